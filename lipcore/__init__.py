@@ -1,0 +1,21 @@
+"""Inverse dynamics of manipulators as physics-informed Gaussian processes."""
+
+from lipcore.fitting import FitCancelledError, FitOptions, FitProgress
+from lipcore.linalg import NotPositiveDefiniteError
+from lipcore.model import TorqueModel, TorquePrediction, train
+from lipcore.persistence import ModelFormatError, load, save
+from lipcore.samples import Samples
+
+__all__ = [
+    "FitCancelledError",
+    "FitOptions",
+    "FitProgress",
+    "ModelFormatError",
+    "NotPositiveDefiniteError",
+    "Samples",
+    "TorqueModel",
+    "TorquePrediction",
+    "load",
+    "save",
+    "train",
+]

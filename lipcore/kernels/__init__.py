@@ -1,0 +1,1 @@
+"""Torque kernels, one idea a file."""

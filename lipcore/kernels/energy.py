@@ -1,0 +1,62 @@
+"""From energy kernels to torque kernels: Lagrange's equations applied to both arguments, in closed form.
+
+tau_i = d/dt(∂L/∂dq_i) − ∂L/∂q_i with L = T − V (eq. 9 of TR2023-063). Both functions take any position kernel with its
+derivatives, so every estimator built on energies shares them.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lipcore.kernels.base import State
+from lipcore.kernels.polynomial import Derivatives
+
+
+def potential_blocks(position: Derivatives) -> Tensor:
+    """Torque covariance of V with kernel K(q, q'): ∂²K/∂q_i∂q'_j, (n, n, *batch)."""
+    return position.mixed
+
+
+def kinetic_blocks(position: Derivatives, weights: Tensor, x: State, y: State) -> Tensor:
+    """Torque covariance of T with kernel K(q, q') h², h = Σ_a w_a v_a v'_a: (n, n, *batch).
+
+    Primes mark the second argument. With A = Σ ∂_iK v_i, B = Σ ∂'_jK v'_j, C = vᵀHv' (each carries the factor K),
+    H the mixed derivatives, ḣ, h', ḣ' the time derivatives of h along the first, second and both arguments:
+
+        2 (w a')(K w a + A w v)ᵀ + 2 (w v')(B w a + C w v − ḣ ∂'K − h Hᵀv)ᵀ − 2 (h' ∂K + h H v')(w v)ᵀ
+        + h² H + 2 diag(w (K ḣ' + A h' + B ḣ + C h))
+
+    weights: (n,) velocity weights w of this link; x, y: the same n joints. Equals the block of DESIGN eq. 15 with the
+    logarithmic derivatives multiplied out.
+    """
+    n = weights.shape[0]
+    w = weights.reshape((n,) + (1,) * (x.q.dim() - 1))
+    k, left, right, mixed = position.value, position.left, position.right, position.mixed
+    wv, wa, wv2, wa2 = w * x.v, w * x.a, w * y.v, w * y.a
+    h, dh = (wv * y.v).sum(0), (wa * y.v).sum(0)
+    h2, dh2 = (wv * y.a).sum(0), (wa * y.a).sum(0)
+    mixed_y = (mixed * y.v).sum(1)
+    x_mixed = (mixed * x.v[:, None]).sum(0)
+    a, b, c = (left * x.v).sum(0), (right * y.v).sum(0), (x_mixed * y.v).sum(0)
+
+    block = (2 * wa2)[:, None] * (k * wa + a * wv)
+    block = block + (2 * wv2)[:, None] * (b * wa + c * wv - dh * right - h * x_mixed)
+    block = block - (h2 * left + h * mixed_y)[:, None] * (2 * wv)
+    block = block + (h * h) * mixed
+    diagonal = (2 * w) * (k * dh2 + a * h2 + b * dh + c * h)
+    return block + torch.diag_embed(diagonal.movedim(0, -1)).movedim((-2, -1), (0, 1))
+
+
+def potential_energy_torque(position: Derivatives) -> Tensor:
+    """Covariance of V at x with its torque j at y: ∂K/∂q'_j, (n, *batch)."""
+    return position.right
+
+
+def kinetic_energy_torque(position: Derivatives, weights: Tensor, x: State, y: State) -> Tensor:
+    """Covariance of T at x with its torque j at y: 2 (B h + K h') w v − h² ∂'K, (n, *batch)."""
+    w = weights.reshape((weights.shape[0],) + (1,) * (x.q.dim() - 1))
+    wv = w * x.v
+    h, h2 = (wv * y.v).sum(0), (wv * y.a).sum(0)
+    b = (position.right * y.v).sum(0)
+    return 2 * (b * h + position.value * h2) * wv - h * h * position.right

@@ -1,0 +1,94 @@
+"""The Lagrangian Inspired Polynomial kernel of the paper (eqs. 9, 11, 15 of TR2023-063)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from lipcore.kernels.base import Params, State, TorqueKernel
+from lipcore.kernels.energy import (
+    kinetic_blocks,
+    kinetic_energy_torque,
+    potential_blocks,
+    potential_energy_torque,
+)
+from lipcore.kernels.polynomial import Derivatives, base_kernels, product
+from lipcore.motion import JointType, Motion, check_joint_types
+
+
+class LipKernel(TorqueKernel):
+    """Potential energy over all joints plus one kinetic energy a link, each over the joints that move it.
+
+    Hyperparameters: `potential.log_scale` (); `potential.logits` (n, 2); for link i of 1..n `kinetic.<i>.log_weights`
+    (i,) velocity weights w and `kinetic.<i>.logits` (i, 2). Logits give each joint's shares (σ, α, β), which sum to
+    one: the energies' scale lives in `log_scale` and `log_weights` alone. With `tied` all links share one
+    `kinetic.logits` (n, 2): fewer parameters to overfit with; without, every link has its own as in the paper.
+    """
+
+    def __init__(self, joint_types: Sequence[str], tied: bool = True) -> None:
+        self.joint_types: tuple[JointType, ...] = check_joint_types(joint_types)
+        self.n_joints = len(self.joint_types)
+        self.tied = tied
+
+    def blocks(self, params: Params, x: State, y: State) -> Tensor:
+        """Covariance of torque i at x with torque j at y: (n, n, *batch), (N·m)²."""
+        total = potential_blocks(self.potential(params, x, y))
+        for link in range(1, self.n_joints + 1):
+            kinetic = kinetic_blocks(
+                self.kinetic(params, link, x, y),
+                torch.exp(params[f"kinetic.{link}.log_weights"]),
+                x.first(link),
+                y.first(link),
+            )
+            total[:link, :link] += kinetic  # a link's kinetic energy loads only the joints before it
+        return total
+
+    def potential(self, params: Params, x: State, y: State) -> Derivatives:
+        """Kernel of the potential energy V and its derivatives."""
+        base = base_kernels(shares(params["potential.logits"]), self.joint_types, x.q, y.q)
+        k, scale = product(base), torch.exp(params["potential.log_scale"])
+        return Derivatives(scale * k.value, scale * k.left, scale * k.right, scale * k.mixed)
+
+    def kinetic(self, params: Params, link: int, x: State, y: State) -> Derivatives:
+        """Position factor of the kinetic energy kernel of `link` (1-based) and its derivatives."""
+        logits = params["kinetic.logits"][:link] if self.tied else params[f"kinetic.{link}.logits"]
+        base = base_kernels(shares(logits), self.joint_types[:link], x.q[:link], y.q[:link])
+        return product(base.squared())
+
+    def energies(self, params: Params, x: State, y: State) -> Tensor:
+        """Covariance of the kinetic and the potential energy at x with torque j at y: (2, n, *batch), J·N·m."""
+        potential = potential_energy_torque(self.potential(params, x, y))
+        kinetic = torch.zeros_like(potential)
+        for link in range(1, self.n_joints + 1):
+            weights = torch.exp(params[f"kinetic.{link}.log_weights"])
+            position = self.kinetic(params, link, x, y)
+            kinetic[:link] += kinetic_energy_torque(position, weights, x.first(link), y.first(link))
+        return torch.stack([kinetic, potential])
+
+    def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
+        """Potential torques as large as the measured ones, joint by joint; inertial torques a third of that."""
+        n = self.n_joints
+        power = tau.square().mean(0).clamp_min(1e-12)
+        acceleration = motion.ddq.square().mean(0).sqrt().clamp_min(1e-3)
+        weights = (power.sqrt() / 3 / acceleration).clamp(1e-3, 10.0) / n**0.5
+        # a joint's potential torque grows with its share α or β: start them at the ratio of the torques
+        ratio = torch.log((power / power.max()).clamp_min(1e-6))
+        params = {
+            "potential.log_scale": torch.log(power.max() * 3),
+            "potential.logits": torch.stack([ratio, ratio], dim=1),
+        }
+        if self.tied:
+            params["kinetic.logits"] = torch.zeros((n, 2), dtype=torch.float64, device=tau.device)
+        for link in range(1, n + 1):
+            params[f"kinetic.{link}.log_weights"] = torch.log(weights[:link])
+            if not self.tied:
+                params[f"kinetic.{link}.logits"] = torch.zeros((link, 2), dtype=torch.float64, device=tau.device)
+        return params
+
+
+def shares(logits: Tensor) -> Tensor:
+    """Softmax of (0, logits): (n, 2) to the shares (σ, α, β) of each joint, (n, 3)."""
+    zero = torch.zeros_like(logits[:, :1])
+    return torch.softmax(torch.cat([zero, logits], dim=1), dim=1)

@@ -1,0 +1,96 @@
+"""Polynomial kernels on joint positions and their derivatives.
+
+The energies of a manipulator are polynomials in (cos q_b, sin q_b) of revolute and q_b of prismatic joints
+(TR2023-063, sec. III). A product over joints of one small base kernel each spans them. Everything here is free of
+division, so a base kernel may pass through zero without loss of precision.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lipcore.motion import JointType
+
+
+@dataclass(frozen=True)
+class Derivatives:
+    """A kernel K(q, q') over n joints with the derivatives that Lagrange's equations need.
+
+    value: (*batch); left: ∂K/∂q_i, right: ∂K/∂q'_j, both (n, *batch); mixed: ∂²K/∂q_i∂q'_j, (n, n, *batch).
+    """
+
+    value: Tensor
+    left: Tensor
+    right: Tensor
+    mixed: Tensor
+
+
+@dataclass(frozen=True)
+class BaseKernels:
+    """One base kernel p_b(q_b, q'_b) a joint with p, ∂p/∂q, ∂p/∂q', ∂²p/∂q∂q', each (n, *batch)."""
+
+    value: Tensor
+    left: Tensor
+    right: Tensor
+    mixed: Tensor
+
+    def squared(self) -> BaseKernels:
+        """p², for the kinetic energy: degree two in each joint's cosine and sine."""
+        p = self.value
+        return BaseKernels(p * p, 2 * p * self.left, 2 * p * self.right, 2 * (p * self.mixed + self.left * self.right))
+
+
+def base_kernels(shares: Tensor, joint_types: Sequence[JointType], q: Tensor, q2: Tensor) -> BaseKernels:
+    """Base kernels of all joints (eqs. 8 and 10 of TR2023-063).
+
+    revolute: p = σ + α cos q cos q' + β sin q sin q'; prismatic: p = (σ + β) + α q q'.
+    shares: (n, 3) with columns σ, α, β; q, q2: (n, *batch), batches broadcast.
+    """
+    dims = (-1,) + (1,) * (q.dim() - 1)
+    sigma, alpha, beta = (column.reshape(dims) for column in shares.unbind(1))
+    if "prismatic" not in joint_types:
+        return _revolute(sigma, alpha, beta, q, q2)
+    # computed for every joint, then chosen: robots that mix the two types are small
+    prismatic = torch.tensor([kind == "prismatic" for kind in joint_types], device=q.device).reshape(dims)
+    straight, round_ = _prismatic(sigma + beta, alpha, q, q2), _revolute(sigma, alpha, beta, q, q2)
+    return BaseKernels(
+        *(
+            torch.where(prismatic, getattr(straight, name), getattr(round_, name))
+            for name in ("value", "left", "right", "mixed")
+        )
+    )
+
+
+def _revolute(sigma: Tensor, alpha: Tensor, beta: Tensor, q: Tensor, q2: Tensor) -> BaseKernels:
+    cos, sin, cos2, sin2 = torch.cos(q), torch.sin(q), torch.cos(q2), torch.sin(q2)
+    ac, as_, bc, bs = alpha * cos, alpha * sin, beta * cos, beta * sin
+    return BaseKernels(
+        sigma + ac * cos2 + bs * sin2, bc * sin2 - as_ * cos2, bs * cos2 - ac * sin2, as_ * sin2 + bc * cos2
+    )
+
+
+def _prismatic(sigma: Tensor, alpha: Tensor, q: Tensor, q2: Tensor) -> BaseKernels:
+    slope = alpha * torch.ones_like(q * q2)
+    return BaseKernels(sigma + slope * q * q2, slope * q2, slope * q, slope)
+
+
+def product(base: BaseKernels) -> Derivatives:
+    """Product of the base kernels over all joints, with derivatives, joint by joint.
+
+    Multiplying K by one more joint's p: the old derivatives scale with p, and the new joint adds a row and a column.
+    """
+    value = base.value[0]
+    left, right, mixed = base.left[:1], base.right[:1], base.mixed[:1, None]
+    for b in range(1, base.value.shape[0]):
+        p, lead, trail, both = base.value[b], base.left[b], base.right[b], base.mixed[b]
+        upper = torch.cat([mixed * p, (left * trail)[:, None]], dim=1)
+        lower = torch.cat([right * lead, (value * both)[None]], dim=0)
+        mixed = torch.cat([upper, lower[None]], dim=0)
+        left = torch.cat([left * p, (value * lead)[None]], dim=0)
+        right = torch.cat([right * p, (value * trail)[None]], dim=0)
+        value = value * p
+    return Derivatives(value, left, right, mixed)

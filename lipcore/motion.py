@@ -1,0 +1,74 @@
+"""Joint motion: what a torque is a function of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, cast, get_args
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+JointType = Literal["revolute", "prismatic"]
+JOINT_TYPES: tuple[JointType, ...] = get_args(JointType)
+
+
+def check_joint_types(joint_types: Sequence[str]) -> tuple[JointType, ...]:
+    """Return `joint_types` as a tuple; raise ValueError naming the first one that is unknown."""
+    if not joint_types:
+        raise ValueError("joint_types is empty: a robot has at least one joint")
+    for index, kind in enumerate(joint_types):
+        if kind not in JOINT_TYPES:
+            raise ValueError(f"joint_types[{index}] is {kind!r}, expected one of {', '.join(JOINT_TYPES)}")
+    return cast(tuple[JointType, ...], tuple(joint_types))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """N instants of motion of n joints, float64 tensors on one device.
+
+    q, dq, ddq: (N, n) position, velocity, acceleration in rad, rad/s, rad/s² (prismatic: m, m/s, m/s²).
+    """
+
+    q: Tensor
+    dq: Tensor
+    ddq: Tensor
+
+    @classmethod
+    def from_arrays(cls, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike, device: torch.device | str = "cpu") -> Motion:
+        """Build from arrays of shape (N, n) or (n,); raise ValueError where shapes differ or a value is not finite."""
+        tensors = []
+        for name, values in (("q", q), ("dq", dq), ("ddq", ddq)):
+            array = np.atleast_2d(np.asarray(values, dtype=np.float64))
+            if not np.isfinite(array).all():
+                sample, joint = np.argwhere(~np.isfinite(array))[0]
+                value = array[sample, joint]
+                raise ValueError(f"{name}[{sample}, {joint}] is {value}, expected a finite number")
+            tensors.append(torch.from_numpy(array.copy()).to(device))
+        shape = tensors[0].shape
+        for name, tensor in zip(("dq", "ddq"), tensors[1:], strict=True):
+            if tensor.shape != shape:
+                raise ValueError(f"{name} has shape {tuple(tensor.shape)}, expected {tuple(shape)} as q has")
+        return cls(*tensors)
+
+    def __len__(self) -> int:
+        return self.q.shape[0]
+
+    def __getitem__(self, rows: slice | Tensor) -> Motion:
+        return Motion(self.q[rows], self.dq[rows], self.ddq[rows])
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints n."""
+        return self.q.shape[1]
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the tensors."""
+        return self.q.device
+
+    def to(self, device: torch.device | str) -> Motion:
+        """Return the same motion on `device`."""
+        return Motion(self.q.to(device), self.dq.to(device), self.ddq.to(device))

@@ -1,0 +1,136 @@
+"""A model on disk: `manifest.json`, which a person can read, and `model.safetensors`. Nothing in either can run code."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+
+from lipcore.model import TORQUE_CONVENTIONS, TorqueModel, restore, training_range
+from lipcore.motion import Motion
+
+FORMAT = "lipserve-model"
+FORMAT_VERSION = 1
+MANIFEST, TENSORS = "manifest.json", "model.safetensors"
+
+
+class ModelFormatError(ValueError):
+    """A folder does not hold a valid model; the message names what is wrong."""
+
+
+def save(model: TorqueModel, folder: Path, lineage: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Write the model as a new folder, all of it or nothing, and return its manifest.
+
+    lineage: where the model comes from, stored as given. Raise FileExistsError where the folder exists.
+    """
+    if folder.exists():
+        raise FileExistsError(f"{folder} exists: a saved model is never overwritten")
+    motion = model.posterior.motion
+    tensors = {f"params/{name}": value for name, value in model.posterior.params.items()}
+    tensors |= {"samples/q": motion.q, "samples/dq": motion.dq, "samples/ddq": motion.ddq, "samples/tau": model.tau}
+    payload = save_tensors({name: value.contiguous() for name, value in tensors.items()})
+    manifest = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "estimator": model.estimator.name,
+        "joint_names": list(model.joint_names),
+        "joint_types": list(model.joint_types),
+        "torque_convention": model.torque_convention,
+        "noise_std": model.noise_std.tolist(),
+        "options": model.options,
+        "fit": model.fit,
+        "training_range": training_range(model),
+        "lineage": dict(lineage or {}),
+        "tensors": {"file": TENSORS, "bytes": len(payload), "sha256": hashlib.sha256(payload).hexdigest()},
+    }
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    draft = Path(tempfile.mkdtemp(prefix=".draft-", dir=folder.parent))
+    try:
+        _write(draft / TENSORS, payload)
+        _write(draft / MANIFEST, json.dumps(manifest, indent=2, allow_nan=False).encode() + b"\n")
+        draft.chmod(0o755)
+        os.rename(draft, folder)
+        _sync(folder.parent)
+    except BaseException:
+        shutil.rmtree(draft, ignore_errors=True)
+        raise
+    return manifest
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """Read and check a model's manifest; raise ModelFormatError."""
+    try:
+        manifest = json.loads((folder / MANIFEST).read_bytes())
+    except (OSError, ValueError) as error:
+        raise ModelFormatError(f"{folder / MANIFEST} cannot be read: {error}") from error
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        raise ModelFormatError(f"{folder / MANIFEST} is not a manifest of format {FORMAT!r}")
+    if manifest.get("format_version") != FORMAT_VERSION:
+        raise ModelFormatError(f"format_version is {manifest.get('format_version')!r}, expected {FORMAT_VERSION}")
+    kinds = {"estimator": str, "joint_names": list, "joint_types": list, "options": dict, "fit": dict, "tensors": dict}
+    for name, kind in kinds.items():
+        if not isinstance(manifest.get(name), kind):
+            raise ModelFormatError(f"{name} is {manifest.get(name)!r}, expected a {kind.__name__}")
+    if manifest.get("torque_convention") not in TORQUE_CONVENTIONS:
+        raise ModelFormatError(f"torque_convention is {manifest.get('torque_convention')!r}")
+    return manifest
+
+
+def load(folder: Path) -> TorqueModel:
+    """Load a model that `save` wrote; raise ModelFormatError for anything else."""
+    manifest = read_manifest(folder)
+    try:
+        payload = (folder / TENSORS).read_bytes()
+    except OSError as error:
+        raise ModelFormatError(f"{folder / TENSORS} cannot be read: {error}") from error
+    if hashlib.sha256(payload).hexdigest() != manifest["tensors"].get("sha256"):
+        raise ModelFormatError(f"{folder / TENSORS} does not match the sha256 of its manifest")
+    try:
+        tensors = load_tensors(payload)
+        for name, value in tensors.items():
+            if value.dtype != torch.float64 or not torch.isfinite(value).all():
+                raise ValueError(f"tensor {name!r} is not made of finite float64 numbers")
+        samples = {name: tensors.pop(f"samples/{name}") for name in ("q", "dq", "ddq", "tau")}
+        n = len(manifest["joint_names"])
+        for name, value in samples.items():
+            if value.dim() != 2 or value.shape != samples["q"].shape or value.shape[1] != n or len(value) < 1:
+                raise ValueError(f"samples/{name} has shape {tuple(value.shape)}, expected (N, {n})")
+        return restore(
+            manifest["estimator"],
+            manifest["joint_names"],
+            manifest["joint_types"],
+            manifest["torque_convention"],
+            manifest["options"],
+            manifest["fit"],
+            {name.removeprefix("params/"): value for name, value in tensors.items()},
+            Motion(samples["q"], samples["dq"], samples["ddq"]),
+            samples["tau"],
+        )
+    except ModelFormatError:
+        raise
+    except Exception as error:
+        raise ModelFormatError(f"{folder} does not hold a valid model: {error}") from error
+
+
+def _write(path: Path, content: bytes) -> None:
+    with path.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _sync(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

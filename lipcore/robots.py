@@ -1,0 +1,141 @@
+"""The fixed-base arms of example-robot-data as Pinocchio models, with every other joint locked.
+
+Needs the packages `pin` and `example-robot-data` (extra `sim`).
+"""
+
+from __future__ import annotations
+
+import importlib
+import site
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lipcore.motion import JointType
+from lipcore.samples import Array
+
+
+class SimulationUnavailableError(RuntimeError):
+    """The packages that simulation needs are not installed."""
+
+
+class UnknownRobotError(ValueError):
+    """No robot of that name can be simulated."""
+
+
+@dataclass(frozen=True)
+class RobotSource:
+    """A URDF below example-robot-data's `robots` folder and the joints that stay free, from base to tip."""
+
+    urdf: str
+    free: tuple[str, ...]
+
+
+def _numbered(pattern: str, *numbers: int) -> tuple[str, ...]:
+    return tuple(pattern.format(number) for number in numbers)
+
+
+_UR = tuple(f"{j}_joint" for j in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"))
+# the gripper's jaw is the last joint of the chain; Pinocchio cannot lock it, since a link has the same name
+_SO = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+
+ROBOTS: dict[str, RobotSource] = {
+    "panda": RobotSource("panda_description/urdf/panda.urdf", _numbered("panda_joint{}", *range(1, 8))),
+    "ur3": RobotSource("ur_description/urdf/ur3_robot.urdf", _UR),
+    "ur5": RobotSource("ur_description/urdf/ur5_robot.urdf", _UR),
+    "ur10": RobotSource("ur_description/urdf/ur10_robot.urdf", _UR),
+    "xarm7": RobotSource("xarm_description/urdf/xarm7.urdf", _numbered("joint{}", *range(1, 8))),
+    "kinova": RobotSource("kinova_description/robots/kinova.urdf", _numbered("j2s6s200_joint_{}", *range(1, 7))),
+    "z1": RobotSource("z1_description/urdf/z1.urdf", _numbered("joint{}", *range(1, 7))),
+    "so100": RobotSource("so_arm_description/urdf/so100.urdf", _SO),
+    "so101": RobotSource("so_arm_description/urdf/so101.urdf", _SO),
+    "baxter-left": RobotSource(
+        "baxter_description/urdf/baxter.urdf", tuple(f"left_{j}" for j in ("s0", "s1", "e0", "e1", "w0", "w1", "w2"))
+    ),
+    "talos-left": RobotSource("talos_data/robots/talos_left_arm.urdf", _numbered("arm_left_{}_joint", *range(2, 8))),
+    "tiago": RobotSource(
+        "tiago_description/robots/tiago_no_hand.urdf",
+        ("torso_lift_joint", *_numbered("arm_{}_joint", *range(1, 8))),
+    ),
+    "double-pendulum": RobotSource("double_pendulum_description/urdf/double_pendulum.urdf", ("joint1", "joint2")),
+    "asr-twodof": RobotSource("asr_twodof_description/urdf/TwoDofs.urdf", ("J1", "J2")),
+    "finger-edu": RobotSource(
+        "finger_edu_description/robots/finger_edu.urdf",
+        ("finger_base_to_upper_joint", "finger_upper_to_middle_joint", "finger_middle_to_lower_joint"),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A serial arm: its Pinocchio model and what the simulator needs to know of its joints.
+
+    lower, upper: (n,) position limits in rad or m; speed: (n,) velocity limits in rad/s or m/s.
+    """
+
+    name: str
+    model: Any
+    joint_names: tuple[str, ...]
+    joint_types: tuple[JointType, ...]
+    lower: Array
+    upper: Array
+    speed: Array
+
+    @property
+    def n_joints(self) -> int:
+        """Number of free joints n."""
+        return len(self.joint_names)
+
+    def configuration(self, q: Array) -> Array:
+        """Pinocchio's configuration of joint positions q (n,): unbounded joints take (cos, sin)."""
+        out = np.empty(self.model.nq)
+        for index in range(1, self.model.njoints):
+            joint, at = self.model.joints[index], self.model.idx_qs[index]
+            angle = q[self.model.idx_vs[index]]
+            out[at : at + joint.nq] = angle if joint.nq == 1 else (np.cos(angle), np.sin(angle))
+        return out
+
+
+def pinocchio() -> Any:
+    """The pinocchio module; raise SimulationUnavailableError with the remedy where it is missing."""
+    try:
+        return importlib.import_module("pinocchio")
+    except ImportError as error:
+        raise SimulationUnavailableError("simulation needs Pinocchio: pip install 'lipserve[sim]'") from error
+
+
+def load_robot(name: str) -> Robot:
+    """Load a robot by name; raise UnknownRobotError or SimulationUnavailableError."""
+    if name not in ROBOTS:
+        raise UnknownRobotError(f"robot is {name!r}, expected one of {', '.join(ROBOTS)}")
+    pin, source = pinocchio(), ROBOTS[name]
+    full = pin.buildModelFromUrdf(str(_robots_folder() / source.urdf))
+    locked = [full.getJointId(joint) for joint in list(full.names)[1:] if joint not in source.free]
+    model = pin.buildReducedModel(full, locked, pin.neutral(full)) if locked else full
+    names = tuple(model.names)[1:]
+    if names != source.free:
+        raise UnknownRobotError(f"robot {name!r} has the joints {names}, expected {source.free}")
+    types: list[JointType] = []
+    limits = []
+    for index in range(1, model.njoints):
+        joint = model.joints[index]
+        types.append("prismatic" if joint.shortname().startswith("JointModelP") else "revolute")
+        at = model.idx_qs[index]
+        low, high = model.lowerPositionLimit[at], model.upperPositionLimit[at]
+        # unbounded joints carry limits of (cos, sin), and some URDFs none at all
+        limits.append((low, high) if joint.nq == 1 and high > low else (-np.pi, np.pi))
+    lower, upper = np.array(limits).T
+    speed = np.where(model.velocityLimit > 0, model.velocityLimit, np.inf)
+    return Robot(name, model, names, tuple(types), lower, upper, speed)
+
+
+def _robots_folder() -> Path:
+    roots = [*site.getsitepackages(), site.getusersitepackages(), *sys.path]
+    for root in roots:
+        folder = Path(root) / "cmeel.prefix/share/example-robot-data/robots"
+        if folder.is_dir():
+            return folder
+    raise SimulationUnavailableError("simulation needs example-robot-data: pip install 'lipserve[sim]'")
