@@ -3,7 +3,7 @@
 from lipcore.fitting import FitCancelledError, FitOptions, FitProgress
 from lipcore.linalg import NotPositiveDefiniteError
 from lipcore.model import TorqueModel, TorquePrediction, train
-from lipcore.persistence import ModelFormatError, load, save
+from lipcore.persistence import ModelFormatError, copy_model, load, save
 from lipcore.samples import Samples
 
 __all__ = [
@@ -15,6 +15,7 @@ __all__ = [
     "Samples",
     "TorqueModel",
     "TorquePrediction",
+    "copy_model",
     "load",
     "save",
     "train",

@@ -23,7 +23,7 @@ class Energies:
 
 def inertia_matrix(posterior: ExactPosterior, dynamics: LipKernel, q: Tensor) -> Tensor:
     """Posterior mean of M(q), (N, n, n): the torque per unit acceleration, exact since torque is affine in ddq."""
-    size, n = q.shape
+    n = q.shape[1]
     zero = torch.zeros_like(q)
     rest = posterior.mean(Motion(q, zero, zero), dynamics)
     columns = []

@@ -46,7 +46,7 @@ def negative_log_evidence(kernel: TorqueKernel, params: Params, motion: Motion, 
         blocks = kernel.blocks(leaves, State.rows(motion[rows]), State.columns(motion[columns]))
         part = 2.0 * by_sample[rows, :, columns].permute(1, 3, 0, 2)
         part[..., : rows.stop - rows.start] *= 0.5
-        (part * blocks).sum().backward()
+        torch.autograd.backward((part * blocks).sum())
     gradient = {name: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for name, leaf in leaves.items()}
     noise = torch.exp(2 * params["noise.log_std"])
     gradient["noise.log_std"] = 2 * noise * weight.diagonal().reshape(size, n).sum(0)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
 
@@ -21,13 +22,15 @@ from lipcore.selection import spread_out
 from lipcore.signals import noise_level
 
 PRIOR_STD = {"noise.log_std": 1.0, "logits": 4.0, "log": 3.0}
-"""Widths of the Gaussian priors on hyperparameters around their starting values: weak, but for the noise, which a small
-data set cannot tell from misfit. A width of 3 on a logarithm admits a factor of 20 either way within one deviation."""
+"""Widths of the Gaussian priors on hyperparameters around their starting values: weak, but for the noise, which a
+small data set cannot tell from misfit. 3 on a logarithm admits a factor of 20 either way within one deviation."""
 NOISE_FLOOR_JOINT = 1e-4
 NOISE_FLOOR_ROBOT = 1e-5
-"""Smallest noise std admitted, relative to the joint's torque spread and to the largest of all joints: below the second,
-a Gram matrix in float64 can no longer be factored faithfully."""
+"""Smallest noise std admitted, relative to the joint's torque spread and to the largest of all joints: below the
+second, a Gram matrix in float64 can no longer be factored faithfully."""
 LINE_SEARCH_PENALTY = 1e4
+TOLERANCE = 1e-7
+"""The fit has converged when an iteration improves the objective by less than this share of it."""
 MEMORY = 30
 """Corrections that L-BFGS keeps."""
 
@@ -47,7 +50,7 @@ class FitOptions:
 
     hyperparameter_samples: int = 150
     posterior_samples: int = 500
-    max_iterations: int = 100
+    max_iterations: int = 150
     tied: bool = True
     device: str = "auto"
 
@@ -113,7 +116,7 @@ class Fit:
     """Fitted hyperparameters and the rows of the data that the posterior stands on."""
 
     params: dict[str, Tensor]
-    rows: Array
+    rows: NDArray[np.int64]
     report: FitReport
 
 
@@ -161,7 +164,7 @@ def fit(
         method="L-BFGS-B",
         callback=callback,
         bounds=objective.bounds({"noise.log_std": np.log(floor)}),
-        options={"maxiter": options.max_iterations, "maxcor": MEMORY},
+        options={"maxiter": options.max_iterations, "maxcor": MEMORY, "ftol": TOLERANCE},
     )
     seconds = time.monotonic() - began
     if on_progress is not None:
@@ -242,4 +245,4 @@ def _noise(samples: Samples) -> Array:
 
 def _noise_floor(samples: Samples) -> Array:
     spread = samples.tau.std(axis=0)
-    return np.maximum(NOISE_FLOOR_JOINT * spread, NOISE_FLOOR_ROBOT * max(spread.max(), 1e-6))
+    return np.asarray(np.maximum(NOISE_FLOOR_JOINT * spread, NOISE_FLOOR_ROBOT * max(float(spread.max()), 1e-6)))

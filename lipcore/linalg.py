@@ -25,15 +25,17 @@ class Factor:
     def solve(self, right: Tensor) -> Tensor:
         """K⁻¹ right for right of shape (m,) or (m, k)."""
         columns = right[:, None] if right.dim() == 1 else right
-        return torch.cholesky_solve(columns, self.lower).reshape(right.shape)
+        solved: Tensor = torch.cholesky_solve(columns, self.lower)
+        return solved.reshape(right.shape)
 
     def whiten(self, right: Tensor) -> Tensor:
         """L⁻¹ right for right of shape (m, k)."""
-        return torch.linalg.solve_triangular(self.lower, right, upper=False)
+        solved: Tensor = torch.linalg.solve_triangular(self.lower, right, upper=False)
+        return solved
 
     def log_determinant(self) -> Tensor:
         """log det K."""
-        return 2 * self.lower.diagonal().log().sum()
+        return self.lower.diagonal().log().sum().mul(2)
 
 
 def cholesky(matrix: Tensor) -> Factor:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Literal, get_args
 
-import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
@@ -18,7 +17,7 @@ from lipcore.posterior import ExactPosterior
 from lipcore.samples import Array, Samples
 
 TorqueConvention = Literal["gravity_included", "gravity_compensated"]
-"""What the torque means: the full joint torque (Franka's `tau_J`), or that beyond gravity compensation."""
+"""What a torque means: all of it (Franka's `tau_J`), or what is added to gravity compensation (its commands)."""
 TORQUE_CONVENTIONS: tuple[TorqueConvention, ...] = get_args(TorqueConvention)
 
 
@@ -26,8 +25,8 @@ TORQUE_CONVENTIONS: tuple[TorqueConvention, ...] = get_args(TorqueConvention)
 class TorquePrediction:
     """Answer for N queries of n joints, N·m.
 
-    tau: (N, n) mean; tau_std: (N, n) standard deviation of the function; noise_std: (n,) of the measurement; an interval
-    for measurements needs both. covariance: (N, n, n) of the function between joints.
+    tau: (N, n) mean; tau_std: (N, n) standard deviation of the function; noise_std: (n,) of the measurement; an
+    interval for measurements needs both. covariance: (N, n, n) of the function between joints.
     """
 
     tau: Array
@@ -60,7 +59,8 @@ class TorqueModel:
     @property
     def noise_std(self) -> Array:
         """Standard deviation of the measured torque around the function, (n,) N·m."""
-        return np.exp(self.posterior.params["noise.log_std"].numpy())
+        noise: Array = self.posterior.params["noise.log_std"].exp().numpy()
+        return noise
 
     def predict(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> TorquePrediction:
         """Torque with uncertainty for arrays of shape (n,) or (N, n).

@@ -1,4 +1,4 @@
-"""A model on disk: `manifest.json`, which a person can read, and `model.safetensors`. Nothing in either can run code."""
+"""A model on disk: `manifest.json`, which a person can read, and `model.safetensors`; neither can hold code."""
 
 from __future__ import annotations
 
@@ -52,17 +52,14 @@ def save(model: TorqueModel, folder: Path, lineage: Mapping[str, Any] | None = N
         "lineage": dict(lineage or {}),
         "tensors": {"file": TENSORS, "bytes": len(payload), "sha256": hashlib.sha256(payload).hexdigest()},
     }
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    draft = Path(tempfile.mkdtemp(prefix=".draft-", dir=folder.parent))
-    try:
-        _write(draft / TENSORS, payload)
-        _write(draft / MANIFEST, json.dumps(manifest, indent=2, allow_nan=False).encode() + b"\n")
-        draft.chmod(0o755)
-        os.rename(draft, folder)
-        _sync(folder.parent)
-    except BaseException:
-        shutil.rmtree(draft, ignore_errors=True)
-        raise
+    _write_folder(folder, payload, json.dumps(manifest, indent=2, allow_nan=False).encode() + b"\n")
+    return manifest
+
+
+def copy_model(source: Path, folder: Path) -> dict[str, Any]:
+    """Copy a saved model to a new folder, all of it or nothing, and return its manifest; raise ModelFormatError."""
+    manifest = read_manifest(source)
+    _write_folder(folder, _read_tensors(source, manifest), (source / MANIFEST).read_bytes())
     return manifest
 
 
@@ -88,12 +85,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 def load(folder: Path) -> TorqueModel:
     """Load a model that `save` wrote; raise ModelFormatError for anything else."""
     manifest = read_manifest(folder)
-    try:
-        payload = (folder / TENSORS).read_bytes()
-    except OSError as error:
-        raise ModelFormatError(f"{folder / TENSORS} cannot be read: {error}") from error
-    if hashlib.sha256(payload).hexdigest() != manifest["tensors"].get("sha256"):
-        raise ModelFormatError(f"{folder / TENSORS} does not match the sha256 of its manifest")
+    payload = _read_tensors(folder, manifest)
     try:
         tensors = load_tensors(payload)
         for name, value in tensors.items():
@@ -119,6 +111,31 @@ def load(folder: Path) -> TorqueModel:
         raise
     except Exception as error:
         raise ModelFormatError(f"{folder} does not hold a valid model: {error}") from error
+
+
+def _read_tensors(folder: Path, manifest: Mapping[str, Any]) -> bytes:
+    try:
+        payload = (folder / TENSORS).read_bytes()
+    except OSError as error:
+        raise ModelFormatError(f"{folder / TENSORS} cannot be read: {error}") from error
+    if hashlib.sha256(payload).hexdigest() != manifest["tensors"].get("sha256"):
+        raise ModelFormatError(f"{folder / TENSORS} does not match the sha256 of its manifest")
+    return payload
+
+
+def _write_folder(folder: Path, payload: bytes, manifest: bytes) -> None:
+    """Write both files to a draft beside `folder`, then rename it: readers see all or nothing."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    draft = Path(tempfile.mkdtemp(prefix=".draft-", dir=folder.parent))
+    try:
+        _write(draft / TENSORS, payload)
+        _write(draft / MANIFEST, manifest)
+        draft.chmod(0o755)
+        os.rename(draft, folder)
+        _sync(folder.parent)
+    except BaseException:
+        shutil.rmtree(draft, ignore_errors=True)
+        raise
 
 
 def _write(path: Path, content: bytes) -> None:

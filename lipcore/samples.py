@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -53,7 +54,7 @@ class Samples:
         """Contiguous runs of equal `episode`, in order of rows."""
         edges = np.flatnonzero(np.diff(self.episode)) + 1
         bounds = [0, *edges.tolist(), len(self)]
-        return [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True) if b > a]
+        return [slice(a, b) for a, b in pairwise(bounds) if b > a]
 
     def motion(self, device: torch.device | str = "cpu") -> Motion:
         """Position, velocity and acceleration as tensors."""

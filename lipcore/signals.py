@@ -34,7 +34,7 @@ def low_pass(signal: Array, rate: float, cutoff: float = CUTOFF) -> Array:
 
 
 def differentiate(signal: Array, rate: float) -> Array:
-    """Central differences of second order, one-sided at both ends. signal: (N, k), N ≥ 3, evenly sampled at `rate` Hz."""
+    """Central differences, one-sided at both ends. signal: (N, k), N ≥ 3, evenly sampled at `rate` Hz."""
     if len(signal) < 3:
         raise ValueError(f"signal has {len(signal)} samples, expected at least 3 to be differentiated")
     return np.asarray(np.gradient(signal, 1.0 / rate, axis=0, edge_order=2), dtype=np.float64)

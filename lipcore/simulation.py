@@ -25,7 +25,7 @@ FAST = 10.0
 
 @dataclass(frozen=True)
 class Payload:
-    """A point mass fixed to the last link from time `at` on. mass in kg, at in s, offset (x, y, z) in m in its frame."""
+    """A point mass (kg) fixed to the last link from time `at` (s) on; offset (x, y, z) in m in the link's frame."""
 
     mass: float
     at: float = 0.0

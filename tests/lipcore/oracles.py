@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.func import jacrev
 
-Energy = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
-"""k(q, v, q', v') of one energy, scalar."""
+from lipcore.motion import Motion
+
+Instant = tuple[Tensor, Tensor, Tensor]
+"""(q, v, a) of one sample, each (n,)."""
+
+
+@dataclass(frozen=True)
+class Energy:
+    """One independent energy. kernel: k(q, v, q', v'), scalar; sign in the Lagrangian: + kinetic, − potential."""
+
+    kernel: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
+    sign: int
 
 
 def base_kernel(kind: str, share: Tensor, q: Tensor, q2: Tensor) -> Tensor:
@@ -19,60 +31,76 @@ def base_kernel(kind: str, share: Tensor, q: Tensor, q2: Tensor) -> Tensor:
     return sigma + beta + alpha * q * q2
 
 
-def lip_energies(
-    joint_types: Sequence[str],
-    potential: tuple[Tensor, Tensor],
-    kinetic: Sequence[tuple[Tensor, Tensor]],
-) -> list[tuple[Energy, bool]]:
-    """Energy kernels of the paper: [(kernel, is kinetic)]; `potential` is (scale, shares), `kinetic` (weights, shares)."""
+def shares_of(logits: Tensor) -> Tensor:
+    """(σ, α, β) of each joint, (n, 3): proportional to (1, e^first, e^second), summing to one."""
+    parts = torch.cat([torch.ones(len(logits), 1, dtype=logits.dtype), torch.exp(logits)], dim=1)
+    return parts / parts.sum(1, keepdim=True)
 
-    def make_potential(scale: Tensor, share: Tensor) -> Energy:
-        def kernel(q: Tensor, v: Tensor, q2: Tensor, v2: Tensor) -> Tensor:
-            value = scale
-            for b, kind in enumerate(joint_types):
-                value = value * base_kernel(kind, share[b], q[b], q2[b])
-            return value
 
-        return kernel
+def lip_energies(joint_types: Sequence[str], params: Mapping[str, Tensor]) -> list[Energy]:
+    """Energies of the paper: the potential over all joints, then one kinetic energy for each link."""
+    potential_shares = shares_of(params["potential.logits"])
+    scale = torch.exp(params["potential.log_scale"])
 
-    def make_kinetic(weights: Tensor, share: Tensor) -> Energy:
-        def kernel(q: Tensor, v: Tensor, q2: Tensor, v2: Tensor) -> Tensor:
+    def potential(q: Tensor, v: Tensor, q2: Tensor, v2: Tensor) -> Tensor:
+        value = scale
+        for b, kind in enumerate(joint_types):
+            value = value * base_kernel(kind, potential_shares[b], q[b], q2[b])
+        return value
+
+    energies = [Energy(potential, -1)]
+    for link in range(1, len(joint_types) + 1):
+        weights = torch.exp(params[f"kinetic.{link}.log_weights"])
+        logits = params["kinetic.logits"] if "kinetic.logits" in params else params[f"kinetic.{link}.logits"]
+        link_shares = shares_of(logits)
+
+        def kinetic(
+            q: Tensor, v: Tensor, q2: Tensor, v2: Tensor, weights: Tensor = weights, share: Tensor = link_shares
+        ) -> Tensor:
             count = len(weights)
             value = (weights * v[:count] * v2[:count]).sum() ** 2
             for b in range(count):
                 value = value * base_kernel(joint_types[b], share[b], q[b], q2[b]) ** 2
             return value
 
-        return kernel
-
-    return [(make_potential(*potential), False)] + [(make_kinetic(*term), True) for term in kinetic]
-
-
-def lagrange(energy: Callable[[Tensor, Tensor], Tensor], q: Tensor, v: Tensor, a: Tensor, kinetic: bool) -> Tensor:
-    """tau = d/dt(∂L/∂v) − ∂L/∂q by automatic differentiation; L is +energy (kinetic) or −energy (potential)."""
-    sign = 1.0 if kinetic else -1.0
-    q, v = q.detach().requires_grad_(True), v.detach().requires_grad_(True)
-    value = sign * energy(q, v)
-    dq, dv = torch.autograd.grad(value, (q, v), create_graph=True, allow_unused=True, materialize_grads=True)
-    # d/dt of ∂L/∂v along (v, a)
-    rows = []
-    for i in range(len(q)):
-        hq, hv = torch.autograd.grad(
-            dv[i], (q, v), create_graph=True, allow_unused=True, materialize_grads=True
-        ) if dv[i].requires_grad else (torch.zeros_like(q), torch.zeros_like(v))
-        rows.append((hq * v).sum() + (hv * a).sum() - dq[i])
-    return torch.stack(rows)
+        energies.append(Energy(kinetic, +1))
+    return energies
 
 
-def torque_block(energies: Sequence[tuple[Energy, bool]], x: Sequence[Tensor], y: Sequence[Tensor]) -> Tensor:
-    """cov(tau_i(x), tau_j(y)), (n, n), with Lagrange's operator applied by autograd to both arguments."""
-    n = len(x[0])
-    total = torch.zeros((n, n), dtype=torch.float64)
-    for kernel, kinetic in energies:
-        for j in range(n):
-            # the operator on the second argument gives a function of the first, on which it is applied again
-            def right(q: Tensor, v: Tensor, kernel: Energy = kernel, j: int = j, kinetic: bool = kinetic) -> Tensor:
-                return lagrange(lambda q2, v2: kernel(q, v, q2, v2), *y, kinetic)[j]
+def lagrange(lagrangian: Callable[[Tensor, Tensor], Tensor], q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+    """d/dt(∂L/∂v) − ∂L/∂q of every entry of L(q, v), the joint as last axis."""
+    momentum = jacrev(lagrangian, argnums=1)
+    by_q, by_v = jacrev(momentum, argnums=(0, 1))(q, v)
+    return by_q @ v + by_v @ a - jacrev(lagrangian, argnums=0)(q, v)
 
-            total[:, j] += lagrange(right, *x, kinetic).detach()
-    return total
+
+def torque_terms(energies: Sequence[Energy], x: Instant, y: Instant) -> Tensor:
+    """cov(tau_i(x), tau_j(y)) due to each energy alone, (energies, n, n)."""
+
+    def block(energy: Energy) -> Tensor:
+        def at_y(q: Tensor, v: Tensor) -> Tensor:
+            return lagrange(lambda q2, v2: energy.kernel(q, v, q2, v2), *y)
+
+        return lagrange(at_y, *x).T  # the sign enters twice
+
+    return torch.stack([block(energy) for energy in energies])
+
+
+def energy_torque(energies: Sequence[Energy], x: Instant, y: Instant) -> Tensor:
+    """cov(energy(x), tau_j(y)) of each energy, (energies, n)."""
+    q, v, _ = x
+    return torch.stack([e.sign * lagrange(lambda q2, v2, e=e: e.kernel(q, v, q2, v2), *y) for e in energies])
+
+
+def scale_of(energies: Sequence[Energy], x: Instant, y: Instant, terms: Tensor) -> float:
+    """Size that rounding errors are relative to: the largest entry of any one term, or the energies themselves.
+
+    The sum of the terms may cancel, and so may a term where the derivative of a base kernel is zero.
+    """
+    values = [float(energy.kernel(*x[:2], *y[:2]).abs()) for energy in energies]
+    return max(float(terms.abs().max()), *values)
+
+
+def instant(motion: Motion, row: int) -> Instant:
+    """One sample of a motion."""
+    return motion.q[row], motion.dq[row], motion.ddq[row]

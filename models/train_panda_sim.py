@@ -1,0 +1,53 @@
+"""Train the shipped model `panda-sim` from simulated streams and print how it does on unseen trajectories."""
+
+import shutil
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import lipcore
+from lipcore.metrics import evaluate
+from lipcore.robots import load_robot
+from lipcore.simulation import Stream, simulate
+
+FOLDER = Path(__file__).parent / "panda-sim"
+SPEEDS = (1.0, 2.0, 5.0, 10.0)
+STREAMS = [(Stream(motion="full", speed=SPEEDS[k % 4]), 100 + k) for k in range(16)]
+
+
+def main() -> None:
+    """Simulate, train, evaluate, save."""
+    torch.set_num_threads(1)
+    robot = load_robot("panda")
+    samples = lipcore.Samples.concatenate([simulate(robot, stream, seed) for stream, seed in STREAMS])
+
+    def show(progress: lipcore.FitProgress) -> None:
+        print(f"\r{progress.stage} {progress.iteration}: {progress.objective:.1f}", end="", file=sys.stderr)
+
+    model = lipcore.train(
+        samples, robot.joint_types, options=lipcore.FitOptions(hyperparameter_samples=200), on_progress=show
+    )
+    print(f"\nspeed  joint  {'nMSE':>9}  {'RMSE N·m':>9}  coverage of 95 %")
+    for speed in SPEEDS:
+        tests = [simulate(robot, Stream(motion="full", speed=speed, n_sinusoids=100), seed) for seed in (900, 901, 902)]
+        test = lipcore.Samples.concatenate(tests)
+        answer = model.predict(test.q, test.dq, test.ddq)
+        metrics = evaluate(test.tau, answer.tau, answer.tau_std, answer.noise_std)
+        for joint in range(robot.n_joints):
+            figures = metrics.nmse[joint], metrics.rmse[joint], metrics.coverage[joint]
+            print(f"{speed:5g}  {joint + 1:5d}  {figures[0]:9.2e}  {figures[1]:9.4f}  {figures[2]:.3f}")
+    if FOLDER.exists():
+        shutil.rmtree(FOLDER)
+    lineage = {
+        "simulation": [{**asdict(stream), "robot": "panda", "seed": seed} for stream, seed in STREAMS],
+        "made_by": "models/train_panda_sim.py",
+    }
+    lipcore.save(model, FOLDER, lineage)
+    print(f"noise {np.round(model.noise_std, 4)} N·m; wrote {FOLDER.name}")
+
+
+if __name__ == "__main__":
+    main()

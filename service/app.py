@@ -1,0 +1,104 @@
+"""The application: settings in, ASGI app out."""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import IO
+
+import torch
+from anyio import CapacityLimiter, to_thread
+from fastapi import FastAPI
+from sqlalchemy import select
+
+from service import __version__, errors, health
+from service.context import Service
+from service.database import Database, DatasetRow, VersionRow
+from service.datasets import routes as datasets
+from service.files import Files
+from service.inference import routes as inference
+from service.inference.loaded import LoadedModels
+from service.models import registry
+from service.models import routes as models
+from service.settings import Settings
+from service.training import routes as training
+from service.training.queue import JobQueue
+
+logger = logging.getLogger(__name__)
+
+DESCRIPTION = """Learns the inverse dynamics of a manipulator from joint data and answers torques with uncertainty.
+
+Units are SI: rad, rad/s, rad/s², N·m (prismatic joints: m, m/s, m/s², N).
+Errors are `{"error": {code, message, detail}}`.
+"""
+
+
+class HomeInUseError(RuntimeError):
+    """Another service works on the same home."""
+
+
+def create_app(settings: Settings | None = None) -> FastAPI:
+    """Build the application. Nothing is opened before it starts."""
+    settings = settings or Settings()
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        lock = _lock(settings.home)
+        service = await to_thread.run_sync(_open, settings)
+        app.state.service = service
+        try:
+            yield
+        finally:
+            service.jobs.close()
+            service.database.close()
+            lock.close()
+
+    app = FastAPI(
+        title="LIPServe",
+        summary="A model server for robot dynamics",
+        description=DESCRIPTION,
+        version=__version__,
+        lifespan=lifespan,
+        max_body_size=settings.max_request_bytes,
+    )
+    errors.install(app)
+    app.include_router(health.router)
+    app.include_router(datasets.router, max_body_size=settings.max_upload_bytes)
+    app.include_router(training.router)
+    app.include_router(models.router)
+    app.include_router(inference.router)
+    return app
+
+
+def _open(settings: Settings) -> Service:
+    """Open the home, finish what an earlier run left, and load the models that are asked for first."""
+    torch.set_num_threads(settings.serving_threads)
+    database, files = Database(settings.home), Files(settings.home)
+    with database.session() as session:
+        datasets_known = set(session.scalars(select(DatasetRow.id)))
+        versions_known = set(session.scalars(select(VersionRow.folder)))
+    if swept := files.sweep(datasets_known, versions_known):
+        logger.warning("removed %d unfinished files of an earlier run", swept)
+    registry.install_shipped(database, files)
+    loaded = LoadedModels(database, files, settings.max_loaded_models)
+    logger.info("loaded %d models", loaded.preload())
+    jobs = JobQueue(settings, database)
+    if recovered := jobs.recover():
+        logger.warning("queued again after an interruption: %s", ", ".join(recovered))
+    limiter = CapacityLimiter(settings.max_concurrent_predictions)
+    return Service(settings, database, files, loaded, jobs, limiter)
+
+
+def _lock(home: Path) -> IO[str]:
+    """Hold the home for this process; the lock ends with the process, however it ends."""
+    home.mkdir(parents=True, exist_ok=True)
+    file = (home / ".lock").open("w")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.close()
+        raise HomeInUseError(f"another service uses {home}: stop it, or set LIPSERVE_HOME to another folder") from None
+    return file

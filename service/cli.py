@@ -1,0 +1,198 @@
+"""The command line: `lipserve`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+import uvicorn
+from pydantic import ValidationError
+from rich.console import Console
+from rich.table import Table
+
+from lipcore.robots import ROBOTS, SimulationUnavailableError, UnknownRobotError, load_robot
+from lipcore.simulation import FAST, Payload, Stream, simulate
+from service import __version__, recordings
+from service.app import create_app
+from service.client import DEFAULT_URL, ApiError, Client, ServiceUnreachableError
+from service.progress import follow
+from service.settings import Settings
+from service.training.states import SUCCEEDED
+
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Learn a manipulator's inverse dynamics and serve torques with uncertainty.",
+)
+out, err = Console(), Console(stderr=True)
+
+Url = Annotated[str, typer.Option("--url", envvar="LIPSERVE_URL", help="Address of the service.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
+Files = Annotated[list[Path], typer.Argument(exists=True, dir_okay=False, help="Recordings, .csv or .npz.")]
+
+
+def main() -> None:
+    """Run the command line; errors that a user can act on are printed without a traceback."""
+    try:
+        app()
+    except ApiError as error:
+        _fail(f"{error.message} ({error.code}, {error.status})")
+    except (ServiceUnreachableError, SimulationUnavailableError, UnknownRobotError, ValueError, OSError) as error:
+        _fail(str(error))
+
+
+@app.callback(invoke_without_command=True)
+def _root(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    if version:
+        out.print(__version__)
+        raise typer.Exit
+
+
+@app.command()
+def serve(
+    host: Annotated[str | None, typer.Option(help="Address to listen on (LIPSERVE_HOST).")] = None,
+    port: Annotated[int | None, typer.Option(help="Port to listen on (LIPSERVE_PORT).")] = None,
+) -> None:
+    """Serve models and run training jobs."""
+    given = {name: value for name, value in (("host", host), ("port", port)) if value is not None}
+    try:
+        settings = Settings(**given)  # type: ignore[arg-type]  # validated here
+    except ValidationError as error:
+        _fail("; ".join(f"{'.'.join(map(str, e['loc'])) or 'settings'}: {e['msg']}" for e in error.errors()))
+    uvicorn.run(
+        create_app(settings),
+        host=settings.host,
+        port=settings.port,
+        log_level=settings.log_level,
+        log_config=_log_config(settings.log_level),
+        access_log=settings.log_level == "debug",
+        loop="uvloop",
+        http="httptools",
+        ws="websockets-sansio",
+    )
+
+
+@app.command("simulate")
+def simulate_(
+    robot: Annotated[str, typer.Argument(help=f"One of {', '.join(ROBOTS)}.")],
+    output: Annotated[Path, typer.Argument(help="File to write, .csv or .npz.", dir_okay=False)],
+    seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal streams.")] = 0,
+    samples: Annotated[int, typer.Option(min=2)] = 500,
+    rate: Annotated[float, typer.Option(help="Hz.")] = 10.0,
+    sinusoids: Annotated[int, typer.Option(min=1, help="50 for training, 100 for testing in the paper.")] = 50,
+    motion: Annotated[str, typer.Option(help="middle (±0.5 rad) or full.")] = "middle",
+    fast: Annotated[bool, typer.Option(help="The faster-moving variant.")] = False,
+    noise: Annotated[float, typer.Option(help="Std of the torque noise, N·m.")] = 0.01,
+    viscous: Annotated[float, typer.Option(help="Viscous friction, N·m·s/rad.")] = 0.0,
+    coulomb: Annotated[float, typer.Option(help="Coulomb friction, N·m.")] = 0.0,
+    payload: Annotated[float, typer.Option(help="Payload, kg.")] = 0.0,
+    payload_at: Annotated[float, typer.Option(help="When the payload is attached, s.")] = 0.0,
+) -> None:
+    """Simulate a robot's stream with Pinocchio and write it as a recording."""
+    stream = Stream(
+        n_samples=samples,
+        rate=rate,
+        n_sinusoids=sinusoids,
+        motion=motion,  # type: ignore[arg-type]  # simulate checks it
+        speed=FAST if fast else 1.0,
+        noise=noise,
+        viscous=viscous,
+        coulomb=coulomb,
+        payload=Payload(payload, payload_at) if payload else None,
+    )
+    data = simulate(load_robot(robot), stream, seed)
+    recordings.write(output, data)
+    out.print(f"{output}: {len(data)} samples of {', '.join(data.joint_names)}")
+
+
+@app.command()
+def train(
+    files: Files,
+    model: Annotated[str, typer.Option(help="Name of the model; a new version of it is made.")],
+    url: Url = DEFAULT_URL,
+    estimator: Annotated[str | None, typer.Option(help="Kernel family.")] = None,
+    joint_types: Annotated[
+        str | None, typer.Option(help="One a joint, separated by commas; all revolute by default.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Upload recordings and train a model on them. Ctrl-C cancels the job."""
+    with Client(url) as client:
+        datasets = [client.upload(path).id for path in files]
+        types = None if joint_types is None else [kind.strip() for kind in joint_types.split(",")]
+        job = client.train(model, datasets, estimator, types)
+        job = follow(client, job, err)
+    if as_json:
+        out.print_json(job.model_dump_json())
+    if job.state != SUCCEEDED:
+        _fail(f"job {job.id} has {job.state}" + (f": {job.error.message}" if job.error else ""))
+    if not as_json:
+        out.print(f"{model} version {job.version} is trained and answers")
+
+
+@app.command()
+def predict(
+    model: Annotated[str, typer.Argument(help="Name of the model.")],
+    q: Annotated[str, typer.Option("--q", help="Positions, rad, separated by commas.")],
+    dq: Annotated[str | None, typer.Option("--dq", help="Velocities, rad/s; zero by default.")] = None,
+    ddq: Annotated[str | None, typer.Option("--ddq", help="Accelerations, rad/s²; zero by default.")] = None,
+    url: Url = DEFAULT_URL,
+    as_json: Json = False,
+) -> None:
+    """Ask a model for the torque at one motion."""
+    position = _numbers("--q", q)
+    zeros = [0.0] * len(position)
+    with Client(url) as client:
+        answer = client.predict(
+            model,
+            position,
+            zeros if dq is None else _numbers("--dq", dq),
+            zeros if ddq is None else _numbers("--ddq", ddq),
+        )
+    if as_json:
+        out.print_json(answer.model_dump_json(exclude_none=True))
+        return
+    table = Table("joint", "tau N·m", "tau_std", "noise_std", title=f"{answer.model} version {answer.version}")
+    rows = zip(answer.joint_names, answer.tau, answer.tau_std, answer.noise_std, strict=True)
+    for name, *figures in rows:
+        table.add_row(name, *(f"{figure:.4f}" for figure in figures))
+    out.print(table)
+
+
+@app.command()
+def demo(
+    port: Annotated[int, typer.Option(help="Port of the service; 0 takes a free one.")] = 8000,
+    once: Annotated[bool, typer.Option(envvar="ONCE", help="Stop the service at the end.")] = False,
+    plot: Annotated[Path | None, typer.Option(help="Also draw measured and predicted torque, .png or .svg.")] = None,
+) -> None:
+    """Run the main job: serve, simulate a Panda, upload, train, evaluate on unseen trajectories, ask."""
+    from service.demo import run  # noqa: PLC0415 - only this command needs it
+
+    run(port, once, plot, out)
+
+
+def _numbers(name: str, text: str) -> list[float]:
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        _fail(f"{name} is {text!r}, expected numbers separated by commas")
+
+
+def _fail(message: str) -> NoReturn:
+    err.print(f"[red]error:[/red] {message}", highlight=False, soft_wrap=True)
+    sys.exit(1)
+
+
+def _log_config(level: str) -> dict[str, object]:
+    config: dict[str, object] = json.loads(json.dumps(uvicorn.config.LOGGING_CONFIG))
+    loggers = config["loggers"]
+    assert isinstance(loggers, dict)
+    loggers |= {name: {"handlers": ["default"], "level": level.upper(), "propagate": False} for name in ("service",)}
+    return config
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,171 @@
+"""A Python client of the service."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import httpx
+import numpy as np
+from numpy.typing import ArrayLike
+
+from service.datasets.schema import Dataset
+from service.inference.schema import EvaluateResponse, PredictResponse
+from service.models.schema import Model, Version
+from service.training.schema import Job
+from service.training.states import ACTIVE
+
+DEFAULT_URL = "http://127.0.0.1:8000"
+MEDIA_TYPES = {".csv": "text/csv", ".npz": "application/x-npz"}
+POLL_SECONDS = 0.3
+
+
+class ServiceUnreachableError(ConnectionError):
+    """No service answers at the address."""
+
+
+class ApiError(RuntimeError):
+    """The service refused a request. status: of HTTP; code, message, detail: as the service says."""
+
+    def __init__(self, status: int, code: str, message: str, detail: list[dict[str, Any]]) -> None:
+        super().__init__(message)
+        self.status, self.code, self.message, self.detail = status, code, message, detail
+
+
+class Client:
+    """Synchronous client; use it as a context manager or close it."""
+
+    def __init__(self, url: str = DEFAULT_URL, timeout: float = 120.0) -> None:
+        self.url = url
+        self._http = httpx.Client(base_url=url, timeout=timeout)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._http.close()
+
+    def ready(self) -> bool:
+        """Whether the service can answer queries now."""
+        try:
+            return self._http.get("/health/ready").status_code == httpx.codes.OK
+        except httpx.TransportError:
+            return False
+
+    def upload(
+        self,
+        path: Path,
+        name: str | None = None,
+        joint_names: list[str] | None = None,
+        torque_convention: str = "gravity_included",
+    ) -> Dataset:
+        """Upload a .csv or .npz file; raise ValueError for another ending, ApiError where the data are refused."""
+        if path.suffix not in MEDIA_TYPES:
+            raise ValueError(f"file is {path.name!r}, expected the ending {' or '.join(MEDIA_TYPES)}")
+        params = {"name": name or path.name, "torque_convention": torque_convention}
+        if joint_names is not None:
+            params["joint_names"] = ",".join(joint_names)
+        with path.open("rb") as file:
+            answer = self._send(
+                "POST",
+                "/v1/datasets",
+                params=params,
+                content=_chunks(file),
+                headers={"content-type": MEDIA_TYPES[path.suffix]},
+            )
+        return Dataset.model_validate(answer)
+
+    def train(
+        self,
+        model: str,
+        datasets: list[str],
+        estimator: str | None = None,
+        joint_types: list[str] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> Job:
+        """Queue a training job."""
+        body: dict[str, Any] = {"model": model, "datasets": datasets, "options": options or {}}
+        if estimator is not None:
+            body["estimator"] = estimator
+        if joint_types is not None:
+            body["joint_types"] = joint_types
+        return Job.model_validate(self._send("POST", "/v1/jobs", json=body))
+
+    def job(self, job: str) -> Job:
+        """Return a job with its progress."""
+        return Job.model_validate(self._send("GET", f"/v1/jobs/{job}"))
+
+    def cancel(self, job: str) -> Job:
+        """Cancel a job."""
+        return Job.model_validate(self._send("POST", f"/v1/jobs/{job}/cancel"))
+
+    def wait(self, job: str, on_progress: Callable[[Job], None] | None = None) -> Job:
+        """Wait for a job's end, however it ends; on_progress is called with every look at it."""
+        while True:
+            seen = self.job(job)
+            if on_progress is not None:
+                on_progress(seen)
+            if seen.state not in ACTIVE:
+                return seen
+            time.sleep(POLL_SECONDS)
+
+    def model(self, model: str) -> Model:
+        """Return a model with its versions."""
+        return Model.model_validate(self._send("GET", f"/v1/models/{model}"))
+
+    def version(self, model: str, version: int) -> Version:
+        """Return one version of a model."""
+        return Version.model_validate(self._send("GET", f"/v1/models/{model}/versions/{version}"))
+
+    def predict(
+        self,
+        model: str,
+        q: ArrayLike,
+        dq: ArrayLike,
+        ddq: ArrayLike,
+        version: int | None = None,
+        covariance: bool = False,
+    ) -> PredictResponse:
+        """Torque for arrays of shape (n,) or (N, n)."""
+        body: dict[str, Any] = {"covariance": covariance}
+        for name, values in (("q", q), ("dq", dq), ("ddq", ddq)):
+            body[name] = np.asarray(values, dtype=np.float64).tolist()
+        if version is not None:
+            body["version"] = version
+        return PredictResponse.model_validate(self._send("POST", f"/v1/models/{model}/predict", json=body))
+
+    def evaluate(self, model: str, dataset: str, version: int | None = None) -> EvaluateResponse:
+        """Compare a model with a data set."""
+        body: dict[str, Any] = {"dataset": dataset}
+        if version is not None:
+            body["version"] = version
+        return EvaluateResponse.model_validate(self._send("POST", f"/v1/models/{model}/evaluate", json=body))
+
+    def _send(self, method: str, path: str, **request: Any) -> Any:
+        try:
+            answer = self._http.request(method, path, **request)
+        except httpx.TransportError as error:
+            raise ServiceUnreachableError(
+                f"no service answers at {self.url} ({error}): start one with `lipserve serve`"
+            ) from error
+        if answer.is_success:
+            return answer.json()
+        try:
+            body = answer.json()["error"]
+            raise ApiError(answer.status_code, body["code"], body["message"], body["detail"])
+        except (ValueError, KeyError, TypeError):
+            raise ApiError(answer.status_code, "http_error", answer.text[:500], []) from None
+
+
+def _chunks(file: Any) -> Iterator[bytes]:
+    while chunk := file.read(1 << 20):
+        yield chunk

@@ -1,0 +1,35 @@
+"""What the routes of one running service share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from anyio import CapacityLimiter
+from fastapi import Depends, Request
+
+from service.database import Database
+from service.files import Files
+from service.inference.loaded import LoadedModels
+from service.settings import Settings
+from service.training.queue import JobQueue
+
+
+@dataclass(frozen=True)
+class Service:
+    """The parts of a running service; made when it starts, closed when it stops."""
+
+    settings: Settings
+    database: Database
+    files: Files
+    loaded: LoadedModels
+    jobs: JobQueue
+    predictions: CapacityLimiter
+
+
+async def _service(request: Request) -> Service:
+    service: Service = request.app.state.service
+    return service
+
+
+ServiceDep = Annotated[Service, Depends(_service)]

@@ -1,0 +1,181 @@
+"""One error shape for every route: {"error": {code, message, detail}}."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, Field
+from starlette.exceptions import HTTPException
+
+logger = logging.getLogger(__name__)
+
+
+class Problem(BaseModel):
+    """One thing that is wrong with a request."""
+
+    field: str = Field(description="Where: a column, a JSON path or a parameter", examples=["q[0][3]"])
+    value: str | None = Field(default=None, description="What was found", examples=["nan"])
+    expected: str = Field(description="What was expected", examples=["a finite number"])
+
+
+class ErrorBody(BaseModel):
+    """code: stable, for programs; message: for people."""
+
+    code: str = Field(examples=["invalid_request"])
+    message: str = Field(examples=["q[0][3] is nan, expected a finite number"])
+    detail: list[Problem] = []
+
+
+class ErrorResponse(BaseModel):
+    """The body of every answer with a status of 400 and above."""
+
+    error: ErrorBody
+
+
+class ServiceError(Exception):
+    """An error a client can act on; subclasses fix status and code."""
+
+    status = 500
+    code = "internal_error"
+
+    def __init__(self, message: str, detail: Sequence[Problem] = ()) -> None:
+        super().__init__(message)
+        self.message, self.detail = message, list(detail)
+
+
+class InvalidRequestError(ServiceError):
+    """The request is understood, but a value in it is wrong."""
+
+    status, code = 422, "invalid_request"
+
+
+class InvalidDataError(ServiceError):
+    """An uploaded data set is wrong."""
+
+    status, code = 422, "invalid_data"
+
+
+class NotFoundError(ServiceError):
+    """No data set, job, model or version of that name."""
+
+    status, code = 404, "not_found"
+
+
+class ConflictError(ServiceError):
+    """The request contradicts the state of things."""
+
+    status, code = 409, "conflict"
+
+
+class TooLargeError(ServiceError):
+    """The body exceeds a limit."""
+
+    status, code = 413, "too_large"
+
+
+class UnsupportedMediaTypeError(ServiceError):
+    """The body's media type is not one of those accepted."""
+
+    status, code = 415, "unsupported_media_type"
+
+
+class BusyError(ServiceError):
+    """A queue is full: try again later."""
+
+    status, code = 429, "busy"
+
+
+class NotReadyError(ServiceError):
+    """The service cannot answer now."""
+
+    status, code = 503, "not_ready"
+
+
+def problem(field: str, value: object, expected: str) -> Problem:
+    """Describe one wrong value; long values are cut."""
+    text = value if isinstance(value, str) else repr(value)
+    return Problem(field=field, value=text if len(text) <= 200 else text[:200] + "…", expected=expected)
+
+
+def sentence(item: Problem) -> str:
+    """Say a problem in one sentence."""
+    return f"{item.field} is {item.value}, expected {item.expected}"
+
+
+def invalid_request(field: str, value: object, expected: str) -> InvalidRequestError:
+    """Error for one wrong value of a request."""
+    item = problem(field, value, expected)
+    return InvalidRequestError(sentence(item), [item])
+
+
+def invalid_data(field: str, value: object, expected: str) -> InvalidDataError:
+    """Error for one wrong thing in an uploaded data set."""
+    item = problem(field, value, expected)
+    return InvalidDataError(sentence(item), [item])
+
+
+def not_found(kind: str, name: object) -> NotFoundError:
+    """Error for something that does not exist."""
+    return NotFoundError(f"no {kind} {str(name)[:200]!r}", [problem(kind, str(name), f"an existing {kind}")])
+
+
+def responses(*errors: type[ServiceError]) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI responses of a route for the errors it can answer with."""
+    out: dict[int | str, dict[str, Any]] = {}
+    for error in errors:
+        said = (error.__doc__ or "").strip()
+        known = out.get(error.status)
+        text = f"`{error.code}`: {said}"
+        out[error.status] = {
+            "model": ErrorResponse,
+            "description": f"{known['description']} {text}" if known else text,
+        }
+    return out
+
+
+def install(app: FastAPI) -> None:
+    """Make every error of the app take the one shape."""
+    app.add_exception_handler(ServiceError, _service_error)
+    app.add_exception_handler(RequestValidationError, _validation_error)
+    app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(Exception, _unexpected_error)
+
+
+def _answer(status: int, code: str, message: str, detail: Sequence[Problem] = ()) -> JSONResponse:
+    body = ErrorResponse(error=ErrorBody(code=code, message=message, detail=list(detail)))
+    return JSONResponse(body.model_dump(), status)
+
+
+async def _service_error(_: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, ServiceError)
+    return _answer(error.status, error.code, error.message, error.detail)
+
+
+async def _validation_error(_: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)
+    detail = []
+    for item in error.errors()[:20]:
+        # bodies may be one of several shapes: pydantic then adds type names to the path, which say nothing to a client
+        where = [part for part in item["loc"] if part not in ("body", "query", "path")]
+        field = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in where).lstrip(".")
+        detail.append(problem(field or "body", item.get("input"), str(item["msg"]).lower()))
+    message = sentence(detail[0]) if detail else "the request is not valid"
+    return _answer(422, "invalid_request", message, detail)
+
+
+async def _http_error(_: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)
+    codes = {404: "not_found", 405: "method_not_allowed", 413: "too_large", 400: "invalid_request"}
+    answer = _answer(error.status_code, codes.get(error.status_code, "http_error"), str(error.detail))
+    answer.headers.update(error.headers or {})
+    return answer
+
+
+async def _unexpected_error(request: Request, error: Exception) -> JSONResponse:
+    logger.error("unexpected error at %s %s", request.method, request.url.path, exc_info=error)
+    return _answer(500, "internal_error", "an unexpected error; the service's log says more")

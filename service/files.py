@@ -1,0 +1,71 @@
+"""Files of the service below its home: samples of data sets, folders of model versions, uploads in progress.
+
+A file is visible only once a database row names it, and the row is written after the file is complete.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import secrets
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from safetensors.numpy import load as load_arrays
+from safetensors.numpy import save as save_arrays
+
+from lipcore.samples import Samples
+
+ARRAYS = ("t", "episode", "q", "dq", "ddq", "tau")
+
+
+def new_id(prefix: str) -> str:
+    """Return a fresh random id such as `ds_5f0c…`."""
+    return f"{prefix}_{secrets.token_hex(8)}"
+
+
+class Files:
+    """The file store of one service. Ids come from `new_id`, never from a client."""
+
+    def __init__(self, home: Path) -> None:
+        self.datasets, self.versions, self.uploads = home / "datasets", home / "versions", home / "uploads"
+        for folder in (self.datasets, self.versions, self.uploads):
+            folder.mkdir(parents=True, exist_ok=True)
+
+    def write_samples(self, dataset: str, samples: Samples) -> str:
+        """Store samples durably under a new id; return their sha256."""
+        payload = save_arrays({name: np.ascontiguousarray(getattr(samples, name)) for name in ARRAYS})
+        path = self.datasets / f"{dataset}.safetensors"
+        draft = path.with_suffix(".draft")
+        with draft.open("wb") as file:
+            file.write(payload)
+            file.flush()
+            os.fsync(file.fileno())
+        draft.rename(path)
+        return hashlib.sha256(payload).hexdigest()
+
+    def read_samples(self, dataset: str, joint_names: list[str]) -> Samples:
+        """Read samples stored under `dataset`."""
+        arrays = load_arrays((self.datasets / f"{dataset}.safetensors").read_bytes())
+        return Samples(joint_names=tuple(joint_names), **arrays)
+
+    def delete_samples(self, dataset: str) -> None:
+        """Delete samples; nothing happens where there are none."""
+        (self.datasets / f"{dataset}.safetensors").unlink(missing_ok=True)
+
+    def upload(self) -> Path:
+        """Create an empty temporary file for an upload; the caller deletes it."""
+        handle, name = tempfile.mkstemp(dir=self.uploads)
+        os.close(handle)
+        return Path(name)
+
+    def sweep(self, datasets: set[str], versions: set[str]) -> int:
+        """Delete what an interrupted write left: files that no row names. Return how many."""
+        left = list(self.uploads.iterdir())
+        left += [path for path in self.datasets.iterdir() if path.name.removesuffix(".safetensors") not in datasets]
+        left += [path for path in self.versions.iterdir() if path.name not in versions]
+        for path in left:
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        return len(left)

@@ -1,0 +1,85 @@
+"""Answering queries: no transport here."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lipcore.metrics import evaluate as compare
+from service.context import Service
+from service.datasets import store
+from service.errors import invalid_request
+from service.inference.schema import EvaluateRequest, EvaluateResponse, PredictRequest, PredictResponse
+
+REVISION = 0
+"""Versions are not updated online yet: every version is at its first revision."""
+
+
+def predict(service: Service, model: str, request: PredictRequest) -> PredictResponse:
+    """Torque with uncertainty at the queries; raise InvalidRequestError or NotFoundError."""
+    row, loaded = service.loaded.get(model, request.version)
+    single = request.q.ndim == 1
+    for name in ("q", "dq", "ddq"):
+        values = getattr(request, name)
+        if values.shape[-1] != loaded.n_joints:
+            expected = f"{loaded.n_joints} numbers: {', '.join(loaded.joint_names)}"
+            raise invalid_request(name, f"{values.shape[-1]} numbers long", expected)
+        if values.shape != request.q.shape:
+            raise invalid_request(name, f"of shape {values.shape}", f"the shape of q, {request.q.shape}")
+    queries = np.atleast_2d(request.q)
+    if len(queries) > service.settings.max_batch:
+        raise invalid_request("q", f"{len(queries)} queries", f"at most {service.settings.max_batch} in one request")
+    _check_positions(queries, single, service.settings.max_position)
+
+    answer = loaded.predict(queries, np.atleast_2d(request.dq), np.atleast_2d(request.ddq))
+    tau, std, covariance = answer.tau, answer.tau_std, answer.covariance
+    return PredictResponse(
+        model=row.model,
+        version=row.version,
+        revision=REVISION,
+        joint_names=list(loaded.joint_names),
+        torque_convention=loaded.torque_convention,
+        tau=(tau[0] if single else tau).tolist(),
+        tau_std=(std[0] if single else std).tolist(),
+        noise_std=answer.noise_std.tolist(),
+        covariance=(covariance[0] if single else covariance).tolist() if request.covariance else None,
+    )
+
+
+def evaluate(service: Service, model: str, request: EvaluateRequest) -> EvaluateResponse:
+    """Compare a model with a data set; raise InvalidRequestError or NotFoundError."""
+    row, loaded = service.loaded.get(model, request.version)
+    dataset = store.find(service.database, request.dataset)
+    if tuple(dataset.joint_names) != loaded.joint_names:
+        expected = f"the joints of the model, {list(loaded.joint_names)}"
+        raise invalid_request("dataset", f"a data set with the joints {dataset.joint_names}", expected)
+    if dataset.torque_convention != loaded.torque_convention:
+        expected = f"that of the model, {loaded.torque_convention}"
+        raise invalid_request("dataset", f"a data set whose torque is {dataset.torque_convention}", expected)
+    samples = store.samples(service.files, dataset)
+    count = min(len(samples), service.settings.max_evaluation_samples)
+    used = samples.rows(np.linspace(0, len(samples) - 1, count).round().astype(np.int64))
+    answer = loaded.predict(used.q, used.dq, used.ddq)
+    metrics = compare(used.tau, answer.tau, answer.tau_std, answer.noise_std)
+    return EvaluateResponse(
+        model=row.model,
+        version=row.version,
+        revision=REVISION,
+        dataset=dataset.id,
+        joint_names=list(loaded.joint_names),
+        samples=len(samples),
+        samples_used=count,
+        level=metrics.level,
+        nmse=[None if np.isnan(value) else float(value) for value in metrics.nmse],
+        rmse=metrics.rmse.tolist(),
+        coverage=metrics.coverage.tolist(),
+        nlpd=metrics.nlpd.tolist(),
+        interval_width=metrics.width.tolist(),
+        in_training=any(item["id"] == dataset.id for item in row.manifest["lineage"].get("datasets", [])),
+    )
+
+
+def _check_positions(q: np.ndarray[tuple[int, int], np.dtype[np.float64]], single: bool, limit: float) -> None:
+    row, joint = np.unravel_index(np.abs(q).argmax(), q.shape)
+    if abs(q[row, joint]) > limit:
+        field = f"q[{joint}]" if single else f"q[{row}][{joint}]"
+        raise invalid_request(field, f"{q[row, joint]:g}", f"radians (or metres) within ±{limit:g}: are these degrees?")

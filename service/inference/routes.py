@@ -1,0 +1,34 @@
+"""Routes of torque queries."""
+
+from __future__ import annotations
+
+from anyio import to_thread
+from fastapi import APIRouter
+
+from service.context import ServiceDep
+from service.errors import InvalidRequestError, NotFoundError, TooLargeError, responses
+from service.inference import answer
+from service.inference.schema import EvaluateRequest, EvaluateResponse, PredictRequest, PredictResponse
+
+router = APIRouter(prefix="/v1/models", tags=["inference"])
+
+
+@router.post(
+    "/{model}/predict",
+    summary="Torque at a motion, with its uncertainty",
+    responses=responses(InvalidRequestError, NotFoundError, TooLargeError),
+    response_model_exclude_none=True,
+)
+async def predict(service: ServiceDep, model: str, request: PredictRequest) -> PredictResponse:
+    """Answer one query or a batch. Nothing is clipped; `tau_std` grows where the model knows little."""
+    return await to_thread.run_sync(answer.predict, service, model, request, limiter=service.predictions)
+
+
+@router.post(
+    "/{model}/evaluate",
+    summary="Compare a model with a data set",
+    responses=responses(InvalidRequestError, NotFoundError),
+)
+async def evaluate(service: ServiceDep, model: str, request: EvaluateRequest) -> EvaluateResponse:
+    """Error, coverage and density of the model's torques against measured ones, joint by joint."""
+    return await to_thread.run_sync(answer.evaluate, service, model, request, limiter=service.predictions)

@@ -1,0 +1,115 @@
+"""Torque queries and answers."""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema
+
+from lipcore.model import TorqueConvention
+from service.errors import invalid_request
+
+_NUMBERS: dict[str, Any] = {"type": "array", "items": {"type": "number"}}
+_ROWS: dict[str, Any] = {"type": "array", "items": _NUMBERS}
+
+
+def _to_array(value: Any, info: ValidationInfo) -> NDArray[np.float64]:
+    """Numbers (n,) or rows of numbers (N, n) as an array; raise InvalidRequestError naming what is wrong."""
+    name = info.field_name or "value"
+    if not isinstance(value, list) or not value:
+        raise invalid_request(name, value, "a list of numbers, or a list of such lists")
+    if not isinstance(value[0], list):
+        return np.array(_row(name, value))
+    width = len(value[0])
+    rows = []
+    for index, row in enumerate(value):
+        if not isinstance(row, list) or len(row) != width:
+            raise invalid_request(f"{name}[{index}]", row, f"a list of {width} numbers, as {name}[0] has")
+        rows.append(_row(f"{name}[{index}]", row))
+    return np.array(rows).reshape(len(rows), width)
+
+
+def _row(name: str, row: list[Any]) -> list[float]:
+    out = []
+    for index, number in enumerate(row):
+        try:
+            valid = type(number) in (int, float) and isfinite(number)
+        except OverflowError:
+            valid = False
+        if not valid:
+            raise invalid_request(f"{name}[{index}]", number, "a finite number")
+        out.append(float(number))
+    return out
+
+
+Vectors = Annotated[NDArray[np.float64], PlainValidator(_to_array), WithJsonSchema({"anyOf": [_NUMBERS, _ROWS]})]
+"""JSON array of shape (n,) for one query or (N, n) for a batch."""
+
+
+class PredictRequest(BaseModel):
+    """One query, or a batch of them, in SI units."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        arbitrary_types_allowed=True,
+        json_schema_extra={
+            "examples": [
+                {
+                    "q": [0.0, -0.5, 0.0, -2.0, 0.0, 1.5, 0.7],
+                    "dq": [0.1, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0],
+                    "ddq": [0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0],
+                }
+            ]
+        },
+    )
+
+    q: Vectors = Field(description="Positions, rad (prismatic: m): (n) or (N, n)")
+    dq: Vectors = Field(description="Velocities, rad/s (m/s)")
+    ddq: Vectors = Field(description="Accelerations, rad/s² (m/s²)")
+    version: int | None = Field(None, ge=1, description="A version of the model; the latest by default")
+    covariance: bool = Field(False, description="Also answer the covariance of the function between joints")
+
+
+class PredictResponse(BaseModel):
+    """Torques, shaped as the query. An interval that shall hold measurements needs both standard deviations."""
+
+    model: str
+    version: int
+    revision: int = Field(description="Online updates applied to the version")
+    joint_names: list[str]
+    torque_convention: TorqueConvention
+    tau: list[float] | list[list[float]] = Field(description="Mean torque, N·m (prismatic: N)")
+    tau_std: list[float] | list[list[float]] = Field(description="Standard deviation of the function")
+    noise_std: list[float] = Field(description="Standard deviation of the measurement, per joint")
+    covariance: list[list[float]] | list[list[list[float]]] | None = Field(None, description="(N·m)², where asked for")
+
+
+class EvaluateRequest(BaseModel):
+    """Which data set to compare a model with."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    dataset: str = Field(max_length=40)
+    version: int | None = Field(None, ge=1, description="A version of the model; the latest by default")
+
+
+class EvaluateResponse(BaseModel):
+    """Figures per joint. nmse is null for a joint whose measured torque does not vary."""
+
+    model: str
+    version: int
+    revision: int
+    dataset: str
+    joint_names: list[str]
+    samples: int = Field(description="Samples of the data set")
+    samples_used: int = Field(description="Samples compared: evenly thinned where there are more than the limit")
+    level: float = Field(description="Probability that the interval promises")
+    nmse: list[float | None] = Field(description="Mean squared error / variance of the measured torque")
+    rmse: list[float] = Field(description="N·m")
+    coverage: list[float] = Field(description="Share of measurements inside the interval, noise included")
+    nlpd: list[float] = Field(description="Mean negative log predictive density, nats")
+    interval_width: list[float] = Field(description="Mean width of the interval, N·m")
+    in_training: bool = Field(description="Whether the model was trained on this data set: then the figures flatter")

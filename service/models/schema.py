@@ -1,0 +1,55 @@
+"""Models and versions as the API shows them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, Field, StringConstraints
+
+from lipcore.model import TorqueConvention
+from lipcore.motion import JointType
+
+ModelName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")]
+"""Lower-case letters, digits, dots, underscores and hyphens: safe in URLs and never a path."""
+
+
+class Version(BaseModel):
+    """An immutable trained version."""
+
+    model: str
+    version: int
+    created_at: str
+    job: str | None = Field(description="The job that made it; null for the model that comes with LIPServe")
+    estimator: str
+    joint_names: list[str]
+    joint_types: list[JointType]
+    torque_convention: TorqueConvention
+    noise_std: list[float] = Field(description="Standard deviation of the measured torque, N·m")
+    training_range: dict[str, dict[str, list[float]]] = Field(description="Where the samples lie that it stands on")
+    options: dict[str, Any]
+    fit: dict[str, Any] = Field(description="What the fit reported")
+    lineage: dict[str, Any] = Field(description="Data sets with their hashes, and when it was trained")
+
+
+class VersionSummary(BaseModel):
+    """A version in the list of its model."""
+
+    version: int
+    created_at: str
+    estimator: str
+
+
+class Model(BaseModel):
+    """A named model. Queries are answered by its latest version unless they name another."""
+
+    name: str
+    created_at: str
+    latest_version: int
+    versions: list[VersionSummary]
+
+
+class ModelPage(BaseModel):
+    """One page of models, newest first."""
+
+    items: list[Model]
+    next_cursor: str | None

@@ -1,0 +1,79 @@
+"""Every setting of the service: environment variables with the prefix `LIPSERVE_`."""
+
+from __future__ import annotations
+
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, model_validator
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+CHECKOUT_MODELS = Path(__file__).resolve().parents[1] / "models"
+PACKAGED_MODELS = Path(__file__).resolve().parent / "shipped"
+
+MiB = 1024 * 1024
+Count = Annotated[int, Field(ge=1)]
+
+
+def shipped_models() -> Path:
+    """Folder of the models that come with LIPServe, in a checkout or in an installed package."""
+    return CHECKOUT_MODELS if (CHECKOUT_MODELS / "panda-sim").is_dir() else PACKAGED_MODELS
+
+
+def _default_home() -> Path:
+    return CHECKOUT_MODELS if CHECKOUT_MODELS.is_dir() else Path.home() / ".local/share/lipserve"
+
+
+class Settings(BaseSettings):
+    """Validated settings; a wrong value stops the start with its name and what was expected."""
+
+    model_config = SettingsConfigDict(env_prefix="LIPSERVE_", extra="ignore", frozen=True)
+
+    home: Path = Field(default_factory=_default_home, description="Folder of the database and all files.")
+    host: str = Field("127.0.0.1", description="Address to listen on; anything but loopback needs `insecure`.")
+    port: int = Field(8000, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
+    insecure: bool = Field(False, description="Allow requests without keys from other hosts.")
+    log_level: str = Field("info", pattern="^(critical|error|warning|info|debug)$")
+
+    max_upload_bytes: Count = Field(256 * MiB, description="Largest upload of a data set.")
+    max_unpacked_bytes: Count = Field(1024 * MiB, description="Largest data set once unpacked.")
+    max_request_bytes: Count = Field(8 * MiB, description="Largest body of any other request.")
+    max_joints: Count = Field(32, description="Most joints of a robot.")
+    min_samples: int = Field(30, ge=10, description="Fewest samples of a data set.")
+    max_samples: Count = Field(1_000_000, description="Most samples of a data set.")
+    max_position: float = Field(
+        12.6, gt=0, description="Largest |q| in rad or m that is taken for SI units: two turns. Beyond it: degrees?"
+    )
+    max_batch: Count = Field(1000, description="Most queries in one prediction request.")
+    max_evaluation_samples: Count = Field(5000, description="Most samples of one evaluation; more are thinned evenly.")
+    max_page: Count = Field(100, description="Most items of one page of a list.")
+    max_job_datasets: Count = Field(100, description="Most data sets of one training job.")
+    max_hyperparameter_samples: Count = Field(500, description="Most samples that hyperparameters are fitted on.")
+    max_posterior_samples: Count = Field(1000, description="Most samples a posterior is conditioned on.")
+    max_queued_jobs: Count = Field(100, description="Most jobs that may wait; more are answered 429.")
+    max_loaded_models: Count = Field(4, description="Model versions kept in memory, about 100 MB each at 500 samples.")
+
+    training_workers: Count = Field(1, description="Training processes.")
+    training_threads: Count = Field(1, description="Threads of each training process.")
+    training_niceness: int = Field(10, ge=0, le=19, description="Niceness of training processes.")
+    max_job_attempts: Count = Field(3, description="Times a job is started before an interruption fails it.")
+    serving_threads: Count = Field(1, description="Threads of one prediction.")
+    max_concurrent_predictions: Count = Field(2, description="Predictions computed at the same time.")
+
+    @model_validator(mode="after")
+    def _loopback_or_insecure(self) -> Settings:
+        if not self.insecure and not is_loopback(self.host):
+            raise ValueError(
+                f"host is {self.host!r}: other hosts could use the service without a key. Listen on 127.0.0.1, "
+                "or set LIPSERVE_INSECURE=1 where a firewall, container or reverse proxy guards the port"
+            )
+        return self
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach `host`."""
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

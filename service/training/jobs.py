@@ -1,0 +1,133 @@
+"""Making, finding and cancelling jobs."""
+
+from __future__ import annotations
+
+from sqlalchemy import func, select
+
+from lipcore.estimators import UnknownEstimatorError, make_estimator
+from service.context import Service
+from service.database import Database, DatasetRow, JobRow, now
+from service.datasets import store
+from service.errors import BusyError, ConflictError, invalid_request, not_found
+from service.files import new_id
+from service.pages import Page
+from service.settings import Settings
+from service.training.schema import Job, JobPage, JobRequest, Options
+from service.training.states import ACTIVE, CANCELLED, QUEUED
+
+
+def create(service: Service, request: JobRequest) -> Job:
+    """Check a request, store it as a queued job and hand it to the queue."""
+    _check_options(request.options, service.settings)
+    if len(request.datasets) > service.settings.max_job_datasets:
+        raise invalid_request("datasets", len(request.datasets), f"at most {service.settings.max_job_datasets}")
+    rows = [store.find(service.database, dataset) for dataset in request.datasets]
+    joint_types = _check_joints(request, rows)
+    job = JobRow(
+        id=new_id("job"),
+        model=request.model,
+        state=QUEUED,
+        request={**request.model_dump(mode="json"), "joint_types": joint_types},
+        progress={"stage": "waiting"},
+        attempts=0,
+        cancel_requested=False,
+        created_at=now(),
+    )
+    with service.database.transaction() as session:
+        waiting = session.scalar(select(func.count()).select_from(JobRow).where(JobRow.state == QUEUED)) or 0
+        if waiting >= service.settings.max_queued_jobs:
+            raise BusyError(f"{waiting} jobs are waiting already, the most that may: try again later")
+        present = set(session.scalars(select(DatasetRow.id).where(DatasetRow.id.in_(request.datasets))))
+        for dataset in request.datasets:
+            if dataset not in present:  # deleted since it was checked
+                raise not_found("dataset", dataset)
+        session.add(job)
+    service.jobs.submit(job.id)
+    return _show(job)
+
+
+def show(database: Database, job: str) -> Job:
+    """Return one job; raise NotFoundError."""
+    with database.session() as session:
+        row = session.scalar(select(JobRow).where(JobRow.id == job))
+    if row is None:
+        raise not_found("job", job)
+    return _show(row)
+
+
+def page(database: Database, part: Page) -> JobPage:
+    """List jobs, newest first."""
+    query = select(JobRow).order_by(JobRow.seq.desc()).limit(part.limit + 1)
+    if part.after is not None:
+        query = query.where(JobRow.seq < part.after)
+    with database.session() as session:
+        rows = list(session.scalars(query))
+    following = str(rows[part.limit - 1].seq) if len(rows) > part.limit else None
+    return JobPage(items=[_show(row) for row in rows[: part.limit]], next_cursor=following)
+
+
+def cancel(database: Database, job: str) -> Job:
+    """Cancel a job: at once while it waits, at its next look at the database while it runs."""
+    with database.transaction() as session:
+        row = session.scalar(select(JobRow).where(JobRow.id == job))
+        if row is None:
+            raise not_found("job", job)
+        if row.state not in ACTIVE:
+            raise ConflictError(f"job {job!r} has {row.state} already")
+        row.cancel_requested = True
+        if row.state == QUEUED:
+            row.state, row.finished_at = CANCELLED, now()
+    return _show(row)
+
+
+def _check_joints(request: JobRequest, rows: list[DatasetRow]) -> list[str]:
+    first = rows[0]
+    for index, row in enumerate(rows):
+        if row.id in request.datasets[:index]:
+            raise invalid_request(f"datasets[{index}]", row.id, "every data set once")
+        for what in ("joint_names", "torque_convention"):
+            if getattr(row, what) != getattr(first, what):
+                expected = f"the {what} of datasets[0], {getattr(first, what)}"
+                raise invalid_request(f"datasets[{index}]", f"a data set with {getattr(row, what)}", expected)
+    n = len(first.joint_names)
+    types: list[str] = list(request.joint_types) if request.joint_types is not None else ["revolute"] * n
+    if len(types) != n:
+        raise invalid_request("joint_types", f"{len(types)} types", f"{n}, one a joint: {', '.join(first.joint_names)}")
+    try:
+        make_estimator(request.estimator, types, request.options.tied)
+    except UnknownEstimatorError as error:
+        expected = str(error).partition("expected ")[2]
+        raise invalid_request("estimator", request.estimator, expected) from None
+    return types
+
+
+def _check_options(options: Options, settings: Settings) -> None:
+    for name in ("hyperparameter_samples", "posterior_samples"):
+        most = getattr(settings, f"max_{name}")
+        if getattr(options, name) > most:
+            raise invalid_request(f"options.{name}", getattr(options, name), f"at most {most}")
+
+
+def _show(row: JobRow) -> Job:
+    return Job.model_validate(
+        {
+            "estimator": row.request["estimator"],
+            "datasets": row.request["datasets"],
+            **{
+                name: getattr(row, name)
+                for name in (
+                    "id",
+                    "state",
+                    "model",
+                    "progress",
+                    "attempts",
+                    "version",
+                    "error",
+                    "created_at",
+                    "started_at",
+                    "heartbeat_at",
+                    "finished_at",
+                )
+            },
+        }
+    )

@@ -1,0 +1,99 @@
+"""The queue of training jobs: rows in the database, worked off by a pool of other processes."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import threading
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+
+from sqlalchemy import select
+
+from service.database import Database, JobRow, now
+from service.settings import Settings
+from service.training import worker
+from service.training.states import ACTIVE, CANCELLED, FAILED, QUEUED
+
+logger = logging.getLogger(__name__)
+
+
+class JobQueue:
+    """Hands queued jobs to training processes and takes back what an interruption left."""
+
+    def __init__(self, settings: Settings, database: Database) -> None:
+        self.settings, self.database = settings, database
+        self._lock = threading.Lock()
+        self._closing = False
+        self._pool = self._new_pool()
+
+    def submit(self, job: str) -> None:
+        """Hand a queued job to the next free training process."""
+        with self._lock:
+            if self._closing:
+                return  # the row stays queued and is taken up at the next start
+            try:
+                future = self._pool.submit(worker.run, self.settings, job)
+            except BrokenProcessPool:
+                self._pool = self._new_pool()
+                future = self._pool.submit(worker.run, self.settings, job)
+        future.add_done_callback(lambda done: self._ended(job, done))
+
+    def recover(self) -> list[str]:
+        """Queue again every job that an earlier run of the service left unfinished; return their ids."""
+        with self.database.transaction() as session:
+            rows = list(session.scalars(select(JobRow).where(JobRow.state.in_(ACTIVE)).order_by(JobRow.seq)))
+            ready = [row.id for row in rows if self._requeue(row)]
+        for job in ready:
+            self.submit(job)
+        return ready
+
+    def close(self) -> None:
+        """Stop the training processes at once; their jobs stay in the database and go on at the next start."""
+        with self._lock:
+            self._closing = True
+            pool = self._pool
+        pool.kill_workers() if hasattr(pool, "kill_workers") else self._kill(pool)
+        pool.shutdown(wait=True, cancel_futures=True)
+
+    def _new_pool(self) -> ProcessPoolExecutor:
+        settings = self.settings
+        return ProcessPoolExecutor(
+            settings.training_workers,
+            mp_context=multiprocessing.get_context("spawn"),
+            initializer=worker.start_process,
+            initargs=(settings.training_niceness, settings.training_threads),
+        )
+
+    @staticmethod
+    def _kill(pool: ProcessPoolExecutor) -> None:
+        # Python < 3.14 has no public way to end a pool's processes
+        for process in list((pool._processes or {}).values()):
+            process.kill()
+
+    def _requeue(self, row: JobRow) -> bool:
+        """Make an interrupted job wait again, or end it where it was cancelled or tried too often."""
+        if row.cancel_requested:
+            row.state, row.finished_at = CANCELLED, now()
+        elif row.attempts >= self.settings.max_job_attempts:
+            row.state, row.finished_at = FAILED, now()
+            message = f"the training process ended before its job, {row.attempts} times"
+            row.error = {"code": "interrupted", "message": message}
+        else:
+            row.state, row.progress = QUEUED, {"stage": "waiting"}
+            return True
+        return False
+
+    def _ended(self, job: str, future: Future[None]) -> None:
+        if self._closing or future.cancelled():
+            return
+        error = future.exception()
+        if error is None:
+            return
+        # the process died or could not reach the database: the job's row still says queued or running
+        logger.error("the training process of job %s ended early: %r", job, error)
+        with self.database.transaction() as session:
+            row = session.scalar(select(JobRow).where(JobRow.id == job, JobRow.state.in_(ACTIVE)))
+            again = row is not None and self._requeue(row)
+        if again:
+            self.submit(job)

@@ -1,0 +1,89 @@
+"""Training jobs as the API takes and shows them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from lipcore.estimators import DEFAULT_ESTIMATOR
+from lipcore.fitting import FitOptions
+from lipcore.motion import JointType
+from service.models.schema import ModelName
+from service.training.states import JobState
+
+_DEFAULTS = FitOptions()
+
+
+class Options(BaseModel):
+    """How to fit; the defaults suit most recordings."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    hyperparameter_samples: int = Field(
+        _DEFAULTS.hyperparameter_samples, ge=10, description="Samples that hyperparameters are fitted on"
+    )
+    posterior_samples: int = Field(
+        _DEFAULTS.posterior_samples, ge=10, description="Samples the model stands on: of more, the most spread-out"
+    )
+    max_iterations: int = Field(_DEFAULTS.max_iterations, ge=1, le=10_000)
+    tied: bool = Field(_DEFAULTS.tied, description="Links share kernel shapes; false is the paper's form")
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+
+
+class JobRequest(BaseModel):
+    """What to train on what."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={"examples": [{"model": "my-panda", "datasets": ["ds_0123456789abcdef"]}]},
+    )
+
+    model: ModelName = Field(description="Name of the model; a new version of it is made")
+    datasets: list[Annotated[str, Field(max_length=40)]] = Field(min_length=1, description="Ids of data sets")
+    estimator: str = Field(DEFAULT_ESTIMATOR, max_length=40)
+    joint_types: list[JointType] | None = Field(None, description="One a joint; all revolute by default")
+    options: Options = Field(default_factory=Options)
+
+
+class JobProgress(BaseModel):
+    """How far a job is."""
+
+    stage: str = Field(description="waiting, loading, hyperparameters, posterior, saving or done")
+    iteration: int = 0
+    max_iterations: int = 0
+    objective: float | None = Field(None, description="Penalised negative log evidence, nats: falls during the fit")
+    fraction: float = Field(0.0, ge=0, le=1)
+    elapsed_s: float = 0.0
+
+
+class JobError(BaseModel):
+    """Why a job failed."""
+
+    code: str
+    message: str
+
+
+class Job(BaseModel):
+    """A training job."""
+
+    id: str
+    state: JobState
+    model: str
+    estimator: str
+    datasets: list[str]
+    progress: JobProgress
+    attempts: int = Field(description="Times it was started; more than one after an interruption")
+    version: int | None = Field(description="The version it made, once succeeded")
+    error: JobError | None
+    created_at: str
+    started_at: str | None
+    heartbeat_at: str | None = Field(description="When the training process last said that it lives")
+    finished_at: str | None
+
+
+class JobPage(BaseModel):
+    """One page of jobs, newest first."""
+
+    items: list[Job]
+    next_cursor: str | None

@@ -1,0 +1,181 @@
+"""What the training process does: one job, from its row to a new model version."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import threading
+import time
+from dataclasses import dataclass
+from multiprocessing.process import BaseProcess
+from typing import Any
+
+import torch
+from sqlalchemy import select
+
+import lipcore
+from lipcore.fitting import FitProgress
+from lipcore.model import TorqueModel
+from service.database import Database, DatasetRow, JobRow, now
+from service.files import Files, new_id
+from service.models import registry
+from service.settings import Settings
+from service.training.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED
+
+logger = logging.getLogger(__name__)
+
+REPORT_EVERY = 0.5
+"""Seconds between two looks at the database: progress out, cancel flag in."""
+
+
+class SupersededError(RuntimeError):
+    """The job is no longer this attempt's."""
+
+
+def start_process(niceness: int, threads: int) -> None:
+    """Prepare a training process: lower priority, few threads, and an end with the service that started it."""
+    os.nice(niceness)
+    torch.set_num_threads(threads)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _end_with(parent: BaseProcess) -> None:
+    parent.join()
+    os._exit(1)
+
+
+def run(settings: Settings, job: str) -> None:
+    """Run one queued job to its end. All outcomes are written to its row; nothing is raised for a failed fit."""
+    database, files = Database(settings.home), Files(settings.home)
+    try:
+        claim = _claim(database, job)
+        if claim is not None:
+            _train(database, files, claim)
+    finally:
+        database.close()
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One attempt at a job."""
+
+    job: str
+    attempt: int
+    model: str
+    request: dict[str, Any]
+
+
+def _claim(database: Database, job: str) -> Claim | None:
+    with database.transaction() as session:
+        row = session.scalar(select(JobRow).where(JobRow.id == job))
+        if row is None or row.state != QUEUED:
+            return None
+        row.state, row.attempts = RUNNING, row.attempts + 1
+        row.started_at = row.heartbeat_at = now()
+        row.progress = {"stage": "loading"}
+        return Claim(job, row.attempts, row.model, row.request)
+
+
+def _train(database: Database, files: Files, claim: Claim) -> None:
+    watch = _Watch(database, claim)
+    try:
+        trained, lineage = _fit(database, files, claim, watch)
+        folder = new_id("mv")
+        manifest = lipcore.save(trained, files.versions / folder, lineage)
+        with database.transaction() as session:
+            row = _own(session, claim)
+            version = registry.publish(session, claim.model, folder, manifest, claim.job)
+            row.state, row.version, row.finished_at = SUCCEEDED, version, now()
+            row.progress = {**row.progress, "stage": "done", "fraction": 1.0, "elapsed_s": watch.elapsed}
+    except lipcore.FitCancelledError:
+        _finish(database, claim, CANCELLED, None)
+    except SupersededError:
+        logger.warning("job %s was taken over by another attempt", claim.job)
+    except Exception as error:
+        logger.exception("job %s failed", claim.job)
+        code = "not_positive_definite" if isinstance(error, lipcore.NotPositiveDefiniteError) else "training_failed"
+        _finish(database, claim, FAILED, {"code": code, "message": f"{type(error).__name__}: {error}"})
+
+
+def _fit(database: Database, files: Files, claim: Claim, watch: _Watch) -> tuple[TorqueModel, dict[str, Any]]:
+    request = claim.request
+    with database.session() as session:
+        found = {
+            row.id: row for row in session.scalars(select(DatasetRow).where(DatasetRow.id.in_(request["datasets"])))
+        }
+    rows = [found[dataset] for dataset in request["datasets"]]
+    samples = lipcore.Samples.concatenate([files.read_samples(row.id, row.joint_names) for row in rows])
+    trained = lipcore.train(
+        samples,
+        request["joint_types"],
+        request["estimator"],
+        lipcore.FitOptions(**request["options"]),
+        torque_convention=rows[0].torque_convention,  # type: ignore[arg-type]  # checked when it was stored
+        on_progress=watch.progress,
+        cancelled=watch.cancelled,
+    )
+    lineage = {
+        "job": claim.job,
+        "datasets": [{"id": row.id, "name": row.name, "sha256": row.sha256, "rows": row.rows} for row in rows],
+        "trained_at": now(),
+    }
+    watch.stage("saving")
+    return trained, lineage
+
+
+class _Watch:
+    """Writes progress to the job's row and reads its cancel flag, at most every REPORT_EVERY seconds."""
+
+    def __init__(self, database: Database, claim: Claim) -> None:
+        self.database, self.claim = database, claim
+        self.began, self.looked = time.monotonic(), 0.0
+        self.latest: dict[str, Any] = {"stage": "hyperparameters"}
+        self.stop = False
+
+    @property
+    def elapsed(self) -> float:
+        return time.monotonic() - self.began
+
+    def progress(self, at: FitProgress) -> None:
+        self.latest = {
+            "stage": at.stage,
+            "iteration": at.iteration,
+            "max_iterations": at.max_iterations,
+            "objective": at.objective,
+            "fraction": at.fraction,
+        }
+        self._exchange(force=at.stage != "hyperparameters")
+
+    def stage(self, name: str) -> None:
+        self.latest = {**self.latest, "stage": name}
+        self._exchange(force=True)
+
+    def cancelled(self) -> bool:
+        self._exchange()
+        return self.stop
+
+    def _exchange(self, force: bool = False) -> None:
+        if not force and time.monotonic() - self.looked < REPORT_EVERY:
+            return
+        self.looked = time.monotonic()
+        with self.database.transaction() as session:
+            row = _own(session, self.claim)
+            row.progress, row.heartbeat_at = {**self.latest, "elapsed_s": self.elapsed}, now()
+            self.stop = row.cancel_requested
+
+
+def _own(session: Any, claim: Claim) -> JobRow:
+    """Return the job's row while it still is this attempt's; a restarted service may have given it away."""
+    row: JobRow | None = session.scalar(select(JobRow).where(JobRow.id == claim.job))
+    if row is None or row.state != RUNNING or row.attempts != claim.attempt:
+        raise SupersededError(claim.job)
+    return row
+
+
+def _finish(database: Database, claim: Claim, state: str, error: dict[str, str] | None) -> None:
+    with database.transaction() as session:
+        row = _own(session, claim)
+        row.state, row.error, row.finished_at = state, error, now()

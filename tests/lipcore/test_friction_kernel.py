@@ -1,0 +1,46 @@
+"""Friction: independent per joint, linear in speed, direction and a constant."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from lipcore.kernels.base import State
+from lipcore.kernels.friction import SIGN_WIDTH, FrictionKernel, friction_features
+from lipcore.motion import Motion
+from tests.lipcore.problems import random_problem
+
+
+def features(speed: float) -> list[float]:
+    return [speed, math.tanh(speed / SIGN_WIDTH), 1.0]
+
+
+def test_block_is_the_covariance_of_independent_weights_on_the_features() -> None:
+    problem = random_problem(("revolute", "prismatic", "revolute"), samples=4, seed=1)
+    motion, std = problem.motion, torch.exp(problem.params["friction.log_std"])
+    motion = Motion(motion.q, 0.02 * motion.dq, motion.ddq)  # slow enough for the sign to turn over
+    blocks = FrictionKernel(3).blocks(problem.params, State.rows(motion), State.columns(motion))
+    for x in range(4):
+        for y in range(4):
+            for i in range(3):
+                for j in range(3):
+                    one, two = features(float(motion.dq[x, i])), features(float(motion.dq[y, j]))
+                    expected = sum(float(std[i, f]) ** 2 * one[f] * two[f] for f in range(3)) if i == j else 0.0
+                    assert math.isclose(float(blocks[i, j, x, y]), expected, rel_tol=1e-12, abs_tol=1e-14)
+
+
+def test_sign_is_smooth_at_standstill_and_full_beyond() -> None:
+    sign = friction_features(torch.tensor([-1.0, -5 * SIGN_WIDTH, 0.0, 5 * SIGN_WIDTH, 1.0]).double())[1]
+    assert sign[2] == 0
+    assert torch.allclose(sign[[0, 1, 3, 4]], torch.tensor([-1.0, -1.0, 1.0, 1.0]).double(), rtol=0, atol=1e-4)
+
+
+def test_initial_hyperparameters_split_a_tenth_of_the_torque_over_features() -> None:
+    motion = random_problem(("revolute",) * 2, samples=200, seed=2).motion
+    tau = torch.stack([5 * motion.q[:, 0], 0.1 * motion.q[:, 1]], dim=1)
+    std = torch.exp(FrictionKernel(2).initial(motion, tau)["friction.log_std"])
+    usual_speed = motion.dq.square().mean(0).sqrt()
+    assert std.shape == (2, 3)
+    assert torch.allclose(std[:, 0] * usual_speed, 0.1 * tau.std(0), rtol=1e-12)
+    assert torch.allclose(std[:, 1:], 0.1 * tau.std(0)[:, None].expand(2, 2), rtol=1e-12)
