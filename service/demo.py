@@ -28,6 +28,8 @@ from service.training.states import SUCCEEDED
 
 MODEL = "panda-demo"
 START_SECONDS = 60.0
+PLOTTED = 150
+"""Samples in the plot: fifteen seconds."""
 REGIMES = {"slow": 1.0, "fast": FAST}
 """The paper's slow sinusoids, where gravity rules, and the faster variant, where inertia shows."""
 
@@ -109,7 +111,8 @@ def run(port: int, once: bool, plot: Path | None, console: Console) -> None:
         answer = client.predict(MODEL, **query)
         _show_query(query, answer, samples.tau[row], service.url, console)
         if plot is not None:
-            draw(plot, samples, client.predict(MODEL, samples.q, samples.dq, samples.ddq))
+            part = samples.rows(slice(0, PLOTTED))
+            draw(plot, part, client.predict(MODEL, part.q, part.dq, part.ddq))
             console.print(f"  drawn to {plot}")
         console.print(f"[bold]done in {time.monotonic() - began:.0f} s[/bold]")
         if once:

@@ -82,6 +82,6 @@ def test_gradient_equals_finite_differences_of_the_density(
 def test_covariance_that_cannot_be_factored_is_reported() -> None:
     problem = random_problem(("revolute",), samples=5, seed=0)
     params = problem.params | {"noise.log_std": torch.tensor([float("nan")]).double()}
+    kernel = SumKernel(problem.kernel, FrictionKernel(1))
     with pytest.raises(NotPositiveDefiniteError):
-        kernel = SumKernel(problem.kernel, FrictionKernel(1))
         negative_log_evidence(kernel, params, problem.motion, torch.zeros(5, 1).double())

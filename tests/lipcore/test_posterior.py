@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -81,7 +82,7 @@ def test_std_shrinks_when_data_are_added(setting: Setting) -> None:
         motion, tau = setting.problem.motion[:count], setting.tau[:count]
         part = ExactPosterior.fit(setting.kernel, setting.problem.params, motion, tau)
         stds.append(part.predict(setting.query).std)
-    for fewer, more in zip(stds[:-1], stds[1:], strict=True):
+    for fewer, more in pairwise(stds):
         assert (more <= fewer * (1 + 1e-9)).all()
         assert more.mean() < 0.99 * fewer.mean()
 

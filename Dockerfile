@@ -1,0 +1,34 @@
+# The serving image: no simulator, no compiler, no CUDA.
+FROM python:3.11-slim AS build
+WORKDIR /src
+RUN python -m venv /opt/lipserve
+COPY .ci/install-torch .ci/install-torch
+RUN .ci/install-torch /opt/lipserve/bin/python
+COPY pyproject.toml README.md LICENSE ./
+COPY lipcore lipcore
+COPY service service
+COPY models/panda-sim models/panda-sim
+RUN /opt/lipserve/bin/python -m pip install --no-cache-dir --disable-pip-version-check . \
+    && /opt/lipserve/bin/python -m pip uninstall --yes --quiet setuptools pip \
+    && site=$(echo /opt/lipserve/lib/python3*/site-packages) \
+    && rm -rf "$site"/torch/include "$site"/torch/share "$site"/torch/test "$site"/torch/bin \
+    && find /opt/lipserve -name __pycache__ -prune -exec rm -rf {} + \
+    && find "$site"/numpy "$site"/scipy "$site"/sympy "$site"/networkx -type d -name tests -prune -exec rm -rf {} +
+
+FROM python:3.11-slim
+RUN useradd --system --uid 10001 --no-create-home --shell /usr/sbin/nologin lipserve \
+    && mkdir /data && chown lipserve /data
+COPY --from=build /opt/lipserve /opt/lipserve
+ENV PATH=/opt/lipserve/bin:$PATH \
+    PYTHONUNBUFFERED=1 \
+    LIPSERVE_HOME=/data \
+    LIPSERVE_HOST=0.0.0.0 \
+    LIPSERVE_INSECURE=1
+# LIPSERVE_INSECURE: a container must listen on all its addresses to be reached; publish the port to loopback only
+# (-p 127.0.0.1:8000:8000) or behind a proxy that checks who asks
+VOLUME /data
+EXPOSE 8000
+USER lipserve
+HEALTHCHECK --interval=10s --timeout=3s --start-period=30s \
+    CMD ["python", "-c", "import urllib.request as r; r.urlopen('http://127.0.0.1:8000/health/ready', timeout=2)"]
+CMD ["lipserve", "serve"]

@@ -1,0 +1,41 @@
+# `make demo` and `make test` are all a fresh machine needs: Python 3.11 or newer and make.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+# one thread a process: the tests' matrices are small, and several processes share the machine
+TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+
+.PHONY: demo test test-all lint install serve image clean
+
+demo: install
+	$(BIN)/lipserve demo
+
+test: install
+	$(TEST) -m "not slow"
+
+test-all: install
+	$(TEST)
+
+lint: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+serve: install
+	$(BIN)/lipserve serve
+
+image:
+	docker build -t lipserve .
+
+install: $(VENV)/.installed
+
+$(VENV)/.installed: pyproject.toml .ci/install-torch
+	@echo "installing into $(VENV): about 1.5 GB, a minute or two from a warm package cache"
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, this is " + sys.version)'
+	$(PYTHON) -m venv $(VENV)
+	.ci/install-torch $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[sim,plot,dev]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis dist build
