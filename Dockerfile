@@ -11,7 +11,7 @@ COPY models/panda-sim models/panda-sim
 RUN /opt/lipserve/bin/python -m pip install --no-cache-dir --disable-pip-version-check . \
     && /opt/lipserve/bin/python -m pip uninstall --yes --quiet setuptools pip \
     && site=$(echo /opt/lipserve/lib/python3*/site-packages) \
-    && rm -rf "$site"/torch/include "$site"/torch/share "$site"/torch/test "$site"/torch/bin \
+    && rm -rf "$site"/torch/include "$site"/torch/share "$site"/torch/test \
     && find /opt/lipserve -name __pycache__ -prune -exec rm -rf {} + \
     && find "$site"/numpy "$site"/scipy "$site"/sympy "$site"/networkx -type d -name tests -prune -exec rm -rf {} +
 

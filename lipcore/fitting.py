@@ -24,6 +24,9 @@ from lipcore.signals import noise_level
 PRIOR_STD = {"noise.log_std": 1.0, "logits": 4.0, "log": 3.0}
 """Widths of the Gaussian priors on hyperparameters around their starting values: weak, but for the noise, which a
 small data set cannot tell from misfit. 3 on a logarithm admits a factor of 20 either way within one deviation."""
+NOISE_START = 0.01
+"""Smallest noise std that a fit starts from, relative to the joint's torque spread: what no model explains is noise
+too, and filtered torques look free of noise though they are not. Data that deserve less are fitted with less."""
 NOISE_FLOOR_JOINT = 1e-4
 NOISE_FLOOR_ROBOT = 1e-5
 """Smallest noise std admitted, relative to the joint's torque spread and to the largest of all joints: below the
@@ -61,7 +64,7 @@ class FitOptions:
             ("max_iterations", 1, 10000),
         ):
             value = getattr(self, name)
-            if not isinstance(value, int) or not low <= value <= high:
+            if type(value) is not int or not low <= value <= high:
                 raise ValueError(f"{name} is {value!r}, expected a whole number from {low} to {high}")
         if self.device not in ("auto", "cpu", "cuda"):
             raise ValueError(f"device is {self.device!r}, expected auto, cpu or cuda")
@@ -240,7 +243,8 @@ def prior_std(name: str) -> float:
 
 
 def _noise(samples: Samples) -> Array:
-    return noise_level([samples.tau[part] for part in samples.episodes()])
+    level = noise_level([samples.tau[part] for part in samples.episodes()])
+    return np.asarray(np.maximum(level, NOISE_START * samples.tau.std(axis=0)))
 
 
 def _noise_floor(samples: Samples) -> Array:

@@ -38,7 +38,8 @@ def evaluate(tau: Array, mean: Array, std: Array, noise_std: Array, level: float
     total = np.sqrt(std**2 + noise_std**2)
     half = float(norm.ppf(0.5 + level / 2)) * total
     squared = np.mean(error**2, axis=0)
-    variance = tau.var(axis=0)
+    # rounding gives a constant column a variance above zero
+    variance = np.where(np.ptp(tau, axis=0) > 0, tau.var(axis=0), 0.0)
     return Metrics(
         nmse=np.divide(squared, variance, out=np.full_like(squared, np.nan), where=variance > 0),
         rmse=np.sqrt(squared),

@@ -12,12 +12,13 @@ from torch import Tensor
 
 from lipcore.estimators import DEFAULT_ESTIMATOR, Estimator, make_estimator
 from lipcore.fitting import Cancelled, FitOptions, Progress, fit
-from lipcore.motion import JointType, Motion, check_joint_types
+from lipcore.motion import JointType, Motion, check_finite, check_joint_types
 from lipcore.posterior import ExactPosterior
 from lipcore.samples import Array, Samples
 
 TorqueConvention = Literal["gravity_included", "gravity_compensated"]
 """What a torque means: all of it (Franka's `tau_J`), or what is added to gravity compensation (its commands)."""
+MIN_SAMPLES = 10
 TORQUE_CONVENTIONS: tuple[TorqueConvention, ...] = get_args(TorqueConvention)
 
 
@@ -93,6 +94,9 @@ def train(
         raise ValueError(f"joint_types has {len(types)} entries, expected {samples.n_joints}, one a joint")
     if torque_convention not in TORQUE_CONVENTIONS:
         raise ValueError(f"torque_convention is {torque_convention!r}, expected one of {', '.join(TORQUE_CONVENTIONS)}")
+    if len(samples) < MIN_SAMPLES:
+        raise ValueError(f"samples has {len(samples)} rows, expected at least {MIN_SAMPLES}")
+    check_finite("tau", samples.tau)
     chosen = make_estimator(estimator, types, options.tied)
     fitted = fit(chosen.kernel, samples, options, on_progress, cancelled)
     used = samples.rows(fitted.rows)

@@ -8,7 +8,7 @@ from typing import Literal, cast, get_args
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 JointType = Literal["revolute", "prismatic"]
@@ -23,6 +23,13 @@ def check_joint_types(joint_types: Sequence[str]) -> tuple[JointType, ...]:
         if kind not in JOINT_TYPES:
             raise ValueError(f"joint_types[{index}] is {kind!r}, expected one of {', '.join(JOINT_TYPES)}")
     return cast(tuple[JointType, ...], tuple(joint_types))
+
+
+def check_finite(name: str, array: NDArray[np.float64]) -> None:
+    """Raise ValueError naming the first element of `array` (N, n) that is not finite."""
+    if not np.isfinite(array).all():
+        sample, joint = np.argwhere(~np.isfinite(array))[0]
+        raise ValueError(f"{name}[{sample}, {joint}] is {array[sample, joint]}, expected a finite number")
 
 
 @dataclass(frozen=True)
@@ -42,10 +49,9 @@ class Motion:
         tensors = []
         for name, values in (("q", q), ("dq", dq), ("ddq", ddq)):
             array = np.atleast_2d(np.asarray(values, dtype=np.float64))
-            if not np.isfinite(array).all():
-                sample, joint = np.argwhere(~np.isfinite(array))[0]
-                value = array[sample, joint]
-                raise ValueError(f"{name}[{sample}, {joint}] is {value}, expected a finite number")
+            if array.ndim != 2 or array.size == 0:
+                raise ValueError(f"{name} has shape {array.shape}, expected (N, n) or (n,), neither of them 0")
+            check_finite(name, array)
             tensors.append(torch.from_numpy(array.copy()).to(device))
         shape = tensors[0].shape
         for name, tensor in zip(("dq", "ddq"), tensors[1:], strict=True):

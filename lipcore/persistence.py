@@ -131,6 +131,7 @@ def _write_folder(folder: Path, payload: bytes, manifest: bytes) -> None:
         _write(draft / TENSORS, payload)
         _write(draft / MANIFEST, manifest)
         draft.chmod(0o755)
+        _sync(draft)
         os.rename(draft, folder)
         _sync(folder.parent)
     except BaseException:

@@ -69,6 +69,8 @@ class Samples:
         """Rows of all parts in order; episodes are renumbered so that parts never share one."""
         if not parts:
             raise ValueError("no samples to concatenate")
+        if empty := [index for index, part in enumerate(parts) if len(part) == 0]:
+            raise ValueError(f"part {empty[0]} has no samples")
         names = parts[0].joint_names
         for part in parts[1:]:
             if part.joint_names != names:

@@ -34,5 +34,6 @@ def spread_out(motion: Motion, count: int) -> Tensor:
     distance = torch.full((size,), torch.inf, dtype=torch.float64, device=motion.device)
     while len(chosen) < count:
         distance = torch.minimum(distance, (features - features[chosen[-1]]).square().sum(1))
+        distance[chosen] = -1.0  # a sample that repeats a chosen one is new, a chosen one is not
         chosen.append(int(distance.argmax()))
     return torch.tensor(sorted(chosen), device=motion.device)

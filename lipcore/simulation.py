@@ -127,5 +127,7 @@ def _check(stream: Stream) -> None:
         raise ValueError(f"noise is {stream.noise}, expected a number of at least 0")
     if stream.motion not in ("middle", "full"):
         raise ValueError(f"motion is {stream.motion!r}, expected 'middle' or 'full'")
-    if stream.payload is not None and not stream.payload.mass >= 0:
-        raise ValueError(f"payload mass is {stream.payload.mass}, expected at least 0 kg")
+    if stream.payload is not None:
+        for name, amount in (("mass", stream.payload.mass), ("at", stream.payload.at)):
+            if not 0 <= amount < np.inf:
+                raise ValueError(f"payload {name} is {amount}, expected a number of at least 0")

@@ -21,6 +21,7 @@ from service.datasets import routes as datasets
 from service.files import Files
 from service.inference import routes as inference
 from service.inference.loaded import LoadedModels
+from service.limits import BodyLimit
 from service.models import registry
 from service.models import routes as models
 from service.settings import Settings
@@ -62,11 +63,13 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         description=DESCRIPTION,
         version=__version__,
         lifespan=lifespan,
-        max_body_size=settings.max_request_bytes,
     )
     errors.install(app)
+    app.add_middleware(
+        BodyLimit, max_upload_bytes=settings.max_upload_bytes, max_request_bytes=settings.max_request_bytes
+    )
     app.include_router(health.router)
-    app.include_router(datasets.router, max_body_size=settings.max_upload_bytes)
+    app.include_router(datasets.router)
     app.include_router(training.router)
     app.include_router(models.router)
     app.include_router(inference.router)

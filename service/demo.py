@@ -95,10 +95,12 @@ def run(port: int, once: bool, plot: Path | None, console: Console) -> None:
         job = follow(client, client.train(MODEL, [dataset for dataset, _ in train.values()]), console)
         if job.state != SUCCEEDED or job.version is None:
             raise DemoError(f"the training job has {job.state}: {job.error.message if job.error else ''}")
-        fit = client.version(MODEL, job.version).fit
+        version = client.version(MODEL, job.version)
+        fit, process = version.fit, version.lineage["training_process"]
         console.print(
             f"  version {job.version} after {job.progress.elapsed_s:.0f} s: {fit['samples_posterior']} of "
-            f"{fit['samples_given']} samples kept, {fit['iterations']} iterations"
+            f"{fit['samples_given']} samples kept, {fit['iterations']} iterations, "
+            f"peak memory of the training process {process['peak_memory_mb']} MB"
         )
 
         console.print("[bold]4. evaluating on the unseen trajectories[/bold]")

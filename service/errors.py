@@ -99,7 +99,13 @@ class NotReadyError(ServiceError):
 def problem(field: str, value: object, expected: str) -> Problem:
     """Describe one wrong value; long values are cut."""
     text = value if isinstance(value, str) else repr(value)
-    return Problem(field=field, value=text if len(text) <= 200 else text[:200] + "…", expected=expected)
+    text = text if len(text) <= 200 else text[:200] + "…"
+    return Problem(field=_encodable(field[:200]), value=_encodable(text), expected=expected)
+
+
+def _encodable(text: str) -> str:
+    """Escape lone surrogates, which JSON can bring in and UTF-8 cannot take out."""
+    return text.encode(errors="backslashreplace").decode()
 
 
 def sentence(item: Problem) -> str:
@@ -158,14 +164,24 @@ async def _service_error(_: Request, error: Exception) -> JSONResponse:
 
 async def _validation_error(_: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
-    detail = []
-    for item in error.errors()[:20]:
-        # bodies may be one of several shapes: pydantic then adds type names to the path, which say nothing to a client
-        where = [part for part in item["loc"] if part not in ("body", "query", "path")]
-        field = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in where).lstrip(".")
-        detail.append(problem(field or "body", item.get("input"), str(item["msg"]).lower()))
+    detail = [_explain(item) for item in error.errors()[:20]]
     message = sentence(detail[0]) if detail else "the request is not valid"
     return _answer(422, "invalid_request", message, detail)
+
+
+def _explain(item: dict[str, Any]) -> Problem:
+    where = [part for part in item["loc"] if part not in ("body", "query", "path")]
+    field = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in where).lstrip(".") or "body"
+    kind, found, said = item["type"], item.get("input"), str(item["msg"])
+    if kind == "json_invalid":
+        return problem("body", f"not JSON at character {where[0]}: {item['ctx']['error']}", "JSON")
+    if isinstance(found, bytes):
+        return problem("body", found, "JSON, with the content-type application/json")
+    if kind == "missing":
+        return problem(field, "missing", "a value")
+    if kind == "extra_forbidden":
+        return problem(field, found, "no field of that name")
+    return problem(field, found, said.removeprefix("Input should be ").replace("String should", "to", 1))
 
 
 async def _http_error(_: Request, error: Exception) -> JSONResponse:

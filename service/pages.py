@@ -6,10 +6,14 @@ from typing import Annotated, TypeVar
 
 from fastapi import Depends, Query, Request
 from pydantic import BaseModel
+from sqlalchemy import select
+from sqlalchemy.orm import Session
 
+from service.database import DatasetRow, JobRow, ModelRow
 from service.errors import invalid_request
 
-Item = TypeVar("Item")
+USUAL = 50
+Row = TypeVar("Row", DatasetRow, JobRow, ModelRow)
 
 
 class Page(BaseModel):
@@ -19,12 +23,24 @@ class Page(BaseModel):
     limit: int
 
 
+def newest(session: Session, table: type[Row], page: Page) -> tuple[list[Row], str | None]:
+    """Return the rows of a page, newest first, and the cursor of the page after it, None on the last."""
+    query = select(table).order_by(table.seq.desc()).limit(page.limit + 1)
+    if page.after is not None:
+        query = query.where(table.seq < page.after)
+    rows = list(session.scalars(query))
+    following = str(rows[page.limit - 1].seq) if len(rows) > page.limit else None
+    return rows[: page.limit], following
+
+
 def _page(
     request: Request,
-    limit: Annotated[int, Query(ge=1, description="Most items of this page")] = 50,
+    limit: Annotated[int | None, Query(ge=1, description=f"Most items of this page; {USUAL} by default")] = None,
     cursor: Annotated[str | None, Query(description="`next_cursor` of the page before")] = None,
 ) -> Page:
     most = request.app.state.service.settings.max_page
+    if limit is None:
+        limit = min(USUAL, most)
     if limit > most:
         raise invalid_request("limit", limit, f"at most {most}")
     if cursor is not None and not (cursor.isascii() and cursor.isdigit() and len(cursor) < 18):

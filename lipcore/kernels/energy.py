@@ -1,6 +1,6 @@
 """From energy kernels to torque kernels: Lagrange's equations applied to both arguments, in closed form.
 
-tau_i = d/dt(∂L/∂dq_i) − ∂L/∂q_i with L = T − V (eq. 9 of TR2023-063). Both functions take any position kernel with its
+tau_i = d/dt(∂L/∂dq_i) − ∂L/∂q_i with L = T − V (TR2023-063). Both functions take any position kernel with its
 derivatives, so every estimator built on energies shares them.
 """
 
@@ -27,8 +27,8 @@ def kinetic_blocks(position: Derivatives, weights: Tensor, x: State, y: State) -
         2 (w a')(K w a + A w v)ᵀ + 2 (w v')(B w a + C w v − ḣ ∂'K − h Hᵀv)ᵀ − 2 (h' ∂K + h H v')(w v)ᵀ
         + h² H + 2 diag(w (K ḣ' + A h' + B ḣ + C h))
 
-    weights: (n,) velocity weights w of this link; x, y: the same n joints. Equals the block of DESIGN eq. 15 with the
-    logarithmic derivatives multiplied out.
+    weights: (n,) velocity weights w of this link; x, y: the same n joints. Written with
+    ∂K and H instead of the logarithmic derivatives ∂K / K, so that K may be zero.
     """
     n = weights.shape[0]
     w = weights.reshape((n,) + (1,) * (x.q.dim() - 1))

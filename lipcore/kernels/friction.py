@@ -19,7 +19,7 @@ def friction_features(dq: Tensor) -> Tensor:
 
 
 class FrictionKernel(TorqueKernel):
-    """Linear friction model tau_i = f_v dq_i + f_c sign(dq_i) + f_o with independent Gaussian weights (DESIGN §2)."""
+    """Linear friction model tau_i = f_v dq_i + f_c sign(dq_i) + f_o with independent Gaussian weights."""
 
     def __init__(self, n_joints: int) -> None:
         self.n_joints = n_joints

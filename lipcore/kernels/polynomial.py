@@ -1,7 +1,7 @@
 """Polynomial kernels on joint positions and their derivatives.
 
 The energies of a manipulator are polynomials in (cos q_b, sin q_b) of revolute and q_b of prismatic joints
-(TR2023-063, sec. III). A product over joints of one small base kernel each spans them. Everything here is free of
+(TR2023-063). A product over joints of one small base kernel each spans them. Everything here is free of
 division, so a base kernel may pass through zero without loss of precision.
 """
 
@@ -45,7 +45,7 @@ class BaseKernels:
 
 
 def base_kernels(shares: Tensor, joint_types: Sequence[JointType], q: Tensor, q2: Tensor) -> BaseKernels:
-    """Base kernels of all joints (eqs. 8 and 10 of TR2023-063).
+    """Base kernels of all joints of the paper, TR2023-063.
 
     revolute: p = σ + α cos q cos q' + β sin q sin q'; prismatic: p = (σ + β) + α q q'.
     shares: (n, 3) with columns σ, α, β; q, q2: (n, *batch), batches broadcast.

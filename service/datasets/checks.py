@@ -10,17 +10,19 @@ from service.settings import Settings
 
 CONSTANT = 1e-6
 """A joint whose positions span less than this (rad, m) has not moved."""
+LARGEST = 1e12
+"""No time, motion or torque in SI units is larger; beyond it, squares and differences overflow."""
 MAX_NAME = 100
 
 
 def check(columns: Columns, settings: Settings) -> None:
     """Raise InvalidDataError for the first thing that makes the recording unusable."""
     rows, n = columns.q.shape
-    if n > settings.max_joints:
-        raise invalid_data("joints", n, f"at most {settings.max_joints}")
+    if not 1 <= n <= settings.max_joints:
+        raise invalid_data("joints", n, f"1 to {settings.max_joints}")
     if rows < settings.min_samples:
         raise invalid_data("rows", rows, f"at least {settings.min_samples} samples")
-    _check_finite(columns)
+    _check_numbers(columns)
     _check_time(columns)
     farthest = np.unravel_index(np.abs(columns.q).argmax(), columns.q.shape)
     if abs(columns.q[farthest]) > settings.max_position:
@@ -47,14 +49,16 @@ def check_names(names: tuple[str, ...], n: int) -> None:
             raise invalid_data(f"joint_names[{index}]", name, "names that differ")
 
 
-def _check_finite(columns: Columns) -> None:
+def _check_numbers(columns: Columns) -> None:
     for name in ("t", "q", "dq", "ddq", "tau"):
         values = getattr(columns, name)
-        if values is None or np.isfinite(values).all():
+        if values is None or (usable := np.abs(values) <= LARGEST).all():
             continue
-        where = np.argwhere(~np.isfinite(values))[0]
+        where = np.argwhere(~usable)[0]
         column = f"{name}{where[1] + 1}" if values.ndim == 2 else name
-        raise invalid_data(f"{column}, row {where[0] + 1}", str(values[tuple(where)]), "a finite number")
+        value = values[tuple(where)]
+        expected = f"SI units, within ±{LARGEST:g}" if np.isfinite(value) else "a finite number"
+        raise invalid_data(f"{column}, row {where[0] + 1}", str(value), expected)
 
 
 def _check_time(columns: Columns) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zipfile
 import zlib
 from pathlib import Path
@@ -29,7 +30,7 @@ def read_npz(path: Path, settings: Settings) -> Columns:
                 name = member.filename.removesuffix(".npy")
                 with archive.open(member) as file:
                     arrays[name] = _read_array(name, file, member.file_size)
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError) as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError, ValueError) as error:
         raise invalid_data("file", str(error) or type(error).__name__, "a complete NPZ archive") from None
     for name in ("q", "tau"):
         if name not in arrays:
@@ -51,8 +52,15 @@ def read_npz(path: Path, settings: Settings) -> Columns:
         ddq=numbers.get("ddq"),
         t=_times(numbers, episode, shape[0]),
         episode=episode,
-        joint_names=None if names is None else tuple(str(name) for name in names),
+        joint_names=None if names is None else _text(names),
     )
+
+
+def _text(names: np.ndarray[Any, Any]) -> tuple[str, ...]:
+    try:
+        return tuple(str(name) for name in names)
+    except (SystemError, ValueError):
+        raise invalid_data("joint_names", "not Unicode", "plain text") from None
 
 
 def _times(numbers: dict[str, Array], episode: np.ndarray[Any, Any] | None, rows: int) -> Array | None:
@@ -78,6 +86,8 @@ def _check_members(archive: zipfile.ZipFile, settings: Settings) -> None:
             raise invalid_data("array", member.filename, f"one of {', '.join(ARRAYS)}")
         if name in seen:
             raise invalid_data("array", name, "every array once")
+        if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise invalid_data("array", f"{name} compressed by method {member.compress_type}", "stored or deflated")
         seen.add(name)
         total += member.file_size  # zipfile never yields more bytes than this
     if total > settings.max_unpacked_bytes:
@@ -91,16 +101,18 @@ def _read_array(name: str, file: IO[bytes], size: int) -> np.ndarray[Any, Any]:
             raise ValueError(f"format version {version}")
         header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
         shape, fortran, dtype = header(file)
-    except ValueError as error:
-        raise invalid_data(name, str(error), "a NumPy array") from None
+    except Exception as error:  # NumPy parses the header as Python text and raises whatever its parser raises
+        raise invalid_data(name, str(error) or type(error).__name__, "a NumPy array") from None
     kinds = "U" if name == "joint_names" else "fiu"
-    if dtype.kind not in kinds or dtype.itemsize > 1024 or len(shape) != ARRAYS[name]:
+    if dtype.kind not in kinds or not 0 < dtype.itemsize <= 1024 or len(shape) != ARRAYS[name]:
         raise invalid_data(
             name,
             f"of type {dtype} and {len(shape)} dimensions",
             f"{ARRAYS[name]} dimensions of plain " + ("text" if kinds == "U" else "numbers"),
         )
-    count = int(np.prod(shape, dtype=object)) if shape else 1
+    if any(not 0 <= length <= size for length in shape):
+        raise invalid_data(name, f"of shape {shape}", "as many values as the file holds")
+    count = math.prod(shape)
     if count * dtype.itemsize > size:
         raise invalid_data(name, "truncated", f"{count} values, as its header says")
     data = file.read(count * dtype.itemsize)

@@ -12,6 +12,8 @@ from lipcore.signals import differentiate, low_pass, noise_level
 from service.datasets.columns import Columns
 from service.errors import invalid_data
 
+MAX_RATE = 1e6
+"""Hz; times that rise faster than this are not in seconds."""
 GAP = 1.5
 """A time step longer than this many usual steps splits a recording."""
 JITTER = 0.25
@@ -83,8 +85,10 @@ def _derive(given: Samples, missing: list[str], rate: float, cutoff: float, step
                 continue
             raise invalid_data("cutoff", f"{cutoff:g} Hz", f"less than half the rate of {rate:g} Hz") from error
         smooth = Samples(given.joint_names, one.t, one.episode, q, dq, ddq, tau)
-        parts.append(smooth.rows(slice(edge, max(edge, len(one) - edge))))
-        dropped += len(one) - len(parts[-1])
+        kept = smooth.rows(slice(edge, max(edge, len(one) - edge)))
+        if len(kept):
+            parts.append(kept)
+        dropped += len(one) - len(kept)
     steps.append(f"q, tau{'' if 'dq' in missing else ', dq'} low-passed at {cutoff:g} Hz without delay")
     steps.append(f"{' and '.join(missing)} derived by central differences")
     steps.append(f"{dropped} samples cut off at the filter's edges")
@@ -97,7 +101,10 @@ def _rate(t: Array, episode: Array | np.ndarray[Any, np.dtype[np.int64]]) -> flo
     step = np.diff(t)[np.diff(episode) == 0]
     if len(step) == 0:
         raise invalid_data("episode", "one sample each", "episodes of several samples")
-    return float(1.0 / np.median(step))
+    usual = float(np.median(step))
+    if usual < 1 / MAX_RATE:
+        raise invalid_data("t", f"in steps of {usual:g}", f"seconds, in steps of at least {1 / MAX_RATE:g}")
+    return 1 / usual
 
 
 def _split_at_gaps(

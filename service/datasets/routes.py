@@ -29,7 +29,7 @@ from service.pages import PageQuery
 
 MEDIA_TYPES = {"text/csv": "csv", "application/x-npz": "npz"}
 
-router = APIRouter(prefix="/v1/datasets", tags=["data sets"])
+router = APIRouter(prefix="/v1/datasets", tags=["data sets"], responses=responses(InvalidRequestError))
 
 
 @router.post(
@@ -68,7 +68,7 @@ async def upload(
     return dataset
 
 
-@router.get("", summary="List data sets, newest first", responses=responses(InvalidRequestError))
+@router.get("", summary="List data sets, newest first")
 def list_datasets(service: ServiceDep, page: PageQuery) -> DatasetPage:
     """One page of data sets with their reports."""
     return store.page(service.database, page)

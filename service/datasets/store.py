@@ -18,7 +18,7 @@ from service.datasets.preparation import prepare
 from service.datasets.schema import Dataset, DatasetPage
 from service.errors import ConflictError, not_found
 from service.files import Files, new_id
-from service.pages import Page
+from service.pages import Page, newest
 from service.training.states import ACTIVE
 
 READERS = {"csv": read_csv, "npz": read_npz}
@@ -78,13 +78,9 @@ def samples(files: Files, row: DatasetRow) -> Samples:
 
 def page(database: Database, part: Page) -> DatasetPage:
     """List data sets, newest first."""
-    query = select(DatasetRow).order_by(DatasetRow.seq.desc()).limit(part.limit + 1)
-    if part.after is not None:
-        query = query.where(DatasetRow.seq < part.after)
     with database.session() as session:
-        rows = list(session.scalars(query))
-    following = str(rows[part.limit - 1].seq) if len(rows) > part.limit else None
-    return DatasetPage(items=[_show(row) for row in rows[: part.limit]], next_cursor=following)
+        rows, following = newest(session, DatasetRow, part)
+    return DatasetPage(items=[_show(row) for row in rows], next_cursor=following)
 
 
 def delete(service: Service, dataset: str) -> None:

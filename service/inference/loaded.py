@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import OrderedDict
 
@@ -10,6 +11,8 @@ from lipcore.model import TorqueModel
 from service.database import Database, VersionRow
 from service.files import Files
 from service.models import registry
+
+logger = logging.getLogger(__name__)
 
 
 class LoadedModels:
@@ -28,10 +31,14 @@ class LoadedModels:
 
     def preload(self) -> int:
         """Load the latest versions of the models that changed last, as many as fit; return how many."""
-        rows = registry.recent(self.database, self.capacity)
-        for row in rows:
-            self._load(row.folder)
-        return len(rows)
+        loaded = 0
+        for row in registry.recent(self.database, self.capacity):
+            try:
+                self._load(row.folder)
+                loaded += 1
+            except lipcore.ModelFormatError as error:  # the others shall answer all the same
+                logger.error("version %d of model %s cannot be loaded: %s", row.version, row.model, error)
+        return loaded
 
     def _load(self, folder: str) -> TorqueModel:
         with self._lock:

@@ -10,13 +10,14 @@ from service.errors import InvalidRequestError, NotFoundError, TooLargeError, re
 from service.inference import answer
 from service.inference.schema import EvaluateRequest, EvaluateResponse, PredictRequest, PredictResponse
 
-router = APIRouter(prefix="/v1/models", tags=["inference"])
+_ERRORS = responses(InvalidRequestError, NotFoundError, TooLargeError)
+
+router = APIRouter(prefix="/v1/models", tags=["inference"], responses=_ERRORS)
 
 
 @router.post(
     "/{model}/predict",
     summary="Torque at a motion, with its uncertainty",
-    responses=responses(InvalidRequestError, NotFoundError, TooLargeError),
     response_model_exclude_none=True,
 )
 async def predict(service: ServiceDep, model: str, request: PredictRequest) -> PredictResponse:
@@ -24,11 +25,7 @@ async def predict(service: ServiceDep, model: str, request: PredictRequest) -> P
     return await to_thread.run_sync(answer.predict, service, model, request, limiter=service.predictions)
 
 
-@router.post(
-    "/{model}/evaluate",
-    summary="Compare a model with a data set",
-    responses=responses(InvalidRequestError, NotFoundError),
-)
+@router.post("/{model}/evaluate", summary="Compare a model with a data set")
 async def evaluate(service: ServiceDep, model: str, request: EvaluateRequest) -> EvaluateResponse:
     """Error, coverage and density of the model's torques against measured ones, joint by joint."""
     return await to_thread.run_sync(answer.evaluate, service, model, request, limiter=service.predictions)

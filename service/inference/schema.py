@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationInf
 
 from lipcore.model import TorqueConvention
 from service.errors import invalid_request
+from service.models.schema import VersionNumber
 
 _NUMBERS: dict[str, Any] = {"type": "array", "items": {"type": "number"}}
 _ROWS: dict[str, Any] = {"type": "array", "items": _NUMBERS}
@@ -69,7 +70,7 @@ class PredictRequest(BaseModel):
     q: Vectors = Field(description="Positions, rad (prismatic: m): (n) or (N, n)")
     dq: Vectors = Field(description="Velocities, rad/s (m/s)")
     ddq: Vectors = Field(description="Accelerations, rad/s² (m/s²)")
-    version: int | None = Field(None, ge=1, description="A version of the model; the latest by default")
+    version: VersionNumber | None = Field(None, description="A version of the model; the latest by default")
     covariance: bool = Field(False, description="Also answer the covariance of the function between joints")
 
 
@@ -93,7 +94,7 @@ class EvaluateRequest(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     dataset: str = Field(max_length=40)
-    version: int | None = Field(None, ge=1, description="A version of the model; the latest by default")
+    version: VersionNumber | None = Field(None, description="A version of the model; the latest by default")
 
 
 class EvaluateResponse(BaseModel):

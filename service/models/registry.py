@@ -13,7 +13,7 @@ from service.database import Database, ModelRow, VersionRow, now
 from service.errors import not_found
 from service.files import Files, new_id
 from service.models.schema import Model, ModelPage, Version, VersionSummary
-from service.pages import Page
+from service.pages import Page, newest
 from service.settings import shipped_models
 
 logger = logging.getLogger(__name__)
@@ -90,14 +90,9 @@ def show_version(database: Database, model: str, version: int) -> Version:
 
 def page(database: Database, part: Page) -> ModelPage:
     """List models, newest first."""
-    query = select(ModelRow).order_by(ModelRow.seq.desc()).limit(part.limit + 1)
-    if part.after is not None:
-        query = query.where(ModelRow.seq < part.after)
     with database.session() as session:
-        rows = list(session.scalars(query))
-        items = [_show(session, row) for row in rows[: part.limit]]
-    following = str(rows[part.limit - 1].seq) if len(rows) > part.limit else None
-    return ModelPage(items=items, next_cursor=following)
+        rows, following = newest(session, ModelRow, part)
+        return ModelPage(items=[_show(session, row) for row in rows], next_cursor=following)
 
 
 def _show(session: Session, row: ModelRow) -> Model:

@@ -7,13 +7,13 @@ from fastapi import APIRouter
 from service.context import ServiceDep
 from service.errors import InvalidRequestError, NotFoundError, responses
 from service.models import registry
-from service.models.schema import Model, ModelPage, Version
+from service.models.schema import Model, ModelPage, Version, VersionNumber
 from service.pages import PageQuery
 
-router = APIRouter(prefix="/v1/models", tags=["models"])
+router = APIRouter(prefix="/v1/models", tags=["models"], responses=responses(InvalidRequestError))
 
 
-@router.get("", summary="List models, newest first", responses=responses(InvalidRequestError))
+@router.get("", summary="List models, newest first")
 def list_models(service: ServiceDep, page: PageQuery) -> ModelPage:
     """One page of models with their versions."""
     return registry.page(service.database, page)
@@ -26,6 +26,6 @@ def show(service: ServiceDep, model: str) -> Model:
 
 
 @router.get("/{model}/versions/{version}", summary="One version", responses=responses(NotFoundError))
-def show_version(service: ServiceDep, model: str, version: int) -> Version:
+def show_version(service: ServiceDep, model: str, version: VersionNumber) -> Version:
     """Joints, noise, training range, options, what the fit reported, and the data it came from."""
     return registry.show_version(service.database, model, version)

@@ -11,6 +11,7 @@ from lipcore.motion import JointType
 
 ModelName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")]
 """Lower-case letters, digits, dots, underscores and hyphens: safe in URLs and never a path."""
+VersionNumber = Annotated[int, Field(ge=1, lt=2**31)]
 
 
 class Version(BaseModel):

@@ -10,7 +10,7 @@ from service.database import Database, DatasetRow, JobRow, now
 from service.datasets import store
 from service.errors import BusyError, ConflictError, invalid_request, not_found
 from service.files import new_id
-from service.pages import Page
+from service.pages import Page, newest
 from service.settings import Settings
 from service.training.schema import Job, JobPage, JobRequest, Options
 from service.training.states import ACTIVE, CANCELLED, QUEUED
@@ -57,13 +57,9 @@ def show(database: Database, job: str) -> Job:
 
 def page(database: Database, part: Page) -> JobPage:
     """List jobs, newest first."""
-    query = select(JobRow).order_by(JobRow.seq.desc()).limit(part.limit + 1)
-    if part.after is not None:
-        query = query.where(JobRow.seq < part.after)
     with database.session() as session:
-        rows = list(session.scalars(query))
-    following = str(rows[part.limit - 1].seq) if len(rows) > part.limit else None
-    return JobPage(items=[_show(row) for row in rows[: part.limit]], next_cursor=following)
+        rows, following = newest(session, JobRow, part)
+    return JobPage(items=[_show(row) for row in rows], next_cursor=following)
 
 
 def cancel(database: Database, job: str) -> Job:

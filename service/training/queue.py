@@ -92,6 +92,10 @@ class JobQueue:
             return
         # the process died or could not reach the database: the job's row still says queued or running
         logger.error("the training process of job %s ended early: %r", job, error)
+        # a broken pool calls back while it holds a lock that submitting needs: from another thread then
+        threading.Thread(target=self._retry, args=(job,)).start()
+
+    def _retry(self, job: str) -> None:
         with self.database.transaction() as session:
             row = session.scalar(select(JobRow).where(JobRow.id == job, JobRow.state.in_(ACTIVE)))
             again = row is not None and self._requeue(row)

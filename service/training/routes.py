@@ -5,19 +5,19 @@ from __future__ import annotations
 from fastapi import APIRouter, Response, status
 
 from service.context import ServiceDep
-from service.errors import BusyError, ConflictError, InvalidRequestError, NotFoundError, responses
+from service.errors import BusyError, ConflictError, InvalidRequestError, NotFoundError, TooLargeError, responses
 from service.pages import PageQuery
 from service.training import jobs
 from service.training.schema import Job, JobPage, JobRequest
 
-router = APIRouter(prefix="/v1/jobs", tags=["training jobs"])
+router = APIRouter(prefix="/v1/jobs", tags=["training jobs"], responses=responses(InvalidRequestError))
 
 
 @router.post(
     "",
     status_code=status.HTTP_202_ACCEPTED,
     summary="Train a model",
-    responses=responses(InvalidRequestError, NotFoundError, BusyError),
+    responses=responses(NotFoundError, TooLargeError, BusyError),
 )
 def create(service: ServiceDep, request: JobRequest, response: Response) -> Job:
     """Queue a training job. It runs in another process and ends in a new version of the model."""
@@ -26,7 +26,7 @@ def create(service: ServiceDep, request: JobRequest, response: Response) -> Job:
     return job
 
 
-@router.get("", summary="List jobs, newest first", responses=responses(InvalidRequestError))
+@router.get("", summary="List jobs, newest first")
 def list_jobs(service: ServiceDep, page: PageQuery) -> JobPage:
     """One page of jobs with their progress."""
     return jobs.page(service.database, page)

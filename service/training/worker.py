@@ -5,6 +5,9 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
+import resource
+import signal
+import sys
 import threading
 import time
 from dataclasses import dataclass
@@ -35,6 +38,7 @@ class SupersededError(RuntimeError):
 
 def start_process(niceness: int, threads: int) -> None:
     """Prepare a training process: lower priority, few threads, and an end with the service that started it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the service ends its processes
     os.nice(niceness)
     torch.set_num_threads(threads)
     parent = multiprocessing.parent_process()
@@ -87,6 +91,8 @@ def _train(database: Database, files: Files, claim: Claim) -> None:
         manifest = lipcore.save(trained, files.versions / folder, lineage)
         with database.transaction() as session:
             row = _own(session, claim)
+            if row.cancel_requested:
+                raise lipcore.FitCancelledError("cancelled after the last look at the flag")
             version = registry.publish(session, claim.model, folder, manifest, claim.job)
             row.state, row.version, row.finished_at = SUCCEEDED, version, now()
             row.progress = {**row.progress, "stage": "done", "fraction": 1.0, "elapsed_s": watch.elapsed}
@@ -121,9 +127,16 @@ def _fit(database: Database, files: Files, claim: Claim, watch: _Watch) -> tuple
         "job": claim.job,
         "datasets": [{"id": row.id, "name": row.name, "sha256": row.sha256, "rows": row.rows} for row in rows],
         "trained_at": now(),
+        "training_process": {"seconds": round(watch.elapsed, 1), "peak_memory_mb": _peak_memory_mb()},
     }
     watch.stage("saving")
     return trained, lineage
+
+
+def _peak_memory_mb() -> int:
+    """Largest resident memory of this process so far; earlier jobs of the same process count too."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return int(peak / (1024 * 1024 if sys.platform == "darwin" else 1024))
 
 
 class _Watch:

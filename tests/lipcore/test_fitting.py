@@ -1,0 +1,193 @@
+"""Fitting: progress, cancellation, noise, options, devices."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from lipcore import evidence, fitting
+from lipcore.estimators import make_estimator
+from lipcore.fitting import Fit, FitCancelledError, FitOptions, FitProgress, fit
+from lipcore.linalg import NotPositiveDefiniteError
+from lipcore.metrics import evaluate
+from lipcore.model import train
+from lipcore.robots import load_robot
+from lipcore.samples import Samples
+from lipcore.signals import low_pass
+from lipcore.simulation import Stream, simulate
+
+pytest.importorskip("pinocchio", reason="simulation needs the extra `sim`")
+
+SMALL = FitOptions(hyperparameter_samples=25, posterior_samples=60, max_iterations=12, device="cpu")
+
+
+def pendulum(noise: float = 0.01, n_samples: int = 80) -> Samples:
+    return simulate(load_robot("double-pendulum"), Stream(n_samples=n_samples, speed=10, noise=noise), seed=1)
+
+
+def fit_pendulum(samples: Samples, options: FitOptions = SMALL, **callbacks) -> Fit:
+    return fit(make_estimator("lip", ("revolute",) * 2).kernel, samples, options, **callbacks)
+
+
+def test_progress_counts_iterations_and_ends_with_the_posterior() -> None:
+    seen: list[FitProgress] = []
+    report = fit_pendulum(pendulum(), on_progress=seen.append).report
+    assert [p.stage for p in seen] == ["hyperparameters"] * (len(seen) - 1) + ["posterior"]
+    assert [p.iteration for p in seen[:-1]] == list(range(1, len(seen)))
+    assert len(seen) - 1 == report.iterations > 5
+    assert all(p.max_iterations == 12 for p in seen)
+    assert all(0 < p.fraction <= 1 for p in seen)
+    assert [p.fraction for p in seen] == sorted(p.fraction for p in seen)
+    assert [p.elapsed for p in seen] == sorted(p.elapsed for p in seen)
+    # L-BFGS accepts no step that makes the objective worse
+    objectives = [p.objective for p in seen]
+    assert objectives == sorted(objectives, reverse=True)
+    assert objectives[-1] == report.objective < objectives[0] - 10
+
+
+def test_gradient_is_that_of_evidence_and_priors_together() -> None:
+    samples = pendulum(n_samples=15)
+    kernel, motion, tau = make_estimator("lip", ("revolute",) * 2).kernel, samples.motion(), samples.torque()
+    start = kernel.initial(motion, tau) | {"noise.log_std": torch.full((2,), -3.0).double()}
+    objective = fitting._Objective(kernel, start, motion, tau, lambda: False)
+    at = objective.pack(start) + np.random.default_rng(0).uniform(-1, 1, objective.pack(start).shape)
+    gradient = objective(at)[1]
+    for k in range(len(at)):
+        step = 1e-4 * np.eye(len(at))[k]
+        near, far = (objective(at + s * step)[0] - objective(at - s * step)[0] for s in (1, 2))
+        assert gradient[k] == pytest.approx((8 * near - far) / 12e-4, rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize("allowed", [0, 1, 5])
+def test_cancellation_stops_before_the_next_evaluation(allowed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    evaluations = 0
+
+    def counted(*arguments):
+        nonlocal evaluations
+        evaluations += 1
+        return evidence.negative_log_evidence(*arguments)
+
+    monkeypatch.setattr(fitting, "negative_log_evidence", counted)
+    with pytest.raises(FitCancelledError):
+        fit_pendulum(pendulum(), cancelled=lambda: evaluations >= allowed)
+    assert evaluations == allowed
+
+
+def test_fit_is_deterministic() -> None:
+    one, two = fit_pendulum(pendulum()), fit_pendulum(pendulum())
+    assert one.report.objective == two.report.objective
+    assert np.array_equal(one.rows, two.rows)
+    assert all(torch.equal(one.params[name], two.params[name]) for name in one.params)
+
+
+def test_report_says_what_was_used() -> None:
+    result = fit_pendulum(pendulum())
+    report = result.report
+    assert (report.samples_given, report.samples_hyperparameters, report.samples_posterior) == (80, 25, 60)
+    assert report.device == "cpu"
+    assert report.rejected_steps == 0
+    assert report.evaluations >= report.iterations
+    assert len(set(result.rows.tolist())) == 60
+
+
+def test_noise_stays_above_its_floor_on_noise_free_data() -> None:
+    samples = pendulum(noise=0.0)
+    noise = np.exp(fit_pendulum(samples, replace(SMALL, max_iterations=60)).params["noise.log_std"].numpy())
+    spread = samples.tau.std(0)
+    floor = np.maximum(1e-4 * spread, 1e-5 * spread.max())
+    assert (noise >= floor * (1 - 1e-9)).all()
+    assert (noise < 20 * floor).all()
+
+
+@pytest.mark.parametrize(("robot", "viscous"), [("ur5", 0.1), ("double-pendulum", 0.0)])
+def test_noise_is_recovered(robot: str, viscous: float) -> None:
+    arm = load_robot(robot)
+    samples = simulate(arm, Stream(n_samples=200, speed=10, noise=0.05, viscous=viscous), seed=1)
+    options = FitOptions(hyperparameter_samples=70, max_iterations=50, device="cpu")
+    noise = np.exp(fit(make_estimator("lip", arm.joint_types).kernel, samples, options).params["noise.log_std"].numpy())
+    assert np.allclose(noise, 0.05, rtol=0.3)
+
+
+def test_low_passed_torque_is_not_taken_for_free_of_noise() -> None:
+    """What a filter leaves is smooth, but no less wrong: no white noise is left to read off it."""
+    arm = load_robot("ur5")
+    stream = Stream(n_samples=300, rate=30, speed=10, noise=0.3, viscous=1.0, coulomb=1.0)
+    samples = simulate(arm, stream, seed=1)
+    samples = replace(samples, tau=low_pass(samples.tau, stream.rate))
+    model = train(samples, arm.joint_types, options=FitOptions(hyperparameter_samples=60, max_iterations=60))
+    unseen = simulate(arm, replace(stream, noise=0.0, n_sinusoids=100), seed=101)
+    answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
+    metrics = evaluate(unseen.tau, answer.tau, answer.tau_std, answer.noise_std)
+    # with the torque as measured the worst joint has 0.016
+    assert (metrics.nmse < 0.1).all(), metrics.nmse.round(3)
+
+
+def test_line_search_survives_a_covariance_that_cannot_be_factored(monkeypatch: pytest.MonkeyPatch) -> None:
+    evaluations = 0
+
+    def fails_once(*arguments):
+        nonlocal evaluations
+        evaluations += 1
+        if evaluations == 3:
+            raise NotPositiveDefiniteError("staged")
+        return evidence.negative_log_evidence(*arguments)
+
+    monkeypatch.setattr(fitting, "negative_log_evidence", fails_once)
+    seen: list[FitProgress] = []
+    report = fit_pendulum(pendulum(), on_progress=seen.append).report
+    assert report.rejected_steps == 1
+    assert report.objective < seen[0].objective
+
+
+def test_start_that_cannot_be_factored_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_):
+        raise NotPositiveDefiniteError("staged")
+
+    monkeypatch.setattr(fitting, "negative_log_evidence", fails)
+    with pytest.raises(NotPositiveDefiniteError, match="staged"):
+        fit_pendulum(pendulum())
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("hyperparameter_samples", 9),
+        ("hyperparameter_samples", 2001),
+        ("hyperparameter_samples", 50.0),
+        ("posterior_samples", 9),
+        ("posterior_samples", 5001),
+        ("max_iterations", 0),
+        ("max_iterations", "many"),
+        ("device", "tpu"),
+    ],
+)
+def test_bad_option_is_named(name: str, value: object) -> None:
+    with pytest.raises(ValueError, match=f"^{name} is {value!r}, expected"):
+        FitOptions(**{name: value})
+
+
+def test_cuda_where_there_is_none_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ValueError, match="device is 'cuda', but no CUDA device is available"):
+        fit_pendulum(pendulum(), replace(SMALL, device="cuda"))
+    assert FitOptions(device="auto").torch_device().type == "cpu"
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device on this machine")
+@pytest.mark.parametrize("robot", ["double-pendulum", "tiago"])
+def test_fit_on_cuda_agrees_with_the_processor(robot: str) -> None:
+    arm = load_robot(robot)
+    samples = simulate(arm, Stream(n_samples=80, speed=10, noise=0.05), seed=1)
+    unseen = simulate(arm, Stream(n_samples=50, speed=10, noise=0.0), seed=101)
+    # few iterations: rounding differs, and L-BFGS amplifies it with every step
+    options = replace(SMALL, max_iterations=5)
+    models = {d: train(samples, arm.joint_types, options=replace(options, device=d)) for d in ("cpu", "cuda")}
+    assert models["cuda"].fit["device"] == "cuda"
+    assert models["cuda"].fit["objective"] == pytest.approx(models["cpu"].fit["objective"], rel=1e-6)
+    answers = {d: m.predict(unseen.q, unseen.dq, unseen.ddq) for d, m in models.items()}
+    scale = unseen.tau.std(0)
+    assert (np.abs(answers["cuda"].tau - answers["cpu"].tau) < 1e-4 * scale).all()
+    assert np.allclose(answers["cuda"].tau_std, answers["cpu"].tau_std, rtol=1e-3)

@@ -1,0 +1,110 @@
+"""Training and asking a model: what it refuses, and what an answer is made of."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lipcore import FitOptions, Samples, TorqueModel, train
+from lipcore.estimators import ESTIMATORS, UnknownEstimatorError
+from lipcore.model import training_range
+from lipcore.robots import load_robot
+from lipcore.simulation import Stream, simulate
+
+pytest.importorskip("pinocchio", reason="simulation needs the extra `sim`")
+
+JOINT_TYPES = ("revolute", "revolute")
+OPTIONS = FitOptions(hyperparameter_samples=20, posterior_samples=50, max_iterations=10, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def samples() -> Samples:
+    return simulate(load_robot("double-pendulum"), Stream(n_samples=60, speed=10, noise=0.01), seed=1)
+
+
+@pytest.fixture(scope="module")
+def model(samples: Samples) -> TorqueModel:
+    return train(samples, JOINT_TYPES, options=OPTIONS)
+
+
+def test_answer_for_many_is_the_answers_for_each(model: TorqueModel, samples: Samples) -> None:
+    many = model.predict(samples.q, samples.dq, samples.ddq)
+    assert many.tau.shape == many.tau_std.shape == (60, 2)
+    assert many.covariance.shape == (60, 2, 2)
+    assert many.noise_std.shape == (2,)
+    for k in (0, 31, 59):
+        one = model.predict(samples.q[k], samples.dq[k], samples.ddq[k])
+        assert np.allclose(one.tau[0], many.tau[k], rtol=1e-8, atol=1e-10)
+        assert np.allclose(one.covariance[0], many.covariance[k], rtol=1e-6, atol=1e-12)
+    assert np.allclose(many.tau_std**2, np.diagonal(many.covariance, axis1=1, axis2=2), rtol=1e-12)
+
+
+def test_model_says_what_it_was_made_of(model: TorqueModel, samples: Samples) -> None:
+    assert model.joint_names == samples.joint_names
+    assert model.joint_types == JOINT_TYPES
+    assert model.torque_convention == "gravity_included"
+    assert model.options["hyperparameter_samples"] == 20
+    assert model.fit["samples_posterior"] == len(model.tau) == 50
+    ranges = training_range(model)
+    assert set(ranges) == {"q", "dq", "ddq"}
+    for name, limits in ranges.items():
+        values = getattr(model.posterior.motion, name).numpy()
+        assert limits == {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
+
+
+def test_posterior_stands_on_rows_of_the_data(model: TorqueModel, samples: Samples) -> None:
+    rows = {tuple(row) for row in np.hstack([samples.q, samples.dq, samples.ddq, samples.tau])}
+    motion = model.posterior.motion
+    used = np.hstack([motion.q, motion.dq, motion.ddq, model.tau])
+    assert {tuple(row) for row in used} <= rows
+
+
+@pytest.mark.parametrize(
+    ("shapes", "message"),
+    [
+        (((4, 3),) * 3, "q has 3 joints, expected 2: joint1, joint2"),
+        (((3,),) * 3, "q has 3 joints, expected 2"),
+        (((4, 2), (4, 2), (3, 2)), r"ddq has shape \(3, 2\), expected \(4, 2\)"),
+        (((4, 2, 2),) * 3, "q"),
+    ],
+    ids=str,
+)
+def test_query_of_wrong_shape_is_refused(model: TorqueModel, shapes: tuple, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        model.predict(*(np.zeros(shape) for shape in shapes))
+
+
+def test_query_that_is_not_finite_is_refused(model: TorqueModel) -> None:
+    with pytest.raises(ValueError, match=r"dq\[0, 1\] is nan"):
+        model.predict([0.0, 0.0], [0.0, np.nan], [0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"joint_types": ("revolute",)}, "joint_types has 1 entries, expected 2"),
+        ({"joint_types": ("revolute", "spherical")}, r"joint_types\[1\] is 'spherical'"),
+        ({"torque_convention": "none"}, "torque_convention is 'none', expected one of gravity_included"),
+        ({"estimator": "oracle"}, "estimator is 'oracle', expected one of lip"),
+    ],
+    ids=str,
+)
+def test_bad_argument_of_training_is_named(samples: Samples, arguments: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        train(samples, **({"joint_types": JOINT_TYPES, "options": OPTIONS} | arguments))
+
+
+@pytest.mark.parametrize("name", ["q", "dq", "ddq", "tau"])
+def test_samples_that_are_not_finite_are_named(samples: Samples, name: str) -> None:
+    values = getattr(samples, name).copy()
+    values[3, 1] = np.nan
+    with pytest.raises(ValueError, match=rf"{name}\[3, 1\]"):
+        train(replace(samples, **{name: values}), JOINT_TYPES, options=OPTIONS)
+
+
+def test_unknown_estimator_has_its_own_error(samples: Samples) -> None:
+    with pytest.raises(UnknownEstimatorError) as caught:
+        train(samples, JOINT_TYPES, estimator="oracle")
+    assert all(name in str(caught.value) for name in ESTIMATORS)
