@@ -91,7 +91,9 @@ class PredictResponse(BaseModel):
 class EvaluateRequest(BaseModel):
     """Which data set to compare a model with."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(
+        extra="forbid", json_schema_extra={"examples": [{"dataset": "ds_0123456789abcdef", "version": 1}]}
+    )
 
     dataset: str = Field(max_length=40)
     version: VersionNumber | None = Field(None, description="A version of the model; the latest by default")

@@ -1,0 +1,103 @@
+"""Services that tests share: starting one loads torch and a model, training in one starts a process."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+
+import lipcore
+from lipcore import Samples, TorqueModel
+from service.app import create_app
+from service.models import registry
+from service.settings import Settings
+from tests.service.data import service_of, stream, train, upload
+from tests.service.server import Server
+
+LIMITS = {
+    "max_upload_bytes": 200_000,
+    "max_unpacked_bytes": 400_000,
+    "max_request_bytes": 20_000,
+    "max_joints": 8,
+    "max_samples": 500,
+    "max_batch": 20,
+    "max_evaluation_samples": 50,
+    "max_page": 3,
+    "max_job_datasets": 2,
+    "max_queued_jobs": 2,
+    "max_hyperparameter_samples": 30,
+    "max_posterior_samples": 40,
+}
+"""Limits small enough to be exceeded."""
+
+
+@pytest.fixture(scope="session")
+def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    """A service with default settings; its data sets and models accumulate over the session."""
+    with TestClient(create_app(Settings(home=tmp_path_factory.mktemp("api")))) as client:
+        yield client
+
+
+@pytest.fixture(scope="session")
+def strict_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    """A service with small limits."""
+    with TestClient(create_app(Settings(home=tmp_path_factory.mktemp("strict"), **LIMITS))) as client:
+        yield client
+
+
+@pytest.fixture
+def strict(strict_service: TestClient) -> Iterator[TestClient]:
+    """The service with small limits, empty of data sets at the start of every test."""
+    yield strict_service
+    while left := strict_service.get("/v1/datasets").json()["items"]:
+        for dataset in left:
+            assert strict_service.delete(f"/v1/datasets/{dataset['id']}").status_code == 204
+
+
+@pytest.fixture(scope="session")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """A service in a process of its own."""
+    limits = {f"LIPSERVE_{name.upper()}": str(LIMITS[name]) for name in ("max_upload_bytes", "max_request_bytes")}
+    with Server(tmp_path_factory.mktemp("server"), **limits) as started:
+        yield started
+
+
+@pytest.fixture(scope="session")
+def pendulum(api: TestClient) -> dict[str, object]:
+    """A data set of a double pendulum."""
+    return upload(api, stream(), name="pendulum")
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A model of a double pendulum: its name and data set in the service, and lipcore's own copy of it."""
+
+    name: str
+    dataset: str
+    samples: Samples
+    model: TorqueModel
+
+
+@pytest.fixture(scope="session")
+def trained(api: TestClient, pendulum: dict[str, str]) -> Trained:
+    """A model of version 1 that no test adds versions to."""
+    train(api, "pendulum", pendulum["id"])
+    service = service_of(api)
+    folder = registry.find(service.database, "pendulum", 1).folder
+    return Trained("pendulum", pendulum["id"], stream(), lipcore.load(service.files.versions / folder))
+
+
+@pytest.fixture
+def no_worker(strict: TestClient, monkeypatch: pytest.MonkeyPatch) -> TestClient:
+    """The service with small limits, where queued jobs stay queued."""
+    monkeypatch.setattr(service_of(strict).jobs, "submit", lambda job: None)
+    return strict
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    """An empty home."""
+    return tmp_path / "home"

@@ -1,0 +1,128 @@
+"""Recordings to upload, and what tests do with them again and again."""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Callable, Mapping
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from lipcore.robots import load_robot
+from lipcore.samples import Samples
+from lipcore.simulation import Stream, simulate
+from service.context import Service
+from service.training.states import ACTIVE
+
+QUICK = {"hyperparameter_samples": 20, "posterior_samples": 60, "max_iterations": 4}
+"""Options of a fit that takes a fraction of a second."""
+ENDLESS = {"hyperparameter_samples": 200, "posterior_samples": 60, "max_iterations": 10_000}
+"""Options of a fit that takes minutes on `panda`: it runs until somebody ends it."""
+DEADLINE = 60.0
+"""Seconds after which a condition that a test waits for has failed."""
+
+
+@cache
+def stream(robot: str = "double-pendulum", samples: int = 80, seed: int = 1, **kwargs: Any) -> Samples:
+    """A simulated recording; equal arguments give the same object."""
+    return simulate(load_robot(robot), Stream(n_samples=samples, **{"speed": 5.0, **kwargs}), seed)
+
+
+def arrays(samples: Samples, *names: str) -> dict[str, np.ndarray]:
+    """Arrays of a recording by name, all that are needed where no names are given."""
+    return {name: getattr(samples, name) for name in names or ("t", "q", "dq", "ddq", "tau")}
+
+
+def npz(**members: Any) -> bytes:
+    """An NPZ archive."""
+    file = io.BytesIO()
+    np.savez(file, **members)
+    return file.getvalue()
+
+
+def columns(samples: Samples) -> dict[str, list[Any]]:
+    """Columns of a recording by their canonical names, as lists of texts to be changed at will."""
+    table: dict[str, list[Any]] = {"t": [f"{value:.17g}" for value in samples.t]}
+    for name in ("q", "dq", "ddq", "tau"):
+        for joint, values in enumerate(getattr(samples, name).T, start=1):
+            table[f"{name}{joint}"] = [f"{value:.17g}" for value in values]
+    return table
+
+
+def csv(table: Mapping[str, list[Any]], newline: str = "\n") -> bytes:
+    """A CSV file of named columns."""
+    rows = zip(*table.values(), strict=True)
+    return (newline.join([",".join(table), *(",".join(map(str, row)) for row in rows)]) + newline).encode()
+
+
+def post(api: Any, body: Any, media_type: str = "application/x-npz", **params: Any) -> Any:
+    """Upload a body as it is; return the answer."""
+    return api.post("/v1/datasets", content=body, headers={"content-type": media_type}, params=params)
+
+
+def upload(api: Any, samples: Samples, **params: Any) -> dict[str, Any]:
+    """Upload a recording with its joint names; return the data set."""
+    answer = post(api, npz(**arrays(samples), joint_names=np.array(samples.joint_names)), **params)
+    assert answer.status_code == 201, answer.text
+    return answer.json()
+
+
+def queue(api: Any, model: str, *datasets: str, **request: Any) -> dict[str, Any]:
+    """Queue a training job, a quick one unless options are given; return it."""
+    body = {"model": model, "datasets": list(datasets), "options": QUICK, **request}
+    answer = api.post("/v1/jobs", json=body)
+    assert answer.status_code == 202, answer.text
+    return answer.json()
+
+
+def eventually(look: Callable[[], Any], seconds: float = DEADLINE) -> Any:
+    """Look until the answer is true and return it; fail after the deadline."""
+    end = time.monotonic() + seconds
+    while not (seen := look()):
+        assert time.monotonic() < end, f"waited {seconds:g} s in vain"
+        time.sleep(0.02)
+    return seen
+
+
+def job(api: Any, name: str) -> dict[str, Any]:
+    """A job as it is now."""
+    answer = api.get(f"/v1/jobs/{name}")
+    assert answer.status_code == 200, answer.text
+    return answer.json()
+
+
+def ended(api: Any, name: str) -> dict[str, Any]:
+    """Wait for the end of a job, however it ends; return it."""
+    return eventually(lambda: (seen := job(api, name))["state"] not in ACTIVE and seen)
+
+
+def running(api: Any, name: str) -> dict[str, Any]:
+    """Wait until a job has made its first iteration; return it."""
+    return eventually(lambda: (seen := job(api, name))["progress"]["iteration"] > 0 and seen)
+
+
+def train(api: Any, model: str, *datasets: str, **request: Any) -> dict[str, Any]:
+    """Train a model; return the job that succeeded."""
+    seen = ended(api, queue(api, model, *datasets, **request)["id"])
+    assert seen["state"] == "succeeded", seen
+    return seen
+
+
+def error(answer: Any, status: int, code: str) -> dict[str, Any]:
+    """Check that an answer is an error of the one shape; return its body."""
+    assert answer.status_code == status, answer.text
+    body = answer.json()
+    assert set(body) == {"error"}
+    assert set(body["error"]) == {"code", "message", "detail"}
+    assert body["error"]["code"] == code
+    assert body["error"]["message"]
+    for item in body["error"]["detail"]:
+        assert set(item) == {"field", "value", "expected"}
+    return body["error"]
+
+
+def service_of(api: Any) -> Service:
+    """The parts of the service behind a test client."""
+    return api.app.state.service

@@ -1,0 +1,77 @@
+"""Cancelling jobs: waiting ones at once, running ones soon, ended ones not at all."""
+
+from __future__ import annotations
+
+import pytest
+
+from service.training import worker
+from tests.service.data import ENDLESS, ended, error, job, queue, running, service_of, stream, upload
+
+
+@pytest.fixture(scope="module")
+def panda(api):
+    """A data set that a fit takes long on."""
+    return upload(api, stream("panda", 200))["id"]
+
+
+def test_a_waiting_job_is_cancelled_at_once_and_never_runs(api, panda, pendulum):
+    ahead = queue(api, "ahead", panda, options=ENDLESS)["id"]
+    running(api, ahead)
+    waiting = queue(api, "waiting", pendulum["id"])["id"]
+    answer = api.post(f"/v1/jobs/{waiting}/cancel")
+    assert answer.status_code == 200
+    assert answer.json()["state"] == "cancelled"
+    assert answer.json()["finished_at"]
+
+    api.post(f"/v1/jobs/{ahead}/cancel")
+    behind = queue(api, "behind", pendulum["id"])["id"]
+    assert ended(api, behind)["state"] == "succeeded"  # so the queue has passed the cancelled job
+    seen = job(api, waiting)
+    assert (seen["state"], seen["attempts"], seen["version"]) == ("cancelled", 0, None)
+    error(api.get("/v1/models/waiting"), 404, "not_found")
+
+
+def test_a_running_job_is_cancelled_without_a_version(api, panda):
+    folders = set(service_of(api).files.versions.iterdir())
+    name = queue(api, "stopped", panda, options=ENDLESS)["id"]
+    running(api, name)
+    assert api.post(f"/v1/jobs/{name}/cancel").status_code == 200
+    seen = ended(api, name)
+    assert (seen["state"], seen["version"], seen["error"]) == ("cancelled", None, None)
+    assert seen["finished_at"]
+    error(api.get("/v1/models/stopped"), 404, "not_found")
+    assert set(service_of(api).files.versions.iterdir()) == folders
+
+
+def test_a_cancel_that_comes_while_the_model_is_saved_still_counts(api, pendulum, monkeypatch):
+    service = service_of(api)
+    monkeypatch.setattr(service.jobs, "submit", lambda job: None)
+    name = queue(api, "late", pendulum["id"])["id"]
+    save = worker.lipcore.save
+
+    def cancel_and_save(*args):
+        assert api.post(f"/v1/jobs/{name}/cancel").json()["state"] == "running"
+        return save(*args)
+
+    monkeypatch.setattr(worker.lipcore, "save", cancel_and_save)
+    worker.run(service.settings, name)
+    assert job(api, name)["state"] == "cancelled"
+    error(api.get("/v1/models/late"), 404, "not_found")
+
+
+@pytest.mark.parametrize("end", ["succeeded", "cancelled"])
+def test_an_ended_job_cannot_be_cancelled(api, pendulum, monkeypatch, end):
+    if end == "cancelled":
+        monkeypatch.setattr(service_of(api).jobs, "submit", lambda job: None)
+    name = queue(api, "ended", pendulum["id"])["id"]
+    if end == "cancelled":
+        api.post(f"/v1/jobs/{name}/cancel")
+    before = ended(api, name)
+    assert before["state"] == end
+    assert end in error(api.post(f"/v1/jobs/{name}/cancel"), 409, "conflict")["message"]
+    assert job(api, name) == before
+
+
+def test_unknown_job_is_not_found(api):
+    for answer in (api.get("/v1/jobs/job_x"), api.post("/v1/jobs/job_x/cancel")):
+        assert "job_x" in error(answer, 404, "not_found")["message"]

@@ -1,0 +1,146 @@
+"""The command line: what it prints, writes and says where it cannot go on."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from lipcore.robots import ROBOTS
+from service import __version__, cli
+from service.datasets.csv import read_csv
+from service.datasets.npz import read_npz
+from service.settings import Settings
+from tests.service.data import arrays, stream
+from tests.service.server import free_port
+
+
+@pytest.fixture
+def lipserve(monkeypatch, capsys):
+    """Run `lipserve` with arguments; return its exit code, output and error output."""
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def run(*arguments):
+        monkeypatch.setattr("sys.argv", ["lipserve", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        said = capsys.readouterr()
+        return ended.value.code or 0, said.out, said.err
+
+    return run
+
+
+def test_version(lipserve):
+    assert lipserve("--version") == (0, f"{__version__}\n", "")
+
+
+def test_help_lists_the_commands(lipserve):
+    code, said, _ = lipserve("--help")
+    assert code == 0
+    for command in ("serve", "simulate", "train", "predict", "demo"):
+        assert command in said
+
+
+@pytest.mark.parametrize(("ending", "read"), [("csv", read_csv), ("npz", read_npz)])
+def test_simulated_streams_are_read_back_equal(lipserve, tmp_path, ending, read):
+    path = tmp_path / f"stream.{ending}"
+    code, said, _ = lipserve("simulate", "double-pendulum", path, "--samples", 50, "--seed", 3, "--rate", 20)
+    assert code == 0
+    assert "50 samples of joint1, joint2" in said
+    found = read(path, Settings())
+    for name, values in arrays(stream(samples=50, seed=3, rate=20.0, speed=1.0)).items():
+        np.testing.assert_array_equal(getattr(found, name), values)
+    assert found.joint_names == (None if ending == "csv" else ("joint1", "joint2"))
+
+
+def test_options_of_the_simulator_matter(lipserve, tmp_path):
+    plain, other = tmp_path / "plain.npz", tmp_path / "other.npz"
+    lipserve("simulate", "ur5", plain, "--samples", 40)
+    options = ("--noise", 0, "--viscous", 2, "--coulomb", 1, "--payload", 3, "--fast", "--motion", "full")
+    lipserve("simulate", "ur5", other, "--samples", 40, *options)
+    found = read_npz(other, Settings())
+    expected = stream(
+        "ur5", 40, 0, speed=10.0, motion="full", noise=0.0, viscous=2.0, coulomb=1.0, payload=cli.Payload(3.0)
+    )
+    np.testing.assert_array_equal(found.tau, expected.tau)
+    assert not np.array_equal(found.tau, read_npz(plain, Settings()).tau)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("simulate", "r2d2", "x.csv"), f"robot is 'r2d2', expected one of {', '.join(ROBOTS)}"),
+        (("simulate", "ur5", "x.parquet"), "expected the ending .csv or .npz"),
+        (("simulate", "ur5", "x.csv", "--motion", "wild"), "motion is 'wild'"),
+        (("simulate", "ur5", "x.csv", "--noise", "-1"), "noise is -1.0"),
+        (("simulate", "ur5", "nowhere/x.csv", "--samples", "40"), "nowhere/x.csv"),
+        (("predict", "m", "--q", "1,two,3"), "--q is '1,two,3', expected numbers separated by commas"),
+        (("predict", "m", "--q", ""), "--q is ''"),
+        (("predict", "m", "--q", "1", "--dq", "x"), "--dq is 'x'"),
+        (("serve", "--port", "70000"), "port: Input should be less than or equal to 65535"),
+        (("serve", "--host", "0.0.0.0"), "host is '0.0.0.0': other hosts could use the service without a key"),
+    ],
+)
+def test_mistakes_are_explained_in_one_line(lipserve, tmp_path, monkeypatch, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    code, said, err = lipserve(*arguments)
+    assert (code, said) == (1, "")
+    assert err.startswith("error: ")
+    assert message in err
+    assert err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nobody_listening_is_said_with_the_remedy(lipserve):
+    code, _, err = lipserve("predict", "m", "--q", "1", "--url", f"http://127.0.0.1:{free_port()}")
+    assert code == 1
+    assert "start one with `lipserve serve`" in err
+
+
+def test_wrong_environment_is_named(lipserve, monkeypatch):
+    monkeypatch.setenv("LIPSERVE_MAX_SAMPLES", "-5")
+    code, _, err = lipserve("serve")
+    assert code == 1
+    assert err.startswith("error: max_samples: ")
+
+
+def test_from_a_recording_to_a_torque(lipserve, server, tmp_path):
+    path = tmp_path / "stream.csv"
+    lipserve("simulate", "double-pendulum", path, "--samples", 60, "--fast")
+    types = ("--joint-types", "revolute, revolute")
+    code, said, err = lipserve("train", path, "--model", "from-cli", "--url", server.url, *types)
+    assert code == 0, err
+    assert "from-cli version 1 is trained and answers" in said
+
+    code, said, _ = lipserve("predict", "from-cli", "--q", "0.1,-0.2", "--url", server.url, "--json")
+    assert code == 0
+    answer = json.loads(said)
+    zero = [0.0, 0.0]
+    query = {"q": [0.1, -0.2], "dq": zero, "ddq": zero}
+    assert answer == server.client.post("/v1/models/from-cli/predict", json=query).json()
+
+    code, said, _ = lipserve("predict", "from-cli", "--q", "0.1,-0.2", "--url", server.url)
+    assert code == 0
+    assert "joint1" in said
+    assert f"{answer['tau'][1]:.4f}" in said
+
+
+def test_refusals_of_the_service_are_passed_on(lipserve, server, tmp_path):
+    code, _, err = lipserve("predict", "nobody", "--q", "1", "--url", server.url)
+    assert code == 1
+    assert err == "error: no model 'nobody' (not_found, 404)\n"
+
+    path = tmp_path / "bad.csv"
+    path.write_text("t,q1,speed1\n0,0,0\n")
+    code, _, err = lipserve("train", path, "--model", "m", "--url", server.url)
+    assert code == 1
+    assert "column 3 is speed1" in err
+
+
+def test_a_model_name_that_is_refused_is_said(lipserve, server, tmp_path):
+    path = tmp_path / "stream.csv"
+    lipserve("simulate", "double-pendulum", path, "--samples", 60)
+    code, _, err = lipserve("train", path, "--model", "BAD NAME", "--url", server.url)
+    assert code == 1
+    assert "model is BAD NAME" in err

@@ -1,0 +1,77 @@
+"""Good files with bytes changed at random: read or refused, never an unexpected error."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+
+import numpy as np
+import pytest
+
+from service.datasets.checks import check, check_names
+from service.datasets.columns import Columns
+from service.datasets.preparation import prepare
+from service.datasets.store import READERS
+from service.errors import InvalidDataError, TooLargeError
+from service.settings import Settings
+from tests.service.data import arrays, columns, csv, npz, stream
+
+SAMPLES = stream(samples=60, rate=50.0)
+NAMES = np.array(["a", "b"])
+CSV = csv({name: values for name, values in columns(SAMPLES).items() if "d" not in name})
+NPZ = npz(**arrays(SAMPLES), joint_names=NAMES, episode=np.zeros(60))
+
+
+def damaged_npz(rng: np.random.Generator) -> bytes:
+    """The archive damaged, or a sound archive with one damaged array: its checksums do not give that away."""
+    if rng.integers(3) == 0:
+        return damaged(NPZ, rng)
+    out = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(NPZ)) as source, zipfile.ZipFile(out, "w") as target:
+        names = source.namelist()
+        chosen = names[rng.integers(len(names))]
+        for name in names:
+            target.writestr(name, damaged(source.read(name), rng) if name == chosen else source.read(name))
+    return out.getvalue()
+
+
+DAMAGED = {"csv": lambda rng: damaged(CSV, rng), "npz": damaged_npz}
+
+
+def damaged(body: bytes, rng: np.random.Generator) -> bytes:
+    """Some bytes replaced, removed, doubled or moved; mostly where structure is: at both ends."""
+    out = bytearray(body)
+    for _ in range(rng.integers(1, 6)):
+        place = int(rng.choice([rng.integers(len(out)), rng.integers(130), len(out) - 1 - rng.integers(130)]))
+        place = max(0, min(place, len(out) - 1))
+        width = int(rng.integers(1, 5))
+        kind = rng.integers(4)
+        if kind == 0:
+            out[place : place + width] = rng.bytes(width)
+        elif kind == 1:
+            del out[place : place + width]
+        elif kind == 2:
+            out[place:place] = out[place : place + width]
+        else:
+            out[place : place + width] = bytes([int(rng.choice([0, 0xFF, 0x7F, 0x2C, 0x2D, 0x0A, 0x22]))]) * width
+    return bytes(out)
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_damaged_files_are_read_or_refused(kind, tmp_path):
+    rng, settings = np.random.default_rng(5), Settings(home=tmp_path)
+    path = tmp_path / "upload"
+    outcomes = {"read": 0, "refused": 0}
+    for _ in range(600):
+        path.write_bytes(DAMAGED[kind](rng))
+        try:
+            found: Columns = READERS[kind](path, settings)
+            check(found, settings)
+            names = found.joint_names or ("a", "b", "c")[: found.q.shape[1]]
+            check_names(names, found.q.shape[1])
+            prepared = prepare(found, names, 4.0, 30)
+            assert all(np.isfinite(values).all() for values in arrays(prepared.samples).values())
+            outcomes["read"] += 1
+        except (InvalidDataError, TooLargeError):
+            outcomes["refused"] += 1
+    assert min(outcomes.values()) > 20, outcomes

@@ -1,0 +1,141 @@
+"""What a service does with the home it finds: sweep what was interrupted, keep what was finished, lock it."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+from fastapi.testclient import TestClient
+
+import lipcore
+from service.app import HomeInUseError, create_app
+from service.database import Database, JobRow, now
+from service.files import Files
+from service.models import registry
+from service.settings import Settings, shipped_models
+from tests.service.data import QUICK, ended, error, job, stream, train, upload
+
+QUERY = {"q": [0.3, -0.2], "dq": [0.1, 0.4], "ddq": [1.0, -0.5], "covariance": True}
+
+
+def started(home, **settings):
+    return TestClient(create_app(Settings(home=home, **settings)))
+
+
+def interrupted(name, dataset, attempts, model="again", state="running", **fields):
+    """The row of a job that an earlier run had not done when it ended."""
+    request = {"datasets": [dataset], "estimator": "lip", "joint_types": ["revolute"] * 2, "options": QUICK}
+    return JobRow(
+        id=name,
+        model=model,
+        state=state,
+        request=request,
+        progress={"stage": "hyperparameters", "iteration": 3},
+        attempts=attempts,
+        created_at=now(),
+        **fields,
+    )
+
+
+@pytest.fixture(scope="module")
+def second_start(tmp_path_factory):
+    """A service started on the home of one that was interrupted; what it answered before; that home."""
+    home = tmp_path_factory.mktemp("home")
+    with started(home) as api:
+        dataset = upload(api, stream())["id"]
+        train(api, "kept", dataset)
+        before = {
+            "predict": api.post("/v1/models/kept/predict", json=QUERY).json(),
+            "datasets": api.get("/v1/datasets").json(),
+            "models": api.get("/v1/models").json(),
+        }
+    database = Database(home)
+    with database.transaction() as session:
+        session.add(interrupted("job_again", dataset, attempts=1, cancel_requested=False))
+        session.add(interrupted("job_enough", dataset, attempts=3, cancel_requested=False))
+        session.add(interrupted("job_unwanted", dataset, attempts=1, cancel_requested=True))
+        for number in (1, 2):
+            session.add(interrupted(f"job_waiting{number}", dataset, attempts=0, model="waiting", state="queued"))
+    database.close()
+    (home / "uploads/tmpabc").write_bytes(b"half an upload")
+    (home / "datasets/ds_0123.draft").write_bytes(b"half a data set")
+    (home / "datasets/ds_0123.safetensors").write_bytes(b"a data set without a row")
+    (home / "versions/.draft-x").mkdir()
+    (home / "versions/.draft-x/model.safetensors").write_bytes(b"half a model")
+    shutil.copytree(next(home.glob("versions/mv_*")), home / "versions/mv_without_a_row")
+    with started(home) as api:
+        yield api, before, home
+
+
+def test_what_was_finished_is_kept(second_start):
+    api, before, _ = second_start
+    assert api.get("/v1/datasets").json() == before["datasets"]
+    models = {item["name"]: item for item in api.get("/v1/models").json()["items"]}
+    assert [models[item["name"]] for item in before["models"]["items"]] == before["models"]["items"]
+
+
+def test_the_same_query_has_the_identical_answer(second_start):
+    api, before, _ = second_start
+    assert api.post("/v1/models/kept/predict", json=QUERY).json() == before["predict"]
+
+
+def test_leftovers_of_interrupted_writes_are_swept(second_start):
+    api, before, home = second_start
+    assert list((home / "uploads").iterdir()) == []
+    datasets = {f"{item['id']}.safetensors" for item in before["datasets"]["items"]}
+    assert {path.name for path in (home / "datasets").iterdir()} == datasets
+    ended(api, "job_waiting2")
+    names = {path.name for path in (home / "versions").iterdir()}
+    assert len(names) == 5  # panda-sim, kept, and the three made after the restart
+    assert not names & {".draft-x", "mv_without_a_row"}
+
+
+def test_an_interrupted_job_is_done_again(second_start):
+    api, _, _ = second_start
+    seen = ended(api, "job_again")
+    assert (seen["state"], seen["attempts"], seen["version"]) == ("succeeded", 2, 1)
+
+
+def test_jobs_that_waited_are_done_in_their_order(second_start):
+    api, _, _ = second_start
+    seen = [ended(api, f"job_waiting{number}") for number in (1, 2)]
+    assert [(now["version"], now["attempts"]) for now in seen] == [(1, 1), (2, 1)]
+
+
+def test_a_job_that_was_interrupted_too_often_fails(second_start):
+    api, _, _ = second_start
+    seen = job(api, "job_enough")
+    assert (seen["state"], seen["attempts"], seen["error"]["code"]) == ("failed", 3, "interrupted")
+    assert seen["finished_at"]
+
+
+def test_a_job_that_was_to_be_cancelled_is_cancelled(second_start):
+    api, _, _ = second_start
+    assert job(api, "job_unwanted")["state"] == "cancelled"
+
+
+def test_the_shipped_model_is_registered_once(second_start):
+    api, _, _ = second_start
+    assert api.get("/v1/models/panda-sim").json()["latest_version"] == 1
+
+
+def test_a_second_service_on_the_same_home_is_refused(second_start):
+    _, _, home = second_start
+    with pytest.raises(HomeInUseError, match=r"another service uses .*: stop it, or set LIPSERVE_HOME"), started(home):
+        pass
+
+
+def test_a_damaged_version_does_not_keep_the_others_from_answering(home):
+    database, files = Database(home), Files(home)
+    registry.install_shipped(database, files)
+    manifest = lipcore.copy_model(shipped_models() / registry.SHIPPED, files.versions / "mv_damaged")
+    with database.transaction() as session:
+        registry.publish(session, "damaged", "mv_damaged", manifest, None)
+    database.close()
+    (files.versions / "mv_damaged/model.safetensors").write_bytes(b"")
+
+    zero = {"q": [0.0] * 7, "dq": [0.0] * 7, "ddq": [0.0] * 7}
+    with TestClient(create_app(Settings(home=home)), raise_server_exceptions=False) as api:
+        assert api.get("/health/ready").status_code == 200
+        assert api.post("/v1/models/panda-sim/predict", json=zero).status_code == 200
+        error(api.post("/v1/models/damaged/predict", json=zero), 500, "internal_error")

@@ -1,0 +1,170 @@
+"""The OpenAPI document: complete, and true to what the service answers."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+METHODS = ("get", "post", "put", "patch", "delete")
+ERROR = {"$ref": "#/components/schemas/ErrorResponse"}
+
+
+@pytest.fixture(scope="module")
+def document(api):
+    return api.get("/openapi.json").json()
+
+
+@pytest.fixture(scope="module")
+def operations(document):
+    return {
+        f"{method.upper()} {path}": operation
+        for path, methods in document["paths"].items()
+        for method, operation in methods.items()
+        if method in METHODS
+    }
+
+
+def references(node):
+    """Every $ref below a node."""
+    if isinstance(node, dict):
+        if "$ref" in node:
+            yield node["$ref"]
+        for value in node.values():
+            yield from references(value)
+    elif isinstance(node, list):
+        for value in node:
+            yield from references(value)
+
+
+def resolve(document, reference):
+    assert reference.startswith("#/"), reference
+    for part in reference[2:].split("/"):
+        document = document[part]
+    return document
+
+
+def test_every_route_of_the_design_is_there(operations):
+    assert set(operations) == {
+        "GET /health/live",
+        "GET /health/ready",
+        "POST /v1/datasets",
+        "GET /v1/datasets",
+        "GET /v1/datasets/{dataset}",
+        "DELETE /v1/datasets/{dataset}",
+        "POST /v1/jobs",
+        "GET /v1/jobs",
+        "GET /v1/jobs/{job}",
+        "POST /v1/jobs/{job}/cancel",
+        "GET /v1/models",
+        "GET /v1/models/{model}",
+        "GET /v1/models/{model}/versions/{version}",
+        "POST /v1/models/{model}/predict",
+        "POST /v1/models/{model}/evaluate",
+    }
+
+
+def test_every_reference_leads_somewhere(document):
+    found = set(references(document))
+    assert len(found) > 10
+    for reference in found:
+        assert resolve(document, reference)
+
+
+def test_every_schema_is_used(document):
+    used = {reference.rpartition("/")[2] for reference in references(document)}
+    assert set(document["components"]["schemas"]) == used
+
+
+def test_structure(document, operations):
+    assert document["openapi"].startswith("3.")
+    assert document["info"]["title"] == "LIPServe"
+    ids = [operation["operationId"] for operation in operations.values()]
+    assert len(set(ids)) == len(ids)
+    for name, operation in operations.items():
+        declared = {item["name"] for item in operation.get("parameters", []) if item["in"] == "path"}
+        in_path = {part.strip("{}") for part in name.split("/") if part.startswith("{")}
+        assert declared == in_path, name
+        for status, response in operation["responses"].items():
+            assert 200 <= int(status) < 600
+            assert response["description"], (name, status)
+
+
+def test_every_route_says_what_it_does(operations):
+    for name, operation in operations.items():
+        assert operation["tags"], name
+        assert operation["summary"], name
+        assert operation["description"], name
+        assert operation["description"] != operation["summary"], name
+
+
+def test_every_parameter_has_a_type_and_a_description(operations):
+    for name, operation in operations.items():
+        for item in operation.get("parameters", []):
+            assert "schema" in item, (name, item["name"])
+            assert item["in"] == "path" or item["description"], (name, item["name"])
+
+
+def test_every_documented_error_has_the_one_shape(operations):
+    for name, operation in operations.items():
+        errors = {status: response for status, response in operation["responses"].items() if int(status) >= 400}
+        for status, response in errors.items():
+            assert response["content"] == {"application/json": {"schema": ERROR}}, (name, status)
+            assert response["description"].startswith("`"), (name, status)
+
+
+@pytest.mark.parametrize(
+    ("operation", "statuses"),
+    [
+        ("GET /health/ready", {503}),
+        ("POST /v1/datasets", {413, 415, 422}),
+        ("GET /v1/datasets", {422}),
+        ("GET /v1/datasets/{dataset}", {404}),
+        ("DELETE /v1/datasets/{dataset}", {404, 409}),
+        ("POST /v1/jobs", {404, 413, 422, 429}),
+        ("GET /v1/jobs/{job}", {404}),
+        ("POST /v1/jobs/{job}/cancel", {404, 409}),
+        ("GET /v1/models/{model}", {404}),
+        ("GET /v1/models/{model}/versions/{version}", {404, 422}),
+        ("POST /v1/models/{model}/predict", {404, 413, 422}),
+        ("POST /v1/models/{model}/evaluate", {404, 413, 422}),
+    ],
+)
+def test_errors_that_a_route_answers_are_documented(operations, operation, statuses):
+    assert {str(status) for status in statuses} <= set(operations[operation]["responses"])
+
+
+def test_requests_have_examples(document, operations):
+    bodies = {name: operation["requestBody"] for name, operation in operations.items() if "requestBody" in operation}
+    assert set(bodies) == {
+        "POST /v1/datasets",
+        "POST /v1/jobs",
+        "POST /v1/models/{model}/predict",
+        "POST /v1/models/{model}/evaluate",
+    }
+    for name, body in bodies.items():
+        assert body["required"] is True
+        media = next(iter(body["content"].values()))
+        schema = media["schema"]
+        schema = resolve(document, schema["$ref"]) if "$ref" in schema else schema
+        assert media.get("example") or schema.get("examples"), name
+
+
+def test_the_example_of_a_query_is_answered(api, document):
+    (example,) = document["components"]["schemas"]["PredictRequest"]["examples"]
+    assert api.post("/v1/models/panda-sim/predict", json=example).status_code == 200
+
+
+def test_media_types_of_an_upload(operations):
+    content = operations["POST /v1/datasets"]["requestBody"]["content"]
+    assert set(content) == {"text/csv", "application/x-npz", "multipart/form-data"}
+
+
+def test_the_document_is_plain_json(document):
+    assert json.loads(json.dumps(document, allow_nan=False)) == document
+
+
+def test_the_documentation_is_served(api):
+    answer = api.get("/docs")
+    assert answer.status_code == 200
+    assert "openapi.json" in answer.text

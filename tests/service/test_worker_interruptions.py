@@ -1,0 +1,79 @@
+"""Training processes that are killed or interrupted: the service goes on and so do the jobs."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
+
+from tests.service import data
+from tests.service.data import ENDLESS, ended, eventually, job, queue, running, service_of, stream, train, upload
+from tests.service.server import command
+
+LONG = {**ENDLESS, "hyperparameter_samples": 60, "max_iterations": 25}
+"""A fit of a few seconds."""
+
+
+def workers():
+    """Process ids of the training processes of this process."""
+    return [child.pid for child in multiprocessing.active_children() if "spawn_main" in command(child.pid)]
+
+
+def test_a_job_whose_process_is_killed_is_tried_again(api):
+    name = queue(api, "killed", upload(api, stream("panda", 100))["id"], options=LONG)["id"]
+    running(api, name)
+    for pid in workers():
+        os.kill(pid, signal.SIGKILL)
+    seen = ended(api, name)
+    assert (seen["state"], seen["attempts"], seen["version"]) == ("succeeded", 2, 1)
+    assert api.get("/v1/models/killed").json()["latest_version"] == 1
+
+
+def test_a_process_killed_while_it_has_nothing_to_do_is_replaced(api, pendulum):
+    train(api, "idle", pendulum["id"])
+    for pid in workers():
+        os.kill(pid, signal.SIGKILL)
+    train(api, "idle", pendulum["id"])
+    assert api.get("/v1/models/idle").json()["latest_version"] == 2
+
+
+def test_a_pool_that_holds_its_lock_may_report_a_broken_process(api, pendulum, monkeypatch):
+    """As pools do since Python 3.12.1: waiting for that lock in the report would wait for ever."""
+    jobs = service_of(api).jobs
+    with monkeypatch.context() as patch:
+        patch.setattr(jobs, "submit", lambda job: None)
+        name = queue(api, "locked", pendulum["id"])["id"]
+    broken = Future()
+    broken.set_exception(BrokenProcessPool())
+    report = threading.Thread(target=jobs._ended, args=(name, broken), daemon=True)
+    with jobs._pool._shutdown_lock:
+        report.start()
+        report.join(data.DEADLINE / 4)
+        assert not report.is_alive()
+    assert ended(api, name)["state"] == "succeeded"
+
+
+def test_an_interrupt_from_the_keyboard_does_not_reach_a_job(api):
+    """Ctrl-C goes to the whole process group: the service decides what becomes of its processes."""
+    name = queue(api, "interrupted", upload(api, stream("panda", 100))["id"], options=LONG)["id"]
+    running(api, name)
+    for pid in workers():
+        os.kill(pid, signal.SIGINT)
+    seen = ended(api, name)
+    assert (seen["state"], seen["attempts"]) == ("succeeded", 1)
+
+
+def test_a_job_whose_process_dies_every_time_fails_in_the_end(api):
+    most = service_of(api).settings.max_job_attempts
+    name = queue(api, "poison", upload(api, stream("panda", 200))["id"], options=ENDLESS)["id"]
+    for attempt in range(1, most + 1):
+        eventually(lambda now=attempt: job(api, name)["attempts"] == now and running(api, name))
+        for pid in workers():
+            os.kill(pid, signal.SIGKILL)
+    seen = ended(api, name)
+    assert seen["state"] == "failed"
+    assert seen["error"]["code"] == "interrupted"
+    assert f"{most} times" in seen["error"]["message"]
