@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from pathlib import Path
-from typing import IO
 
 import torch
 from anyio import CapacityLimiter, to_thread
@@ -19,6 +16,7 @@ from service.context import Service
 from service.database import Database, DatasetRow, VersionRow
 from service.datasets import routes as datasets
 from service.files import Files
+from service.home import hold_home
 from service.inference import routes as inference
 from service.inference.loaded import LoadedModels
 from service.limits import BodyLimit
@@ -37,17 +35,13 @@ Errors are `{"error": {code, message, detail}}`.
 """
 
 
-class HomeInUseError(RuntimeError):
-    """Another service works on the same home."""
-
-
 def create_app(settings: Settings | None = None) -> FastAPI:
     """Build the application. Nothing is opened before it starts."""
     settings = settings or Settings()
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        lock = _lock(settings.home)
+        lock = hold_home(settings.home)
         service = await to_thread.run_sync(_open, settings)
         app.state.service = service
         try:
@@ -93,15 +87,3 @@ def _open(settings: Settings) -> Service:
         logger.warning("queued again after an interruption: %s", ", ".join(recovered))
     limiter = CapacityLimiter(settings.max_concurrent_predictions)
     return Service(settings, database, files, loaded, jobs, limiter)
-
-
-def _lock(home: Path) -> IO[str]:
-    """Hold the home for this process; the lock ends with the process, however it ends."""
-    home.mkdir(parents=True, exist_ok=True)
-    file = (home / ".lock").open("w")
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        file.close()
-        raise HomeInUseError(f"another service uses {home}: stop it, or set LIPSERVE_HOME to another folder") from None
-    return file

@@ -13,11 +13,12 @@ from pydantic import ValidationError
 from rich.console import Console
 from rich.table import Table
 
-from lipcore.robots import ROBOTS, SimulationUnavailableError, UnknownRobotError, load_robot
+from lipcore.robots import ROBOTS, SimulationUnavailableError, load_robot
 from lipcore.simulation import FAST, Payload, Stream, simulate
 from service import __version__, recordings
 from service.app import create_app
 from service.client import DEFAULT_URL, ApiError, Client, ServiceUnreachableError
+from service.home import HomeInUseError, hold_home
 from service.progress import follow
 from service.settings import Settings
 from service.training.states import SUCCEEDED
@@ -40,7 +41,7 @@ def main() -> None:
         app()
     except ApiError as error:
         _fail(f"{error.message} ({error.code}, {error.status})")
-    except (ServiceUnreachableError, SimulationUnavailableError, UnknownRobotError, ValueError, OSError) as error:
+    except (ServiceUnreachableError, HomeInUseError, SimulationUnavailableError, ValueError, OSError) as error:
         _fail(str(error))
 
 
@@ -62,6 +63,7 @@ def serve(
         settings = Settings(**given)  # type: ignore[arg-type]  # validated here
     except ValidationError as error:
         _fail("; ".join(f"{'.'.join(map(str, e['loc'])) or 'settings'}: {e['msg']}" for e in error.errors()))
+    hold_home(settings.home).close()  # the app holds it for good; asking first gives a message without a traceback
     uvicorn.run(
         create_app(settings),
         host=settings.host,

@@ -13,7 +13,7 @@ from sqlalchemy import select
 from service.database import Database, JobRow, now
 from service.settings import Settings
 from service.training import worker
-from service.training.states import ACTIVE, CANCELLED, FAILED, QUEUED
+from service.training.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING
 
 logger = logging.getLogger(__name__)
 
@@ -55,6 +55,10 @@ class JobQueue:
             pool = self._pool
         pool.kill_workers() if hasattr(pool, "kill_workers") else self._kill(pool)
         pool.shutdown(wait=True, cancel_futures=True)
+        with self.database.transaction() as session:
+            for row in session.scalars(select(JobRow).where(JobRow.state == RUNNING)):
+                # handed back in order: such a start is no failed attempt
+                row.state, row.attempts, row.progress = QUEUED, row.attempts - 1, {"stage": "waiting"}
 
     def _new_pool(self) -> ProcessPoolExecutor:
         settings = self.settings

@@ -8,9 +8,10 @@ import pytest
 from fastapi.testclient import TestClient
 
 import lipcore
-from service.app import HomeInUseError, create_app
+from service.app import create_app
 from service.database import Database, JobRow, now
 from service.files import Files
+from service.home import HomeInUseError
 from service.models import registry
 from service.settings import Settings, shipped_models
 from tests.service.data import QUICK, ended, error, job, stream, train, upload

@@ -47,6 +47,7 @@ def test_a_second_server_on_the_same_home_says_why_it_ends(server):
     )
     assert ended.returncode != 0
     assert f"another service uses {server.home}: stop it, or set LIPSERVE_HOME" in ended.stdout + ended.stderr
+    assert "Traceback" not in ended.stdout + ended.stderr
 
 
 def test_data_sets_are_served_over_http(server):
