@@ -9,6 +9,7 @@ from contextlib import asynccontextmanager
 import torch
 from anyio import CapacityLimiter, to_thread
 from fastapi import FastAPI
+from fastapi_offline import FastAPIOffline
 from sqlalchemy import select
 
 from service import __version__, errors, health
@@ -51,12 +52,14 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             service.database.close()
             lock.close()
 
-    app = FastAPI(
+    # the documentation page loads nothing from other hosts: robots' networks often have no way out
+    app = FastAPIOffline(
         title="LIPServe",
         summary="A model server for robot dynamics",
         description=DESCRIPTION,
         version=__version__,
         lifespan=lifespan,
+        redoc_url=None,
     )
     errors.install(app)
     app.add_middleware(

@@ -184,10 +184,13 @@ def _explain(item: dict[str, Any]) -> Problem:
     return problem(field, found, said.removeprefix("Input should be ").replace("String should", "to", 1))
 
 
-async def _http_error(_: Request, error: Exception) -> JSONResponse:
+async def _http_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
     codes = {404: "not_found", 405: "method_not_allowed", 413: "too_large", 400: "invalid_request"}
-    answer = _answer(error.status_code, codes.get(error.status_code, "http_error"), str(error.detail))
+    message = str(error.detail)
+    if error.status_code in (404, 405):
+        message = f"no route {request.method} {request.url.path[:200]}: /docs lists all"
+    answer = _answer(error.status_code, codes.get(error.status_code, "http_error"), message)
     answer.headers.update(error.headers or {})
     return answer
 

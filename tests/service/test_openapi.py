@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import pytest
 
@@ -168,3 +169,13 @@ def test_the_documentation_is_served(api):
     answer = api.get("/docs")
     assert answer.status_code == 200
     assert "openapi.json" in answer.text
+
+
+def test_the_documentation_page_loads_nothing_from_other_hosts(api):
+    page = api.get("/docs").text
+    assert "https://" not in page
+    assert "http://" not in page
+    assets = re.findall(r'(?:src|href)="([^"]+)"', page)
+    assert len(assets) >= 2
+    for asset in assets:
+        assert api.get(asset).status_code == 200
