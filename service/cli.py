@@ -18,6 +18,8 @@ from lipcore.simulation import FAST, Payload, Stream, simulate
 from service import __version__, recordings
 from service.app import create_app
 from service.client import DEFAULT_URL, ApiError, Client, ServiceUnreachableError
+from service.demo import DemoError
+from service.demo import run as run_demo
 from service.home import HomeInUseError, hold_home
 from service.progress import follow
 from service.settings import Settings
@@ -41,7 +43,14 @@ def main() -> None:
         app()
     except ApiError as error:
         _fail(f"{error.message} ({error.code}, {error.status})")
-    except (ServiceUnreachableError, HomeInUseError, SimulationUnavailableError, ValueError, OSError) as error:
+    except (
+        ServiceUnreachableError,
+        HomeInUseError,
+        DemoError,
+        SimulationUnavailableError,
+        ValueError,
+        OSError,
+    ) as error:
         _fail(str(error))
 
 
@@ -171,9 +180,7 @@ def demo(
     plot: Annotated[Path | None, typer.Option(help="Also draw measured and predicted torque, .png or .svg.")] = None,
 ) -> None:
     """Run the main job: serve, simulate a Panda, upload, train, evaluate on unseen trajectories, ask."""
-    from service.demo import run  # noqa: PLC0415 - only this command needs it
-
-    run(port, once, plot, out)
+    run_demo(port, once, plot, out)
 
 
 def _numbers(name: str, text: str) -> list[float]:
