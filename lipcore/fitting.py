@@ -29,8 +29,8 @@ NOISE_START = 0.01
 too, and filtered torques look free of noise though they are not. Data that deserve less are fitted with less."""
 NOISE_FLOOR_JOINT = 1e-4
 NOISE_FLOOR_ROBOT = 1e-5
-"""Smallest noise std admitted, relative to the joint's torque spread and to the largest of all joints: below the
-second, a Gram matrix in float64 can no longer be factored faithfully."""
+"""Smallest noise std admitted, relative to the joint's torque spread and to the largest root mean square of all joints:
+below the second, a Gram matrix in float64 can no longer be factored faithfully."""
 LINE_SEARCH_PENALTY = 1e4
 TOLERANCE = 1e-7
 """The fit has converged when an iteration improves the objective by less than this share of it."""
@@ -248,5 +248,6 @@ def _noise(samples: Samples) -> Array:
 
 
 def _noise_floor(samples: Samples) -> Array:
-    spread = samples.tau.std(axis=0)
-    return np.asarray(np.maximum(NOISE_FLOOR_JOINT * spread, NOISE_FLOOR_ROBOT * max(float(spread.max()), 1e-6)))
+    largest = float(np.sqrt(np.mean(samples.tau**2, axis=0)).max())
+    floor = NOISE_FLOOR_JOINT * samples.tau.std(axis=0)
+    return np.asarray(np.maximum(floor, NOISE_FLOOR_ROBOT * max(largest, 1e-6)))

@@ -59,9 +59,10 @@ class TorqueModel:
 
     @property
     def noise_std(self) -> Array:
-        """Standard deviation of the measured torque around the function, (n,) N·m."""
-        noise: Array = self.posterior.params["noise.log_std"].exp().numpy()
-        return noise
+        """Standard deviation of the measured torque around the function, (n,) N·m, jitter included."""
+        noise = self.posterior.params["noise.log_std"].exp().square() + self.posterior.factor.jitter
+        std: Array = noise.sqrt().numpy()
+        return std
 
     def predict(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> TorquePrediction:
         """Torque with uncertainty for arrays of shape (n,) or (N, n).

@@ -32,7 +32,7 @@ class FrictionKernel(TorqueKernel):
         return torch.diag_embed(diagonal.movedim(0, -1)).movedim((-2, -1), (0, 1))
 
     def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
-        """A tenth of each joint's torque spread for every feature at the joint's usual speed: log std (n, 3)."""
-        spread = tau.std(0).clamp_min(1e-6) * 0.1
+        """A tenth of each joint's torque for every feature at the joint's usual speed: log std (n, 3)."""
+        usual = tau.square().mean(0).sqrt().clamp_min(1e-6) * 0.1
         speed = motion.dq.square().mean(0).sqrt().clamp_min(1e-3)
-        return {"friction.log_std": torch.log(torch.stack([spread / speed, spread, spread], dim=1))}
+        return {"friction.log_std": torch.log(torch.stack([usual / speed, usual, usual], dim=1))}

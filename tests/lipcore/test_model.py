@@ -108,3 +108,17 @@ def test_unknown_estimator_has_its_own_error(samples: Samples) -> None:
     with pytest.raises(UnknownEstimatorError) as caught:
         train(samples, JOINT_TYPES, estimator="oracle")
     assert all(name in str(caught.value) for name in ESTIMATORS)
+
+
+def test_a_torque_that_never_changes_is_learnt_as_offset(samples: Samples) -> None:
+    constant = replace(samples, tau=np.full_like(samples.tau, 3.0))
+    trained = train(constant, JOINT_TYPES, options=FitOptions(max_iterations=60, device="cpu"))
+    answer = trained.predict(samples.q, samples.dq, samples.ddq)
+    assert np.abs(answer.tau - 3.0).max() < 1e-2
+    assert trained.fit["jitter"] == 0.0
+
+
+def test_jitter_that_was_needed_counts_as_noise(model: TorqueModel) -> None:
+    factor = replace(model.posterior.factor, jitter=0.25)
+    shaken = replace(model, posterior=replace(model.posterior, factor=factor))
+    assert np.allclose(shaken.noise_std**2, model.noise_std**2 + 0.25, rtol=1e-12)
