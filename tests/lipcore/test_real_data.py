@@ -14,7 +14,9 @@ from lipcore.signals import differentiate, low_pass
 
 DATA = Path(__file__).parents[3] / "shared/data"
 PANDA, SCHUNK = DATA / "panda_exciting_trajectory.db3", DATA / "schunk_liu_althoff.npz"
-OPTIONS = FitOptions(hyperparameter_samples=60, max_iterations=60, device="cpu")
+QUICK = FitOptions(hyperparameter_samples=60, max_iterations=60, device="cpu")
+DEFAULT = FitOptions(device="cpu")
+"""What a user gets who chooses nothing: the figures that the README quotes."""
 
 
 def from_signals(names: tuple[str, ...], rate: float, q: np.ndarray, dq: np.ndarray, tau: np.ndarray) -> Samples:
@@ -24,12 +26,13 @@ def from_signals(names: tuple[str, ...], rate: float, q: np.ndarray, dq: np.ndar
     return Samples(names, t, np.zeros(len(q), dtype=np.int64), q, dq, differentiate(dq, rate), tau)
 
 
-def learn_and_judge(title: str, training: Samples, held_out: Samples) -> Metrics:
+def learn_and_judge(title: str, training: Samples, held_out: Samples, options: FitOptions) -> Metrics:
     """Metrics on what was held out, printed as a table."""
-    model = train(training, ("revolute",) * training.n_joints, options=OPTIONS)
+    model = train(training, ("revolute",) * training.n_joints, options=options)
     answer = model.predict(held_out.q, held_out.dq, held_out.ddq)
     metrics = evaluate(held_out.tau, answer.tau, answer.tau_std, answer.noise_std)
-    lines = [f"{title}: {len(training)} samples given, {len(held_out)} held out"]
+    fitted = f"hyperparameters on {options.hyperparameter_samples} samples"
+    lines = [f"{title}: {len(training)} samples given, {fitted}, {len(held_out)} held out"]
     lines.append(f"{'joint':<14}{'torque std':>12}{'noise std':>12}{'nMSE':>12}{'coverage':>12}")
     columns = held_out.tau.std(0), answer.noise_std, metrics.nmse, metrics.coverage
     for name, *figures in zip(training.joint_names, *columns, strict=True):
@@ -55,21 +58,24 @@ def read_panda() -> tuple[tuple[str, ...], np.ndarray]:
 
 
 @pytest.mark.skipif(not PANDA.exists(), reason=f"no recording at {PANDA}")
-def test_panda_predicts_the_rest_of_its_trajectory() -> None:
+@pytest.mark.parametrize(("options", "lowest_coverage"), [(QUICK, 0.4), (DEFAULT, 0.3)], ids=["quick", "default"])
+def test_panda_predicts_the_rest_of_its_trajectory(options: FitOptions, lowest_coverage: float) -> None:
     names, signals = read_panda()
     assert signals.shape == (3, 727, 7)
     cut = int(0.7 * 727)
     # filtered apart, so that nothing of what is held out leaks across the cut
     training, held_out = (from_signals(names, 30.0, *part) for part in (signals[:, :cut], signals[:, cut:]))
-    metrics = learn_and_judge("Panda", training, held_out)
+    metrics = learn_and_judge("Panda", training, held_out, options)
     # joint 1 turns about the vertical and carries next to nothing: friction rules it
     assert (metrics.nmse < [1.0, 0.002, 0.006, 0.08, 0.6, 0.02, 0.12]).all()
-    assert metrics.coverage.min() > 0.4
+    # the default fit is overconfident on joint 5: uncertainty is not calibrated yet
+    assert metrics.coverage.min() > lowest_coverage
     assert metrics.coverage.mean() > 0.8
 
 
 @pytest.mark.skipif(not SCHUNK.exists(), reason=f"no recording at {SCHUNK}")
-def test_schunk_predicts_episodes_held_out() -> None:
+@pytest.mark.parametrize("options", [QUICK, DEFAULT], ids=["quick", "default"])
+def test_schunk_predicts_episodes_held_out(options: FitOptions) -> None:
     """Every fourth episode is held out: trajectories of the same kinds, driven at other speeds or again."""
     with np.load(SCHUNK) as file:
         q, dq, tau, episode, rate = file["q"], file["dq"], file["tau"], file["episode"], 1 / float(file["dt"])
@@ -82,6 +88,6 @@ def test_schunk_predicts_episodes_held_out() -> None:
     training, held_out = Samples.concatenate(parts[False]), Samples.concatenate(parts[True])
     assert len(training.episodes()) == 75
     assert len(held_out.episodes()) == 25
-    metrics = learn_and_judge("Schunk", training, held_out)
+    metrics = learn_and_judge("Schunk", training, held_out, options)
     assert (metrics.nmse < [0.1, 0.12, 0.05, 0.12, 0.02, 0.03]).all()
     assert (metrics.coverage > 0.8).all()
