@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -74,11 +74,6 @@ class FitOptions:
         if self.device == "cuda" and not torch.cuda.is_available():
             raise ValueError("device is 'cuda', but no CUDA device is available")
         return torch.device("cuda" if self.device != "cpu" and torch.cuda.is_available() else "cpu")
-
-    @classmethod
-    def names(cls) -> tuple[str, ...]:
-        """Names of all options."""
-        return tuple(field.name for field in fields(cls))
 
 
 @dataclass(frozen=True)

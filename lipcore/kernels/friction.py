@@ -8,7 +8,6 @@ from torch import Tensor
 from lipcore.kernels.base import Params, State, TorqueKernel
 from lipcore.motion import Motion
 
-FEATURES = ("viscous", "coulomb", "offset")
 SIGN_WIDTH = 0.02
 """Velocity over which the Coulomb sign turns over, rad/s (m/s): tanh(dq / width) avoids a jump at standstill."""
 
