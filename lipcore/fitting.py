@@ -13,24 +13,18 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
 
+from lipcore import noise
 from lipcore.evidence import negative_log_evidence
 from lipcore.kernels.base import Params, TorqueKernel
+from lipcore.kernels.rigid_body import PRIORS
 from lipcore.linalg import NotPositiveDefiniteError
 from lipcore.motion import Motion
 from lipcore.samples import Array, Samples
 from lipcore.selection import spread_out
-from lipcore.signals import noise_level
 
-PRIOR_STD = {"noise.log_std": 1.0, "logits": 4.0, "log": 3.0}
+PRIOR_STD = {"noise.log_std": noise.PRIOR_STD, "logits": 4.0, "log": 3.0}
 """Widths of the Gaussian priors on hyperparameters around their starting values: weak, but for the noise, which a
 small data set cannot tell from misfit. 3 on a logarithm admits a factor of 20 either way within one deviation."""
-NOISE_START = 0.01
-"""Smallest noise std that a fit starts from, relative to the joint's torque spread: what no model explains is noise
-too, and filtered torques look free of noise though they are not. Data that deserve less are fitted with less."""
-NOISE_FLOOR_JOINT = 1e-4
-NOISE_FLOOR_ROBOT = 1e-5
-"""Smallest noise std admitted, relative to the joint's torque spread and to the largest root mean square of all joints:
-below the second, a Gram matrix in float64 can no longer be factored faithfully."""
 LINE_SEARCH_PENALTY = 1e4
 TOLERANCE = 1e-7
 """The fit has converged when an iteration improves the objective by less than this share of it."""
@@ -48,7 +42,7 @@ class FitOptions:
 
     hyperparameter_samples: samples that hyperparameters are fitted on; posterior_samples: samples the posterior is
     conditioned on, where there are more the most spread-out ones; tied: links share kernel shapes (see LipKernel);
-    device: "cpu", "cuda" or "auto".
+    device: "cpu", "cuda" or "auto"; prior: of rigid bodies, "urdf" or "zero" (see RigidBodyKernel).
     """
 
     hyperparameter_samples: int = 150
@@ -56,6 +50,7 @@ class FitOptions:
     max_iterations: int = 150
     tied: bool = True
     device: str = "auto"
+    prior: str = "urdf"
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -68,6 +63,8 @@ class FitOptions:
                 raise ValueError(f"{name} is {value!r}, expected a whole number from {low} to {high}")
         if self.device not in ("auto", "cpu", "cuda"):
             raise ValueError(f"device is {self.device!r}, expected auto, cpu or cuda")
+        if self.prior not in PRIORS:
+            raise ValueError(f"prior is {self.prior!r}, expected one of {', '.join(PRIORS)}")
 
     def torch_device(self) -> torch.device:
         """The device to fit on; raise ValueError for `cuda` where there is none."""
@@ -133,8 +130,8 @@ def fit(
     device = options.torch_device()
     motion, tau = samples.motion(device), samples.torque(device)
     start = kernel.initial(motion, tau)
-    floor = _noise_floor(samples)
-    start["noise.log_std"] = torch.from_numpy(np.log(np.maximum(_noise(samples), floor))).to(device)
+    floor = noise.floor(samples)
+    start["noise.log_std"] = torch.from_numpy(np.log(np.maximum(noise.start(samples), floor))).to(device)
     rows = spread_out(motion, options.hyperparameter_samples)
     objective = _Objective(kernel, start, motion[rows], tau[rows], cancelled or (lambda: False))
 
@@ -180,7 +177,10 @@ def fit(
         seconds=seconds,
         device=device.type,
     )
-    params = {name: value.cpu() for name, value in objective.unpack(result.x).items()}
+    lowest = torch.from_numpy(np.log(floor)).to(device)
+    params = objective.unpack(result.x)
+    params = noise.refine(kernel, params, motion[used], tau[used], start["noise.log_std"], lowest)
+    params = {name: value.cpu() for name, value in params.items()}
     return Fit(params, used.cpu().numpy(), report)
 
 
@@ -189,6 +189,7 @@ class _Objective:
 
     def __init__(self, kernel: TorqueKernel, start: Params, motion: Motion, tau: Tensor, cancelled: Cancelled) -> None:
         self.kernel, self.start, self.motion, self.tau = kernel, start, motion, tau
+        self.widths = {name: prior_std(name) for name in start} | kernel.prior_std()
         self.cancelled = cancelled
         self.evaluations = self.rejected = 0
         self.best = np.inf
@@ -207,9 +208,10 @@ class _Objective:
             return self.best + LINE_SEARCH_PENALTY, np.zeros_like(flat)
         value, gradient = evidence.value, evidence.gradient
         for name, centre in self.start.items():
-            deviation = (params[name] - centre) / prior_std(name)
+            width = self.widths[name]
+            deviation = (params[name] - centre) / width
             value += float(0.5 * deviation.square().sum())
-            gradient[name] = gradient[name] + deviation / prior_std(name)
+            gradient[name] = gradient[name] + deviation / width
         self.best = min(self.best, value)
         return value, self.pack(gradient)
 
@@ -235,14 +237,3 @@ def prior_std(name: str) -> float:
     if name in PRIOR_STD:
         return PRIOR_STD[name]
     return PRIOR_STD["logits" if name.endswith("logits") else "log"]
-
-
-def _noise(samples: Samples) -> Array:
-    level = noise_level([samples.tau[part] for part in samples.episodes()])
-    return np.asarray(np.maximum(level, NOISE_START * samples.tau.std(axis=0)))
-
-
-def _noise_floor(samples: Samples) -> Array:
-    largest = float(np.sqrt(np.mean(samples.tau**2, axis=0)).max())
-    floor = NOISE_FLOOR_JOINT * samples.tau.std(axis=0)
-    return np.asarray(np.maximum(floor, NOISE_FLOOR_ROBOT * max(largest, 1e-6)))

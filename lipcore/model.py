@@ -15,6 +15,7 @@ from lipcore.fitting import Cancelled, FitOptions, Progress, fit
 from lipcore.motion import JointType, Motion, check_finite, check_joint_types
 from lipcore.posterior import ExactPosterior
 from lipcore.samples import Array, Samples
+from lipcore.urdf import JointMismatchError, RigidBody
 
 TorqueConvention = Literal["gravity_included", "gravity_compensated"]
 """What a torque means: all of it (Franka's `tau_J`), or what is added to gravity compensation (its commands)."""
@@ -40,7 +41,8 @@ class TorquePrediction:
 class TorqueModel:
     """Fitted inverse dynamics of one robot: immutable, safe to share between threads.
 
-    motion, tau: the samples that the posterior is conditioned on; fit: what the fit reported, for the manifest.
+    motion, tau: the samples that the posterior is conditioned on; fit: what the fit reported, for the manifest;
+    robot: the rigid bodies of an estimator that has them.
     """
 
     estimator: Estimator
@@ -51,6 +53,7 @@ class TorqueModel:
     fit: dict[str, float | int | bool | str]
     tau: Tensor
     posterior: ExactPosterior
+    robot: RigidBody | None = None
 
     @property
     def n_joints(self) -> int:
@@ -84,9 +87,11 @@ def train(
     torque_convention: TorqueConvention = "gravity_included",
     on_progress: Progress | None = None,
     cancelled: Cancelled | None = None,
+    robot: RigidBody | None = None,
 ) -> TorqueModel:
     """Train a model on samples; see `lipcore.fitting.fit` for progress and cancellation.
 
+    robot: for estimators of rigid bodies, built for the joints of the samples.
     Raise ValueError for bad arguments, FitCancelledError, or NotPositiveDefiniteError.
     """
     options = options or FitOptions()
@@ -98,13 +103,21 @@ def train(
     if len(samples) < MIN_SAMPLES:
         raise ValueError(f"samples has {len(samples)} rows, expected at least {MIN_SAMPLES}")
     check_finite("tau", samples.tau)
-    chosen = make_estimator(estimator, types, options.tied)
+    if robot is not None and robot.joint_names != samples.joint_names:
+        raise JointMismatchError(
+            f"robot {robot.name!r} was built for the joints {', '.join(robot.joint_names)}; the data have "
+            f"{', '.join(samples.joint_names)}"
+        )
+    gravity = torque_convention == "gravity_included"
+    chosen = make_estimator(estimator, types, options.tied, robot, options.prior, gravity)
     fitted = fit(chosen.kernel, samples, options, on_progress, cancelled)
     used = samples.rows(fitted.rows)
     motion, tau = used.motion(), used.torque()
     posterior = ExactPosterior.fit(chosen.kernel, fitted.params, motion, tau)
     report = {**asdict(fitted.report), "jitter": posterior.factor.jitter}
-    return TorqueModel(chosen, samples.joint_names, types, torque_convention, asdict(options), report, tau, posterior)
+    return TorqueModel(
+        chosen, samples.joint_names, types, torque_convention, asdict(options), report, tau, posterior, robot
+    )
 
 
 def training_range(model: TorqueModel) -> dict[str, dict[str, list[float]]]:
@@ -126,12 +139,15 @@ def restore(
     params: dict[str, Tensor],
     motion: Motion,
     tau: Tensor,
+    robot: RigidBody | None = None,
 ) -> TorqueModel:
     """Rebuild a model from its parts; the posterior is computed anew from hyperparameters and samples.
 
     Raise ValueError naming the hyperparameter that is missing, unknown or of the wrong shape.
     """
-    chosen = make_estimator(estimator, joint_types, bool(options.get("tied", True)))
+    tied, prior = bool(options.get("tied", True)), str(options.get("prior", "urdf"))
+    gravity = torque_convention == "gravity_included"
+    chosen = make_estimator(estimator, joint_types, tied, robot, prior, gravity)
     expected = {name: value.shape for name, value in chosen.kernel.initial(motion, tau).items()}
     expected["noise.log_std"] = torch.Size([len(joint_names)])
     for name in expected.keys() | params.keys():
@@ -149,4 +165,5 @@ def restore(
         fit_report,
         tau,
         posterior,
+        robot,
     )

@@ -1,4 +1,7 @@
-"""A model on disk: `manifest.json`, which a person can read, and `model.safetensors`; neither can hold code."""
+"""A model on disk: `manifest.json`, which a person can read, `model.safetensors`, and `robot.urdf` where there is one.
+
+None of them can hold code.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +21,12 @@ from safetensors.torch import save as save_tensors
 
 from lipcore.model import TORQUE_CONVENTIONS, TorqueModel, restore, training_range
 from lipcore.motion import Motion
+from lipcore.parameters import report
+from lipcore.urdf import RigidBody
 
 FORMAT = "lipserve-model"
 FORMAT_VERSION = 1
-MANIFEST, TENSORS = "manifest.json", "model.safetensors"
+MANIFEST, TENSORS, ROBOT = "manifest.json", "model.safetensors", "robot.urdf"
 
 
 class ModelFormatError(ValueError):
@@ -48,18 +54,35 @@ def save(model: TorqueModel, folder: Path, lineage: Mapping[str, Any] | None = N
         "noise_std": model.noise_std.tolist(),
         "options": model.options,
         "fit": model.fit,
+        "parameters": report(model.posterior, model.estimator),
         "training_range": training_range(model),
         "lineage": dict(lineage or {}),
         "tensors": {"file": TENSORS, "bytes": len(payload), "sha256": hashlib.sha256(payload).hexdigest()},
     }
-    _write_folder(folder, payload, json.dumps(manifest, indent=2, allow_nan=False).encode() + b"\n")
+    files = {TENSORS: payload}
+    if model.robot is not None:
+        urdf = model.robot.urdf.encode()
+        files[ROBOT] = urdf
+        manifest["robot"] = {
+            "name": model.robot.name,
+            "joints": list(model.robot.urdf_joints),
+            "matched": model.robot.matched,
+            "prior": model.options["prior"],
+            "file": ROBOT,
+            "bytes": len(urdf),
+            "sha256": model.robot.sha256,
+        }
+    _write_folder(folder, {**files, MANIFEST: json.dumps(manifest, indent=2, allow_nan=False).encode() + b"\n"})
     return manifest
 
 
 def copy_model(source: Path, folder: Path) -> dict[str, Any]:
     """Copy a saved model to a new folder, all of it or nothing, and return its manifest; raise ModelFormatError."""
     manifest = read_manifest(source)
-    _write_folder(folder, _read_tensors(source, manifest), (source / MANIFEST).read_bytes())
+    files = {TENSORS: _read_tensors(source, manifest)}
+    if "robot" in manifest:
+        files[ROBOT] = _read_urdf(source, manifest)
+    _write_folder(folder, {**files, MANIFEST: (source / MANIFEST).read_bytes()})
     return manifest
 
 
@@ -79,6 +102,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
             raise ModelFormatError(f"{name} is {manifest.get(name)!r}, expected a {kind.__name__}")
     if manifest.get("torque_convention") not in TORQUE_CONVENTIONS:
         raise ModelFormatError(f"torque_convention is {manifest.get('torque_convention')!r}")
+    if not isinstance(manifest.get("robot", {}), dict):
+        raise ModelFormatError(f"robot is {manifest['robot']!r}, expected a dict")
     return manifest
 
 
@@ -106,6 +131,7 @@ def load(folder: Path) -> TorqueModel:
             {name.removeprefix("params/"): value for name, value in tensors.items()},
             Motion(samples["q"], samples["dq"], samples["ddq"]),
             samples["tau"],
+            _read_robot(folder, manifest),
         )
     except ModelFormatError:
         raise
@@ -123,13 +149,33 @@ def _read_tensors(folder: Path, manifest: Mapping[str, Any]) -> bytes:
     return payload
 
 
-def _write_folder(folder: Path, payload: bytes, manifest: bytes) -> None:
-    """Write both files to a draft beside `folder`, then rename it: readers see all or nothing."""
+def _read_urdf(folder: Path, manifest: Mapping[str, Any]) -> bytes:
+    try:
+        urdf = (folder / ROBOT).read_bytes()
+    except OSError as error:
+        raise ModelFormatError(f"{folder / ROBOT} cannot be read: {error}") from error
+    if hashlib.sha256(urdf).hexdigest() != manifest["robot"].get("sha256"):
+        raise ModelFormatError(f"{folder / ROBOT} does not match the sha256 of its manifest")
+    return urdf
+
+
+def _read_robot(folder: Path, manifest: Mapping[str, Any]) -> RigidBody | None:
+    if "robot" not in manifest:
+        return None
+    entry, urdf = manifest["robot"], _read_urdf(folder, manifest).decode()
+    robot = RigidBody.from_urdf(
+        urdf, manifest["joint_names"], manifest["joint_types"], list(entry["joints"]), str(entry["name"])
+    )
+    return replace(robot, matched=entry["matched"])
+
+
+def _write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write all files to a draft beside `folder`, then rename it: readers see all or nothing."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     draft = Path(tempfile.mkdtemp(prefix=".draft-", dir=folder.parent))
     try:
-        _write(draft / TENSORS, payload)
-        _write(draft / MANIFEST, manifest)
+        for name, content in files.items():
+            _write(draft / name, content)
         draft.chmod(0o755)
         _sync(draft)
         os.rename(draft, folder)

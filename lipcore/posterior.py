@@ -44,24 +44,25 @@ class ExactPosterior:
     def fit(cls, kernel: TorqueKernel, params: Params, motion: Motion, tau: Tensor) -> ExactPosterior:
         """Condition the prior on torques tau (N, n) at `motion`; raise NotPositiveDefiniteError if K is singular."""
         factor = cholesky(noisy_gram(kernel, params, motion))
-        return cls(kernel, params, motion, factor, factor.solve(tau.reshape(-1)))
+        return cls(kernel, params, motion, factor, factor.solve((tau - kernel.mean(motion)).reshape(-1)))
 
     def mean(self, query: Motion, component: TorqueKernel | None = None) -> Tensor:
         """Posterior mean torque, (N, n) N·m; with `component`, a term of the kernel, that term's share of it."""
         kernel = component or self.kernel
-        return (kernel.gram(self.params, query, self.motion) @ self.weights).reshape(len(query), -1)
+        learnt = (kernel.gram(self.params, query, self.motion) @ self.weights).reshape(len(query), -1)
+        return kernel.mean(query) + learnt
 
-    def predict(self, query: Motion) -> Prediction:
-        """Posterior mean and n×n covariance of the torques at each of N queries."""
-        n = self.kernel.n_joints
+    def predict(self, query: Motion, component: TorqueKernel | None = None) -> Prediction:
+        """Posterior mean and n×n covariance of the torques at each of N queries, or of one term of the kernel."""
+        kernel, n = component or self.kernel, self.kernel.n_joints
         means, covariances = [], []
         for start in range(0, len(query), QUERIES_PER_CHUNK):
             part = query[start : start + QUERIES_PER_CHUNK]
-            cross = self.kernel.gram(self.params, self.motion, part)  # (N n, M n)
-            means.append((self.weights @ cross).reshape(-1, n))
+            cross = kernel.gram(self.params, self.motion, part)  # (N n, M n)
+            means.append(kernel.mean(part) + (self.weights @ cross).reshape(-1, n))
             white = self.factor.whiten(cross).reshape(-1, len(part), n)
             explained = torch.einsum("kmi,kmj->mij", white, white)
-            covariances.append(self.kernel.variance(self.params, part) - explained)
+            covariances.append(kernel.variance(self.params, part) - explained)
         return Prediction(torch.cat(means), torch.cat(covariances))
 
 

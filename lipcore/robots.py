@@ -1,6 +1,6 @@
 """The fixed-base arms of example-robot-data as Pinocchio models, with every other joint locked.
 
-Needs the packages `pin` and `example-robot-data` (extra `sim`).
+The URDFs come with the package `example-robot-data` (extra `sim`).
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def pinocchio() -> Any:
     try:
         return importlib.import_module("pinocchio")
     except ImportError as error:
-        raise SimulationUnavailableError("simulation needs Pinocchio: pip install 'lipserve[sim]'") from error
+        raise SimulationUnavailableError("rigid-body dynamics need Pinocchio: pip install pin") from error
 
 
 def load_robot(name: str) -> Robot:
@@ -132,10 +132,26 @@ def load_robot(name: str) -> Robot:
     return Robot(name, model, names, tuple(types), lower, upper, speed)
 
 
+def installed_profiles() -> tuple[str, ...]:
+    """Names of the robots whose URDFs are installed here."""
+    try:
+        folder = _robots_folder()
+    except SimulationUnavailableError:
+        return ()
+    return tuple(name for name, source in ROBOTS.items() if (folder / source.urdf).is_file())
+
+
+def profile_urdf(name: str) -> str:
+    """The URDF of a robot of ROBOTS as text; raise UnknownRobotError or SimulationUnavailableError."""
+    if name not in ROBOTS:
+        raise UnknownRobotError(f"robot is {name!r}, expected one of {', '.join(ROBOTS)}")
+    return (_robots_folder() / ROBOTS[name].urdf).read_text()
+
+
 def _robots_folder() -> Path:
     roots = [*site.getsitepackages(), site.getusersitepackages(), *sys.path]
     for root in roots:
         folder = Path(root) / "cmeel.prefix/share/example-robot-data/robots"
         if folder.is_dir():
             return folder
-    raise SimulationUnavailableError("simulation needs example-robot-data: pip install 'lipserve[sim]'")
+    raise SimulationUnavailableError("robots by name need example-robot-data: pip install 'lipserve[sim]'")

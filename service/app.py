@@ -23,6 +23,7 @@ from service.inference.loaded import LoadedModels
 from service.limits import BodyLimit
 from service.models import registry
 from service.models import routes as models
+from service.robots import routes as robots
 from service.settings import Settings
 from service.training import routes as training
 from service.training.queue import JobQueue
@@ -63,10 +64,14 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     errors.install(app)
     app.add_middleware(
-        BodyLimit, max_upload_bytes=settings.max_upload_bytes, max_request_bytes=settings.max_request_bytes
+        BodyLimit,
+        max_upload_bytes=settings.max_upload_bytes,
+        max_urdf_bytes=settings.max_urdf_bytes,
+        max_request_bytes=settings.max_request_bytes,
     )
     app.include_router(health.router)
     app.include_router(datasets.router)
+    app.include_router(robots.router)
     app.include_router(training.router)
     app.include_router(models.router)
     app.include_router(inference.router)

@@ -11,8 +11,9 @@ import typer
 import uvicorn
 from pydantic import ValidationError
 from rich.console import Console
-from rich.table import Table
+from rich.markup import escape
 
+from lipcore.dynamics import COMPONENTS
 from lipcore.robots import ROBOTS, SimulationUnavailableError, load_robot
 from lipcore.simulation import FAST, Payload, Stream, simulate
 from service import __version__, recordings
@@ -22,7 +23,11 @@ from service.demo import DemoError
 from service.demo import run as run_demo
 from service.home import HomeInUseError, hold_home
 from service.progress import follow
+from service.reproduce import command as reproduction
+from service.reproduce.figures import FiguresUnavailableError
+from service.reproduce.running import ReproductionError
 from service.settings import Settings
+from service.tables import prediction_tables
 from service.training.states import SUCCEEDED
 
 app = typer.Typer(
@@ -47,6 +52,8 @@ def main() -> None:
         ServiceUnreachableError,
         HomeInUseError,
         DemoError,
+        FiguresUnavailableError,
+        ReproductionError,
         SimulationUnavailableError,
         ValueError,
         OSError,
@@ -128,13 +135,18 @@ def train(
     joint_types: Annotated[
         str | None, typer.Option(help="One a joint, separated by commas; all revolute by default.")
     ] = None,
+    robot: Annotated[
+        str | None, typer.Option(help="For rigid bodies: a profile such as panda, the id of a URDF, or a .urdf file.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Upload recordings and train a model on them. Ctrl-C cancels the job."""
     with Client(url) as client:
         datasets = [client.upload(path).id for path in files]
         types = None if joint_types is None else [kind.strip() for kind in joint_types.split(",")]
-        job = client.train(model, datasets, estimator, types)
+        if robot is not None and robot.endswith(".urdf"):
+            robot = client.upload_robot(Path(robot)).id
+        job = client.train(model, datasets, estimator, types, robot=robot)
         job = follow(client, job, err)
     if as_json:
         out.print_json(job.model_dump_json())
@@ -150,6 +162,10 @@ def predict(
     q: Annotated[str, typer.Option("--q", help="Positions, rad, separated by commas.")],
     dq: Annotated[str | None, typer.Option("--dq", help="Velocities, rad/s; zero by default.")] = None,
     ddq: Annotated[str | None, typer.Option("--ddq", help="Accelerations, rad/s²; zero by default.")] = None,
+    components: Annotated[
+        str | None, typer.Option(help=f"Parts of the dynamics, separated by commas: {', '.join(COMPONENTS)}.")
+    ] = None,
+    tau: Annotated[str | None, typer.Option("--tau", help="Torques, N·m, for forward_dynamics.")] = None,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
@@ -162,15 +178,14 @@ def predict(
             position,
             zeros if dq is None else _numbers("--dq", dq),
             zeros if ddq is None else _numbers("--ddq", ddq),
+            components=[] if components is None else [name.strip() for name in components.split(",")],
+            tau=None if tau is None else _numbers("--tau", tau),
         )
     if as_json:
         out.print_json(answer.model_dump_json(exclude_none=True))
         return
-    table = Table("joint", "tau N·m", "tau_std", "noise_std", title=f"{answer.model} version {answer.version}")
-    rows = zip(answer.joint_names, answer.tau, answer.tau_std, answer.noise_std, strict=True)
-    for name, *figures in rows:
-        table.add_row(name, *(f"{figure:.4f}" for figure in figures))
-    out.print(table)
+    for table in prediction_tables(answer):
+        out.print(table)
 
 
 @app.command()
@@ -183,6 +198,9 @@ def demo(
     run_demo(port, once, plot, out)
 
 
+app.command()(reproduction.reproduce)
+
+
 def _numbers(name: str, text: str) -> list[float]:
     try:
         return [float(part) for part in text.split(",")]
@@ -191,7 +209,7 @@ def _numbers(name: str, text: str) -> list[float]:
 
 
 def _fail(message: str) -> NoReturn:
-    err.print(f"[red]error:[/red] {message}", highlight=False, soft_wrap=True)
+    err.print(f"[red]error:[/red] {escape(message)}", highlight=False, soft_wrap=True)
     sys.exit(1)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from service.datasets.schema import Dataset
 from service.inference.schema import EvaluateResponse, PredictResponse
 from service.models.schema import Model, Version
+from service.robots.schema import Robot
 from service.training.schema import Job
 from service.training.states import ACTIVE
 
@@ -84,6 +85,13 @@ class Client:
             )
         return Dataset.model_validate(answer)
 
+    def upload_robot(self, path: Path, name: str | None = None) -> Robot:
+        """Upload a URDF; raise ApiError where it is refused."""
+        params = {} if name is None else {"name": name}
+        headers = {"content-type": "application/xml"}
+        answer = self._send("POST", "/v1/robots", params=params, content=path.read_bytes(), headers=headers)
+        return Robot.model_validate(answer)
+
     def train(
         self,
         model: str,
@@ -91,13 +99,16 @@ class Client:
         estimator: str | None = None,
         joint_types: list[str] | None = None,
         options: dict[str, Any] | None = None,
+        robot: str | None = None,
     ) -> Job:
-        """Queue a training job."""
+        """Queue a training job. robot: for rigid bodies, a profile such as panda or the id of an uploaded URDF."""
         body: dict[str, Any] = {"model": model, "datasets": datasets, "options": options or {}}
         if estimator is not None:
             body["estimator"] = estimator
         if joint_types is not None:
             body["joint_types"] = joint_types
+        if robot is not None:
+            body["robot"] = robot
         return Job.model_validate(self._send("POST", "/v1/jobs", json=body))
 
     def job(self, job: str) -> Job:
@@ -134,11 +145,14 @@ class Client:
         ddq: ArrayLike,
         version: int | None = None,
         covariance: bool = False,
+        components: Sequence[str] = (),
+        tau: ArrayLike | None = None,
     ) -> PredictResponse:
-        """Torque for arrays of shape (n,) or (N, n)."""
-        body: dict[str, Any] = {"covariance": covariance}
-        for name, values in (("q", q), ("dq", dq), ("ddq", ddq)):
-            body[name] = np.asarray(values, dtype=np.float64).tolist()
+        """Torque for arrays of shape (n,) or (N, n), and components by name; tau is for `forward_dynamics` only."""
+        body: dict[str, Any] = {"covariance": covariance, "components": list(components)}
+        for name, values in (("q", q), ("dq", dq), ("ddq", ddq), ("tau", tau)):
+            if values is not None:
+                body[name] = np.asarray(values, dtype=np.float64).tolist()
         if version is not None:
             body["version"] = version
         return PredictResponse.model_validate(self._send("POST", f"/v1/models/{model}/predict", json=body))

@@ -22,7 +22,7 @@ def now() -> str:
 class Base(DeclarativeBase):
     """Base of all tables."""
 
-    type_annotation_map = {dict[str, Any]: JSON, list[str]: JSON}  # noqa: RUF012 - SQLAlchemy's own form
+    type_annotation_map = {dict[str, Any]: JSON, list[str]: JSON, list[dict[str, str]]: JSON}  # noqa: RUF012 - SQLAlchemy's own form
 
 
 class DatasetRow(Base):
@@ -39,6 +39,20 @@ class DatasetRow(Base):
     joint_names: Mapped[list[str]]
     rows: Mapped[int]
     report: Mapped[dict[str, Any]]
+
+
+class RobotRow(Base):
+    """An uploaded URDF with the joints that move."""
+
+    __tablename__ = "robots"
+
+    seq: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
+    id: Mapped[str] = mapped_column(String(40), unique=True)
+    name: Mapped[str]
+    created_at: Mapped[str]
+    sha256: Mapped[str]
+    joints: Mapped[list[dict[str, str]]]
+    urdf: Mapped[str] = mapped_column(deferred=True)  # up to megabytes, which no list needs
 
 
 class JobRow(Base):

@@ -6,7 +6,7 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-UPLOADS = "/v1/datasets"
+UPLOADS, ROBOTS = "/v1/datasets", "/v1/robots"
 
 
 class BodyLimit:
@@ -15,15 +15,17 @@ class BodyLimit:
     Not FastAPI's `max_body_size`: to a body whose length is announced, that answers in plain text.
     """
 
-    def __init__(self, app: ASGIApp, max_upload_bytes: int, max_request_bytes: int) -> None:
-        self.app, self.max_upload_bytes, self.max_request_bytes = app, max_upload_bytes, max_request_bytes
+    def __init__(self, app: ASGIApp, max_upload_bytes: int, max_urdf_bytes: int, max_request_bytes: int) -> None:
+        self.app, self.others = app, max_request_bytes
+        self.limits = {UPLOADS: max_upload_bytes, ROBOTS: max_urdf_bytes}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on; reading too much of its body raises an answer of 413."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        limit = self.max_upload_bytes if scope["path"].startswith(UPLOADS) else self.max_request_bytes
+        path: str = scope["path"]
+        limit = next((most for prefix, most in self.limits.items() if path.startswith(prefix)), self.others)
         length = Headers(scope=scope).get("content-length", "")
         refused = length.isascii() and length.isdigit() and int(length) > limit
         seen = 0

@@ -9,11 +9,11 @@ from pydantic import BaseModel
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from service.database import DatasetRow, JobRow, ModelRow
+from service.database import DatasetRow, JobRow, ModelRow, RobotRow
 from service.errors import invalid_request
 
 USUAL = 50
-Row = TypeVar("Row", DatasetRow, JobRow, ModelRow)
+Row = TypeVar("Row", DatasetRow, JobRow, ModelRow, RobotRow)
 
 
 class Page(BaseModel):

@@ -38,6 +38,7 @@ class Settings(BaseSettings):
 
     max_upload_bytes: Count = Field(256 * MiB, description="Largest upload of a data set.")
     max_unpacked_bytes: Count = Field(1024 * MiB, description="Largest data set once unpacked.")
+    max_urdf_bytes: Count = Field(2 * MiB, description="Largest upload of a URDF.")
     max_request_bytes: Count = Field(8 * MiB, description="Largest body of any other request.")
     max_joints: Count = Field(32, description="Most joints of a robot.")
     min_samples: int = Field(30, ge=10, description="Fewest samples of a data set.")
@@ -46,6 +47,7 @@ class Settings(BaseSettings):
         12.6, gt=0, description="Largest |q| in rad or m that is taken for SI units: two turns. Beyond it: degrees?"
     )
     max_batch: Count = Field(1000, description="Most queries in one prediction request.")
+    max_component_batch: Count = Field(100, description="Most queries in one prediction request with components.")
     max_evaluation_samples: Count = Field(5000, description="Most samples of one evaluation; more are thinned evenly.")
     max_page: Count = Field(100, description="Most items of one page of a list.")
     max_job_datasets: Count = Field(100, description="Most data sets of one training job.")

@@ -1,4 +1,4 @@
-"""What every torque kernel offers, and the one place where kernel blocks become a Gram matrix."""
+"""What every torque kernel offers, and the one place where pairs of samples become a Gram matrix."""
 
 from __future__ import annotations
 
@@ -50,17 +50,53 @@ class State:
 
 
 class TorqueKernel(ABC):
-    """Prior covariance of the joint torques of an n-joint robot."""
+    """Prior of the joint torques of an n-joint robot: a covariance, and a mean that is zero unless said otherwise.
+
+    Gram matrices have rows and columns sample by sample, n a sample.
+    """
 
     n_joints: int
 
     @abstractmethod
-    def blocks(self, params: Params, x: State, y: State) -> Tensor:
-        """Covariance of torque i at x with torque j at y: (n, n, *batch), (N·m)²."""
+    def gram(self, params: Params, x: Motion, y: Motion) -> Tensor:
+        """Covariance of all torques of x (N samples) with all of y (M): (N n, M n), (N·m)²."""
+
+    @abstractmethod
+    def symmetric_gram(self, params: Params, x: Motion) -> Tensor:
+        """Covariance of all torques of x with each other, (N n, N n), exactly symmetric."""
+
+    @abstractmethod
+    def variance(self, params: Params, x: Motion) -> Tensor:
+        """Prior covariance of the torques at each sample: (N, n, n)."""
+
+    @abstractmethod
+    def gradient(self, params: Params, x: Motion, weight: Tensor) -> dict[str, Tensor]:
+        """Derivative of Σ weight ∘ gram(x, x) by each of the kernel's hyperparameters; weight symmetric, (N n, N n)."""
 
     @abstractmethod
     def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
         """Hyperparameters to start a fit from, scaled to the data. motion: N samples, tau: (N, n)."""
+
+    def names(self) -> list[str]:
+        """Names of the kernel's hyperparameters."""
+        one = torch.ones((2, self.n_joints), dtype=torch.float64)
+        return list(self.initial(Motion(one, one, one), one))
+
+    def prior_std(self) -> dict[str, float]:
+        """Width of the Gaussian prior around the start, for hyperparameters whose width is not the usual one."""
+        return {}
+
+    def mean(self, x: Motion) -> Tensor:
+        """Prior mean of the torques, (N, n) N·m."""
+        return torch.zeros_like(x.q)
+
+
+class PairKernel(TorqueKernel):
+    """A kernel given as a formula for one pair of samples; its gradient comes from automatic differentiation."""
+
+    @abstractmethod
+    def blocks(self, params: Params, x: State, y: State) -> Tensor:
+        """Covariance of torque i at x with torque j at y: (n, n, *batch), (N·m)²."""
 
     def variance(self, params: Params, x: Motion) -> Tensor:
         """Prior covariance of the torques at each sample: (N, n, n)."""
@@ -68,7 +104,7 @@ class TorqueKernel(ABC):
         return self.blocks(params, state, state).permute(2, 0, 1)
 
     def gram(self, params: Params, x: Motion, y: Motion) -> Tensor:
-        """Covariance of all torques of x with all of y: (N n, M n), rows and columns sample by sample."""
+        """Covariance of all torques of x with all of y: (N n, M n)."""
         n, columns = self.n_joints, State.columns(y)
         out = torch.empty((len(x), n, len(y), n), dtype=torch.float64, device=x.device)
         for rows in row_chunks(len(x), len(y)):
@@ -87,12 +123,69 @@ class TorqueKernel(ABC):
         # pairs inside a diagonal block were computed both ways, equal only to rounding
         return 0.5 * (gram + gram.T)
 
+    def gradient(self, params: Params, x: Motion, weight: Tensor) -> dict[str, Tensor]:
+        """Derivative of Σ weight ∘ gram(x, x), by automatic differentiation over small chunks of pairs.
 
-def row_chunks(n_rows: int, n_columns: int) -> Iterator[slice]:
-    """Slices over `n_rows` such that rows × `n_columns` stays near PAIRS_PER_CHUNK."""
-    step = max(1, PAIRS_PER_CHUNK // max(1, n_columns))
-    for start in range(0, n_rows, step):
-        yield slice(start, min(start + step, n_rows))
+        Memory stays that of one Gram matrix: no derivative of it is ever stored.
+        """
+        n, size = self.n_joints, len(x)
+        leaves = {name: params[name].detach().clone().requires_grad_(True) for name in self.names()}
+        by_sample = weight.reshape(size, n, size, n)
+        for rows in row_chunks(size, size):
+            # pairs below the chunk's diagonal block are the transposes of those above it, counted by the factor two
+            columns = slice(rows.start, size)
+            blocks = self.blocks(leaves, State.rows(x[rows]), State.columns(x[columns]))
+            part = 2.0 * by_sample[rows, :, columns].permute(1, 3, 0, 2)
+            part[..., : rows.stop - rows.start] *= 0.5
+            torch.autograd.backward((part * blocks).sum())
+        return {name: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for name, leaf in leaves.items()}
+
+
+class LinearKernel(TorqueKernel):
+    """A torque that is linear in unknown weights with a Gaussian prior: tau = Φ(q, dq, ddq) w."""
+
+    @abstractmethod
+    def features(self, x: Motion) -> Tensor:
+        """Φ at each sample: (N, n, p)."""
+
+    @abstractmethod
+    def covariance(self, params: Params) -> Tensor:
+        """Prior covariance of the weights, (p, p), differentiable in params."""
+
+    def prior_weights(self) -> Tensor | None:
+        """Prior mean of the weights, (p,); None for zero."""
+        return None
+
+    def mean(self, x: Motion) -> Tensor:
+        """Prior mean of the torques, (N, n) N·m."""
+        weights = self.prior_weights()
+        return torch.zeros_like(x.q) if weights is None else self.features(x) @ weights.to(x.device)
+
+    def gram(self, params: Params, x: Motion, y: Motion) -> Tensor:
+        """Φ(x) Λ Φ(y)ᵀ: (N n, M n)."""
+        return self._rows(x) @ self.covariance(params) @ self._rows(y).T
+
+    def symmetric_gram(self, params: Params, x: Motion) -> Tensor:
+        """Φ(x) Λ Φ(x)ᵀ, exactly symmetric: (N n, N n)."""
+        rows = self._rows(x)
+        gram = rows @ self.covariance(params) @ rows.T
+        return 0.5 * (gram + gram.T)
+
+    def variance(self, params: Params, x: Motion) -> Tensor:
+        """Prior covariance of the torques at each sample: (N, n, n)."""
+        features = self.features(x)
+        return features @ self.covariance(params) @ features.mT
+
+    def gradient(self, params: Params, x: Motion, weight: Tensor) -> dict[str, Tensor]:
+        """Derivative of Σ weight ∘ Φ Λ Φᵀ = Σ Λ ∘ Φᵀ weight Φ."""
+        rows = self._rows(x)
+        leaves = {name: params[name].detach().clone().requires_grad_(True) for name in self.names()}
+        ((rows.T @ weight @ rows) * self.covariance(leaves)).sum().backward()  # type: ignore[no-untyped-call]
+        return {name: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for name, leaf in leaves.items()}
+
+    def _rows(self, x: Motion) -> Tensor:
+        features = self.features(x)
+        return features.reshape(-1, features.shape[-1])
 
 
 class SumKernel(TorqueKernel):
@@ -105,13 +198,49 @@ class SumKernel(TorqueKernel):
         self.terms = terms
         self.n_joints = terms[0].n_joints
 
-    def blocks(self, params: Params, x: State, y: State) -> Tensor:
-        """Sum of the terms' blocks: (n, n, *batch)."""
-        total = self.terms[0].blocks(params, x, y)
-        for term in self.terms[1:]:
-            total = total + term.blocks(params, x, y)
-        return total
+    def gram(self, params: Params, x: Motion, y: Motion) -> Tensor:
+        """Sum of the terms' Gram matrices."""
+        return _total([term.gram(params, x, y) for term in self.terms])
+
+    def symmetric_gram(self, params: Params, x: Motion) -> Tensor:
+        """Sum of the terms' Gram matrices, exactly symmetric."""
+        return _total([term.symmetric_gram(params, x) for term in self.terms])
+
+    def variance(self, params: Params, x: Motion) -> Tensor:
+        """Sum of the terms' prior covariances at each sample: (N, n, n)."""
+        return _total([term.variance(params, x) for term in self.terms])
+
+    def gradient(self, params: Params, x: Motion, weight: Tensor) -> dict[str, Tensor]:
+        """Each term's derivatives: no hyperparameter belongs to two terms."""
+        return {name: value for term in self.terms for name, value in term.gradient(params, x, weight).items()}
 
     def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
         """Union of the terms' hyperparameters."""
         return {name: value for term in self.terms for name, value in term.initial(motion, tau).items()}
+
+    def names(self) -> list[str]:
+        """Names of the kernel's hyperparameters."""
+        one = torch.ones((2, self.n_joints), dtype=torch.float64)
+        return list(self.initial(Motion(one, one, one), one))
+
+    def prior_std(self) -> dict[str, float]:
+        """Union of the terms' widths."""
+        return {name: value for term in self.terms for name, value in term.prior_std().items()}
+
+    def mean(self, x: Motion) -> Tensor:
+        """Sum of the terms' prior means."""
+        return _total([term.mean(x) for term in self.terms])
+
+
+def row_chunks(n_rows: int, n_columns: int) -> Iterator[slice]:
+    """Slices over `n_rows` such that rows × `n_columns` stays near PAIRS_PER_CHUNK."""
+    step = max(1, PAIRS_PER_CHUNK // max(1, n_columns))
+    for start in range(0, n_rows, step):
+        yield slice(start, min(start + step, n_rows))
+
+
+def _total(parts: list[Tensor]) -> Tensor:
+    total = parts[0]
+    for part in parts[1:]:
+        total = total + part
+    return total

@@ -5,11 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lipcore.kernels.base import Params, State, TorqueKernel
+from lipcore.kernels.base import LinearKernel, Params
 from lipcore.motion import Motion
 
 SIGN_WIDTH = 0.02
 """Velocity over which the Coulomb sign turns over, rad/s (m/s): tanh(dq / width) avoids a jump at standstill."""
+FRICTION_TERMS = ("viscous", "coulomb", "offset")
 
 
 def friction_features(dq: Tensor) -> Tensor:
@@ -17,18 +18,27 @@ def friction_features(dq: Tensor) -> Tensor:
     return torch.stack([dq, torch.tanh(dq / SIGN_WIDTH), torch.ones_like(dq)])
 
 
-class FrictionKernel(TorqueKernel):
-    """Linear friction model tau_i = f_v dq_i + f_c sign(dq_i) + f_o with independent Gaussian weights."""
+class FrictionKernel(LinearKernel):
+    """Linear friction model tau_i = f_v dq_i + f_c sign(dq_i) + f_o with independent Gaussian weights.
+
+    Weights joint by joint, FRICTION_TERMS each: (3 n,). Hyperparameter: `friction.log_std` (n, 3).
+    """
 
     def __init__(self, n_joints: int) -> None:
         self.n_joints = n_joints
 
-    def blocks(self, params: Params, x: State, y: State) -> Tensor:
-        """Diagonal blocks Σ_f s_f² φ_f(dq_i) φ_f(dq'_i): (n, n, *batch)."""
-        variance = torch.exp(2 * params["friction.log_std"]).T  # (3, n)
-        variance = variance.reshape(variance.shape + (1,) * (x.v.dim() - 1))
-        diagonal = (variance * friction_features(x.v) * friction_features(y.v)).sum(0)
-        return torch.diag_embed(diagonal.movedim(0, -1)).movedim((-2, -1), (0, 1))
+    def features(self, x: Motion) -> Tensor:
+        """Each joint's three features in its own row: (N, n, 3 n)."""
+        n = self.n_joints
+        features = friction_features(x.dq).permute(1, 2, 0)  # (N, n, 3)
+        out = torch.zeros((len(x), n, n, 3), dtype=x.dq.dtype, device=x.device)
+        joints = torch.arange(n, device=x.device)
+        out[:, joints, joints] = features
+        return out.reshape(len(x), n, 3 * n)
+
+    def covariance(self, params: Params) -> Tensor:
+        """Prior variances on the diagonal: (3 n, 3 n)."""
+        return torch.diag(torch.exp(2 * params["friction.log_std"]).reshape(-1))
 
     def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
         """A tenth of each joint's torque for every feature at the joint's usual speed: log std (n, 3)."""

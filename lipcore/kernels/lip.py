@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from lipcore.kernels.base import Params, State, TorqueKernel
+from lipcore.kernels.base import Params, State
+from lipcore.kernels.compiled import Array, CompiledKernel, arrays, inner
+from lipcore.kernels.compiled_lip import lip_gradient, lip_gram
 from lipcore.kernels.energy import (
     kinetic_blocks,
     kinetic_energy_torque,
@@ -18,7 +22,7 @@ from lipcore.kernels.polynomial import Derivatives, base_kernels, product
 from lipcore.motion import JointType, Motion, check_joint_types
 
 
-class LipKernel(TorqueKernel):
+class LipKernel(CompiledKernel):
     """Potential energy over all joints plus one kinetic energy a link, each over the joints that move it.
 
     Hyperparameters: `potential.log_scale` (); `potential.logits` (n, 2); for link i of 1..n `kinetic.<i>.log_weights`
@@ -45,6 +49,32 @@ class LipKernel(TorqueKernel):
             total[:link, :link] += kinetic  # a link's kinetic energy loads only the joints before it
         return total
 
+    def compiled_gram(self, params: Params, x: Motion, y: Motion, symmetric: bool) -> Array:
+        """Gram matrix (N, n, M, n)."""
+        tensors = self._arguments(params)
+        return lip_gram(*arrays(x), *arrays(y), self._prismatic(), *_numbers(tensors), symmetric)
+
+    def compiled_gradient(self, leaves: Params, x: Motion, weight: Array) -> Tensor:
+        """Scalar whose derivatives by `leaves` are those of Σ weight ∘ gram(x, x)."""
+        tensors = self._arguments(leaves)
+        derivatives = lip_gradient(*arrays(x), *arrays(x), self._prismatic(), *_numbers(tensors), True, weight)
+        return inner(tensors, list(derivatives))
+
+    def _prismatic(self) -> NDArray[np.bool_]:
+        return np.array([kind == "prismatic" for kind in self.joint_types])
+
+    def _arguments(self, params: Params) -> list[Tensor]:
+        """Kinetic shares (n, n, 3) and weights (n, n), link by link; potential shares (n, 3) and scale ()."""
+        n = self.n_joints
+        logits = params["potential.logits"].new_zeros((n, n, 2))
+        weights = logits.new_zeros((n, n))
+        for link in range(1, n + 1):
+            own = params["kinetic.logits"] if self.tied else params[f"kinetic.{link}.logits"]
+            logits[link - 1, : len(own)] = own
+            weights[link - 1, :link] = torch.exp(params[f"kinetic.{link}.log_weights"])
+        kinetic = shares(logits.reshape(n * n, 2)).reshape(n, n, 3)
+        return [kinetic, weights, shares(params["potential.logits"]), torch.exp(params["potential.log_scale"])]
+
     def potential(self, params: Params, x: State, y: State) -> Derivatives:
         """Kernel of the potential energy V and its derivatives."""
         base = base_kernels(shares(params["potential.logits"]), self.joint_types, x.q, y.q)
@@ -65,6 +95,16 @@ class LipKernel(TorqueKernel):
             weights = torch.exp(params[f"kinetic.{link}.log_weights"])
             position = self.kinetic(params, link, x, y)
             kinetic[:link] += kinetic_energy_torque(position, weights, x.first(link), y.first(link))
+        return torch.stack([kinetic, potential])
+
+    def energy_covariance(self, params: Params, x: State, y: State) -> Tensor:
+        """Covariance of the kinetic energies at x and y, Σ_l K_l h_l², and of the potential ones: (2, *batch), J²."""
+        potential = self.potential(params, x, y).value
+        kinetic = torch.zeros_like(potential)
+        for link in range(1, self.n_joints + 1):
+            weights = torch.exp(params[f"kinetic.{link}.log_weights"]).reshape((-1,) + (1,) * (x.q.dim() - 1))
+            h = (weights * x.v[:link] * y.v[:link]).sum(0)
+            kinetic = kinetic + self.kinetic(params, link, x, y).value * h * h
         return torch.stack([kinetic, potential])
 
     def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
@@ -92,3 +132,8 @@ def shares(logits: Tensor) -> Tensor:
     """Softmax of (0, logits): (n, 2) to the shares (σ, α, β) of each joint, (n, 3)."""
     zero = torch.zeros_like(logits[:, :1])
     return torch.softmax(torch.cat([zero, logits], dim=1), dim=1)
+
+
+def _numbers(arguments: list[Tensor]) -> tuple[Array, Array, Array, float]:
+    kinetic, weights, potential, scale = (part.detach().numpy() for part in arguments)
+    return kinetic, weights, potential, float(scale)

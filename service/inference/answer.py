@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
+from lipcore.metrics import LEVELS, RELIABILITY_LEVELS
 from lipcore.metrics import evaluate as compare
 from service.context import Service
 from service.datasets import store
 from service.errors import invalid_request
-from service.inference.schema import EvaluateRequest, EvaluateResponse, PredictRequest, PredictResponse
+from service.inference import components
+from service.inference.schema import (
+    EvaluateRequest,
+    EvaluateResponse,
+    Interval,
+    PredictRequest,
+    PredictResponse,
+    Reliability,
+)
 
 REVISION = 0
 """Versions are not updated online yet: every version is at its first revision."""
@@ -18,8 +27,11 @@ def predict(service: Service, model: str, request: PredictRequest) -> PredictRes
     """Torque with uncertainty at the queries; raise InvalidRequestError or NotFoundError."""
     row, loaded = service.loaded.get(model, request.version)
     single = request.q.ndim == 1
-    for name in ("q", "dq", "ddq"):
+    components.check(loaded, request, service.settings.max_component_batch)
+    for name in ("q", "dq", "ddq", "tau"):
         values = getattr(request, name)
+        if values is None:
+            continue
         if values.shape[-1] != loaded.n_joints:
             expected = f"{loaded.n_joints} numbers: {', '.join(loaded.joint_names)}"
             raise invalid_request(name, f"{values.shape[-1]} numbers long", expected)
@@ -42,6 +54,7 @@ def predict(service: Service, model: str, request: PredictRequest) -> PredictRes
         tau_std=(std[0] if single else std).tolist(),
         noise_std=answer.noise_std.tolist(),
         covariance=(covariance[0] if single else covariance).tolist() if request.covariance else None,
+        components=components.answer(loaded, request) if request.components else None,
     )
 
 
@@ -74,6 +87,11 @@ def evaluate(service: Service, model: str, request: EvaluateRequest) -> Evaluate
         coverage=metrics.coverage.tolist(),
         nlpd=metrics.nlpd.tolist(),
         interval_width=metrics.width.tolist(),
+        coverages=[
+            Interval(level=each, coverage=coverage.tolist(), interval_width=width.tolist())
+            for each, coverage, width in zip(LEVELS, metrics.coverages, metrics.widths, strict=True)
+        ],
+        reliability=Reliability(nominal=list(RELIABILITY_LEVELS), observed=metrics.reliability.T.tolist()),
         in_training=any(item["id"] == dataset.id for item in row.manifest["lineage"].get("datasets", [])),
     )
 

@@ -7,8 +7,9 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema
 
+from lipcore.dynamics import COMPONENTS, ComponentName
 from lipcore.model import TorqueConvention
 from service.errors import invalid_request
 from service.models.schema import VersionNumber
@@ -50,6 +51,21 @@ Vectors = Annotated[NDArray[np.float64], PlainValidator(_to_array), WithJsonSche
 """JSON array of shape (n,) for one query or (N, n) for a batch."""
 
 
+def _each_once(names: list[ComponentName]) -> list[ComponentName]:
+    for index, name in enumerate(names):
+        if name in names[:index]:
+            raise invalid_request(f"components[{index}]", name, "each component once")
+    return names
+
+
+ComponentNames = Annotated[
+    list[ComponentName],
+    AfterValidator(_each_once),
+    Field(max_length=len(COMPONENTS), json_schema_extra={"uniqueItems": True}),
+]
+Nested = float | list[float] | list[list[float]] | list[list[list[float]]]
+
+
 class PredictRequest(BaseModel):
     """One query, or a batch of them, in SI units."""
 
@@ -62,6 +78,7 @@ class PredictRequest(BaseModel):
                     "q": [0.0, -0.5, 0.0, -2.0, 0.0, 1.5, 0.7],
                     "dq": [0.1, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0],
                     "ddq": [0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0],
+                    "components": ["gravity", "kinetic_energy"],
                 }
             ]
         },
@@ -72,6 +89,19 @@ class PredictRequest(BaseModel):
     ddq: Vectors = Field(description="Accelerations, rad/s² (m/s²)")
     version: VersionNumber | None = Field(None, description="A version of the model; the latest by default")
     covariance: bool = Field(False, description="Also answer the covariance of the function between joints")
+    components: ComponentNames = Field(
+        default=[],
+        description="Also answer these parts of the dynamics. Energy and rigid-body estimators offer all, others "
+        "`friction`. They cost several times a torque: the most queries of such a request are fewer",
+    )
+    tau: Vectors | None = Field(None, description="Torque that `forward_dynamics` is asked for, N·m (prismatic: N)")
+
+
+class ComponentValues(BaseModel):
+    """A component at one query or a batch: numbers, vectors (n) or matrices (n, n) a query."""
+
+    mean: Nested
+    std: Nested = Field(description="Standard deviation of the function; of forward dynamics to first order")
 
 
 class PredictResponse(BaseModel):
@@ -86,6 +116,14 @@ class PredictResponse(BaseModel):
     tau_std: list[float] | list[list[float]] = Field(description="Standard deviation of the function")
     noise_std: list[float] = Field(description="Standard deviation of the measurement, per joint")
     covariance: list[list[float]] | list[list[list[float]]] | None = Field(None, description="(N·m)², where asked for")
+    components: dict[ComponentName, ComponentValues] | None = Field(
+        None,
+        description="Where asked for. `inertia_matrix` M(q), kg·m²; torques `inertial` M(q) ddq, `coriolis`, `gravity` "
+        "and `friction`, N·m, which sum to `tau`; `kinetic_energy`, J; `potential_energy`, J, relative to the posture "
+        "in the middle of each joint's training range; `forward_dynamics`, rad/s²: the acceleration under the torque "
+        "asked for. Friction is in `friction` and `forward_dynamics` alone; a model of gravity-compensated torques "
+        "knows no gravity",
+    )
 
 
 class EvaluateRequest(BaseModel):
@@ -97,6 +135,23 @@ class EvaluateRequest(BaseModel):
 
     dataset: str = Field(max_length=40)
     version: VersionNumber | None = Field(None, description="A version of the model; the latest by default")
+
+
+class Interval(BaseModel):
+    """What the central intervals of one probability hold, per joint."""
+
+    level: float = Field(description="Probability that the interval promises")
+    coverage: list[float] = Field(description="Share of measurements inside the interval, noise included")
+    interval_width: list[float] = Field(description="Mean width of the interval, N·m")
+
+
+class Reliability(BaseModel):
+    """Reliability curve: observed equals nominal where uncertainty is true, and lies below where it is too small."""
+
+    nominal: list[float] = Field(description="Probabilities that intervals promise")
+    observed: list[list[float]] = Field(
+        description="Share of measurements inside: for each joint one list, like nominal"
+    )
 
 
 class EvaluateResponse(BaseModel):
@@ -115,4 +170,6 @@ class EvaluateResponse(BaseModel):
     coverage: list[float] = Field(description="Share of measurements inside the interval, noise included")
     nlpd: list[float] = Field(description="Mean negative log predictive density, nats")
     interval_width: list[float] = Field(description="Mean width of the interval, N·m")
+    coverages: list[Interval] = Field(description="Coverage and width of the 50, 80, 95 and 99 % intervals")
+    reliability: Reliability
     in_training: bool = Field(description="Whether the model was trained on this data set: then the figures flatter")

@@ -30,6 +30,10 @@ class Version(BaseModel):
     options: dict[str, Any]
     fit: dict[str, Any] = Field(description="What the fit reported")
     lineage: dict[str, Any] = Field(description="Data sets with their hashes, and when it was trained")
+    robot: dict[str, Any] | None = Field(None, description="The URDF of an estimator with rigid bodies, and its prior")
+    parameters: dict[str, Any] | None = Field(
+        None, description="Friction coefficients and, of rigid bodies, inertial parameters, with standard deviations"
+    )
 
 
 class VersionSummary(BaseModel):

@@ -5,12 +5,14 @@ from __future__ import annotations
 from sqlalchemy import func, select
 
 from lipcore.estimators import UnknownEstimatorError, make_estimator
+from lipcore.robots import ROBOTS, SimulationUnavailableError
 from service.context import Service
-from service.database import Database, DatasetRow, JobRow, now
+from service.database import Database, DatasetRow, JobRow, RobotRow, now
 from service.datasets import store
-from service.errors import BusyError, ConflictError, invalid_request, not_found
+from service.errors import BusyError, ConflictError, InvalidRequestError, invalid_request, not_found, problem
 from service.files import new_id
 from service.pages import Page, newest
+from service.robots import store as robots
 from service.settings import Settings
 from service.training.schema import Job, JobPage, JobRequest, Options
 from service.training.states import ACTIVE, CANCELLED, QUEUED
@@ -23,6 +25,7 @@ def create(service: Service, request: JobRequest) -> Job:
         raise invalid_request("datasets", len(request.datasets), f"at most {service.settings.max_job_datasets}")
     rows = [store.find(service.database, dataset) for dataset in request.datasets]
     joint_types = _check_joints(request, rows)
+    _check_estimator(service.database, request, rows[0].joint_names, joint_types)
     job = JobRow(
         id=new_id("job"),
         model=request.model,
@@ -41,6 +44,9 @@ def create(service: Service, request: JobRequest) -> Job:
         for dataset in request.datasets:
             if dataset not in present:  # deleted since it was checked
                 raise not_found("dataset", dataset)
+        uploaded = request.robot is not None and request.robot not in ROBOTS
+        if uploaded and session.scalar(select(RobotRow.id).where(RobotRow.id == request.robot)) is None:
+            raise not_found("robot", request.robot)
         session.add(job)
     service.jobs.submit(job.id)
     return _show(job)
@@ -89,12 +95,22 @@ def _check_joints(request: JobRequest, rows: list[DatasetRow]) -> list[str]:
     types: list[str] = list(request.joint_types) if request.joint_types is not None else ["revolute"] * n
     if len(types) != n:
         raise invalid_request("joint_types", f"{len(types)} types", f"{n}, one a joint: {', '.join(first.joint_names)}")
+    return types
+
+
+def _check_estimator(database: Database, request: JobRequest, joint_names: list[str], joint_types: list[str]) -> None:
+    """Build the estimator as the training process will, so that what it refuses is refused here."""
     try:
-        make_estimator(request.estimator, types, request.options.tied)
+        robot = None
+        if request.robot is not None:
+            robot = robots.resolve(database, request.robot, joint_names, joint_types)
+        make_estimator(request.estimator, joint_types, request.options.tied, robot, request.options.prior)
     except UnknownEstimatorError as error:
         expected = str(error).partition("expected ")[2]
         raise invalid_request("estimator", request.estimator, expected) from None
-    return types
+    except (ValueError, SimulationUnavailableError) as error:
+        detail = problem("robot", request.robot, "a profile or the id of an uploaded URDF, with the joints of the data")
+        raise InvalidRequestError(str(error), [detail]) from None
 
 
 def _check_options(options: Options, settings: Settings) -> None:
@@ -108,6 +124,7 @@ def _show(row: JobRow) -> Job:
     return Job.model_validate(
         {
             "estimator": row.request["estimator"],
+            "robot": row.request.get("robot"),
             "datasets": row.request["datasets"],
             **{
                 name: getattr(row, name)

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from lipcore.estimators import DEFAULT_ESTIMATOR
+from lipcore.estimators import DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS
 from lipcore.fitting import FitOptions
 from lipcore.motion import JointType
 from service.models.schema import ModelName
@@ -28,6 +28,9 @@ class Options(BaseModel):
     )
     max_iterations: int = Field(_DEFAULTS.max_iterations, ge=1, le=10_000)
     tied: bool = Field(_DEFAULTS.tied, description="Links share kernel shapes; false is the paper's form")
+    prior: Literal["urdf", "zero"] = Field(
+        "urdf", description="Of rigid bodies: expect the URDF's inertial parameters, or none"
+    )
     device: Literal["auto", "cpu", "cuda"] = "auto"
 
 
@@ -43,6 +46,11 @@ class JobRequest(BaseModel):
     datasets: list[Annotated[str, Field(max_length=40)]] = Field(min_length=1, description="Ids of data sets")
     estimator: str = Field(DEFAULT_ESTIMATOR, max_length=40)
     joint_types: list[JointType] | None = Field(None, description="One a joint; all revolute by default")
+    robot: str | None = Field(
+        None,
+        max_length=40,
+        description=f"For {' and '.join(ROBOT_ESTIMATORS)}: a profile such as panda, or the id of an uploaded URDF",
+    )
     options: Options = Field(default_factory=Options)
 
 
@@ -71,6 +79,7 @@ class Job(BaseModel):
     state: JobState
     model: str
     estimator: str
+    robot: str | None = Field(description="Profile or id of an uploaded URDF, of estimators with rigid bodies")
     datasets: list[str]
     progress: JobProgress
     attempts: int = Field(description="Times it was started; more than one after an interruption")

@@ -23,6 +23,7 @@ from lipcore.model import TorqueModel
 from service.database import Database, DatasetRow, JobRow, now
 from service.files import Files, new_id
 from service.models import registry
+from service.robots import store as robots
 from service.settings import Settings
 from service.training.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED
 
@@ -114,6 +115,7 @@ def _fit(database: Database, files: Files, claim: Claim, watch: _Watch) -> tuple
         }
     rows = [found[dataset] for dataset in request["datasets"]]
     samples = lipcore.Samples.concatenate([files.read_samples(row.id, row.joint_names) for row in rows])
+    robot, names = request.get("robot"), rows[0].joint_names
     trained = lipcore.train(
         samples,
         request["joint_types"],
@@ -122,6 +124,7 @@ def _fit(database: Database, files: Files, claim: Claim, watch: _Watch) -> tuple
         torque_convention=rows[0].torque_convention,  # type: ignore[arg-type]  # checked when it was stored
         on_progress=watch.progress,
         cancelled=watch.cancelled,
+        robot=None if robot is None else robots.resolve(database, robot, names, request["joint_types"]),
     )
     lineage = {
         "job": claim.job,

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from lipcore.metrics import evaluate
+from lipcore.metrics import LEVELS, RELIABILITY_LEVELS, evaluate
 
 Z95 = 1.959963984540054
 
@@ -41,6 +41,43 @@ def test_coverage_of_a_true_gaussian_is_the_level(level: float) -> None:
     tau = mean + np.sqrt(std**2 + noise**2) * rng.standard_normal(std.shape)
     # three standard errors of a binomial share
     assert np.allclose(evaluate(tau, mean, std, noise, level).coverage, level, atol=3 * math.sqrt(0.25 / 20_000))
+
+
+def gaussian(confidence: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Torques, means, and stds that are too small by the factor `confidence`."""
+    rng = np.random.default_rng(1)
+    std, noise = rng.uniform(0.1, 2.0, (20_000, 2)), np.array([0.5, 1.5])
+    mean = rng.normal(size=std.shape)
+    tau = mean + np.sqrt(std**2 + noise**2) * rng.standard_normal(std.shape)
+    return tau, mean, std / confidence, noise / confidence
+
+
+def test_calibrated_intervals_cover_what_they_promise_at_every_level() -> None:
+    answer = evaluate(*gaussian())
+    atol = 4 * math.sqrt(0.25 / 20_000)
+    assert np.allclose(answer.coverages, np.array(LEVELS)[:, None], atol=atol)
+    assert np.allclose(answer.reliability, np.array(RELIABILITY_LEVELS)[:, None], atol=atol)
+    assert answer.coverages[LEVELS.index(0.95)].tolist() == answer.coverage.tolist()
+    assert answer.widths[LEVELS.index(0.95)].tolist() == answer.width.tolist()
+
+
+def test_overconfident_intervals_cover_less_at_every_level_and_timid_ones_more() -> None:
+    true, proud, timid = evaluate(*gaussian()), evaluate(*gaussian(2.0)), evaluate(*gaussian(0.5))
+    for name in ("coverages", "reliability"):
+        assert (getattr(proud, name) < getattr(true, name)).all()
+        assert (getattr(timid, name) > getattr(true, name)).all()
+    assert np.allclose(proud.widths * 2, true.widths)
+
+
+def test_coverage_and_width_grow_with_the_level() -> None:
+    answer = evaluate(*gaussian())
+    assert answer.coverages.shape == answer.widths.shape == (4, 2)
+    assert answer.reliability.shape == (20, 2)
+    for figures in (answer.coverages, answer.widths, answer.reliability):
+        assert (np.diff(figures, axis=0) > 0).all()
+    # half a Gaussian's mass lies within 0.6745 deviations
+    _, _, std, noise = gaussian()
+    assert answer.widths[0] == pytest.approx(2 * 0.6744897501960817 * np.hypot(std, noise).mean(axis=0))
 
 
 # the mean of seven times 0.1 is not 0.1: a variance by formula is not exactly zero

@@ -72,13 +72,13 @@ def trained(request: pytest.FixtureRequest) -> Trained:
     robot = load_robot(case.robot)
     model = train(simulate(robot, case.train, case.seed), robot.joint_types, options=case.options)
     unseen = simulate(robot, Stream(n_samples=501, n_sinusoids=100, motion="middle", speed=10, noise=0.0), seed=101)
-    inertia = dynamics.inertia_matrix(model.posterior, model.estimator.dynamics, unseen.motion().q).numpy()
+    inertia = dynamics.inertia_matrix(model.posterior, model.estimator.terms["energy"], unseen.motion().q).numpy()
     return Trained(case, robot, model, unseen, inertia)
 
 
 def learnt_torque(trained: Trained, motion: Motion) -> torch.Tensor:
     """Torque of the learnt energies, friction left out."""
-    return trained.model.posterior.mean(motion, trained.model.estimator.dynamics)
+    return trained.model.posterior.mean(motion, trained.model.estimator.terms["energy"])
 
 
 def test_torque_on_an_unseen_trajectory(trained: Trained) -> None:
@@ -131,7 +131,7 @@ def test_inertia_is_that_of_pinocchio(trained: Trained) -> None:
 
 def test_gravity_is_that_of_pinocchio(trained: Trained) -> None:
     q = trained.unseen.q[::10]
-    learnt = dynamics.gravity(trained.model.posterior, trained.model.estimator.dynamics, torch.from_numpy(q)).numpy()
+    learnt = dynamics.gravity(trained.model.posterior, trained.model.estimator.terms["energy"], torch.from_numpy(q)).numpy()
     model, data = trained.robot.model, trained.robot.model.createData()
     expected = [pin.computeGeneralizedGravity(model, data, trained.robot.configuration(x)) for x in q]
     assert np.abs(learnt - expected).max() < trained.case.gravity * np.abs(expected).max()
@@ -143,7 +143,7 @@ def test_rate_of_energy_is_power(trained: Trained) -> None:
 
     def energy(t: float) -> torch.Tensor:
         moved = Motion(motion.q + t * motion.dq + 0.5 * t**2 * motion.ddq, motion.dq + t * motion.ddq, motion.ddq)
-        both = dynamics.energies(trained.model.posterior, trained.model.estimator.dynamics, moved)
+        both = dynamics.energies(trained.model.posterior, trained.model.estimator.terms["energy"], moved)
         return both.kinetic + both.potential
 
     rate = (8 * (energy(step) - energy(-step)) - (energy(2 * step) - energy(-2 * step))) / (12 * step)
@@ -155,6 +155,6 @@ def test_rate_of_energy_is_power(trained: Trained) -> None:
 def test_kinetic_energy_is_half_dq_inertia_dq(trained: Trained) -> None:
     rows = slice(0, 501, 25)
     motion = trained.unseen.motion()[rows]
-    kinetic = dynamics.energies(trained.model.posterior, trained.model.estimator.dynamics, motion).kinetic
+    kinetic = dynamics.energies(trained.model.posterior, trained.model.estimator.terms["energy"], motion).kinetic
     expected = 0.5 * torch.einsum("ki,kij,kj->k", motion.dq, torch.from_numpy(trained.inertia[rows]), motion.dq)
     assert (kinetic - expected).abs().max() < 1e-7 * expected.abs().max()

@@ -20,6 +20,7 @@ from tests.service.server import Server
 LIMITS = {
     "max_upload_bytes": 200_000,
     "max_unpacked_bytes": 400_000,
+    "max_urdf_bytes": 5_000,
     "max_request_bytes": 20_000,
     "max_joints": 8,
     "max_samples": 500,

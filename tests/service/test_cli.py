@@ -144,3 +144,24 @@ def test_a_model_name_that_is_refused_is_said(lipserve, server, tmp_path):
     code, _, err = lipserve("train", path, "--model", "BAD NAME", "--url", server.url)
     assert code == 1
     assert "model is BAD NAME" in err
+
+
+def test_components_are_printed_beside_the_torque(lipserve, server):
+    q, names = [0.0, -0.5, 0.0, -2.0, 0.0, 1.5, 0.7], ["gravity", "inertia_matrix", "potential_energy"]
+    query = {"q": q, "dq": [0.0] * 7, "ddq": [0.0] * 7, "components": names}
+    expected = server.client.post("/v1/models/panda-sim/predict", json=query).json()["components"]
+    motion = ("--q", ",".join(map(str, q)))
+    asked = ("predict", "panda-sim", *motion, "--components", ", ".join(names), "--url", server.url)
+    code, said, err = lipserve(*asked)
+    assert code == 0, err
+    for mean, std in (
+        (expected["gravity"]["mean"][1], expected["gravity"]["std"][1]),
+        (expected["inertia_matrix"]["mean"][2][3], expected["inertia_matrix"]["std"][2][3]),
+    ):
+        assert f"{mean:.4f} ± {std:.4f}" in said
+    assert f"{expected['potential_energy']['mean']:.4f}" in said
+
+    code, said, _ = lipserve(*asked, "--json")
+    assert json.loads(said)["components"] == expected
+    code, _, err = lipserve(*asked, "--tau", "0,0,0,0,0,0,0")
+    assert (code, "tau is given, expected no tau" in err) == (1, True)

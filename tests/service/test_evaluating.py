@@ -18,6 +18,10 @@ def compare(answer, metrics):
         np.testing.assert_allclose(np.array(answer[name], dtype=float), getattr(metrics, name), rtol=1e-10)
     np.testing.assert_allclose(answer["interval_width"], metrics.width, rtol=1e-10)
     assert answer["level"] == metrics.level == 0.95
+    for row, interval in enumerate(answer["coverages"]):
+        np.testing.assert_allclose(interval["coverage"], metrics.coverages[row], rtol=1e-10)
+        np.testing.assert_allclose(interval["interval_width"], metrics.widths[row], rtol=1e-10)
+    np.testing.assert_allclose(answer["reliability"]["observed"], metrics.reliability.T, rtol=1e-10)
 
 
 def ask(api, model, dataset, **request):
@@ -46,6 +50,20 @@ def test_the_answer_says_what_was_compared(api, trained, unseen):
     assert (answer["model"], answer["version"], answer["revision"]) == (trained.name, 1, 0)
     assert (answer["dataset"], answer["samples"], answer["samples_used"]) == (unseen, 80, 80)
     assert answer["joint_names"] == ["joint1", "joint2"]
+
+
+def test_coverage_is_told_at_four_levels_and_as_a_reliability_curve(api, trained, unseen):
+    answer = ask(api, trained.name, unseen).json()
+    assert [interval["level"] for interval in answer["coverages"]] == [0.5, 0.8, 0.95, 0.99]
+    assert answer["coverages"][2]["coverage"] == answer["coverage"]
+    assert answer["coverages"][2]["interval_width"] == answer["interval_width"]
+    widths = np.array([interval["interval_width"] for interval in answer["coverages"]])
+    assert (np.diff(widths, axis=0) > 0).all()
+    curve = answer["reliability"]
+    np.testing.assert_allclose(curve["nominal"], [*np.arange(5, 100, 5) / 100, 0.99])
+    assert np.shape(curve["observed"]) == (2, 20)
+    assert [observed[-1] for observed in curve["observed"]] == answer["coverages"][3]["coverage"]
+    assert (np.diff(curve["observed"]) >= 0).all()
 
 
 def test_data_of_the_training_are_told_from_others(api, trained, unseen):

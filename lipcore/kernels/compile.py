@@ -1,0 +1,53 @@
+"""Numba compilation of the kernels' inner loops."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+from numba import njit
+from numba.core.compiler import Compiler
+
+_F = TypeVar("_F", bound=Callable[..., object])
+
+# Fused multiply-add and sums in any order; NaN and infinity keep their meaning.
+_FASTMATH = {"contract", "reassoc", "nsz"}
+
+
+class _NoAlias(Compiler):
+    """Numba's compiler, with arguments that LLVM may take for disjoint; `njit` has no option for it."""
+
+    def define_pipelines(self) -> Any:
+        """Called once, with the flags of the function to compile."""
+        self.state.flags.noalias = True
+        return super().define_pipelines()  # type: ignore[no-untyped-call]
+
+
+def compiled(function: _F) -> _F:
+    """Compile `function` with Numba at its first call, without the GIL; division by zero gives what NumPy gives.
+
+    The machine code is kept on disk: beside the source, or else below the home directory or `NUMBA_CACHE_DIR`. Where
+    none of them is writable, as in a read-only container, every process compiles anew.
+    """
+    return _compile(function)
+
+
+def inlined(function: _F) -> _F:
+    """Like `compiled`, and inlined where another compiled function calls it; Python itself cannot call it.
+
+    No element that `function` writes through one array may be reached through another of its arguments. In return,
+    loops become SIMD instructions without a check for overlap at run time.
+    """
+    return _compile(function, forceinline=True, no_cpython_wrapper=True, pipeline_class=_NoAlias)
+
+
+def _compile(function: _F, **options: Any) -> _F:
+    # entry points for C are never used, and take a fifth of the compile time
+    options |= {"fastmath": _FASTMATH, "error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
+    try:
+        return cast(_F, njit(cache=True, **options)(function))
+    except RuntimeError as error:
+        # raised at decoration time, so without this the import itself would fail
+        if "no locator available" not in str(error):
+            raise
+        return cast(_F, njit(cache=False, **options)(function))

@@ -1,0 +1,92 @@
+"""The Lagrangian squared exponential baseline: L(q, dq) has one smooth prior that knows no polynomial (TR2023-063).
+
+Primes mark the second argument, D = Σ_k v_k ∂/∂q_k + a_k ∂/∂v_k is the time derivative and T_i = D ∂/∂v_i − ∂/∂q_i
+makes L a torque. The prior is
+
+    K = s² Π_b κ_b(q_b − q'_b) exp(−½ Σ_b c_b (v_b − v'_b)²),   c_b = 1 / m_b²
+
+with κ = exp((cos(q − q') − 1) / ℓ²), the squared exponential of (cos q, sin q), for revolute and
+κ = exp(−(q − q')² / (2 ℓ²)) for prismatic joints. K is nowhere zero and all its derivatives are multiples of it. With
+
+    e = ∂ log κ / ∂q,  d = ∂² log κ / ∂q²,  g = −c∘(v − v'),  b = c∘a,  b' = c∘a',
+    Λ = e·v + g·a,  Λ' = e·v' + g·a',  Ω = Σ d v v' − Σ c a a',  x = b − Λ g,  y = b' − Λ' g
+
+the nine products of left and right derivatives in T_i T'_j K collect into four of rank one and a diagonal:
+
+    block / K = (x + e)(y − e)ᵀ + y xᵀ + g ((Ω − ΛΛ') g + d∘v)ᵀ − (d∘v') gᵀ − diag((Ω + ΛΛ') c + d)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from lipcore.kernels.base import PairKernel, Params, State
+from lipcore.kernels.se import independent_blocks, per_joint, power, spread
+from lipcore.motion import JointType, Motion, check_joint_types
+
+
+class LagrangianSEKernel(PairKernel):
+    """One squared exponential kernel on (cos q, sin q, dq), q itself where prismatic, for the whole Lagrangian.
+
+    Hyperparameters: `lse.log_scale` (), log s² in J²; `lse.log_position_lengthscales` (n,), log ℓ, no unit
+    (prismatic: m); `lse.log_velocity_lengthscales` (n,), log m in rad/s (m/s).
+    """
+
+    def __init__(self, joint_types: Sequence[str]) -> None:
+        self.joint_types: tuple[JointType, ...] = check_joint_types(joint_types)
+        self.n_joints = len(self.joint_types)
+
+    def blocks(self, params: Params, x: State, y: State) -> Tensor:
+        """Covariance of torque i at x with torque j at y: (n, n, *batch), (N·m)²."""
+        log_k, e, d = self._position(params["lse.log_position_lengthscales"], x.q, y.q)
+        c = per_joint(torch.exp(-2 * params["lse.log_velocity_lengthscales"]), x.v)
+        u = x.v - y.v
+        g, b, b2 = -c * u, c * x.a, c * y.a
+        k = torch.exp(params["lse.log_scale"] + (log_k + 0.5 * g * u).sum(0))
+        rate, rate2 = (e * x.v + g * x.a).sum(0), (e * y.v + g * y.a).sum(0)
+        both = rate * rate2
+        omega = (d * x.v * y.v - b * y.a).sum(0)
+
+        left, right = b - rate * g, b2 - rate2 * g
+        kg = k * g
+        block = (k * (left + e))[:, None] * (right - e)
+        block = block + (k * right)[:, None] * left
+        block = block + kg[:, None] * ((omega - both) * g + d * x.v)
+        block = block - (d * y.v)[:, None] * kg
+        return block - independent_blocks(k * ((omega + both) * c + d))
+
+    def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
+        """Every input's spread, times √(2 n) as distances add up; the scale that gives all torques their power."""
+        revolute = self._revolute(tau.device)
+        circle = spread(torch.cos(motion.q)).square() + spread(torch.sin(motion.q)).square()
+        position = torch.where(revolute, circle.sqrt(), spread(motion.q))
+        inputs = (2 * self.n_joints) ** 0.5
+        params = {
+            "lse.log_scale": torch.zeros((), dtype=tau.dtype, device=tau.device),
+            "lse.log_position_lengthscales": torch.log(position * inputs),
+            "lse.log_velocity_lengthscales": torch.log(spread(motion.dq) * inputs),
+        }
+        unit = self.variance(params, motion).diagonal(dim1=1, dim2=2).mean(0)
+        params["lse.log_scale"] = torch.log(power(tau).sum() / unit.sum())
+        return params
+
+    def _position(self, log_lengthscales: Tensor, q: Tensor, q2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """log κ and its first and second derivative by q, each (n, *batch)."""
+        z = q - q2
+        c = per_joint(torch.exp(-2 * log_lengthscales), z)
+        sin, cos = torch.sin(z), torch.cos(z)
+        # cos z − 1 without cancellation
+        log_k, e, d = -2 * torch.sin(0.5 * z).square(), -sin, -cos
+        if "prismatic" in self.joint_types:
+            revolute = per_joint(self._revolute(z.device), z)
+            log_k = torch.where(revolute, log_k, -0.5 * z.square())
+            e = torch.where(revolute, e, -z)
+            d = torch.where(revolute, d, -torch.ones_like(z))
+        return c * log_k, c * e, c * d
+
+    def _revolute(self, device: torch.device) -> Tensor:
+        """Which joints are revolute, (n,)."""
+        return torch.tensor([kind == "revolute" for kind in self.joint_types], device=device)

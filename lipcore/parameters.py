@@ -1,0 +1,213 @@
+"""Physical parameters that a model has learnt, with uncertainty: friction coefficients and inertial parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.optimize import least_squares
+from torch import Tensor
+
+from lipcore.estimators import Estimator
+from lipcore.kernels.base import LinearKernel
+from lipcore.kernels.friction import FRICTION_TERMS, FrictionKernel
+from lipcore.kernels.rigid_body import RigidBodyKernel
+from lipcore.posterior import ExactPosterior
+from lipcore.robots import pinocchio
+from lipcore.samples import Array
+from lipcore.urdf import PARAMETERS
+
+LEAST_MASS, MOST_MASS = 1e-4, 1e2
+"""Mass of a plausible body, as a share of the whole arm's: the search must neither vanish nor run away."""
+LEAST_EXTENT, MOST_EXTENT = 1e-3, 1e2
+"""Spread of a plausible body's mass along each axis, m: no real body is a point."""
+LEAST_VARIANCE = 1e-10
+"""Smallest posterior variance relative to the prior's that rounding leaves meaningful."""
+
+SEARCH: dict[str, Any] = {"x_scale": "jac", "ftol": 1e-4, "max_nfev": 1000}
+"""Ends within a few percent of the least squared distance; the rest would take ten times as long."""
+
+
+@dataclass(frozen=True)
+class WeightPosterior:
+    """Gaussian posterior of the weights of one linear term. mean: (p,); covariance: (p, p); scale: (p,) prior std."""
+
+    mean: Array
+    covariance: Array
+    scale: Array
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations, (p,)."""
+        return np.sqrt(np.maximum(self.covariance.diagonal(), 0.0))
+
+
+@dataclass(frozen=True)
+class Friction:
+    """Coefficients per joint and their standard deviations, each (n,).
+
+    viscous: N·m·s/rad (N·s/m); coulomb, offset: N·m (N).
+    """
+
+    viscous: Array
+    viscous_std: Array
+    coulomb: Array
+    coulomb_std: Array
+    offset: Array
+    offset_std: Array
+
+
+@dataclass(frozen=True)
+class InertialParameters:
+    """Ten parameters of each of n bodies, (n, 10): mass kg, first moment (3) kg·m, inertia (6) kg·m².
+
+    The inertia, xx, xy, yy, xz, yz, zz, is about the frame of the joint that moves the body. mean, std: of the
+    posterior; many are known from torques only in combinations, which std shows. plausible: the physically possible
+    parameters nearest to the mean in the posterior's metric; mean_is_plausible: whether the mean is possible itself.
+    """
+
+    joint_names: tuple[str, ...]
+    mean: Array
+    std: Array
+    plausible: Array
+    mean_is_plausible: bool
+
+
+def weight_posterior(posterior: ExactPosterior, term: LinearKernel) -> WeightPosterior:
+    """Posterior of a term's weights: mean μ + Λ Φᵀ α, covariance Λ − Λ Φᵀ K⁻¹ Φ Λ with α = K⁻¹ (y − mean)."""
+    features = term.features(posterior.motion)
+    prior = term.covariance(posterior.params).detach()
+    cross = features.reshape(-1, features.shape[-1]) @ prior  # (N n, p)
+    white = posterior.factor.whiten(cross)
+    mean = cross.T @ posterior.weights
+    if (centre := term.prior_weights()) is not None:
+        mean = mean + centre.to(mean.device)
+    covariance = prior - white.T @ white
+    return WeightPosterior(_numpy(mean), _numpy(0.5 * (covariance + covariance.T)), _numpy(prior.diagonal().sqrt()))
+
+
+def friction_coefficients(posterior: ExactPosterior, estimator: Estimator) -> Friction:
+    """Friction of each joint with standard deviations; raise ValueError for an estimator without friction."""
+    term = estimator.terms.get("friction")
+    if not isinstance(term, FrictionKernel):
+        raise ValueError(f"estimator {estimator.name!r} has no friction term")
+    weights = weight_posterior(posterior, term)
+    shape = (term.n_joints, len(FRICTION_TERMS))
+    mean, std = weights.mean.reshape(shape).T, weights.std.reshape(shape).T
+    named = dict(zip(FRICTION_TERMS, mean, strict=True))
+    named |= {f"{name}_std": value for name, value in zip(FRICTION_TERMS, std, strict=True)}
+    return Friction(**named)
+
+
+def inertial_parameters(posterior: ExactPosterior, estimator: Estimator) -> InertialParameters:
+    """Inertial parameters of each body; raise ValueError for an estimator without rigid bodies."""
+    term = estimator.terms.get("rigid_body")
+    if not isinstance(term, RigidBodyKernel):
+        raise ValueError(f"estimator {estimator.name!r} has no rigid bodies")
+    weights = weight_posterior(posterior, term)
+    mean, std = (part.reshape(-1, PARAMETERS) for part in (weights.mean, weights.std))
+    plausible = all(is_plausible(body) for body in mean)
+    nearest = mean if plausible else nearest_plausible(weights, term.urdf_parameters)
+    return InertialParameters(term.robot.joint_names, mean, std, nearest, plausible)
+
+
+def report(posterior: ExactPosterior, estimator: Estimator) -> dict[str, Any]:
+    """All parameters of an estimator as plain numbers, for a manifest."""
+    friction = friction_coefficients(posterior, estimator)
+    out: dict[str, Any] = {
+        "friction": {
+            name: {"mean": getattr(friction, name).tolist(), "std": getattr(friction, f"{name}_std").tolist()}
+            for name in FRICTION_TERMS
+        }
+    }
+    if "rigid_body" in estimator.terms:
+        inertia = inertial_parameters(posterior, estimator)
+        out["inertia"] = {
+            "mean_is_plausible": inertia.mean_is_plausible,
+            "bodies": [
+                {"joint": name, "mean": _body(mean), "std": _body(std), "plausible": _body(plausible)}
+                for name, mean, std, plausible in zip(
+                    inertia.joint_names, inertia.mean, inertia.std, inertia.plausible, strict=True
+                )
+            ],
+        }
+    return out
+
+
+def pseudo_inertia(body: Array) -> Array:
+    """The pseudo-inertia [[Σ, h], [hᵀ, m]] of ten parameters, (4, 4): positive definite for every real body."""
+    mass, moment = body[0], body[1:4]
+    xx, xy, yy, xz, yz, zz = body[4:]
+    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    out = np.empty((4, 4))
+    out[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+    out[:3, 3] = out[3, :3] = moment
+    out[3, 3] = mass
+    return out
+
+
+def is_plausible(body: Array) -> bool:
+    """Whether ten parameters belong to a body that can exist: its pseudo-inertia is positive definite."""
+    return bool(np.linalg.eigvalsh(pseudo_inertia(body))[0] > 0)
+
+
+def nearest_plausible(weights: WeightPosterior, start: Array) -> Array:
+    """Plausible parameters (n, 10) nearest to the posterior mean in the posterior's metric.
+
+    Least squares over the log-Cholesky coordinates of each pseudo-inertia (Rucker & Wensing 2022), which no implausible
+    body has; start: (n, 10), from which the search starts, made plausible where it is not.
+    """
+    log_cholesky = pinocchio().LogCholeskyParameters
+    n = len(start)
+    total = max(float(weights.mean.reshape(n, PARAMETERS)[:, 0].sum()), float(start[:, 0].sum()), 1e-3)
+    # whitened by the prior first: posterior variances span many orders of magnitude
+    scaled = weights.covariance / np.outer(weights.scale, weights.scale)
+    values, vectors = np.linalg.eigh(scaled)
+    metric = (vectors / np.sqrt(np.maximum(values, LEAST_VARIANCE))).T / weights.scale
+    low, high = np.full((2, n, PARAMETERS), MOST_EXTENT) * np.array([-1, 1])[:, None, None]
+    low[:, 0], high[:, 0] = 0.5 * np.log([LEAST_MASS * total, MOST_MASS * total])
+    low[:, 1:4], high[:, 1:4] = np.log([LEAST_EXTENT, MOST_EXTENT])
+
+    def residual(flat: Array) -> Array:
+        bodies = [log_cholesky(part).toDynamicParameters() for part in flat.reshape(n, PARAMETERS)]
+        return np.asarray(metric @ (np.concatenate(bodies) - weights.mean))
+
+    def jacobian(flat: Array) -> Array:
+        out = np.empty((n * PARAMETERS, n * PARAMETERS))
+        for index, part in enumerate(flat.reshape(n, PARAMETERS)):
+            columns = slice(index * PARAMETERS, (index + 1) * PARAMETERS)
+            out[:, columns] = metric[:, columns] @ log_cholesky(part).calculateJacobian()
+        return out
+
+    limits = (low.reshape(-1), high.reshape(-1))
+    begin = np.array([_log_cholesky(body, total / n) for body in start])
+    begin = np.clip(begin, low + 1e-3, high - 1e-3)
+    found = least_squares(residual, begin.reshape(-1), jacobian, bounds=limits, **SEARCH)
+    return np.array([log_cholesky(part).toDynamicParameters() for part in found.x.reshape(n, PARAMETERS)])
+
+
+def _log_cholesky(body: Array, usual_mass: float) -> Array:
+    """Log-Cholesky coordinates [α, d1, d2, d3, s12, s23, s13, t1, t2, t3] of a body, of a small ball where it is none.
+
+    Its pseudo-inertia is U Uᵀ with U = e^α [[e^d1, s12, s13, t1], [0, e^d2, s23, t2], [0, 0, e^d3, t3], [0, 0, 0, 1]].
+    """
+    if not is_plausible(body):
+        radius = 0.05
+        ball = 0.4 * usual_mass * radius**2
+        body = np.array([usual_mass, 0, 0, 0, ball, 0, ball, 0, 0, ball])
+    flip = np.eye(4)[::-1]
+    upper = flip @ np.linalg.cholesky(flip @ pseudo_inertia(body) @ flip) @ flip
+    unit = upper / upper[3, 3]
+    logs = np.log([upper[3, 3], unit[0, 0], unit[1, 1], unit[2, 2]])
+    return np.concatenate([logs, [unit[0, 1], unit[1, 2], unit[0, 2]], unit[:3, 3]])
+
+
+def _body(values: Array) -> dict[str, Any]:
+    return {"mass": float(values[0]), "first_moment": values[1:4].tolist(), "inertia": values[4:].tolist()}
+
+
+def _numpy(values: Tensor) -> Array:
+    out: Array = values.to(torch.float64).cpu().numpy()
+    return out

@@ -1,0 +1,1 @@
+"""Uploaded URDFs and the robots that are known by name."""

@@ -1,0 +1,251 @@
+"""The baselines: lse against automatic differentiation of its Lagrangian, se and gip against plain loops."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from torch import Tensor
+
+from lipcore import FitOptions, train
+from lipcore.estimators import make_estimator
+from lipcore.evidence import negative_log_evidence
+from lipcore.kernels.base import PairKernel, State
+from lipcore.kernels.gip import GeometricallyInspiredKernel
+from lipcore.kernels.lse import LagrangianSEKernel
+from lipcore.kernels.se import SquaredExponentialKernel
+from lipcore.motion import Motion
+from lipcore.robots import load_robot
+from lipcore.simulation import Stream, simulate
+from tests.lipcore.oracles import Energy, instant, scale_of, torque_terms
+
+BASELINES = ["se", "gip", "lse"]
+KERNELS: dict[str, Callable[[Sequence[str]], PairKernel]] = {
+    "se": lambda joint_types: SquaredExponentialKernel(len(joint_types)),
+    "gip": GeometricallyInspiredKernel,
+    "lse": LagrangianSEKernel,
+}
+ROBOTS = [
+    ("revolute",) * 4,
+    ("prismatic", "revolute", "revolute"),
+    ("revolute", "prismatic", "revolute", "prismatic"),
+    ("prismatic",),
+    ("revolute",),
+]
+robots = pytest.mark.parametrize("joint_types", ROBOTS, ids=lambda kinds: "".join(kind[0] for kind in kinds))
+
+
+def shapes(name: str, n: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of the hyperparameters as the kernels' documentation states them."""
+    return {
+        "se": {"se.log_scale": (n,), "se.log_lengthscales": (n, 3 * n)},
+        "gip": {
+            "gip.log_constant": (n,),
+            "gip.log_acceleration": (n, n),
+            "gip.log_velocity": (n, n),
+            "gip.logits": (n, n, 2, 2),
+        },
+        "lse": {
+            "lse.log_scale": (),
+            "lse.log_position_lengthscales": (n,),
+            "lse.log_velocity_lengthscales": (n,),
+        },
+    }[name]
+
+
+def random_case(name: str, joint_types: Sequence[str], samples: int) -> tuple[PairKernel, dict[str, Tensor], Motion]:
+    rng, n = np.random.default_rng(len(joint_types)), len(joint_types)
+    params = {key: torch.as_tensor(rng.uniform(-0.5, 1.0, shape)) for key, shape in shapes(name, n).items()}
+    return KERNELS[name](joint_types), params, Motion.from_arrays(*rng.uniform(-2.0, 2.0, (3, samples, n)))
+
+
+def lagrangian(joint_types: Sequence[str], params: Mapping[str, Tensor]) -> Energy:
+    """The prior of L as its definition says it: a squared exponential of (cos q, sin q) or q, and of dq."""
+    position = torch.exp(params["lse.log_position_lengthscales"])
+    velocity = torch.exp(params["lse.log_velocity_lengthscales"])
+
+    def kernel(q: Tensor, v: Tensor, q2: Tensor, v2: Tensor) -> Tensor:
+        total = (((v - v2) / velocity) ** 2).sum()
+        for b, kind in enumerate(joint_types):
+            pairs = [(q[b], q2[b])]
+            if kind == "revolute":
+                pairs = [(torch.cos(q[b]), torch.cos(q2[b])), (torch.sin(q[b]), torch.sin(q2[b]))]
+            for one, other in pairs:
+                total = total + ((one - other) / position[b]) ** 2
+        return torch.exp(params["lse.log_scale"]) * torch.exp(-0.5 * total)
+
+    return Energy(kernel, +1)
+
+
+def worst_lse_error(joint_types: Sequence[str], params: Mapping[str, Tensor], motion: Motion) -> float:
+    """Largest error over the pairs (0, 0) and (0, 1), relative to the size that rounding errors have."""
+    blocks = LagrangianSEKernel(joint_types).blocks(params, State.rows(motion), State.columns(motion))
+    energy, worst = lagrangian(joint_types, params), 0.0
+    for i, j in ((0, 0), (0, 1)):
+        x, y = instant(motion, i), instant(motion, j)
+        terms = torque_terms([energy], x, y)
+        error = float((blocks[:, :, i, j] - terms.sum(0)).abs().max())
+        worst = max(worst, error / scale_of([energy], x, y, terms))
+    return worst
+
+
+@robots
+def test_lse_equals_automatic_differentiation(joint_types: tuple[str, ...]) -> None:
+    _, params, motion = random_case("lse", joint_types, samples=2)
+    assert worst_lse_error(joint_types, params, motion) < 1e-12
+
+
+@given(st.data())
+def test_lse_equals_automatic_differentiation_for_drawn_robots(data: st.DataObject) -> None:
+    joint_types = data.draw(st.lists(st.sampled_from(["revolute", "prismatic"]), min_size=1, max_size=3))
+    n = len(joint_types)
+
+    def array(shape: tuple[int, ...], low: float, high: float) -> np.ndarray:
+        return data.draw(arrays(np.float64, shape, elements=st.floats(low, high, allow_subnormal=False)))
+
+    params = {key: torch.as_tensor(array(shape, -0.5, 2.0)) for key, shape in shapes("lse", n).items()}
+    motion = Motion.from_arrays(*(array((2, n), -3.0, 3.0) for _ in range(3)))
+    assert worst_lse_error(joint_types, params, motion) < 1e-9
+
+
+def test_lse_variance_of_one_straight_joint_adds_up() -> None:
+    """At x = y of one prismatic joint: s² (c d v² + 3 c² a² + d), d = 1 / ℓ², from moments of L's derivatives."""
+    ell, m, scale, v, a = 0.7, 1.3, 2.0, 0.4, -0.9
+    params = {
+        "lse.log_scale": torch.tensor(math.log(scale), dtype=torch.float64),
+        "lse.log_position_lengthscales": torch.tensor([math.log(ell)], dtype=torch.float64),
+        "lse.log_velocity_lengthscales": torch.tensor([math.log(m)], dtype=torch.float64),
+    }
+    variance = LagrangianSEKernel(["prismatic"]).variance(params, Motion.from_arrays([0.2], [v], [a]))
+    # tau = v L_qv + a L_vv − L_q: var L_qv = s² c d, var L_vv = 3 s² c², var L_q = s² d, all uncorrelated
+    c, d = m**-2, ell**-2
+    assert variance.item() == pytest.approx(scale * (v**2 * c * d + 3 * a**2 * c**2 + d), rel=1e-12)
+
+
+def se_loop(joint_types: Sequence[str], params: Mapping[str, np.ndarray], x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """x, y: (3, n), rows q, dq, ddq."""
+    n = len(joint_types)
+    out = np.zeros((n, n))
+    for i in range(n):
+        total = 0.0
+        for d, difference in enumerate((x - y).ravel()):
+            total += (difference / math.exp(params["se.log_lengthscales"][i, d])) ** 2
+        out[i, i] = math.exp(params["se.log_scale"][i]) * math.exp(-total / 2)
+    return out
+
+
+def gip_loop(joint_types: Sequence[str], params: Mapping[str, np.ndarray], x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Every product dq_a dq_b by itself, as the polynomial is meant."""
+    n = len(joint_types)
+    out = np.zeros((n, n))
+    for i in range(n):
+        value = math.exp(params["gip.log_constant"][i])
+        weights = np.exp(params["gip.log_velocity"][i])
+        for a in range(n):
+            value += math.exp(params["gip.log_acceleration"][i, a]) * x[2, a] * y[2, a]
+            for b in range(n):
+                value += weights[a] * weights[b] * (x[1, a] * x[1, b]) * (y[1, a] * y[1, b])
+        for b, kind in enumerate(joint_types):
+            for factor in range(2):
+                alpha, beta = np.exp(params["gip.logits"][i, b, factor])
+                q, q2 = x[0, b], y[0, b]
+                if kind == "revolute":
+                    p = 1 + alpha * math.cos(q) * math.cos(q2) + beta * math.sin(q) * math.sin(q2)
+                else:
+                    p = 1 + beta + alpha * q * q2
+                value *= p / (1 + alpha + beta)
+        out[i, i] = value
+    return out
+
+
+@robots
+@pytest.mark.parametrize(("name", "loop"), [("se", se_loop), ("gip", gip_loop)], ids=["se", "gip"])
+def test_se_and_gip_equal_plain_loops(name: str, loop: Callable[..., np.ndarray], joint_types: tuple[str, ...]) -> None:
+    kernel, params, motion = random_case(name, joint_types, samples=3)
+    blocks = kernel.blocks(params, State.rows(motion), State.columns(motion)).numpy()
+    arrays_ = {key: value.numpy() for key, value in params.items()}
+    states = torch.stack([motion.q, motion.dq, motion.ddq], dim=1).numpy()
+    for i, x in enumerate(states):
+        for j, y in enumerate(states):
+            np.testing.assert_allclose(blocks[:, :, i, j], loop(joint_types, arrays_, x, y), rtol=1e-12, atol=1e-14)
+
+
+@robots
+@pytest.mark.parametrize("name", BASELINES)
+def test_gram_is_symmetric_and_positive_semidefinite(name: str, joint_types: tuple[str, ...]) -> None:
+    kernel, params, motion = random_case(name, joint_types, samples=12)
+    gram = kernel.symmetric_gram(params, motion)
+    assert torch.equal(gram, gram.T)
+    torch.testing.assert_close(gram, kernel.gram(params, motion, motion), rtol=1e-12, atol=1e-12 * float(gram.max()))
+    eigenvalues = torch.linalg.eigvalsh(gram)
+    assert eigenvalues[0] > -1e-12 * eigenvalues[-1]
+
+
+@pytest.mark.parametrize("name", ["gip", "lse"])
+def test_a_full_turn_of_a_revolute_joint_changes_nothing(name: str) -> None:
+    kernel, params, motion = random_case(name, ("revolute", "prismatic"), samples=4)
+    turned = Motion(motion.q + torch.tensor([2 * math.pi, 0.0], dtype=torch.float64), motion.dq, motion.ddq)
+    torch.testing.assert_close(kernel.gram(params, turned, motion), kernel.gram(params, motion, motion))
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_gradient_of_the_evidence_equals_finite_differences(name: str) -> None:
+    joint_types = ("revolute", "prismatic", "revolute")
+    kernel, params, motion = random_case(name, joint_types, samples=8)
+    rng = np.random.default_rng(5)
+    tau = torch.from_numpy(rng.standard_normal((8, 3)))
+    params["noise.log_std"] = torch.full((3,), -1.0, dtype=torch.float64)
+    gradient = negative_log_evidence(kernel, params, motion, tau).gradient
+    for key in shapes(name, 3):
+        at = int(rng.integers(params[key].numel()))
+        values = []
+        for step in (1e-5, -1e-5):
+            moved = {other: value.clone() for other, value in params.items()}
+            moved[key].view(-1)[at] += step
+            values.append(negative_log_evidence(kernel, moved, motion, tau).value)
+        expected = (values[0] - values[1]) / 2e-5
+        assert float(gradient[key].reshape(-1)[at]) == pytest.approx(expected, rel=1e-6, abs=1e-7), key
+
+
+@pytest.mark.parametrize("still", [(0,), (0, 1, 2)], ids=["one", "all"])
+@pytest.mark.parametrize("name", BASELINES)
+def test_start_is_scaled_to_the_data_even_where_joints_stand_still(name: str, still: tuple[int, ...]) -> None:
+    joint_types = ("revolute", "prismatic", "revolute")
+    rng = np.random.default_rng(3)
+    q, dq, ddq = rng.uniform(-1.0, 1.0, (3, 30, 3))
+    for joint in still:
+        q[:, joint], dq[:, joint], ddq[:, joint] = 0.4, 0.0, 0.0
+    tau = torch.from_numpy(rng.standard_normal((30, 3)) * [20.0, 5.0, 0.5])
+    motion, kernel = Motion.from_arrays(q, dq, ddq), KERNELS[name](joint_types)
+    params = kernel.initial(motion, tau)
+    assert {key: tuple(value.shape) for key, value in params.items()} == shapes(name, 3)
+    assert all(value.dtype == torch.float64 and bool(value.isfinite().all()) for value in params.values())
+
+    prior = kernel.variance(params, motion).diagonal(dim1=1, dim2=2).mean(0).sum()
+    assert 0.2 < float(prior / tau.square().mean(0).sum()) < 5.0
+    params["noise.log_std"] = torch.log(0.01 * tau.std(0))
+    assert math.isfinite(negative_log_evidence(kernel, params, motion, tau).value)
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_short_fit_predicts_unseen_samples(name: str) -> None:
+    robot = load_robot("double-pendulum")
+    samples = simulate(robot, Stream(n_samples=120, rate=5.0, noise=0.001), seed=1)
+    seen = np.arange(len(samples)) % 2 == 0
+    training, unseen = samples.rows(seen), samples.rows(~seen)
+    model = train(training, robot.joint_types, name, FitOptions(hyperparameter_samples=60, max_iterations=30))
+    error = unseen.tau - model.predict(unseen.q, unseen.dq, unseen.ddq).tau
+    assert (np.mean(error**2, axis=0) / unseen.tau.var(axis=0) < 0.5).all()
+
+
+def test_baselines_can_be_chosen_by_name() -> None:
+    for name in BASELINES:
+        estimator = make_estimator(name, ["revolute", "prismatic"])
+        assert isinstance(estimator.terms["torque"], PairKernel)
+        assert "friction" in estimator.terms

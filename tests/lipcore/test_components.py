@@ -1,0 +1,207 @@
+"""Components of the dynamics against Pinocchio at configurations never seen, and the laws that tie them together."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from torch.func import jacrev
+
+from lipcore import FitOptions, Samples, TorqueModel, dynamics, train
+from lipcore.kernels.base import SumKernel
+from lipcore.motion import Motion
+from lipcore.robots import Robot, load_robot
+from lipcore.simulation import Stream, simulate
+from lipcore.urdf import RigidBody
+
+pin = pytest.importorskip("pinocchio", reason="simulation needs the extra `sim`")
+
+
+class Setting(NamedTuple):
+    """What is trained, and the robot's viscous friction in N·m·s/rad."""
+
+    estimator: str
+    robot: str
+    viscous: float = 0.01
+    prior: str = "zero"
+
+
+SETTINGS = [
+    Setting("lip-chain", "finger-edu"),
+    Setting("lip", "finger-edu"),
+    Setting("lip-chain", "ur5", viscous=0.5),
+    Setting("rigid-body", "ur5", viscous=0.5),
+    Setting("rigid-body+lip-chain", "double-pendulum", prior="urdf"),
+]
+LARGEST = {
+    "inertia_matrix": 0.01,
+    "coriolis": 0.05,
+    "gravity": 0.001,
+    "inertial": 0.005,
+    "friction": 0.01,
+    "kinetic_energy": 0.002,
+    "potential_energy": 0.002,
+    "forward_dynamics": 0.05,
+}
+"""Largest error admitted, relative to the largest value: about three times what was measured."""
+
+
+class Case(NamedTuple):
+    """A model, an unseen motion of its robot, the components there, and what Pinocchio says they are."""
+
+    robot: Robot
+    model: TorqueModel
+    unseen: Samples
+    found: dict[str, dynamics.Estimate]
+    truth: dict[str, np.ndarray]
+
+
+@pytest.fixture(scope="module", params=SETTINGS, ids=lambda setting: f"{setting.estimator} {setting.robot}")
+def case(request: pytest.FixtureRequest) -> Case:
+    setting = request.param
+    robot, options = load_robot(setting.robot), FitOptions(100, max_iterations=150, device="cpu", prior=setting.prior)
+    samples = simulate(robot, Stream(n_samples=150, speed=10, noise=1e-5, viscous=setting.viscous), seed=1)
+    bodies = None
+    if setting.estimator.startswith("rigid-body"):
+        bodies = RigidBody.from_profile(setting.robot, samples.joint_names, robot.joint_types)
+    model = train(samples, robot.joint_types, setting.estimator, options, robot=bodies)
+    unseen = simulate(robot, Stream(n_samples=40, n_sinusoids=100, speed=10, noise=0.0), seed=7)
+    tau = torch.from_numpy(unseen.tau)
+    found = dynamics.components(model, unseen.motion(), dynamics.COMPONENTS, tau)
+    reference = dynamics.reference_posture(model).numpy()
+    return Case(robot, model, unseen, found, truth_of(robot, unseen, reference, setting.viscous))
+
+
+def truth_of(robot: Robot, unseen: Samples, reference: np.ndarray, viscous: float) -> dict[str, np.ndarray]:
+    model, data, rest = robot.model, robot.model.createData(), np.zeros(robot.n_joints)
+    bottom = pin.computePotentialEnergy(model, data, robot.configuration(reference))
+    friction = viscous * unseen.dq
+    rows: dict[str, list[np.ndarray]] = {name: [] for name in dynamics.COMPONENTS}
+    for k in range(len(unseen)):
+        q, v, a = robot.configuration(unseen.q[k]), unseen.dq[k], unseen.ddq[k]
+        upper = np.triu(pin.crba(model, data, q))
+        inertia = upper + np.triu(upper, 1).T
+        gravity = pin.computeGeneralizedGravity(model, data, q).copy()
+        rows["inertia_matrix"].append(inertia)
+        rows["gravity"].append(gravity)
+        rows["coriolis"].append(pin.rnea(model, data, q, v, rest) - gravity)
+        rows["inertial"].append(inertia @ a)
+        rows["friction"].append(friction[k])
+        rows["kinetic_energy"].append(pin.computeKineticEnergy(model, data, q, v))
+        rows["potential_energy"].append(pin.computePotentialEnergy(model, data, q) - bottom)
+        rows["forward_dynamics"].append(pin.aba(model, data, q, v, unseen.tau[k] - friction[k]).copy())
+    return {name: np.array(values) for name, values in rows.items()}
+
+
+@pytest.mark.parametrize("name", dynamics.COMPONENTS)
+def test_components_are_those_of_pinocchio(case: Case, name: str) -> None:
+    estimate, truth = case.found[name], case.truth[name]
+    error, std = np.abs(estimate.mean.numpy() - truth), estimate.std.numpy()
+    size = np.abs(truth).max()
+    inside = float((error <= 4 * std + 1e-9 * size).mean())
+    print(f"\n{name}: error {error.max() / size:.1e}, std {std.max() / size:.1e}, {inside:.0%} in 4 std")  # noqa: T201
+    assert estimate.mean.shape == estimate.std.shape == truth.shape
+    assert error.max() < LARGEST[name] * size
+    assert inside > 0.9
+    assert std.max() > 0
+
+
+def test_parts_sum_to_the_torque(case: Case) -> None:
+    total = sum(case.found[name].mean for name in ("inertial", "coriolis", "gravity", "friction"))
+    torque = case.model.posterior.mean(case.unseen.motion())
+    assert (total - torque).abs().max() < 1e-9 * max(1.0, float(torque.abs().max()))
+
+
+def test_inertia_links_its_kin(case: Case) -> None:
+    """T = ½ dqᵀ M dq, inertial = M ddq, and M is symmetric: all hold for the posterior means."""
+    inertia, motion = case.found["inertia_matrix"], case.unseen.motion()
+    assert (inertia.mean == inertia.mean.mT).all()
+    assert (inertia.std == inertia.std.mT).all()
+    kinetic = 0.5 * torch.einsum("ki,kij,kj->k", motion.dq, inertia.mean, motion.dq)
+    assert (case.found["kinetic_energy"].mean - kinetic).abs().max() < 1e-7 * kinetic.abs().max()
+    inertial = torch.einsum("kij,kj->ki", inertia.mean, motion.ddq)
+    assert (case.found["inertial"].mean - inertial).abs().max() < 1e-7 * inertial.abs().max()
+
+
+def test_forward_dynamics_undoes_the_torque(case: Case) -> None:
+    motion = case.unseen.motion()
+    torque = case.model.posterior.mean(motion)
+    found = dynamics.components(case.model, motion, ["forward_dynamics"], torque)["forward_dynamics"]
+    assert (found.mean - motion.ddq).abs().max() < 1e-5 * motion.ddq.abs().max()
+
+
+@pytest.mark.parametrize("row", [0, 17])
+def test_uncertainty_of_forward_dynamics_is_that_of_its_linearization(case: Case, row: int) -> None:
+    """Through the joint posterior of the torques that make up bias and inertia, and the derivative of the solution."""
+    posterior, motion, n = case.model.posterior, case.unseen.motion()[row : row + 1], case.robot.n_joints
+    tau = torch.from_numpy(case.unseen.tau[row])
+    ddq = torch.cat([torch.zeros((1, n), dtype=torch.float64), torch.eye(n, dtype=torch.float64)])
+    stack = Motion(motion.q.repeat(n + 1, 1), motion.dq.repeat(n + 1, 1), ddq)
+    white = posterior.factor.whiten(posterior.kernel.gram(posterior.params, posterior.motion, stack))
+    covariance = posterior.kernel.symmetric_gram(posterior.params, stack) - white.T @ white
+
+    def solve(torques: torch.Tensor) -> torch.Tensor:
+        inertia = (torques[1:] - torques[0]).T
+        return torch.linalg.solve(inertia, tau - torques[0])
+
+    jacobian = jacrev(solve)(posterior.mean(stack)).reshape(n, -1)
+    expected = (jacobian @ covariance @ jacobian.T).diagonal().sqrt()
+    torch.testing.assert_close(case.found["forward_dynamics"].std[row], expected, rtol=1e-2, atol=0)
+
+
+def test_potential_energy_vanishes_at_its_reference_with_certainty(case: Case) -> None:
+    q = dynamics.reference_posture(case.model)[None]
+    found = dynamics.components(case.model, Motion(q, 0 * q, 0 * q), ["potential_energy", "kinetic_energy"])
+    for estimate in found.values():
+        assert estimate.mean.tolist() == estimate.std.tolist() == [0.0]
+
+
+def test_uncertainty_of_gravity_is_that_of_the_torque_at_standstill_without_friction(case: Case) -> None:
+    q = case.unseen.motion().q
+    terms = [term for name, term in case.model.estimator.terms.items() if name != "friction"]
+    rest = case.model.posterior.predict(Motion(q, 0 * q, 0 * q), SumKernel(*terms))
+    torch.testing.assert_close(case.found["gravity"].mean, rest.mean, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(case.found["gravity"].std, rest.std, rtol=1e-4, atol=1e-9)
+
+
+def test_asking_for_fewer_or_in_smaller_batches_changes_nothing(case: Case) -> None:
+    motion = case.unseen.motion()[:3]
+    for name in dynamics.COMPONENTS:
+        tau = torch.from_numpy(case.unseen.tau[:3]) if name == "forward_dynamics" else None
+        (alone,) = dynamics.components(case.model, motion, [name], tau).values()
+        scale = float(case.found[name].mean.abs().max())
+        torch.testing.assert_close(alone.mean, case.found[name].mean[:3], rtol=1e-6, atol=1e-9 * scale)
+        torch.testing.assert_close(alone.std, case.found[name].std[:3], rtol=1e-3, atol=1e-8 * scale)
+
+
+def test_uncertainty_grows_away_from_the_data(case: Case) -> None:
+    if case.model.robot is not None:
+        pytest.skip("the parameters of rigid bodies are the same everywhere")
+    motion = case.unseen.motion()
+    away = Motion(motion.q + 1.5, motion.dq, motion.ddq)
+    for name, far in dynamics.components(case.model, away, ["inertia_matrix", "gravity", "potential_energy"]).items():
+        assert far.std.mean() > 2 * case.found[name].std.mean(), name
+
+
+def test_names_that_are_not_on_offer(case: Case) -> None:
+    motion = case.unseen.motion()[:1]
+    with pytest.raises(dynamics.UnavailableComponentError, match="component is 'mass', expected one that estimator"):
+        dynamics.components(case.model, motion, ["gravity", "mass"])
+
+
+def test_torque_and_forward_dynamics_come_together(case: Case) -> None:
+    motion, tau = case.unseen.motion()[:2], torch.from_numpy(case.unseen.tau[:2])
+    with pytest.raises(ValueError, match="tau is None, expected a torque for forward_dynamics"):
+        dynamics.components(case.model, motion, ["forward_dynamics"])
+    with pytest.raises(ValueError, match="tau is given, expected None without forward_dynamics"):
+        dynamics.components(case.model, motion, ["gravity"], tau)
+    with pytest.raises(ValueError, match=r"tau has shape \(1, ., expected|tau has shape \(1, .\), expected \(2, .\)"):
+        dynamics.components(case.model, motion, ["forward_dynamics"], tau[:1])
+
+
+def test_motion_of_another_robot_is_refused(case: Case) -> None:
+    q = torch.zeros((1, 5), dtype=torch.float64)
+    with pytest.raises(ValueError, match="motion has 5 joints, expected"):
+        dynamics.components(case.model, Motion(q, q, q), ["gravity"])

@@ -1,0 +1,282 @@
+"""The rigid-body estimators: Pinocchio's dynamics as oracle, what they learn, and what they say of the bodies."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, copy_model, load, save, train
+from lipcore.estimators import make_estimator
+from lipcore.kernels.rigid_body import RigidBodyKernel
+from lipcore.metrics import evaluate
+from lipcore.motion import Motion
+from lipcore.parameters import (
+    friction_coefficients,
+    inertial_parameters,
+    is_plausible,
+    nearest_plausible,
+    pseudo_inertia,
+    weight_posterior,
+)
+from lipcore.robots import load_robot, profile_urdf
+from lipcore.simulation import Stream, simulate
+from lipcore.urdf import JointMismatchError, RigidBody
+
+pin = pytest.importorskip("pinocchio", reason="rigid bodies need Pinocchio")
+
+VISCOUS, COULOMB = 0.5, 0.3
+OPTIONS = FitOptions(hyperparameter_samples=80, max_iterations=60, device="cpu")
+
+
+def permuted(samples: Samples, order: tuple[int, ...]) -> Samples:
+    columns = {name: getattr(samples, name)[:, order] for name in ("q", "dq", "ddq", "tau")}
+    return replace(samples, joint_names=tuple(samples.joint_names[i] for i in order), **columns)
+
+
+def perturbed(urdf: str, seed: int) -> str:
+    """The URDF with every mass and inertia off by up to 40 %."""
+    rng = np.random.default_rng(seed)
+    number = re.compile(r'(<mass value="|\bi[xyz][xyz]=")([^"]+)"')
+    return number.sub(lambda found: f'{found[1]}{float(found[2]) * rng.uniform(0.7, 1.4)}"', urdf)
+
+
+@pytest.fixture(scope="module")
+def panda() -> RigidBody:
+    robot = load_robot("panda")
+    return RigidBody.from_profile("panda", robot.joint_names, robot.joint_types)
+
+
+@pytest.fixture(scope="module")
+def wrong_panda(panda: RigidBody) -> RigidBody:
+    body = RigidBody.from_urdf(perturbed(panda.urdf, 3), panda.joint_names, panda.joint_types)
+    assert np.abs(body.parameters()[:, 0] / panda.parameters()[:, 0] - 1).max() > 0.2
+    return body
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Samples:
+    """300 samples of a moving Panda with friction, its sign as smooth about standstill as the model says."""
+    samples = simulate(load_robot("panda"), Stream(300, speed=10, noise=0.005, viscous=VISCOUS), seed=1)
+    return replace(samples, tau=samples.tau + COULOMB * np.tanh(samples.dq / 0.02))
+
+
+@pytest.fixture(scope="module")
+def unseen() -> Samples:
+    return simulate(load_robot("panda"), Stream(100, speed=10, noise=0.0, n_sinusoids=100), seed=2)
+
+
+@pytest.fixture(scope="module", params=["urdf", "zero"])
+def model(request: pytest.FixtureRequest, recorded: Samples, wrong_panda: RigidBody) -> TorqueModel:
+    options = replace(OPTIONS, prior=request.param)
+    return train(recorded, wrong_panda.joint_types, "rigid-body", options, robot=wrong_panda)
+
+
+@pytest.mark.parametrize("name", ["panda", "kinova", "tiago", "double-pendulum"])
+def test_features_times_the_parameters_of_the_urdf_are_its_dynamics(name: str) -> None:
+    robot = load_robot(name)
+    samples = simulate(robot, Stream(20, speed=10, noise=0.0, motion="full"), seed=4)
+    for order in (tuple(range(robot.n_joints)), tuple(np.random.default_rng(0).permutation(robot.n_joints))):
+        data = permuted(samples, order)
+        body = RigidBody.from_profile(name, data.joint_names, tuple(robot.joint_types[i] for i in order))
+        kernel = RigidBodyKernel(body)
+        assert kernel.features(data.motion()).shape == (20, robot.n_joints, 10 * robot.n_joints)
+        torque = kernel.mean(data.motion()).numpy()
+        assert np.allclose(torque, data.tau, rtol=0, atol=1e-10 * np.abs(data.tau).max())
+
+
+def test_compensated_torques_hold_no_gravity(panda: RigidBody) -> None:
+    robot = load_robot("panda")
+    q = 0.3 * torch.ones((3, 7), dtype=torch.float64)
+    motion, rest = Motion(q, q, 2 * q), Motion(q, 0 * q, 0 * q)
+    kernel = RigidBodyKernel(panda, gravity=False)
+    assert torch.count_nonzero(kernel.mean(rest)) == 0
+    data, x = robot.model.createData(), q[0].numpy()
+    gravity = pin.computeGeneralizedGravity(robot.model, data, x)
+    expected = pin.rnea(robot.model, data, x, x, 2 * x) - gravity
+    assert np.allclose(kernel.mean(motion)[0], expected, atol=1e-10)
+
+
+def test_remembered_features_are_those_of_the_motion_asked_for(panda: RigidBody) -> None:
+    kernel = RigidBodyKernel(panda)
+    motions = [Motion(*torch.full((3, 2, 7), 0.1 * k, dtype=torch.float64)) for k in range(7)]
+    for motion in [*motions, *motions[::-1]]:
+        assert torch.equal(kernel.features(motion), RigidBodyKernel(panda).features(motion))
+
+
+def test_gradient_of_the_prior_scales(panda: RigidBody) -> None:
+    kernel, rng = RigidBodyKernel(panda), np.random.default_rng(5)
+    motion = Motion.from_arrays(*rng.uniform(-1, 1, (3, 2, 7)))
+    weight = torch.from_numpy(rng.standard_normal((14, 14)))
+    params = {"rigid_body.log_scale": torch.tensor([-1.0, 0.5, -2.0], dtype=torch.float64)}
+    slope = kernel.gradient(params, motion, weight + weight.T)["rigid_body.log_scale"]
+    for index in range(3):
+        step = torch.zeros(3, dtype=torch.float64)
+        step[index] = 1e-5
+        value = [
+            float(((weight + weight.T) * kernel.gram({"rigid_body.log_scale": at}, motion, motion)).sum())
+            for at in (params["rigid_body.log_scale"] + step, params["rigid_body.log_scale"] - step)
+        ]
+        assert slope[index] == pytest.approx((value[0] - value[1]) / 2e-5, rel=1e-4)
+
+
+def test_robot_without_mass_needs_the_prior_around_zero(panda: RigidBody) -> None:
+    massless = re.sub(r"<inertial>.*?</inertial>", "", panda.urdf, flags=re.DOTALL)
+    body = RigidBody.from_urdf(massless, panda.joint_names, panda.joint_types)
+    with pytest.raises(ValueError, match="no mass in its URDF, expected inertial parameters or prior 'zero'"):
+        RigidBodyKernel(body)
+    assert RigidBodyKernel(body, "zero").prior_weights() is None
+    with pytest.raises(ValueError, match="prior is 'flat', expected one of urdf, zero"):
+        RigidBodyKernel(body, "flat")
+
+
+def test_rigid_body_motion_is_learnt_from_a_wrong_urdf_and_from_none(model: TorqueModel, unseen: Samples) -> None:
+    # the query leaves friction out: only the bodies' share is compared with Pinocchio's rigid-body torque
+    term = model.estimator.terms["rigid_body"]
+    answer = model.posterior.predict(unseen.motion(), term)
+    noise = model.noise_std
+    figures = evaluate(unseen.tau, answer.mean.numpy(), answer.std.numpy(), 0 * noise)
+    assert (figures.nmse[:6] < 1e-4).all(), figures.nmse
+    assert figures.nmse[6] < 2e-3
+    wrong = RigidBodyKernel(model.robot).mean(unseen.motion()).numpy()
+    assert (evaluate(unseen.tau, wrong, answer.std.numpy(), noise).nmse > 10 * figures.nmse).all()
+
+
+def test_friction_is_recovered(model: TorqueModel) -> None:
+    friction = friction_coefficients(model.posterior, model.estimator)
+    assert (np.abs(friction.viscous - VISCOUS) < 3 * friction.viscous_std).all()
+    assert (np.abs(friction.coulomb - COULOMB) < 3 * friction.coulomb_std).all()
+    assert (friction.viscous_std < 0.1 * VISCOUS).all()
+    assert (friction.coulomb_std < 0.1 * COULOMB).all()
+
+
+def test_weights_give_the_posterior_of_their_term(model: TorqueModel, unseen: Samples) -> None:
+    term = model.estimator.terms["rigid_body"]
+    weights = weight_posterior(model.posterior, term)
+    features = term.features(unseen.motion()[:5]).numpy()
+    answer = model.posterior.predict(unseen.motion()[:5], term)
+    assert np.allclose(features @ weights.mean, answer.mean, atol=1e-6)
+    spread = features @ weights.covariance @ features.transpose(0, 2, 1)
+    assert np.allclose(spread, answer.covariance, rtol=1e-4, atol=1e-8)
+
+
+def test_inertial_parameters_are_plausible_and_as_good(model: TorqueModel, recorded: Samples) -> None:
+    inertia = inertial_parameters(model.posterior, model.estimator)
+    assert inertia.mean.shape == inertia.std.shape == inertia.plausible.shape == (7, 10)
+    assert all(np.linalg.eigvalsh(pseudo_inertia(body))[0] > 0 for body in inertia.plausible)
+    assert inertia.mean_is_plausible == all(is_plausible(body) for body in inertia.mean)
+    features = model.estimator.terms["rigid_body"].features(recorded.motion()).numpy()
+    moved = features @ (inertia.plausible - inertia.mean).reshape(-1)
+    assert (np.sqrt(np.mean(moved**2, axis=0)) < 0.02 * recorded.tau.std(axis=0)).all()
+
+
+def test_pseudo_inertia_is_that_of_pinocchio(panda: RigidBody) -> None:
+    for body in panda.parameters():
+        assert np.allclose(pseudo_inertia(body), pin.PseudoInertia.FromDynamicParameters(body).toMatrix(), atol=1e-12)
+        assert is_plausible(body)
+    assert not is_plausible(np.array([1, 0, 0, 0, 0.1, 0, 0.1, 0, 0, 0.3]))  # breaks the triangle inequality
+    assert not is_plausible(-panda.parameters()[0])
+
+
+def test_plausible_mean_is_its_own_nearest(model: TorqueModel, panda: RigidBody) -> None:
+    weights = weight_posterior(model.posterior, model.estimator.terms["rigid_body"])
+    true = replace(weights, mean=panda.parameters().reshape(-1))
+    found = nearest_plausible(true, model.robot.parameters()).reshape(-1)
+    distance = np.abs(found - true.mean) / weights.std
+    assert distance.max() < 0.5, distance.max()
+
+
+def test_saved_model_comes_back_with_its_robot(model: TorqueModel, unseen: Samples, tmp_path: Path) -> None:
+    manifest = save(model, tmp_path / "model")
+    copy_model(tmp_path / "model", tmp_path / "copy")
+    before = model.predict(unseen.q, unseen.dq, unseen.ddq)
+    for folder in ("model", "copy"):
+        again = load(tmp_path / folder)
+        after = again.predict(unseen.q, unseen.dq, unseen.ddq)
+        assert np.array_equal(before.tau, after.tau)
+        assert np.array_equal(before.covariance, after.covariance)
+        assert again.robot == model.robot
+    assert manifest == json.loads((tmp_path / "copy" / "manifest.json").read_text())
+    robot = manifest["robot"]
+    assert (robot["joints"], robot["matched"]) == (list(model.robot.urdf_joints), "name")
+    assert (robot["sha256"], robot["prior"]) == (model.robot.sha256, model.options["prior"])
+    parameters = manifest["parameters"]
+    assert set(parameters["friction"]) == {"viscous", "coulomb", "offset"}
+    assert [body["joint"] for body in parameters["inertia"]["bodies"]] == list(model.joint_names)
+
+
+def test_changed_robot_of_a_saved_model_is_refused(model: TorqueModel, tmp_path: Path) -> None:
+    save(model, tmp_path / "model")
+    path = tmp_path / "model" / "robot.urdf"
+    text = path.read_text()
+    path.write_text(text.replace("panda", "bandit", 1))
+    with pytest.raises(ModelFormatError, match=r"robot\.urdf does not match the sha256"):
+        load(tmp_path / "model")
+    with pytest.raises(ModelFormatError, match="sha256"):
+        copy_model(tmp_path / "model", tmp_path / "copy")
+    path.unlink()
+    with pytest.raises(ModelFormatError, match=r"robot\.urdf cannot be read"):
+        load(tmp_path / "model")
+
+
+def test_model_that_lost_its_robot_is_refused(model: TorqueModel, tmp_path: Path) -> None:
+    save(model, tmp_path / "model")
+    path = tmp_path / "model" / "manifest.json"
+    manifest = json.loads(path.read_text())
+    path.write_text(json.dumps({name: value for name, value in manifest.items() if name != "robot"}))
+    with pytest.raises(ModelFormatError, match="'rigid-body' needs a robot"):
+        load(tmp_path / "model")
+
+
+def test_robot_of_other_joints_is_refused(panda: RigidBody, recorded: Samples) -> None:
+    other = permuted(recorded, (1, 0, 2, 3, 4, 5, 6))
+    with pytest.raises(JointMismatchError, match=r"built for .* panda_joint1, .*; the data have panda_joint2, "):
+        train(other, panda.joint_types, "rigid-body", OPTIONS, robot=panda)
+
+
+def test_compensated_model_keeps_its_convention(tmp_path: Path) -> None:
+    robot = load_robot("double-pendulum")
+    samples = simulate(robot, Stream(60, speed=10), seed=1)
+    body = RigidBody.from_urdf(profile_urdf("double-pendulum"), robot.joint_names, robot.joint_types)
+    options = replace(OPTIONS, hyperparameter_samples=20, max_iterations=5)
+    model = train(samples, robot.joint_types, "rigid-body", options, "gravity_compensated", robot=body)
+    save(model, tmp_path / "model")
+    query = samples.q[:3], samples.dq[:3], samples.ddq[:3]
+    assert np.array_equal(load(tmp_path / "model").predict(*query).tau, model.predict(*query).tau)
+    zeros = torch.zeros((1, 2), dtype=torch.float64)
+    term = load(tmp_path / "model").estimator.terms["rigid_body"]
+    assert torch.count_nonzero(term.mean(Motion(zeros + 0.5, zeros, zeros))) == 0
+
+
+def test_energies_take_what_rigid_bodies_leave(tmp_path: Path) -> None:
+    """A spring at the elbow is no rigid body, but it is an energy."""
+    robot = load_robot("double-pendulum")
+    body = RigidBody.from_profile("double-pendulum", robot.joint_names, robot.joint_types)
+
+    def spring(samples: Samples) -> Samples:
+        return replace(samples, tau=samples.tau + np.stack([0 * samples.q[:, 1], 0.4 * np.sin(2 * samples.q[:, 1])], 1))
+
+    data = spring(simulate(robot, Stream(150, speed=10, noise=0.001), seed=1))
+    unseen = spring(simulate(robot, Stream(60, speed=10, noise=0.0), seed=2))
+    options = replace(OPTIONS, hyperparameter_samples=60, max_iterations=40)
+    errors = {}
+    for name in ("rigid-body", "rigid-body+lip-chain"):
+        model = train(data, robot.joint_types, name, options, robot=body)
+        answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
+        errors[name] = evaluate(unseen.tau, answer.tau, answer.tau_std, answer.noise_std).nmse[1]
+    assert errors["rigid-body+lip-chain"] < 0.1 * errors["rigid-body"], errors
+
+
+def test_residual_energies_start_small(panda: RigidBody, recorded: Samples) -> None:
+    motion, tau = recorded.motion(), recorded.torque()
+    both = make_estimator("rigid-body+lip-chain", panda.joint_types, robot=panda).terms["energy"]
+    alone = make_estimator("lip-chain", panda.joint_types).terms["energy"]
+    small, large = (
+        float(k.variance(k.initial(motion, tau), motion[:20]).diagonal(dim1=1, dim2=2).mean()) for k in (both, alone)
+    )
+    assert small < 0.05 * large

@@ -1,0 +1,235 @@
+"""Robots: uploading URDFs, what is refused, and training with rigid bodies."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+import pytest
+
+import lipcore
+from lipcore.robots import ROBOTS, load_robot, profile_urdf
+from service.client import ApiError, Client
+from service.models import registry
+from tests.service.data import QUICK, error, post, queue, service_of, stream, train, upload
+from tests.service.data import csv as csv_file
+from tests.service.test_cli import lipserve  # noqa: F401 - a fixture
+
+LINK = '<link name="{}"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
+LINK += "</inertial></link>"
+JOINT = '<joint name="{}" type="{}"><parent link="{}"/><child link="{}"/><axis xyz="0 1 0"/>'
+JOINT += '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
+
+
+def urdf(name="arm", kind="continuous", joints=("joint1", "joint2")):
+    parts = [LINK.format(f"l{i}") for i in range(len(joints) + 1)]
+    parts += [JOINT.format(joint, kind, f"l{i}", f"l{i + 1}") for i, joint in enumerate(joints)]
+    return f'<robot name="{name}">{"".join(parts)}</robot>'.encode()
+
+
+def send(api, body, media_type="application/xml", **params):
+    return api.post("/v1/robots", content=body, headers={"content-type": media_type}, params=params)
+
+
+def added(api, body, **params):
+    answer = send(api, body, **params)
+    assert answer.status_code == 201, answer.text
+    return answer.json()
+
+
+@pytest.fixture(scope="module")
+def panda(api):
+    """A short recording of a Panda with friction."""
+    return upload(api, stream("panda", 60, viscous=0.4), name="panda")
+
+
+@pytest.fixture
+def empty(strict):
+    """The service with small limits, empty of robots."""
+    yield strict
+    while left := strict.get("/v1/robots").json()["items"]:
+        for robot in left:
+            assert strict.delete(f"/v1/robots/{robot['id']}").status_code == 204
+
+
+@pytest.mark.parametrize("media_type", ["application/xml", "text/xml; charset=utf-8", "multipart"])
+def test_an_upload_is_shown_with_its_joints(api, media_type):
+    body = urdf()
+    if media_type == "multipart":
+        answer = api.post("/v1/robots", files={"file": ("arm.urdf", body)})
+    else:
+        answer = send(api, body, media_type)
+    assert answer.status_code == 201, answer.text
+    robot = answer.json()
+    assert robot["id"].startswith("urdf_")
+    assert robot["name"] == "arm"
+    assert robot["joints"] == [{"name": f"joint{i}", "type": "revolute"} for i in (1, 2)]
+    assert robot["sha256"] == hashlib.sha256(body).hexdigest()
+    assert answer.headers["location"] == f"/v1/robots/{robot['id']}"
+    assert api.get(answer.headers["location"]).json() == robot
+
+
+def test_robots_are_paged_and_deleted(empty):
+    robots = [added(empty, urdf(), name=f"arm {i}") for i in range(4)]
+    first = empty.get("/v1/robots").json()
+    assert first["items"] == robots[:0:-1]
+    second = empty.get("/v1/robots", params={"cursor": first["next_cursor"]}).json()
+    assert second == {"items": robots[:1], "next_cursor": None}
+    path = f"/v1/robots/{robots[0]['id']}"
+    assert empty.delete(path).status_code == 204
+    assert "urdf_" in error(empty.get(path), 404, "not_found")["message"]
+    error(empty.delete(path), 404, "not_found")
+
+
+def test_profiles_are_listed(api):
+    assert api.get("/v1/robots/profiles").json() == {"items": list(ROBOTS), "next_cursor": None}
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        (b"", "not well-formed XML"),
+        (b"q1,dq1\n", "not well-formed XML"),
+        (urdf()[:-9], "not well-formed XML"),
+        (urdf().decode().encode("utf-16"), "not text in UTF-8"),
+        (b'<!DOCTYPE r [<!ENTITY a "aa"><!ENTITY b "&a;&a;">]>' + urdf("&amp;b;"), "document type or an entity"),
+        (b'<!DOCTYPE r SYSTEM "file:///etc/passwd">' + urdf(), "document type or an entity"),
+        (urdf(kind="floating"), "joint 'joint1' is of type 'floating': expected a fixed base"),
+        (urdf(joints=()), "no joint that moves"),
+    ],
+)
+def test_a_body_that_is_no_usable_urdf(empty, body, message):
+    said = error(send(empty, body), 422, "invalid_data")
+    assert message in said["message"]
+    assert said["detail"][0]["field"] == "urdf"
+    assert empty.get("/v1/robots").json()["items"] == []
+
+
+def test_uploads_of_other_kinds(empty):
+    error(send(empty, urdf(), "application/json"), 415, "unsupported_media_type")
+    error(empty.post("/v1/robots", files={"file": ("arm.stl", urdf())}), 415, "unsupported_media_type")
+    error(empty.post("/v1/robots", files={"other": ("arm.urdf", urdf())}), 422, "invalid_request")
+
+
+def test_an_upload_that_is_too_large(empty):
+    body = urdf() + b"<!-- " + 5_000 * b"-" + b" -->"
+    assert "5000 bytes" in error(send(empty, body), 413, "too_large")["message"]
+    error(send(empty, (chunk for chunk in [body])), 413, "too_large")
+    assert empty.get("/v1/robots").json()["items"] == []
+
+
+def ask(api, dataset, **request):
+    return api.post("/v1/jobs", json={"model": "refused", "datasets": [dataset], "options": QUICK, **request})
+
+
+def test_jobs_whose_robot_does_not_fit(api, pendulum):
+    before = api.get("/v1/jobs").json()
+    other = added(api, urdf(joints=("shoulder", "elbow")))["id"]
+    sliding = added(api, urdf(kind="prismatic"))["id"]
+    for request, messages in (
+        ({"estimator": "rigid-body"}, ["'rigid-body' needs a robot: a profile such as panda, or a URDF"]),
+        ({"robot": "panda"}, [*ROBOTS["panda"].free, "joint1, joint2"]),
+        ({"robot": other}, ["shoulder, elbow; the data have joint1, joint2"]),
+        ({"robot": sliding}, ["joint 'joint1' is revolute in the data", "is prismatic"]),
+        ({"robot": "r2d2"}, ["robot is 'r2d2', expected one of panda, ur3", "uploaded URDF"]),
+        ({"robot": "urdf_0123456789abcdef"}, ["expected one of panda"]),
+        ({"robot": "double-pendulum", "estimator": "lip-chain"}, ["'lip-chain' takes no robot, only rigid-body"]),
+    ):
+        said = error(ask(api, pendulum["id"], **{"estimator": "rigid-body", **request}), 422, "invalid_request")
+        assert said["detail"][0]["field"] == "robot"
+        assert all(message in said["message"] for message in messages), said["message"]
+    said = error(ask(api, pendulum["id"], estimator="rigid-body", options={"prior": "flat"}), 422, "invalid_request")
+    assert said["detail"][0]["field"] == "options.prior"
+    assert api.get("/v1/jobs").json() == before
+
+
+def test_a_robot_in_use_is_kept(no_worker, empty):
+    dataset, robot = upload(empty, stream())["id"], added(empty, urdf())["id"]
+    job = queue(
+        empty, "waits", dataset, estimator="rigid-body", robot=robot, options={**QUICK, "posterior_samples": 40}
+    )
+    assert job["robot"] == robot
+    assert job["id"] in error(empty.delete(f"/v1/robots/{robot}"), 409, "conflict")["message"]
+    assert empty.post(f"/v1/jobs/{job['id']}/cancel").status_code == 200
+    assert empty.delete(f"/v1/robots/{robot}").status_code == 204
+
+
+def test_a_profile_trains_and_answers(api, panda):
+    """The Panda's own URDF predicts the Panda; its joints are found although the data name them by number."""
+    body = csv_file(table(stream("panda", 60, viscous=0.4)))
+    numbered = post(api, body, "text/csv").json()
+    assert numbered["joint_names"] == [f"joint{i}" for i in range(1, 8)]
+    for dataset, matched in ((panda, "name"), (numbered, "order")):
+        job = train(api, f"rigid-{matched}", dataset["id"], estimator="rigid-body", robot="panda")
+        assert (job["robot"], job["estimator"]) == ("panda", "rigid-body")
+        version = api.get(f"/v1/models/rigid-{matched}/versions/1").json()
+        robot = version["robot"]
+        assert (robot["name"], robot["matched"], robot["prior"]) == ("panda", matched, "urdf")
+        assert robot["joints"] == list(ROBOTS["panda"].free)
+        assert robot["sha256"] == hashlib.sha256(profile_urdf("panda").encode()).hexdigest()
+        assert (np.abs(np.array(version["parameters"]["friction"]["viscous"]["mean"]) - 0.4) < 0.2).all()
+        bodies = version["parameters"]["inertia"]["bodies"]
+        assert [entry["joint"] for entry in bodies] == dataset["joint_names"]
+        assert all(entry["plausible"]["mass"] > 0 for entry in bodies)
+
+    unseen = stream("panda", 20, seed=2, noise=0.0)
+    query = {name: getattr(unseen, name).tolist() for name in ("q", "dq", "ddq")}
+    answer = api.post("/v1/models/rigid-name/predict", json=query).json()
+    error_left = np.array(answer["tau"]) - (unseen.tau + 0.4 * unseen.dq)
+    assert (np.sqrt(np.mean(error_left**2, axis=0))[:4] < 0.01 * unseen.tau.std(axis=0)[:4]).all()
+
+
+def table(samples):
+    """Columns of a recording by number, as CSV has them."""
+    found = {"t": samples.t.tolist()}
+    for name in ("q", "dq", "ddq", "tau"):
+        found |= {f"{name}{i}": column.tolist() for i, column in enumerate(getattr(samples, name).T, start=1)}
+    return found
+
+
+def test_an_uploaded_urdf_trains_as_its_profile_does(api, pendulum):
+    robot = added(api, profile_urdf("double-pendulum").encode(), name="my pendulum")
+    assert [joint["name"] for joint in robot["joints"]] == list(load_robot("double-pendulum").joint_names)
+    for model, name in (("by-upload", robot["id"]), ("by-profile", "double-pendulum")):
+        train(api, model, pendulum["id"], estimator="rigid-body+lip-chain", robot=name)
+    query = {"q": [0.3, -0.2], "dq": [0.1, 0.4], "ddq": [1.0, -0.5]}
+    answers = [
+        api.post(f"/v1/models/{model}/predict", json=query).json()["tau"] for model in ("by-upload", "by-profile")
+    ]
+    assert np.allclose(*answers)
+    assert api.get("/v1/models/by-upload/versions/1").json()["robot"]["name"] == "my pendulum"
+    assert api.delete(f"/v1/robots/{robot['id']}").status_code == 204
+    service = service_of(api)
+    kept = lipcore.load(service.files.versions / registry.find(service.database, "by-upload", 1).folder)
+    assert kept.predict(**query).tau[0].tolist() == answers[0]
+
+
+def test_other_models_show_their_friction_and_no_robot(api, trained):
+    version = api.get(f"/v1/models/{trained.name}/versions/1").json()
+    assert version["robot"] is None
+    assert set(version["parameters"]) == {"friction"}
+    assert len(version["parameters"]["friction"]["coulomb"]["std"]) == 2
+
+
+def test_command_line_and_client(server, lipserve, tmp_path):  # noqa: F811 - the fixture
+    recording, arm = tmp_path / "stream.npz", tmp_path / "arm.urdf"
+    lipserve("simulate", "double-pendulum", recording, "--samples", 60, "--fast")
+    arm.write_text(profile_urdf("double-pendulum"))
+    common = ("train", recording, "--url", server.url, "--model", "by-cli", "--estimator", "rigid-body")
+    for robot in (arm, "double-pendulum"):
+        code, said, wrong = lipserve(*common, "--robot", robot)
+        assert code == 0, wrong
+    assert "by-cli version 2 is trained" in said
+    code, _, wrong = lipserve(*common, "--robot", tmp_path / "missing.urdf")
+    assert code == 1
+    assert "missing.urdf" in wrong
+    with Client(server.url) as client:
+        assert client.version("by-cli", 1).robot["name"] == "2dof_planar"
+        with pytest.raises(ApiError, match="not well-formed"):
+            client.upload_robot(recording_of_text(tmp_path))
+
+
+def recording_of_text(folder):
+    path = folder / "text.urdf"
+    path.write_text("no XML")
+    return path
