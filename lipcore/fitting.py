@@ -179,7 +179,9 @@ def fit(
     )
     lowest = torch.from_numpy(np.log(floor)).to(device)
     params = objective.unpack(result.x)
-    params = noise.refine(kernel, params, motion[used], tau[used], start["noise.log_std"], lowest)
+    # evenly among those of the posterior: spread-out samples are the odd ones
+    even = used[torch.linspace(0, len(used) - 1, min(len(used), noise.SAMPLES), device=device).round().long()]
+    params = noise.refine(kernel, params, motion[even], tau[even], start["noise.log_std"], lowest)
     params = {name: value.cpu() for name, value in params.items()}
     return Fit(params, used.cpu().numpy(), report)
 

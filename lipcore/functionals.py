@@ -31,7 +31,7 @@ def condition(posterior: ExactPosterior, prior_mean: Tensor, prior_variance: Ten
     """
     explained = posterior.factor.whiten(cross).square().sum(0)
     std = (prior_variance - explained).clamp_min(0.0).sqrt()  # rounding may end below zero where all is known
-    return Estimate(prior_mean + posterior.weights @ cross, std)
+    return Estimate(prior_mean + posterior.weights @ cross, posterior.std_factor * std)
 
 
 def combine_torques(

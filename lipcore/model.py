@@ -10,6 +10,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from lipcore.calibration import NO_CALIBRATION, Calibration, calibrate
 from lipcore.estimators import DEFAULT_ESTIMATOR, Estimator, make_estimator
 from lipcore.fitting import Cancelled, FitOptions, Progress, fit
 from lipcore.motion import JointType, Motion, check_finite, check_joint_types
@@ -42,7 +43,7 @@ class TorqueModel:
     """Fitted inverse dynamics of one robot: immutable, safe to share between threads.
 
     motion, tau: the samples that the posterior is conditioned on; fit: what the fit reported, for the manifest;
-    robot: the rigid bodies of an estimator that has them.
+    robot: the rigid bodies of an estimator that has them; calibration: how the posterior's deviations are corrected.
     """
 
     estimator: Estimator
@@ -54,6 +55,7 @@ class TorqueModel:
     tau: Tensor
     posterior: ExactPosterior
     robot: RigidBody | None = None
+    calibration: Calibration = NO_CALIBRATION
 
     @property
     def n_joints(self) -> int:
@@ -113,10 +115,20 @@ def train(
     fitted = fit(chosen.kernel, samples, options, on_progress, cancelled)
     used = samples.rows(fitted.rows)
     motion, tau = used.motion(), used.torque()
-    posterior = ExactPosterior.fit(chosen.kernel, fitted.params, motion, tau)
+    calibration = calibrate(estimator)
+    posterior = ExactPosterior.fit(chosen.kernel, fitted.params, motion, tau, calibration.function_std_factor)
     report = {**asdict(fitted.report), "jitter": posterior.factor.jitter}
     return TorqueModel(
-        chosen, samples.joint_names, types, torque_convention, asdict(options), report, tau, posterior, robot
+        chosen,
+        samples.joint_names,
+        types,
+        torque_convention,
+        asdict(options),
+        report,
+        tau,
+        posterior,
+        robot,
+        calibration,
     )
 
 
@@ -140,6 +152,7 @@ def restore(
     motion: Motion,
     tau: Tensor,
     robot: RigidBody | None = None,
+    calibration: Calibration = NO_CALIBRATION,
 ) -> TorqueModel:
     """Rebuild a model from its parts; the posterior is computed anew from hyperparameters and samples.
 
@@ -155,7 +168,7 @@ def restore(
         wanted = tuple(expected[name]) if name in expected else None
         if found != wanted:
             raise ValueError(f"hyperparameter {name!r} has shape {found}, expected {wanted}")
-    posterior = ExactPosterior.fit(chosen.kernel, params, motion, tau)
+    posterior = ExactPosterior.fit(chosen.kernel, params, motion, tau, calibration.function_std_factor)
     return TorqueModel(
         chosen,
         tuple(joint_names),
@@ -166,4 +179,5 @@ def restore(
         tau,
         posterior,
         robot,
+        calibration,
     )

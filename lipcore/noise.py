@@ -23,6 +23,8 @@ PRIOR_STD = 1.0
 """Width of the prior on the logarithm: a small data set cannot tell noise from misfit."""
 LARGEST_STEP = 0.7
 REFINEMENTS = 3
+SAMPLES = 250
+"""Samples that tell the noise: its estimate is then good to about five per cent."""
 
 
 def start(samples: Samples) -> Array:

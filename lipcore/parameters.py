@@ -84,7 +84,7 @@ def weight_posterior(posterior: ExactPosterior, term: LinearKernel) -> WeightPos
     mean = cross.T @ posterior.weights
     if (centre := term.prior_weights()) is not None:
         mean = mean + centre.to(mean.device)
-    covariance = prior - white.T @ white
+    covariance = posterior.std_factor**2 * (prior - white.T @ white)
     return WeightPosterior(_numpy(mean), _numpy(0.5 * (covariance + covariance.T)), _numpy(prior.diagonal().sqrt()))
 
 

@@ -11,7 +11,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +19,14 @@ import torch
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
+from lipcore.calibration import Calibration
 from lipcore.model import TORQUE_CONVENTIONS, TorqueModel, restore, training_range
 from lipcore.motion import Motion
 from lipcore.parameters import report
 from lipcore.urdf import RigidBody
 
 FORMAT = "lipserve-model"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 MANIFEST, TENSORS, ROBOT = "manifest.json", "model.safetensors", "robot.urdf"
 
 
@@ -54,6 +55,7 @@ def save(model: TorqueModel, folder: Path, lineage: Mapping[str, Any] | None = N
         "noise_std": model.noise_std.tolist(),
         "options": model.options,
         "fit": model.fit,
+        "calibration": asdict(model.calibration),
         "parameters": report(model.posterior, model.estimator),
         "training_range": training_range(model),
         "lineage": dict(lineage or {}),
@@ -96,7 +98,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         raise ModelFormatError(f"{folder / MANIFEST} is not a manifest of format {FORMAT!r}")
     if manifest.get("format_version") != FORMAT_VERSION:
         raise ModelFormatError(f"format_version is {manifest.get('format_version')!r}, expected {FORMAT_VERSION}")
-    kinds = {"estimator": str, "joint_names": list, "joint_types": list, "options": dict, "fit": dict, "tensors": dict}
+    kinds: dict[str, type] = {"estimator": str, "joint_names": list, "joint_types": list}
+    kinds |= dict.fromkeys(("options", "fit", "calibration", "tensors"), dict)
     for name, kind in kinds.items():
         if not isinstance(manifest.get(name), kind):
             raise ModelFormatError(f"{name} is {manifest.get(name)!r}, expected a {kind.__name__}")
@@ -132,6 +135,7 @@ def load(folder: Path) -> TorqueModel:
             Motion(samples["q"], samples["dq"], samples["ddq"]),
             samples["tau"],
             _read_robot(folder, manifest),
+            Calibration(**manifest["calibration"]),
         )
     except ModelFormatError:
         raise

@@ -31,7 +31,8 @@ class Prediction:
 class ExactPosterior:
     """Posterior of f given N noisy torques: K = k(X, X) + R, weights α = K⁻¹ y, with R one variance a joint.
 
-    motion: the N training samples; factor: Cholesky of K, (N n, N n); weights: (N n,), sample by sample.
+    motion: the N training samples; factor: Cholesky of K, (N n, N n); weights: (N n,), sample by sample; std_factor:
+    calibration of every standard deviation that is not noise (see `calibration`).
     """
 
     kernel: TorqueKernel
@@ -39,12 +40,15 @@ class ExactPosterior:
     motion: Motion
     factor: Factor
     weights: Tensor
+    std_factor: float = 1.0
 
     @classmethod
-    def fit(cls, kernel: TorqueKernel, params: Params, motion: Motion, tau: Tensor) -> ExactPosterior:
+    def fit(
+        cls, kernel: TorqueKernel, params: Params, motion: Motion, tau: Tensor, std_factor: float = 1.0
+    ) -> ExactPosterior:
         """Condition the prior on torques tau (N, n) at `motion`; raise NotPositiveDefiniteError if K is singular."""
         factor = cholesky(noisy_gram(kernel, params, motion))
-        return cls(kernel, params, motion, factor, factor.solve((tau - kernel.mean(motion)).reshape(-1)))
+        return cls(kernel, params, motion, factor, factor.solve((tau - kernel.mean(motion)).reshape(-1)), std_factor)
 
     def mean(self, query: Motion, component: TorqueKernel | None = None) -> Tensor:
         """Posterior mean torque, (N, n) N·m; with `component`, a term of the kernel, that term's share of it."""
@@ -62,7 +66,7 @@ class ExactPosterior:
             means.append(kernel.mean(part) + (self.weights @ cross).reshape(-1, n))
             white = self.factor.whiten(cross).reshape(-1, len(part), n)
             explained = torch.einsum("kmi,kmj->mij", white, white)
-            covariances.append(kernel.variance(self.params, part) - explained)
+            covariances.append(self.std_factor**2 * (kernel.variance(self.params, part) - explained))
         return Prediction(torch.cat(means), torch.cat(covariances))
 
 

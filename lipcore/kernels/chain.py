@@ -1,7 +1,7 @@
 """The serial-chain LIP kernel: each link's kinetic energy prior holds only what a serial chain can produce.
 
-In the frame of link l its twist is Σ_a v_a Ad(q_{a+1}..q_l) ξ_a: the column of joint a moves with joints a+1..l alone and
-is affine in their cosines and sines. So T_l has the kernel h_l² with
+In the frame of link l its twist is Σ_a v_a Ad(q_{a+1}..q_l) ξ_a: the column of joint a moves with joints a+1..l alone
+and is affine in their cosines and sines. So T_l has the kernel h_l² with
 
     h_l = Σ_{a≤l} w_{l,a} v_a v'_a R_{l,a},   R_{l,a} = Π_{a<b≤l} p_b(q_b, q'_b)
 
@@ -24,25 +24,24 @@ from lipcore.kernels.base import Params, State
 from lipcore.kernels.compiled import Array, CompiledKernel, arrays, inner
 from lipcore.kernels.compiled_chain import chain_gradient, chain_gram
 from lipcore.kernels.energy import potential_blocks, potential_energy_torque
-from lipcore.kernels.polynomial import BaseKernels, Derivatives, base_kernels, product
+from lipcore.kernels.polynomial import BaseKernels, Derivatives, base_kernels, chain_sum
+from lipcore.kernels.weights import PRIOR_STD as WEIGHTS_PRIOR_STD
+from lipcore.kernels.weights import initial_weights, velocity_weights
 from lipcore.motion import JointType, Motion, check_joint_types
 
-INERTIA_PER_TORQUE = 0.1
-"""d / g for an arm half a metre long, kg·m² per N·m."""
-import os, json
-WIDTHS = {"kinetic.log_scale": 2.0, "kinetic.log_link": 1.0, "kinetic.log_joint": 1.0, "kinetic.log_gap": 1.0, "kinetic.log_deviation": 0.7, "kinetic.logits": 2.0}
-WIDTHS |= json.loads(os.environ.get("W","{}"))
+SHARE = 2 / 3
+"""α of a rotation about an axis that is as likely along as across: E[R c · R'c] = (1 + 2 cos(q − q')) / 3 · |c|²."""
+PRIOR_STD = {"chain.logits": 2.0, "potential.log_scales": 2.0, **WEIGHTS_PRIOR_STD}
 
 
 class ChainKernel(CompiledKernel):
-    """Potential energy over all joints plus one kinetic energy a link of a serial chain.
+    """One potential and one kinetic energy a link of a serial chain.
 
-    Hyperparameters: `potential.log_scale` (), `potential.logits` (n,), `kinetic.logits` (n,): logits of each joint's
-    share α, with σ = 1 − α. The velocity weights are log w_{l,a} = s + s_l + u_a + g_{l−a} + δ_{l,a}: `kinetic.log_scale`
-    (), `kinetic.log_link` (n,), `kinetic.log_joint` (n,), `kinetic.log_gap` (n,), how levers grow with the number of
-    joints in between, and `kinetic.log_deviation` (n (n+1) / 2,), what is particular to a link and a joint. A weight that
-    the data say little of is thus guessed from its neighbours instead of fitted to zero, which would make the model too
-    sure of itself.
+    Link l's potential has the kernel s_l Π_{b≤l} p_b. The same joints turn gravity and the twists, so both energies
+    share the p_b; the first joint turns gravity alone.
+
+    Hyperparameters: `chain.logits` (n,), logits of each joint's share α, with σ = 1 − α; `potential.log_scales` (n,),
+    log s_l; and those of `weights.velocity_weights`.
     """
 
     def __init__(self, joint_types: Sequence[str]) -> None:
@@ -51,83 +50,60 @@ class ChainKernel(CompiledKernel):
 
     def blocks(self, params: Params, x: State, y: State) -> Tensor:
         """Covariance of torque i at x with torque j at y: (n, n, *batch), (N·m)²."""
-        chain = _Chain.build(self._base(params["kinetic.logits"], x, y), self.weights(params), x, y)
+        chain = _Chain.build(self._base(params["chain.logits"], x, y), self.weights(params), x, y)
         return potential_blocks(self.potential(params, x, y)) + chain.blocks().movedim((-2, -1), (0, 1))
 
     def compiled_gram(self, params: Params, x: Motion, y: Motion, symmetric: bool) -> Array:
         """Gram matrix (N, n, M, n)."""
-        tensors = self._arguments(params)
-        return chain_gram(*arrays(x), *arrays(y), self._prismatic(), *_numbers(tensors), symmetric)
+        alpha, weights, scales = _contiguous(self._arguments(params))
+        return chain_gram(*arrays(x), *arrays(y), self._prismatic(), alpha, weights, scales, symmetric)
 
     def compiled_gradient(self, leaves: Params, x: Motion, weight: Array) -> Tensor:
         """Scalar whose derivatives by `leaves` are those of Σ weight ∘ gram(x, x)."""
-        tensors = self._arguments(leaves)
-        derivatives = chain_gradient(*arrays(x), *arrays(x), self._prismatic(), *_numbers(tensors), True, weight)
-        return inner(tensors, list(derivatives))
+        tensors, both = self._arguments(leaves), (*arrays(x), *arrays(x))
+        alpha, weights, scales = _contiguous(tensors)
+        return inner(tensors, list(chain_gradient(*both, self._prismatic(), alpha, weights, scales, True, weight)))
 
     def _prismatic(self) -> NDArray[np.bool_]:
         return np.array([kind == "prismatic" for kind in self.joint_types])
 
     def _arguments(self, params: Params) -> list[Tensor]:
-        """Kinetic α (n,) and weights (n, n), potential α (n,) and scale ()."""
-        kinetic, potential = torch.sigmoid(params["kinetic.logits"]), torch.sigmoid(params["potential.logits"])
-        return [kinetic, self.weights(params), potential, torch.exp(params["potential.log_scale"])]
+        """Shares α (n,), velocity weights (n, n) and scales of the potentials (n,)."""
+        return [torch.sigmoid(params["chain.logits"]), self.weights(params), torch.exp(params["potential.log_scales"])]
 
     def potential(self, params: Params, x: State, y: State) -> Derivatives:
         """Kernel of the potential energy V and its derivatives."""
-        k, scale = product(self._base(params["potential.logits"], x, y)), torch.exp(params["potential.log_scale"])
-        return Derivatives(scale * k.value, scale * k.left, scale * k.right, scale * k.mixed)
+        return chain_sum(self._base(params["chain.logits"], x, y), torch.exp(params["potential.log_scales"]))
 
     def energies(self, params: Params, x: State, y: State) -> Tensor:
         """Covariance of the kinetic and the potential energy at x with torque j at y: (2, n, *batch), J·N·m."""
         potential = potential_energy_torque(self.potential(params, x, y))
-        chain = _Chain.build(self._base(params["kinetic.logits"], x, y), self.weights(params), x, y)
+        chain = _Chain.build(self._base(params["chain.logits"], x, y), self.weights(params), x, y)
         return torch.stack([chain.energy_torque().movedim(-1, 0), potential])
 
     def energy_covariance(self, params: Params, x: State, y: State) -> Tensor:
         """Covariance of the kinetic energies at x and y, Σ_l h_l², and of the potential ones: (2, *batch), J²."""
-        chain = _Chain.build(self._base(params["kinetic.logits"], x, y), self.weights(params), x, y)
+        chain = _Chain.build(self._base(params["chain.logits"], x, y), self.weights(params), x, y)
         h = (chain.weights * chain.r * (chain.v * chain.v2)[..., None, :]).sum(-1)
         return torch.stack([h.square().sum(-1), self.potential(params, x, y).value])
 
     def weights(self, params: Params) -> Tensor:
         """Velocity weights w_{l,a} as a lower triangular matrix (n, n)."""
-        n = self.n_joints
-        rows, columns = torch.tril_indices(n, n)
-        log_weights = (
-            params["kinetic.log_scale"]
-            + params["kinetic.log_link"][rows]
-            + params["kinetic.log_joint"][columns]
-            + params["kinetic.log_gap"][rows - columns]
-            + params["kinetic.log_deviation"]
-        )
-        full = torch.zeros((n, n), dtype=log_weights.dtype, device=log_weights.device)
-        return full.index_put((rows, columns), torch.exp(log_weights))
+        return velocity_weights(params, self.n_joints)
 
     def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
-        """Potential torques as large as the measured ones; inertia as arms have it that weigh as much.
-
-        An arm of length d that needs the torque m g d against gravity has an inertia near m d², and levers grow with the
-        joints in between.
-        """
-        n = self.n_joints
+        """Potential torques as large as the measured ones; inertia as arms have it that weigh as much."""
         power = tau.square().mean(0).clamp_min(1e-12)
-        ratio = torch.log((power / power.max()).clamp_min(1e-6))
-        zeros = torch.zeros(n, dtype=torch.float64, device=tau.device)
-        return {
-            "potential.log_scale": torch.log(power.max() * 3),
-            "potential.logits": ratio,
-            "kinetic.logits": zeros,
-            "kinetic.log_scale": torch.log(INERTIA_PER_TORQUE * power.max().sqrt() / n),
-            "kinetic.log_link": zeros,
-            "kinetic.log_joint": zeros,
-            "kinetic.log_gap": zeros,
-            "kinetic.log_deviation": zeros.new_zeros(n * (n + 1) // 2),
-        }
+        # variance of the gravity torque at joint i: α_i Σ_{l≥i} s_l
+        moved = power.flip(0).cummax(0).values.flip(0) / SHARE
+        scales = torch.maximum(moved - torch.cat([moved[1:], moved.new_zeros(1)]), 0.1 * moved)
+        logits = torch.full_like(power, SHARE).logit()
+        logits[0] = (SHARE * power[0] / power.max()).clamp_min(1e-6).logit()  # mostly a vertical axis
+        return {"chain.logits": logits, "potential.log_scales": torch.log(scales), **initial_weights(tau)}
 
     def prior_std(self) -> dict[str, float]:
         """How far the weights may stray from their pattern, and the pattern from its start."""
-        return WIDTHS
+        return dict(PRIOR_STD)
 
     def _base(self, logits: Tensor, x: State, y: State) -> BaseKernels:
         alpha = torch.sigmoid(logits)
@@ -136,9 +112,8 @@ class ChainKernel(CompiledKernel):
         return base_kernels(shares, self.joint_types, x.q, y.q)
 
 
-def _numbers(arguments: list[Tensor]) -> tuple[Array, Array, Array, float]:
-    kinetic, weights, potential, scale = (part.detach().numpy() for part in arguments)
-    return kinetic, weights, potential, float(scale)
+def _contiguous(arguments: list[Tensor]) -> list[Array]:
+    return [np.ascontiguousarray(part.detach().numpy()) for part in arguments]
 
 
 @dataclass(frozen=True)
@@ -186,14 +161,16 @@ class _Chain:
             rows.append([torch.cat([part, zero[b + 1 :]]) for part in row])
         full = [torch.stack([link[k] for link in rows]).movedim((0, 1), (-2, -1)) for k in range(4)]
         between = [torch.cat([torch.zeros_like(part[..., :1, :]), part[..., :-1, :]], dim=-2) for part in full[:3]]
-        vectors = (part.movedim(0, -1) for part in (v, a, v2, a2, left, right, mixed))
-        return cls(*vectors, weights, *full, *between)
+        v, a, v2, a2, left, right, mixed = (part.movedim(0, -1) for part in (v, a, v2, a2, left, right, mixed))
+        return cls(v, a, v2, a2, left, right, mixed, weights, *full, *between)
 
     def blocks(self) -> Tensor:
         """T'_j T_i Σ_l h_l², with T_i = d/dt ∂/∂v_i − ∂/∂q_i: (*batch, n, n).
 
         For one link, with e_i = T_i h, f_j = T'_j h, u_i = ∂h/∂v_i and dots and primes for time derivatives along the
-        first and second argument: 2 [e fᵀ + e' (∂'_v h)ᵀ + u ḟᵀ + u' (∂'_v ḣ)ᵀ + h T'e + h' ∂'_v e + ḣ T'u + ḣ' ∂'_v u].
+        first and second argument:
+
+            2 [e fᵀ + e' (∂'_v h)ᵀ + u ḟᵀ + u' (∂'_v ḣ)ᵀ + h T'e + h' ∂'_v e + ḣ T'u + ḣ' ∂'_v u]
         """
         w, r, r1, r2 = self.weights, self.r, self.r1, self.r2
         v, a, v2, a2 = (part[..., None, :] for part in (self.v, self.a, self.v2, self.a2))
@@ -225,9 +202,9 @@ class _Chain:
         above = right_i * left * self.m * cross - v2 * (
             (mixed_i * v_i * rw + right_i * upper) * self.m + right_i * rw * self.m1
         )
-        diagonal = (
-            h[..., None] * g12 + dh2[..., None] * g1 + dh[..., None] * g2 + ddh[..., None] * g
-        ).sum(-2) + self.mixed * cross.diagonal(dim1=-2, dim2=-1)
+        diagonal = (h[..., None] * g12 + dh2[..., None] * g1 + dh[..., None] * g2 + ddh[..., None] * g).sum(
+            -2
+        ) + self.mixed * cross.diagonal(dim1=-2, dim2=-1)
         return 2 * (rank_one + below + above.mT + torch.diag_embed(diagonal))
 
     def energy_torque(self) -> Tensor:

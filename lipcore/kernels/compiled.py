@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 class CompiledKernel(PairKernel):
-    """A pair kernel whose Gram matrices and gradients are compiled; on other devices than the CPU torch does the work."""
+    """A pair kernel whose Gram matrices and gradients are compiled; on devices other than the CPU torch does it all."""
 
     @abstractmethod
     def compiled_gram(self, params: Params, x: Motion, y: Motion, symmetric: bool) -> Array:

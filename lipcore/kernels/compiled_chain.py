@@ -46,10 +46,9 @@ class _Samples(NamedTuple):
 class _Hyper(NamedTuple):
     """Hyperparameters, or the sums of the derivatives by them, which have an axis of lanes more."""
 
-    kinetic_alpha: Array
+    alpha: Array
     weights: Array
-    potential_alpha: Array
-    scale: Array
+    scales: Array
 
 
 class _Work(NamedTuple):
@@ -65,11 +64,10 @@ class _Work(NamedTuple):
     e: Four  # of one link: e, e', u', u̇' in the notation of `chain`, (n,)
     f: Four  # of one link: f, u, ḟ, u̇, (n,)
     kinetic: Array  # half the kinetic block, (n, n)
-    potential_base: Four  # (n,)
     before: Array  # Π_{b<i} p_b, (n,)
-    after: Array  # Π_{b>i} p_b, (n,)
+    after: Array  # Σ_{l≥i} s_l Π_{i<b≤l} p_b, (n,)
     between: Array  # Π_{i<b<j} p_b, (n, n)
-    potential: Array  # the potential block over its scale, (n, n)
+    potential: Array  # the potential block, (n, n)
 
 
 def chain_gram(
@@ -80,20 +78,20 @@ def chain_gram(
     v2: Array,
     a2: Array,
     prismatic: NDArray[np.bool_],
-    kinetic_alpha: Array,
+    alpha: Array,
     weights: Array,
-    potential_alpha: Array,
-    potential_scale: float,
+    scales: Array,
     symmetric: bool,
 ) -> Array:
     """Covariance of torque i of sample k with torque j of sample m: (N, n, M, n) at (k, i, m, j), (N·m)².
 
     q, v, a: (N, n); q2, v2, a2: (M, n); prismatic: (n,), the other joints are revolute. Base kernels are
-    1 − α + α cos(q − q') or 1 − α + α q q', with kinetic_alpha and potential_alpha (n,). weights: (n, n), w_{l,a} in
-    the lower triangle. symmetric: both arguments are the same samples; half the work, exactly symmetric.
+    1 − α + α cos(q − q') or 1 − α + α q q', α of each joint, (n,). weights: (n, n), w_{l,a} in the
+    lower triangle; scales: (n,), s_l of the potential's Σ_l s_l Π_{b≤l} p_b. symmetric: both arguments are the same
+    samples; half the work, exactly symmetric.
     """
     x, y = _samples(q, v, a, prismatic), _columns(_samples(q2, v2, a2, prismatic))
-    hyper = _Hyper(kinetic_alpha, weights, potential_alpha, np.array([potential_scale]))
+    hyper = _Hyper(alpha, weights, scales)
     n = q.shape[1]
     out = np.empty((len(q), n, len(q2), n))
     _gram(x, y, hyper, symmetric, _work(n), out)
@@ -108,24 +106,23 @@ def chain_gradient(
     v2: Array,
     a2: Array,
     prismatic: NDArray[np.bool_],
-    kinetic_alpha: Array,
+    alpha: Array,
     weights: Array,
-    potential_alpha: Array,
-    potential_scale: float,
+    scales: Array,
     symmetric: bool,
     weight: Array,
-) -> tuple[Array, Array, Array, float]:
-    """Derivative of Σ weight ∘ `chain_gram` by kinetic_alpha, weights, potential_alpha and potential_scale.
+) -> tuple[Array, Array, Array]:
+    """Derivative of Σ weight ∘ `chain_gram` by alpha, weights and scales.
 
     weight: (N, n, M, n); if symmetric, a symmetric matrix, and only pairs m ≥ k are computed.
     """
     x, y = _samples(q, v, a, prismatic), _columns(_samples(q2, v2, a2, prismatic))
-    hyper = _Hyper(kinetic_alpha, weights, potential_alpha, np.array([potential_scale]))
+    hyper = _Hyper(alpha, weights, scales)
     n = q.shape[1]
-    sums = _Hyper(*(np.zeros((*shape, LANES)) for shape in ((n,), (n, n), (n,), (1,))))
+    sums = _Hyper(*(np.zeros((*shape, LANES)) for shape in ((n,), (n, n), (n,))))
     _gradient(x, y, hyper, symmetric, _work(n), _work(n), np.ascontiguousarray(weight), sums)
     total = [part.sum(-1) for part in sums]
-    return total[0], total[1], total[2], float(total[3][0])
+    return total[0], total[1], total[2]
 
 
 def _samples(q: Array, v: Array, a: Array, prismatic: NDArray[np.bool_]) -> _Samples:
@@ -167,7 +164,6 @@ def _work(n: int) -> _Work:
         e=four(n),
         f=four(n),
         kinetic=zeros(n, n),
-        potential_base=four(n),
         before=zeros(n),
         after=zeros(n),
         between=zeros(n, n),
@@ -178,7 +174,6 @@ def _work(n: int) -> _Work:
 @compiled
 def _gram(x: _Samples, y: _Samples, hyper: _Hyper, symmetric: bool, work: _Work, out: Array) -> None:
     rows, size = out.shape[0], out.shape[2]
-    scale = hyper.scale[0]
     # blocks of columns outside: the mirrored blocks then follow each other in memory
     for block in range(y.v.shape[0]):
         start = block * LANES
@@ -186,7 +181,7 @@ def _gram(x: _Samples, y: _Samples, hyper: _Hyper, symmetric: bool, work: _Work,
             _forward(x, k, y, block, hyper, work)
             _kinetic_blocks(hyper.weights, x.v[k], x.a[k], y.v[block], y.a[block], work)
             first = max(0, k - start) if symmetric else 0
-            _write(work.kinetic, work.potential, scale, k, start, first, min(LANES, size - start), symmetric, out)
+            _write(work.kinetic, work.potential, k, start, first, min(LANES, size - start), symmetric, out)
 
 
 @compiled
@@ -202,16 +197,16 @@ def _gradient(
             _clear(back)
             first = max(0, k - start) if symmetric else 0
             _read(weight, k, start, first, min(LANES, size - start), symmetric, back.potential)
-            _weigh(back.potential, work.potential, hyper.scale, back.kinetic, sums.scale)
-            _potential_adjoint(work.potential_base, work.before, work.after, work.between, back)
-            _share_adjoint(work.unit, back.potential_base, sums.potential_alpha)
+            back.kinetic[:] = 2 * back.potential
+            _potential_adjoint(work.base, work.before, work.after, work.between, back)
+            sums.scales[:] += back.after
 
             _coupling_adjoint(v, v2, work.base, work.r, work.s, work.c, back)
             _links_adjoint(hyper.weights, v, a, v2, a2, work, back, sums.weights)
             _tail_adjoint(hyper.weights, work, back, sums.weights)
             _head_adjoint(hyper.weights, v, a, v2, a2, work, back, sums.weights)
             _jet_adjoint(v, v2, back.jet, back.base)
-            _share_adjoint(work.unit, back.base, sums.kinetic_alpha)
+            _share_adjoint(work.unit, back.base, sums.alpha)
 
 
 @compiled
@@ -219,10 +214,9 @@ def _forward(x: _Samples, k: int, y: _Samples, block: int, hyper: _Hyper, work: 
     """Everything but the kinetic blocks, for sample k of x and one block of y."""
     v, a, v2, a2 = x.v[k], x.a[k], y.v[block], y.a[block]
     _unit(x.x1[k], x.x2[k], x.d1[k], x.d2[k], y.x1[block], y.x2[block], y.d1[block], y.d2[block], work.unit)
-    _share(work.unit, hyper.potential_alpha, work.potential_base)
-    _products(work.potential_base[0], work.before, work.after, work.between)
-    _potential_blocks(work.potential_base, work.before, work.after, work.between, work.potential)
-    _share(work.unit, hyper.kinetic_alpha, work.base)
+    _share(work.unit, hyper.alpha, work.base)
+    _products(work.base[0], hyper.scales, work.before, work.after, work.between)
+    _potential_blocks(work.base, work.before, work.after, work.between, work.potential)
     _jet(work.base, v, v2, work.jet)
     _head(hyper.weights, v, a, v2, a2, work.jet, work.r, work.b)
     _tail(hyper.weights, work.jet, work.b, work.s, work.c)
@@ -238,13 +232,13 @@ def _kinetic_blocks(w: Array, v: Array, a: Array, v2: Array, a2: Array, work: _W
 
 @inlined
 def _write(
-    kinetic: Array, potential: Array, scale: float, k: int, start: int, first: int, last: int, mirror: bool, out: Array
+    kinetic: Array, potential: Array, k: int, start: int, first: int, last: int, mirror: bool, out: Array
 ) -> None:
     n = kinetic.shape[0]
     for lane in range(first, last):
         for i in range(n):
             for j in range(n):
-                value = 2 * kinetic[i, j, lane] + scale * potential[i, j, lane]
+                value = 2 * kinetic[i, j, lane] + potential[i, j, lane]
                 out[k, i, start + lane, j] = value
                 if mirror:
                     out[start + lane, j, k, i] = value
@@ -262,25 +256,11 @@ def _read(weight: Array, k: int, start: int, first: int, last: int, mirrored: bo
                 out[i, j, lane] = count * weight[k, i, column, j]
 
 
-@inlined
-def _weigh(weight: Array, potential: Array, scale: Array, dkinetic: Array, dscale: Array) -> None:
-    """From the pairs' weights to the derivatives by both blocks; that by the potential one replaces the weights."""
-    n = weight.shape[0]
-    for i in range(n):
-        for j in range(n):
-            for s in range(LANES):
-                value = weight[i, j, s]
-                dscale[0, s] += value * potential[i, j, s]
-                dkinetic[i, j, s] = 2 * value
-                weight[i, j, s] = scale[0] * value
-
-
 @compiled
 def _clear(back: _Work) -> None:
     """Set to zero what the adjoints add to."""
     for k in range(4):
         back.base[k][:] = 0.0
-        back.potential_base[k][:] = 0.0
         back.jet[k][:] = 0.0
         back.r[k][:] = 0.0
         back.b[k][:] = 0.0
@@ -401,15 +381,15 @@ def _set(out: Four, i: int, j: int, value: float) -> None:
 
 
 @inlined
-def _products(p: Array, before: Array, after: Array, between: Array) -> None:
+def _products(p: Array, scales: Array, before: Array, after: Array, between: Array) -> None:
     n = p.shape[0]
     before[0] = 1.0
-    after[n - 1] = 1.0
+    after[n - 1] = scales[n - 1]
     for b in range(n - 1):
         for s in range(LANES):
             before[b + 1, s] = before[b, s] * p[b, s]
         for s in range(LANES):
-            after[n - 2 - b, s] = after[n - 1 - b, s] * p[n - 1 - b, s]
+            after[n - 2 - b, s] = scales[n - 2 - b] + after[n - 1 - b, s] * p[n - 1 - b, s]
         between[b, b + 1] = 1.0
         for j in range(b + 1, n - 1):
             for s in range(LANES):
@@ -418,7 +398,7 @@ def _products(p: Array, before: Array, after: Array, between: Array) -> None:
 
 @inlined
 def _potential_blocks(base: Four, before: Array, after: Array, between: Array, out: Array) -> None:
-    """∂²K/∂q_i∂q'_j of K = Π_b p_b."""
+    """∂²K/∂q_i∂q'_j of K = Σ_l s_l Π_{b≤l} p_b."""
     _, left, right, mixed = base
     for i in range(before.shape[0]):
         for s in range(LANES):
@@ -440,12 +420,12 @@ def _potential_adjoint(base: Four, before: Array, after: Array, between: Array, 
         after,
         between,
         back.potential,
-        back.potential_base,
+        back.base,
         back.before,
         back.after,
         back.between,
     )
-    _products_adjoint(base[0], before, after, between, back.before, back.after, back.between, back.potential_base[0])
+    _products_adjoint(base[0], before, after, between, back.before, back.after, back.between, back.base[0])
 
 
 @inlined

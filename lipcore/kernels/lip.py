@@ -19,16 +19,17 @@ from lipcore.kernels.energy import (
     potential_energy_torque,
 )
 from lipcore.kernels.polynomial import Derivatives, base_kernels, product
+from lipcore.kernels.weights import PRIOR_STD, initial_weights, velocity_weights
 from lipcore.motion import JointType, Motion, check_joint_types
 
 
 class LipKernel(CompiledKernel):
     """Potential energy over all joints plus one kinetic energy a link, each over the joints that move it.
 
-    Hyperparameters: `potential.log_scale` (); `potential.logits` (n, 2); for link i of 1..n `kinetic.<i>.log_weights`
-    (i,) velocity weights w and `kinetic.<i>.logits` (i, 2). Logits give each joint's shares (σ, α, β), which sum to
-    one: the energies' scale lives in `log_scale` and `log_weights` alone. With `tied` all links share one
-    `kinetic.logits` (n, 2): fewer parameters to overfit with; without, every link has its own as in the paper.
+    Hyperparameters: `potential.log_scale` (); `potential.logits` (n, 2); `kinetic.<i>.logits` (i, 2) of link i in 1..n;
+    and those of `weights.velocity_weights`. Logits give each joint's shares (σ, α, β), which sum to one: the energies'
+    scale lives in the scale and the weights alone. With `tied` all links share one `kinetic.logits` (n, 2): fewer
+    parameters to overfit with; without, every link has its own as in the paper.
     """
 
     def __init__(self, joint_types: Sequence[str], tied: bool = True) -> None:
@@ -42,7 +43,7 @@ class LipKernel(CompiledKernel):
         for link in range(1, self.n_joints + 1):
             kinetic = kinetic_blocks(
                 self.kinetic(params, link, x, y),
-                torch.exp(params[f"kinetic.{link}.log_weights"]),
+                self.weights(params)[link - 1, :link],
                 x.first(link),
                 y.first(link),
             )
@@ -51,13 +52,16 @@ class LipKernel(CompiledKernel):
 
     def compiled_gram(self, params: Params, x: Motion, y: Motion, symmetric: bool) -> Array:
         """Gram matrix (N, n, M, n)."""
-        tensors = self._arguments(params)
-        return lip_gram(*arrays(x), *arrays(y), self._prismatic(), *_numbers(tensors), symmetric)
+        kinetic, weights, potential, scale = (part.detach().numpy() for part in self._arguments(params))
+        return lip_gram(*arrays(x), *arrays(y), self._prismatic(), kinetic, weights, potential, float(scale), symmetric)
 
     def compiled_gradient(self, leaves: Params, x: Motion, weight: Array) -> Tensor:
         """Scalar whose derivatives by `leaves` are those of Σ weight ∘ gram(x, x)."""
-        tensors = self._arguments(leaves)
-        derivatives = lip_gradient(*arrays(x), *arrays(x), self._prismatic(), *_numbers(tensors), True, weight)
+        tensors, both = self._arguments(leaves), (*arrays(x), *arrays(x))
+        kinetic, weights, potential, scale = (part.detach().numpy() for part in tensors)
+        derivatives = lip_gradient(
+            *both, self._prismatic(), kinetic, weights, potential, float(scale), symmetric=True, weight=weight
+        )
         return inner(tensors, list(derivatives))
 
     def _prismatic(self) -> NDArray[np.bool_]:
@@ -67,13 +71,16 @@ class LipKernel(CompiledKernel):
         """Kinetic shares (n, n, 3) and weights (n, n), link by link; potential shares (n, 3) and scale ()."""
         n = self.n_joints
         logits = params["potential.logits"].new_zeros((n, n, 2))
-        weights = logits.new_zeros((n, n))
         for link in range(1, n + 1):
             own = params["kinetic.logits"] if self.tied else params[f"kinetic.{link}.logits"]
             logits[link - 1, : len(own)] = own
-            weights[link - 1, :link] = torch.exp(params[f"kinetic.{link}.log_weights"])
         kinetic = shares(logits.reshape(n * n, 2)).reshape(n, n, 3)
-        return [kinetic, weights, shares(params["potential.logits"]), torch.exp(params["potential.log_scale"])]
+        return [
+            kinetic,
+            self.weights(params),
+            shares(params["potential.logits"]),
+            torch.exp(params["potential.log_scale"]),
+        ]
 
     def potential(self, params: Params, x: State, y: State) -> Derivatives:
         """Kernel of the potential energy V and its derivatives."""
@@ -92,7 +99,7 @@ class LipKernel(CompiledKernel):
         potential = potential_energy_torque(self.potential(params, x, y))
         kinetic = torch.zeros_like(potential)
         for link in range(1, self.n_joints + 1):
-            weights = torch.exp(params[f"kinetic.{link}.log_weights"])
+            weights = self.weights(params)[link - 1, :link]
             position = self.kinetic(params, link, x, y)
             kinetic[:link] += kinetic_energy_torque(position, weights, x.first(link), y.first(link))
         return torch.stack([kinetic, potential])
@@ -102,38 +109,35 @@ class LipKernel(CompiledKernel):
         potential = self.potential(params, x, y).value
         kinetic = torch.zeros_like(potential)
         for link in range(1, self.n_joints + 1):
-            weights = torch.exp(params[f"kinetic.{link}.log_weights"]).reshape((-1,) + (1,) * (x.q.dim() - 1))
+            weights = self.weights(params)[link - 1, :link].reshape((-1,) + (1,) * (x.q.dim() - 1))
             h = (weights * x.v[:link] * y.v[:link]).sum(0)
             kinetic = kinetic + self.kinetic(params, link, x, y).value * h * h
         return torch.stack([kinetic, potential])
 
     def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
-        """Potential torques as large as the measured ones, joint by joint; inertial torques a third of that."""
+        """Potential torques as large as the measured ones; inertia as arms have it that weigh as much."""
         n = self.n_joints
         power = tau.square().mean(0).clamp_min(1e-12)
-        acceleration = motion.ddq.square().mean(0).sqrt().clamp_min(1e-3)
-        weights = (power.sqrt() / 3 / acceleration).clamp(1e-3, 10.0) / n**0.5
         # a joint's potential torque grows with its share α or β: start them at the ratio of the torques
         ratio = torch.log((power / power.max()).clamp_min(1e-6))
-        params = {
+        kinetic = {"kinetic.logits": n} if self.tied else {f"kinetic.{link}.logits": link for link in range(1, n + 1)}
+        return {
             "potential.log_scale": torch.log(power.max() * 3),
             "potential.logits": torch.stack([ratio, ratio], dim=1),
+            **{name: torch.zeros((size, 2), dtype=tau.dtype, device=tau.device) for name, size in kinetic.items()},
+            **initial_weights(tau),
         }
-        if self.tied:
-            params["kinetic.logits"] = torch.zeros((n, 2), dtype=torch.float64, device=tau.device)
-        for link in range(1, n + 1):
-            params[f"kinetic.{link}.log_weights"] = torch.log(weights[:link])
-            if not self.tied:
-                params[f"kinetic.{link}.logits"] = torch.zeros((link, 2), dtype=torch.float64, device=tau.device)
-        return params
+
+    def weights(self, params: Params) -> Tensor:
+        """Velocity weights w_{l,a} as a lower triangular matrix (n, n)."""
+        return velocity_weights(params, self.n_joints)
+
+    def prior_std(self) -> dict[str, float]:
+        """Weights are pooled between links and joints; a share may stray far from its start."""
+        return dict(PRIOR_STD)
 
 
 def shares(logits: Tensor) -> Tensor:
     """Softmax of (0, logits): (n, 2) to the shares (σ, α, β) of each joint, (n, 3)."""
     zero = torch.zeros_like(logits[:, :1])
     return torch.softmax(torch.cat([zero, logits], dim=1), dim=1)
-
-
-def _numbers(arguments: list[Tensor]) -> tuple[Array, Array, Array, float]:
-    kinetic, weights, potential, scale = (part.detach().numpy() for part in arguments)
-    return kinetic, weights, potential, float(scale)

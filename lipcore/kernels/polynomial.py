@@ -94,3 +94,21 @@ def product(base: BaseKernels) -> Derivatives:
         right = torch.cat([right * p, (value * trail)[None]], dim=0)
         value = value * p
     return Derivatives(value, left, right, mixed)
+
+
+def chain_sum(base: BaseKernels, scales: Tensor) -> Derivatives:
+    """Σ_l s_l Π_{b≤l} p_b with derivatives, from tip to base: K ← p_b (s_b + K). scales: s, (n,)."""
+    last = base.value.shape[0] - 1
+    scale = scales[last]
+    value = scale * base.value[last]
+    left, right, mixed = scale * base.left[last:], scale * base.right[last:], scale * base.mixed[last:, None]
+    for b in range(last - 1, -1, -1):
+        p, lead, trail, both = base.value[b], base.left[b], base.right[b], base.mixed[b]
+        inner = scales[b] + value
+        upper = torch.cat([(inner * both)[None], right * lead], dim=0)
+        lower = torch.cat([(left * trail)[:, None], mixed * p], dim=1)
+        mixed = torch.cat([upper[None], lower], dim=0)
+        left = torch.cat([(inner * lead)[None], left * p], dim=0)
+        right = torch.cat([(inner * trail)[None], right * p], dim=0)
+        value = inner * p
+    return Derivatives(value, left, right, mixed)

@@ -29,6 +29,9 @@ class Version(BaseModel):
     training_range: dict[str, dict[str, list[float]]] = Field(description="Where the samples lie that it stands on")
     options: dict[str, Any]
     fit: dict[str, Any] = Field(description="What the fit reported")
+    calibration: dict[str, Any] = Field(
+        description="`function_std_factor`: what `tau_std` was multiplied by so that intervals hold on unseen motion"
+    )
     lineage: dict[str, Any] = Field(description="Data sets with their hashes, and when it was trained")
     robot: dict[str, Any] | None = Field(None, description="The URDF of an estimator with rigid bodies, and its prior")
     parameters: dict[str, Any] | None = Field(

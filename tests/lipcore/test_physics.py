@@ -131,7 +131,9 @@ def test_inertia_is_that_of_pinocchio(trained: Trained) -> None:
 
 def test_gravity_is_that_of_pinocchio(trained: Trained) -> None:
     q = trained.unseen.q[::10]
-    learnt = dynamics.gravity(trained.model.posterior, trained.model.estimator.terms["energy"], torch.from_numpy(q)).numpy()
+    learnt = dynamics.gravity(
+        trained.model.posterior, trained.model.estimator.terms["energy"], torch.from_numpy(q)
+    ).numpy()
     model, data = trained.robot.model, trained.robot.model.createData()
     expected = [pin.computeGeneralizedGravity(model, data, trained.robot.configuration(x)) for x in q]
     assert np.abs(learnt - expected).max() < trained.case.gravity * np.abs(expected).max()

@@ -38,7 +38,7 @@ def test_version(lipserve):
 def test_help_lists_the_commands(lipserve):
     code, said, _ = lipserve("--help")
     assert code == 0
-    for command in ("serve", "simulate", "train", "predict", "demo"):
+    for command in ("serve", "simulate", "train", "predict", "demo", "reproduce"):
         assert command in said
 
 
