@@ -30,6 +30,9 @@ TOLERANCE = 1e-7
 """The fit has converged when an iteration improves the objective by less than this share of it."""
 MEMORY = 30
 """Corrections that L-BFGS keeps."""
+SCREENING_SAMPLES, SCREENING_ITERATIONS = 60, 15
+START_SPREAD = 0.3
+"""How far other starts lie from the kernel's own, in widths of the prior."""
 
 
 class FitCancelledError(RuntimeError):
@@ -41,13 +44,15 @@ class FitOptions:
     """How to fit.
 
     hyperparameter_samples: samples that hyperparameters are fitted on; posterior_samples: samples the posterior is
-    conditioned on, where there are more the most spread-out ones; tied: links share kernel shapes (see LipKernel);
+    conditioned on, where there are more the most spread-out ones; starts: points that the search for hyperparameters is
+    tried from, the best of which is followed; tied: links share kernel shapes (see LipKernel);
     device: "cpu", "cuda" or "auto"; prior: of rigid bodies, "urdf" or "zero" (see RigidBodyKernel).
     """
 
     hyperparameter_samples: int = 150
     posterior_samples: int = 500
     max_iterations: int = 150
+    starts: int = 3
     tied: bool = True
     device: str = "auto"
     prior: str = "urdf"
@@ -57,6 +62,7 @@ class FitOptions:
             ("hyperparameter_samples", 10, 2000),
             ("posterior_samples", 10, 5000),
             ("max_iterations", 1, 10000),
+            ("starts", 1, 100),
         ):
             value = getattr(self, name)
             if type(value) is not int or not low <= value <= high:
@@ -87,14 +93,19 @@ class FitProgress:
 
 @dataclass(frozen=True)
 class FitReport:
-    """What a fit did. objective: penalised −log evidence at the end; rejected_steps: line-search points whose
-    covariance could not be factored; seconds: wall time of the hyperparameters' fit."""
+    """What a fit did.
+
+    objective: penalised −log evidence at the end; rejected_steps: line-search points whose covariance could not be
+    factored; start: number of the start that was followed, 0 for the kernel's own; seconds: wall time of the
+    hyperparameters' fit.
+    """
 
     objective: float
     iterations: int
     evaluations: int
     rejected_steps: int
     converged: bool
+    start: int
     samples_given: int
     samples_hyperparameters: int
     samples_posterior: int
@@ -129,68 +140,84 @@ def fit(
     """
     device = options.torch_device()
     motion, tau = samples.motion(device), samples.torque(device)
+    floor = torch.from_numpy(np.log(noise.floor(samples))).to(device)
     start = kernel.initial(motion, tau)
-    floor = noise.floor(samples)
-    start["noise.log_std"] = torch.from_numpy(np.log(np.maximum(noise.start(samples), floor))).to(device)
+    start["noise.log_std"] = torch.maximum(torch.from_numpy(np.log(noise.start(samples))).to(device), floor)
+    stop = cancelled or (lambda: False)
     rows = spread_out(motion, options.hyperparameter_samples)
-    objective = _Objective(kernel, start, motion[rows], tau[rows], cancelled or (lambda: False))
+    search = _Search(kernel, start, floor, motion[rows], tau[rows], stop)
 
     began, iteration = time.monotonic(), 0
+
+    def report_progress(stage: str, objective: float) -> None:
+        if on_progress is not None:
+            done, most, elapsed = iteration, options.max_iterations, time.monotonic() - began
+            fraction = 0.95 * (1.0 if stage == "posterior" else iteration / most)
+            on_progress(FitProgress(stage, done, most, objective, fraction, elapsed))
 
     def callback(intermediate_result: Any) -> None:
         nonlocal iteration
         iteration += 1
-        if on_progress is not None:
-            on_progress(
-                FitProgress(
-                    "hyperparameters",
-                    iteration,
-                    options.max_iterations,
-                    float(intermediate_result.fun),
-                    0.95 * iteration / options.max_iterations,
-                    time.monotonic() - began,
-                )
-            )
+        report_progress("hyperparameters", float(intermediate_result.fun))
 
-    result = minimize(
-        objective,
-        objective.pack(start),
-        jac=True,
-        method="L-BFGS-B",
-        callback=callback,
-        bounds=objective.bounds({"noise.log_std": np.log(floor)}),
-        options={"maxiter": options.max_iterations, "maxcor": MEMORY, "ftol": TOLERANCE},
-    )
+    few = spread_out(motion, SCREENING_SAMPLES)
+    screening = _Search(kernel, start, floor, motion[few], tau[few], stop)
+    chosen, origin = _best_start(screening, options.starts)
+    result = search.run(origin, options.max_iterations, callback)
     seconds = time.monotonic() - began
-    if on_progress is not None:
-        on_progress(FitProgress("posterior", iteration, options.max_iterations, float(result.fun), 0.95, seconds))
+    report_progress("posterior", float(result.fun))
+
     used = spread_out(motion, options.posterior_samples)
+    # evenly among those of the posterior: spread-out samples are the odd ones
+    even = used[torch.linspace(0, len(used) - 1, min(len(used), noise.SAMPLES), device=device).round().long()]
+    params = search.unpack(result.x)
+    params = noise.refine(kernel, params, motion[even], tau[even], start["noise.log_std"], floor)
     report = FitReport(
         objective=float(result.fun),
         iterations=int(result.nit),
-        evaluations=objective.evaluations,
-        rejected_steps=objective.rejected,
+        evaluations=search.evaluations,
+        rejected_steps=search.rejected,
         converged=bool(result.success),
+        start=chosen,
         samples_given=len(samples),
         samples_hyperparameters=len(rows),
         samples_posterior=len(used),
         seconds=seconds,
         device=device.type,
     )
-    lowest = torch.from_numpy(np.log(floor)).to(device)
-    params = objective.unpack(result.x)
-    # evenly among those of the posterior: spread-out samples are the odd ones
-    even = used[torch.linspace(0, len(used) - 1, min(len(used), noise.SAMPLES), device=device).round().long()]
-    params = noise.refine(kernel, params, motion[even], tau[even], start["noise.log_std"], lowest)
-    params = {name: value.cpu() for name, value in params.items()}
-    return Fit(params, used.cpu().numpy(), report)
+    return Fit({name: value.cpu() for name, value in params.items()}, used.cpu().numpy(), report)
 
 
-class _Objective:
+def _best_start(screening: _Search, starts: int) -> tuple[int, Array]:
+    """Return which of several starts leads to the best evidence of few samples in few steps, and where it led.
+
+    The first is the kernel's own, the others are drawn from the prior. A poor optimum mostly shows early, and few samples
+    cost little: this finds it before the long search.
+    """
+    rng = np.random.default_rng(0)
+    centre, width = screening.pack(screening.start), screening.pack(screening.width_tensors())
+    best, found, origin = np.inf, 0, centre
+    for number in range(starts):
+        begin = centre if number == 0 else centre + START_SPREAD * width * rng.standard_normal(len(centre))
+        screening.best = np.inf
+        try:
+            result = screening.run(begin, SCREENING_ITERATIONS)
+        except NotPositiveDefiniteError:
+            if number == 0 and starts == 1:
+                raise
+            continue
+        if result.fun < best:
+            best, found, origin = float(result.fun), number, result.x
+    return found, origin
+
+
+class _Search:
     """Penalised negative log evidence as a function of one flat vector, for scipy."""
 
-    def __init__(self, kernel: TorqueKernel, start: Params, motion: Motion, tau: Tensor, cancelled: Cancelled) -> None:
-        self.kernel, self.start, self.motion, self.tau = kernel, start, motion, tau
+    def __init__(
+        self, kernel: TorqueKernel, start: Params, floor: Tensor, motion: Motion, tau: Tensor, cancelled: Cancelled
+    ) -> None:
+        self.kernel, self.start, self.floor, self.motion, self.tau = kernel, start, floor, motion, tau
         self.widths = {name: prior_std(name) for name in start} | kernel.prior_std()
         self.cancelled = cancelled
         self.evaluations = self.rejected = 0
@@ -217,10 +244,28 @@ class _Objective:
         self.best = min(self.best, value)
         return value, self.pack(gradient)
 
-    def bounds(self, lower: dict[str, Array]) -> list[tuple[float, float]]:
-        """Bounds of the flat vector: from below where `lower` names a hyperparameter, none elsewhere."""
-        limits = [lower.get(name, np.full(like.numel(), -np.inf)) for name, like in self.start.items()]
-        return [(float(low), np.inf) for low in np.concatenate(limits)]
+    def run(self, begin: Array, iterations: int, callback: Callable[..., None] | None = None) -> Any:
+        """Minimise by L-BFGS-B from `begin`; scipy's result. The noise stays above its floor."""
+        lower = self.pack({name: torch.full_like(value, -np.inf) for name, value in self.start.items()})
+        lowest = self.pack({**self.start, "noise.log_std": self.floor})
+        lower = np.where(self._is_noise(), lowest, lower)
+        return minimize(
+            self,
+            np.maximum(begin, lower),
+            jac=True,
+            method="L-BFGS-B",
+            callback=callback,
+            bounds=[(low, np.inf) for low in lower.tolist()],
+            options={"maxiter": iterations, "maxcor": MEMORY, "ftol": TOLERANCE},
+        )
+
+    def width_tensors(self) -> dict[str, Tensor]:
+        """Width of the prior of every hyperparameter."""
+        return {name: torch.full_like(value, self.widths[name]) for name, value in self.start.items()}
+
+    def _is_noise(self) -> NDArray[np.bool_]:
+        flags = {name: torch.full_like(value, float(name == "noise.log_std")) for name, value in self.start.items()}
+        return self.pack(flags) > 0
 
     def pack(self, params: Params) -> Array:
         return np.concatenate([params[name].detach().cpu().numpy().ravel() for name in self.start])

@@ -37,6 +37,18 @@ def shares_of(logits: Tensor) -> Tensor:
     return parts / parts.sum(1, keepdim=True)
 
 
+def pooled_weight(params: Mapping[str, Tensor], link: int, joint: int) -> Tensor:
+    """w_{l,a} of link l and joint a ≤ l, both counted from 0: five logarithms added up."""
+    before = sum(range(link + 1))  # deviations run link by link, a link's first joint first
+    return torch.exp(
+        params["kinetic.log_scale"]
+        + params["kinetic.log_link"][link]
+        + params["kinetic.log_joint"][joint]
+        + params["kinetic.log_gap"][link - joint]
+        + params["kinetic.log_deviation"][before + joint]
+    )
+
+
 def lip_energies(joint_types: Sequence[str], params: Mapping[str, Tensor]) -> list[Energy]:
     """Energies of the paper: the potential over all joints, then one kinetic energy for each link."""
     potential_shares = shares_of(params["potential.logits"])
@@ -50,7 +62,7 @@ def lip_energies(joint_types: Sequence[str], params: Mapping[str, Tensor]) -> li
 
     energies = [Energy(potential, -1)]
     for link in range(1, len(joint_types) + 1):
-        weights = torch.exp(params[f"kinetic.{link}.log_weights"])
+        weights = torch.stack([pooled_weight(params, link - 1, joint) for joint in range(link)])
         logits = params["kinetic.logits"] if "kinetic.logits" in params else params[f"kinetic.{link}.logits"]
         link_shares = shares_of(logits)
 
@@ -65,6 +77,45 @@ def lip_energies(joint_types: Sequence[str], params: Mapping[str, Tensor]) -> li
 
         energies.append(Energy(kinetic, +1))
     return energies
+
+
+def chain_base_kernel(kind: str, alpha: Tensor, q: Tensor, q2: Tensor) -> Tensor:
+    """p(q, q') of one joint of a chain, which has no zero where it is revolute."""
+    return 1 - alpha + alpha * (torch.cos(q - q2) if kind == "revolute" else q * q2)
+
+
+def chain_energies(joint_types: Sequence[str], params: Mapping[str, Tensor]) -> list[Energy]:
+    """Energies of a serial chain: the potentials of all links added up, then one kinetic energy for each link."""
+    n, scales = len(joint_types), torch.exp(params["potential.log_scales"])
+    alpha = 1 / (1 + torch.exp(-params["chain.logits"]))
+
+    def base(b: int, q: Tensor, q2: Tensor) -> Tensor:
+        return chain_base_kernel(joint_types[b], alpha[b], q[b], q2[b])
+
+    def potential(q: Tensor, v: Tensor, q2: Tensor, v2: Tensor) -> Tensor:
+        total = torch.zeros((), dtype=q.dtype)
+        for link in range(n):
+            value = scales[link]
+            for b in range(link + 1):
+                value = value * base(b, q, q2)
+            total = total + value
+        return total
+
+    def kinetic_of(link: int) -> Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]:
+        weights = [pooled_weight(params, link, joint) for joint in range(link + 1)]
+
+        def kinetic(q: Tensor, v: Tensor, q2: Tensor, v2: Tensor) -> Tensor:
+            total = torch.zeros((), dtype=q.dtype)
+            for joint, weight in enumerate(weights):
+                term = weight * v[joint] * v2[joint]
+                for b in range(joint + 1, link + 1):
+                    term = term * base(b, q, q2)
+                total = total + term
+            return total**2
+
+        return kinetic
+
+    return [Energy(potential, -1), *(Energy(kinetic_of(link), +1) for link in range(n))]
 
 
 def lagrange(lagrangian: Callable[[Tensor, Tensor], Tensor], q: Tensor, v: Tensor, a: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import NamedTuple
 
@@ -13,47 +13,25 @@ from torch import Tensor
 
 from lipcore import TorqueModel, dynamics
 from lipcore.estimators import make_estimator
-from lipcore.kernels.chain import ChainKernel
 from lipcore.kernels.friction import SIGN_WIDTH
 from lipcore.model import restore
 from lipcore.motion import Motion
-from tests.lipcore.oracles import Energy, Instant, energy_torque, instant, lip_energies, torque_terms
+from tests.lipcore.oracles import (
+    Energy,
+    Instant,
+    chain_energies,
+    energy_torque,
+    instant,
+    lip_energies,
+    torque_terms,
+)
 
 TYPES = ("revolute", "prismatic")
 N, SAMPLES, QUERIES = 2, 3, 2
 JOINT_NAMES = ("a", "b")
 
 
-def chain_energies(params: dict[str, Tensor]) -> list[Energy]:
-    """Energies of a serial chain, DESIGN §2: Π p_b and, a link, (Σ_a w_a v_a v'_a Π_{b>a} p_b)²."""
-    weights = ChainKernel(TYPES).weights(params)
-
-    def base(logits: str, b: int, q: Tensor, q2: Tensor) -> Tensor:
-        alpha = torch.sigmoid(params[logits][b])
-        return 1 - alpha + alpha * (torch.cos(q[b] - q2[b]) if TYPES[b] == "revolute" else q[b] * q2[b])
-
-    def potential(q: Tensor, v: Tensor, q2: Tensor, v2: Tensor) -> Tensor:
-        value = torch.exp(params["potential.log_scale"])
-        for b in range(N):
-            value = value * base("potential.logits", b, q, q2)
-        return value
-
-    def link(last: int) -> Callable[..., Tensor]:
-        def kinetic(q: Tensor, v: Tensor, q2: Tensor, v2: Tensor) -> Tensor:
-            total = torch.zeros((), dtype=torch.float64)
-            for a in range(last + 1):
-                term = weights[last, a] * v[a] * v2[a]
-                for b in range(a + 1, last + 1):
-                    term = term * base("kinetic.logits", b, q, q2)
-                total = total + term
-            return total**2
-
-        return kinetic
-
-    return [Energy(potential, -1), *(Energy(link(last), +1) for last in range(N))]
-
-
-ENERGIES = {"lip": lambda params: lip_energies(TYPES, params), "lip-chain": chain_energies}
+ENERGIES = {"lip": lip_energies, "lip-chain": chain_energies}
 
 
 class Case(NamedTuple):
@@ -75,7 +53,7 @@ def case(request: pytest.FixtureRequest) -> Case:
     params = {name: torch.from_numpy(np.asarray(rng.uniform(-1, 0.5, value.shape))) for name, value in like.items()}
     params["noise.log_std"] = torch.tensor([-1.5, -2.0], dtype=torch.float64)
     model = restore(request.param, JOINT_NAMES, TYPES, "gravity_included", {}, {}, params, motion, tau)
-    energies = ENERGIES[request.param](params)
+    energies = ENERGIES[request.param](TYPES, params)
     data = samples(model)
     noise = np.tile(np.exp(2 * params["noise.log_std"].numpy()), SAMPLES)
     gram = torque_covariance(energies, data, data) + friction_covariance(params, data, data) + np.diag(noise)

@@ -10,10 +10,10 @@ import torch
 from scipy.stats import multivariate_normal
 
 from lipcore.evidence import negative_log_evidence
-from lipcore.kernels.base import Params, SumKernel
+from lipcore.kernels.base import Params, SumKernel, TorqueKernel
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.linalg import NotPositiveDefiniteError
-from tests.lipcore.problems import Problem, random_problem
+from tests.lipcore.problems import KERNELS, Problem, TorchForm, random_problem
 
 SAMPLES = 9
 STEP = 1e-4
@@ -27,10 +27,10 @@ class Setting(NamedTuple):
     tau: np.ndarray
 
 
-@pytest.fixture(scope="module", params=[True, False], ids=["tied", "untied"])
+@pytest.fixture(scope="module", params=KERNELS)
 def setting(request: pytest.FixtureRequest) -> Setting:
     joints = ("revolute", "prismatic", "revolute")
-    problem = random_problem(joints, SAMPLES, seed=7, tied=request.param)
+    problem = random_problem(joints, SAMPLES, seed=7, kernel=request.param)
     tau = np.random.default_rng(8).normal(size=(SAMPLES, 3))
     return Setting(problem, SumKernel(problem.kernel, FrictionKernel(3)), tau)
 
@@ -53,13 +53,16 @@ def test_value_is_the_gaussian_density(setting: Setting) -> None:
     assert evidence(setting).value == pytest.approx(density(setting, setting.problem.params), rel=1e-10)
 
 
-@pytest.mark.parametrize("pairs", [4096, 30], ids=["one chunk", "many chunks"])
+@pytest.mark.parametrize("pairs", [None, 4096, 30], ids=["compiled", "one chunk", "many chunks"])
 def test_gradient_equals_finite_differences_of_the_density(
-    setting: Setting, pairs: int, monkeypatch: pytest.MonkeyPatch
+    setting: Setting, pairs: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # with many chunks the pairs below the diagonal blocks are only counted, not computed
-    monkeypatch.setattr("lipcore.kernels.base.PAIRS_PER_CHUNK", pairs)
-    gradient = evidence(setting).gradient
+    energies: TorqueKernel = setting.problem.kernel
+    if pairs is not None:
+        # with many chunks the pairs below the diagonal blocks are only counted, not computed
+        monkeypatch.setattr("lipcore.kernels.base.PAIRS_PER_CHUNK", pairs)
+        energies = TorchForm(setting.problem.kernel)
+    gradient = evidence(setting._replace(kernel=SumKernel(energies, FrictionKernel(3)))).gradient
     params = setting.problem.params
     assert gradient.keys() == params.keys()
 

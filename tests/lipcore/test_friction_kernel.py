@@ -6,7 +6,6 @@ import math
 
 import torch
 
-from lipcore.kernels.base import State
 from lipcore.kernels.friction import SIGN_WIDTH, FrictionKernel, friction_features
 from lipcore.motion import Motion
 from tests.lipcore.problems import random_problem
@@ -20,14 +19,14 @@ def test_block_is_the_covariance_of_independent_weights_on_the_features() -> Non
     problem = random_problem(("revolute", "prismatic", "revolute"), samples=4, seed=1)
     motion, std = problem.motion, torch.exp(problem.params["friction.log_std"])
     motion = Motion(motion.q, 0.02 * motion.dq, motion.ddq)  # slow enough for the sign to turn over
-    blocks = FrictionKernel(3).blocks(problem.params, State.rows(motion), State.columns(motion))
+    gram = FrictionKernel(3).gram(problem.params, motion, motion).reshape(4, 3, 4, 3)
     for x in range(4):
         for y in range(4):
             for i in range(3):
                 for j in range(3):
                     one, two = features(float(motion.dq[x, i])), features(float(motion.dq[y, j]))
                     expected = sum(float(std[i, f]) ** 2 * one[f] * two[f] for f in range(3)) if i == j else 0.0
-                    assert math.isclose(float(blocks[i, j, x, y]), expected, rel_tol=1e-12, abs_tol=1e-14)
+                    assert math.isclose(float(gram[x, i, y, j]), expected, rel_tol=1e-12, abs_tol=1e-14)
 
 
 def test_sign_is_smooth_at_standstill_and_full_beyond() -> None:

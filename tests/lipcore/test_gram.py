@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -9,7 +10,7 @@ from hypothesis import given
 from lipcore.kernels.base import PAIRS_PER_CHUNK, State, SumKernel, row_chunks
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.kernels.lip import LipKernel
-from tests.lipcore.problems import Problem, problems, random_problem
+from tests.lipcore.problems import KERNELS, Problem, TorchForm, problems, random_problem
 
 JOINTS = ("revolute", "prismatic", "revolute")
 
@@ -31,6 +32,23 @@ def test_symmetric_gram_is_the_gram_and_exactly_symmetric(problem: Problem) -> N
     assert (symmetric - gram).abs().max() <= 1e-13 * gram.abs().max()
 
 
+@pytest.mark.parametrize("name", KERNELS)
+def test_torch_form_of_a_compiled_kernel_is_the_kernel(name: str) -> None:
+    problem = random_problem(JOINTS, samples=9, seed=4, kernel=name)
+    kernel, params, motion = problem.kernel, problem.params, problem.motion
+    weight = torch.from_numpy(np.random.default_rng(0).normal(size=(27, 27)))
+    grams, symmetric, gradients = [], [], []
+    for form in (kernel, TorchForm(kernel)):
+        grams.append(form.gram(params, motion[:4], motion))
+        symmetric.append(form.symmetric_gram(params, motion))
+        gradients.append(form.gradient(params, motion, weight + weight.T))
+    for one, other in (grams, symmetric):
+        assert (one - other).abs().max() <= 1e-13 * one.abs().max()
+    assert gradients[0].keys() == gradients[1].keys()
+    for key, one in gradients[0].items():
+        assert (one - gradients[1][key]).abs().max() <= 1e-11 * max(1.0, float(one.abs().max())), key
+
+
 def test_rows_and_columns_run_sample_by_sample() -> None:
     problem = random_problem(JOINTS, samples=5, seed=0)
     kernel, params, motion = problem.kernel, problem.params, problem.motion
@@ -46,7 +64,7 @@ def test_rows_and_columns_run_sample_by_sample() -> None:
 @pytest.mark.parametrize("pairs", [1, 7, 20, 10**6])
 def test_results_do_not_depend_on_the_chunk_size(pairs: int, monkeypatch: pytest.MonkeyPatch) -> None:
     problem = random_problem(JOINTS, samples=11, seed=1)
-    kernel, params, motion = problem.kernel, problem.params, problem.motion
+    kernel, params, motion = TorchForm(problem.kernel), problem.params, problem.motion
     gram, symmetric = kernel.gram(params, motion[:4], motion), kernel.symmetric_gram(params, motion)
     monkeypatch.setattr("lipcore.kernels.base.PAIRS_PER_CHUNK", pairs)
     tolerance = {"rtol": 1e-12, "atol": 1e-13 * float(gram.abs().max())}
@@ -61,9 +79,9 @@ def test_chunks_cover_all_rows_once_and_stay_small() -> None:
         assert all((c.stop - c.start) * columns <= max(PAIRS_PER_CHUNK, columns) for c in chunks)
 
 
-@pytest.mark.parametrize("tied", [True, False])
-def test_variance_is_the_diagonal_of_the_gram(tied: bool) -> None:
-    problem = random_problem(JOINTS, samples=6, seed=2, tied=tied)
+@pytest.mark.parametrize("name", KERNELS)
+def test_variance_is_the_diagonal_of_the_gram(name: str) -> None:
+    problem = random_problem(JOINTS, samples=6, seed=2, kernel=name)
     kernel = SumKernel(problem.kernel, FrictionKernel(3))
     gram = kernel.gram(problem.params, problem.motion, problem.motion)
     blocks = torch.stack([gram[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(6)])

@@ -2,44 +2,23 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
-from torch import Tensor
 
-from lipcore.kernels.base import State
 from lipcore.kernels.lip import LipKernel, shares
 from lipcore.motion import Motion
-from tests.lipcore.oracles import base_kernel, energy_torque, instant, lip_energies, scale_of, shares_of, torque_terms
+from tests.lipcore.agreement import RELATIVE, opposite, worst_block_error, worst_energy_error
+from tests.lipcore.oracles import base_kernel, shares_of
 from tests.lipcore.problems import Problem, lip_shapes, problems, random_problem
 
-RELATIVE = 1e-10
-
-
-def worst_block_error(problem: Problem, pairs: Sequence[tuple[int, int]] = ((0, 0), (0, 1))) -> float:
-    """Largest error over pairs of samples, relative to `scale_of` their terms."""
-    kernel, params, motion = problem.kernel, problem.params, problem.motion
-    blocks = kernel.blocks(params, State.rows(motion), State.columns(motion))
-    energies = lip_energies(kernel.joint_types, params)
-    worst = 0.0
-    for i, j in pairs:
-        x, y = instant(motion, i), instant(motion, j)
-        terms = torque_terms(energies, x, y)
-        error = float((blocks[:, :, i, j] - terms.sum(0)).abs().max())
-        worst = max(worst, error / scale_of(energies, x, y, terms))
-    return worst
-
-
-@given(problems())
+@given(problems(kernels=("tied", "untied")))
 def test_blocks_equal_automatic_differentiation_for_drawn_robots(problem: Problem) -> None:
     assert worst_block_error(problem) < RELATIVE
 
 
-@pytest.mark.parametrize("tied", [True, False])
+@pytest.mark.parametrize("kernel", ["tied", "untied"])
 @pytest.mark.parametrize(
     "joint_types",
     [
@@ -52,17 +31,8 @@ def test_blocks_equal_automatic_differentiation_for_drawn_robots(problem: Proble
     ],
     ids=lambda kinds: "".join(kind[0] for kind in kinds),
 )
-def test_blocks_equal_automatic_differentiation(joint_types: tuple[str, ...], tied: bool) -> None:
-    assert worst_block_error(random_problem(joint_types, samples=2, seed=len(joint_types), tied=tied)) < RELATIVE
-
-
-def opposite(kind: str, share: Tensor, q: float) -> float:
-    """The position q' at which the base kernel p(q, q') is zero."""
-    sigma, alpha, beta = share.tolist()
-    if kind == "prismatic":
-        return -(sigma + beta) / (alpha * q)
-    cosine, sine = alpha * math.cos(q), beta * math.sin(q)
-    return math.atan2(sine, cosine) + math.acos(-sigma / math.hypot(cosine, sine))
+def test_blocks_equal_automatic_differentiation(joint_types: tuple[str, ...], kernel: str) -> None:
+    assert worst_block_error(random_problem(joint_types, samples=2, seed=len(joint_types), kernel=kernel)) < RELATIVE
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e-14, 1e-11, 1e-8, 1e-5, 1e-2])
@@ -75,14 +45,14 @@ def test_blocks_stay_exact_where_base_kernels_pass_through_zero(
 ) -> None:
     n = len(joint_types)
     rng = np.random.default_rng(n)
-    params = {name: torch.as_tensor(rng.uniform(-1, 1, shape)) for name, shape in lip_shapes(n, tied=True).items()}
+    params = random_problem(joint_types, samples=1, seed=n).params
     logits = torch.tensor([[0.9, 1.3]]).double().expand(n, 2)  # σ < α, β: p changes sign
     params["potential.logits"] = params["kinetic.logits"] = logits
     share = shares_of(logits)
     assert (share[:, :1] < share[:, 1:]).all()
     q, q2 = rng.uniform(0.3, 1.2, (2, n))
     for joint in zero_joints:
-        q2[joint] = opposite(joint_types[joint], share[joint], q[joint])
+        q2[joint] = opposite(joint_types[joint], share[joint].tolist(), q[joint])
         p = base_kernel(joint_types[joint], share[joint], torch.tensor(q[joint]), torch.tensor(q2[joint]))
         assert abs(float(p)) < 1e-15
         q2[joint] += offset
@@ -91,17 +61,9 @@ def test_blocks_stay_exact_where_base_kernels_pass_through_zero(
     assert worst_block_error(Problem(LipKernel(joint_types), params, motion), [(0, 1)]) < RELATIVE
 
 
-@given(problems(max_joints=3))
+@given(problems(max_joints=3, kernels=("tied", "untied")))
 def test_energies_equal_automatic_differentiation(problem: Problem) -> None:
-    kernel, params, motion = problem.kernel, problem.params, problem.motion
-    answer = kernel.energies(params, State.rows(motion), State.columns(motion))
-    energies = lip_energies(kernel.joint_types, params)
-    for i, j in ((0, 0), (0, 1)):
-        x, y = instant(motion, i), instant(motion, j)
-        terms = energy_torque(energies, x, y)
-        expected = torch.stack([terms[1:].sum(0), terms[0]])
-        error = float((answer[:, :, i, j] - expected).abs().max())
-        assert error / scale_of(energies, x, y, terms) < RELATIVE
+    assert worst_energy_error(problem) < RELATIVE
 
 
 def test_shares_sum_to_one_and_equal_their_definition() -> None:
@@ -110,11 +72,11 @@ def test_shares_sum_to_one_and_equal_their_definition() -> None:
     assert torch.allclose(shares(logits), shares_of(logits), rtol=1e-14, atol=0)
 
 
-@pytest.mark.parametrize("tied", [True, False])
-def test_initial_hyperparameters_have_the_documented_names_and_shapes(tied: bool) -> None:
-    problem = random_problem(("revolute", "prismatic", "revolute"), samples=20, seed=0, tied=tied)
+@pytest.mark.parametrize("kernel", ["tied", "untied"])
+def test_initial_hyperparameters_have_the_documented_names_and_shapes(kernel: str) -> None:
+    problem = random_problem(("revolute", "prismatic", "revolute"), samples=20, seed=0, kernel=kernel)
     initial = problem.kernel.initial(problem.motion, problem.motion.q)
-    assert {name: tuple(value.shape) for name, value in initial.items()} == lip_shapes(3, tied)
+    assert {name: tuple(value.shape) for name, value in initial.items()} == lip_shapes(3, kernel == "tied")
 
 
 def test_untied_kernel_with_equal_shapes_in_all_links_is_the_tied_kernel() -> None:

@@ -13,7 +13,7 @@ from lipcore.kernels.base import SumKernel
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.motion import Motion
 from lipcore.posterior import ExactPosterior, noisy_gram
-from tests.lipcore.problems import Problem, random_problem
+from tests.lipcore.problems import KERNELS, Problem, random_problem
 
 JOINTS = ("revolute", "prismatic", "revolute")
 N_JOINTS = len(JOINTS)
@@ -29,9 +29,9 @@ class Setting(NamedTuple):
     posterior: ExactPosterior
 
 
-@pytest.fixture(scope="module", params=[True, False], ids=["tied", "untied"])
+@pytest.fixture(scope="module", params=KERNELS)
 def setting(request: pytest.FixtureRequest) -> Setting:
-    problem = random_problem(JOINTS, samples=12, seed=4, tied=request.param)
+    problem = random_problem(JOINTS, samples=12, seed=4, kernel=request.param)
     kernel = SumKernel(problem.kernel, FrictionKernel(N_JOINTS))
     tau = torch.from_numpy(np.random.default_rng(5).normal(size=(12, N_JOINTS)))
     query = random_problem(JOINTS, samples=7, seed=6).motion
