@@ -14,8 +14,10 @@ import numpy as np
 import torch
 
 import lipcore
+from lipcore.estimators import ROBOT_ESTIMATORS
 from lipcore.robots import Robot, load_robot, pinocchio
 from lipcore.simulation import FAST, Stream, simulate
+from lipcore.urdf import RigidBody
 
 SEEDS, TESTS, SPEEDS, SIZES = (301, 302), 2, (1.0, FAST), (60, 200, 500)
 STRIDE = 5
@@ -33,6 +35,13 @@ def randomised(robot: Robot, seed: int) -> Robot:
     return replace(robot, model=model)
 
 
+def _bodies(name: str, robot: Robot, estimator: str) -> RigidBody | None:
+    """What a user's URDF would say: the arm's geometry, with the nominal masses instead of the true ones."""
+    if estimator not in ROBOT_ESTIMATORS:
+        return None
+    return RigidBody.from_profile(name, robot.joint_names, robot.joint_types)
+
+
 def collect(path: str, estimator: str, names: list[str]) -> None:
     """Train on every arm, seed, speed and size; store residuals and standard deviations, calibration taken out."""
     torch.set_num_threads(1)
@@ -48,7 +57,7 @@ def collect(path: str, estimator: str, names: list[str]) -> None:
                 ]
                 for size in SIZES:
                     thinned = stream.rows(np.linspace(0, len(stream) - 1, size).round().astype(np.int64))
-                    model = lipcore.train(thinned, robot.joint_types, estimator)
+                    model = lipcore.train(thinned, robot.joint_types, estimator, robot=_bodies(name, robot, estimator))
                     for test in tests:
                         answer = model.predict(test.q, test.dq, test.ddq)
                         std = answer.tau_std / model.calibration.function_std_factor

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-FUNCTION_STD_FACTOR = {"lip-chain": 1.0}
+FUNCTION_STD_FACTOR = {"lip-chain": 1.1, "rigid-body+lip-chain": 1.1}
 
 
 @dataclass(frozen=True)

@@ -191,8 +191,8 @@ def fit(
 def _best_start(screening: _Search, starts: int) -> tuple[int, Array]:
     """Return which of several starts leads to the best evidence of few samples in few steps, and where it led.
 
-    The first is the kernel's own, the others are drawn from the prior. A poor optimum mostly shows early, and few samples
-    cost little: this finds it before the long search.
+    The first is the kernel's own, the others are drawn from the prior. A poor optimum mostly shows early, and few
+    samples cost little: this finds it before the long search.
     """
     rng = np.random.default_rng(0)
     centre, width = screening.pack(screening.start), screening.pack(screening.width_tensors())

@@ -23,6 +23,10 @@ PRIOR_STD = 1.0
 """Width of the prior on the logarithm: a small data set cannot tell noise from misfit."""
 LARGEST_STEP = 0.7
 REFINEMENTS = 3
+STRETCHES = 25
+"""Contiguous parts of the samples that are left out one after another."""
+TOLERATED = 1.15
+"""Squared error over expected variance that chance explains."""
 SAMPLES = 250
 """Samples that tell the noise: its estimate is then good to about five per cent."""
 
@@ -42,10 +46,14 @@ def floor(samples: Samples) -> Array:
 def refine(
     kernel: TorqueKernel, params: Params, motion: Motion, tau: Tensor, centre: Tensor, lowest: Tensor
 ) -> dict[str, Tensor]:
-    """Maximise the penalised evidence of more samples over the noise alone, all else held; return new hyperparameters.
+    """What up to SAMPLES samples say of the noise, all else held: two steps, returned as new hyperparameters.
 
-    Newton steps on log σ_j. With K = k(X, X) + R and α = K⁻¹y, the evidence falls as ½σ_j²(Σα² − tr K⁻¹) over joint j;
-    σ_j² tr K⁻¹ is the number of samples left to tell the noise, after those that the function uses up.
+    First the penalised evidence is maximised over the noise by Newton steps on log σ_j. With K = k(X, X) + R and
+    α = K⁻¹y, its slope is σ_j²(Σα² − tr K⁻¹) over joint j; σ_j² tr K⁻¹ is the number of samples left to tell the noise,
+    after those that the function uses up.
+
+    Then contiguous stretches are left out one after another and predicted by the rest. Errors larger than the model
+    expects, as where filtered noise lasts over several samples and was taken for the function, raise the noise.
 
     centre, lowest: (n,) log std of the prior's centre and of the floor. Raise NotPositiveDefiniteError as a fit does.
     """
@@ -53,14 +61,37 @@ def refine(
     y = (tau - kernel.mean(motion)).reshape(-1)
     log_std = params["noise.log_std"]
     for _ in range(REFINEMENTS):
+        inverse, alpha = _inverse(gram, log_std, y)
         variance = torch.exp(2 * log_std)
-        noisy = gram.clone()
-        noisy.diagonal().add_(variance.repeat(len(motion)))
-        factor = cholesky(noisy)
-        alpha = factor.solve(y).reshape(-1, n)
-        free = variance * torch.cholesky_inverse(factor.lower).diagonal().reshape(-1, n).sum(0)
-        explained = variance * alpha.square().sum(0)
+        free = variance * inverse.diagonal().reshape(-1, n).sum(0)
+        explained = variance * alpha.reshape(-1, n).square().sum(0)
         slope = explained - free - (log_std - centre) / PRIOR_STD**2
         step = slope / (2 * free + 1 / PRIOR_STD**2)
         log_std = torch.maximum(log_std + step.clamp(-LARGEST_STEP, LARGEST_STEP), lowest)
+    for _ in range(REFINEMENTS):
+        excess = _left_out(*_inverse(gram, log_std, y), n)
+        if bool((excess <= TOLERATED).all()):
+            break
+        log_std = log_std + torch.where(excess > TOLERATED, 0.5 * torch.log(excess), 0.0).clamp_max(LARGEST_STEP)
     return {**params, "noise.log_std": log_std}
+
+
+def _inverse(gram: Tensor, log_std: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """K⁻¹ and α = K⁻¹y."""
+    noisy = gram.clone()
+    noisy.diagonal().add_(torch.exp(2 * log_std).repeat(len(y) // len(log_std)))
+    factor = cholesky(noisy)
+    return torch.cholesky_inverse(factor.lower), factor.solve(y)
+
+
+def _left_out(inverse: Tensor, alpha: Tensor, n: int) -> Tensor:
+    """Mean squared error over predicted variance of each joint, stretch by stretch predicted from all others: (n,).
+
+    Leaving out block B, the error is [K⁻¹]_BB⁻¹ α_B and its covariance [K⁻¹]_BB⁻¹ (Rasmussen & Williams, eq. 5.12).
+    """
+    ratios = []
+    for block in torch.arange(len(alpha), device=alpha.device).reshape(-1, n).tensor_split(STRETCHES):
+        rows = block.reshape(-1)
+        covariance = torch.linalg.inv(inverse[rows][:, rows])
+        ratios.append(((covariance @ alpha[rows]).square() / covariance.diagonal()).reshape(-1, n))
+    return torch.cat(ratios).mean(0)

@@ -14,13 +14,26 @@ import torch
 from torch import Tensor
 
 from lipcore.kernels.base import PairKernel, Params, State
-from lipcore.kernels.se import SPREAD_FLOOR, SPREAD_SHARE, independent_blocks, per_joint, power
+from lipcore.kernels.se import independent_blocks, largest_behind, per_joint, power
 from lipcore.motion import JointType, Motion, check_joint_types
 
-FACTOR_LOGITS = (-2.0, -4.0)
-"""Starting logits of a joint's two position factors: were they equal, their gradients would keep them equal. Starts
-nearer to zero ended with less evidence on a simulated Panda."""
+FACTOR_LOGITS = (0.0, -4.0)
+"""Starting logits of a joint's two position factors: gravity is of degree one, so the second is nearly constant. Were
+they equal, their gradients would keep them equal."""
 DEGREE = len(FACTOR_LOGITS)
+INERTIA_PER_TORQUE = 0.05
+"""kg·m² per N·m of root mean square torque: where the weights of accelerations start."""
+PRIOR_STD = {
+    "gip.log_constant": 2.0,
+    "gip.log_row": 1.0,
+    "gip.log_column": 0.5,
+    "gip.log_acceleration": 0.5,
+    "gip.log_speed": 1.0,
+    "gip.log_velocity": 0.5,
+    "gip.logits": 1.0,
+    "gip.logits_deviation": 1.0,
+}
+"""Chosen on fits to simulated data of a Panda, six seeds other than those of the tests."""
 
 
 class GeometricallyInspiredKernel(PairKernel):
@@ -29,8 +42,14 @@ class GeometricallyInspiredKernel(PairKernel):
     p = σ + α cos q cos q' + β sin q sin q' for revolute, σ + β + α q q' for prismatic joints, with σ + α + β = 1: the
     scale lives in c, w and u. The square weighs dq_a dq_b by u_a u_b, the paper every product by a number of its own.
 
-    Hyperparameters of all joints i: `gip.log_constant` (n,), log c; `gip.log_acceleration` (n, n), log w;
-    `gip.log_velocity` (n, n), log u; `gip.logits` (n, n, 2, 2), joint i × joint b × factor × (α, β).
+    The weights are pooled, log w_{i,a} = 2 (r_i + m_a) + δ_{i,a} and log u_{i,a} = ½ log w_{i,a} + s_i + ε_{i,a}: inertia
+    is large where both joints bear much, and velocity products have the size of an inertia. So are the position factors:
+    their logits are those of joint b, the same for all torques, plus a deviation of joint i. The pattern is a prior: the
+    joints' functions are independent, and their data make none of them more certain of another's.
+
+    Hyperparameters: `gip.log_constant` (n,), log c; `gip.log_row` (n,), r; `gip.log_column` (n,), m;
+    `gip.log_acceleration` (n, n), δ; `gip.log_speed` (n,), s; `gip.log_velocity` (n, n), ε; `gip.logits` (n, 2, 2),
+    joint b × factor × (α, β); `gip.logits_deviation` (n, n, 2, 2), joint i × joint b × factor × (α, β).
     """
 
     def __init__(self, joint_types: Sequence[str]) -> None:
@@ -39,26 +58,41 @@ class GeometricallyInspiredKernel(PairKernel):
 
     def blocks(self, params: Params, x: State, y: State) -> Tensor:
         """Covariance of torque i at x with torque j at y: (n, n, *batch), (N·m)², zero for i ≠ j."""
-        acceleration = torch.tensordot(torch.exp(params["gip.log_acceleration"]), x.a * y.a, dims=1)
-        velocity = torch.tensordot(torch.exp(params["gip.log_velocity"]), x.v * y.v, dims=1)
+        log_w, log_u = self._log_weights(params)
+        acceleration = torch.tensordot(torch.exp(log_w), x.a * y.a, dims=1)
+        velocity = torch.tensordot(torch.exp(log_u), x.v * y.v, dims=1)
         constant = per_joint(torch.exp(params["gip.log_constant"]), velocity)
         dynamic = constant + acceleration + velocity.square()
-        return independent_blocks(dynamic * self._position(params["gip.logits"], x.q, y.q))
+        logits = params["gip.logits"] + params["gip.logits_deviation"]
+        return independent_blocks(dynamic * self._position(logits, x.q, y.q))
 
     def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
-        """A third of the measured power each from the constant, all accelerations and all velocity products."""
-        n = self.n_joints
-        logits = (
-            torch.tensor(FACTOR_LOGITS, dtype=tau.dtype, device=tau.device)[:, None].expand(n, n, DEGREE, 2).clone()
-        )
-        position = self._position(logits, motion.q.T, motion.q.T).mean(1)
-        third = power(tau) / position / 3
+        """The measured power from the constant; inertia as arms have it that need as much torque."""
+        n, zeros = self.n_joints, tau.new_zeros
+        logits = zeros((n, DEGREE, 2)) + torch.tensor(FACTOR_LOGITS, dtype=tau.dtype, device=tau.device)[:, None]
+        position = self._position(logits.expand(n, n, DEGREE, 2), motion.q.T, motion.q.T).mean(1)
+        # w is the square of an inertia, half of its logarithm from either joint
+        half = 0.5 * torch.log(INERTIA_PER_TORQUE * largest_behind(power(tau).sqrt()))
         return {
-            "gip.log_constant": torch.log(third),
-            "gip.log_acceleration": torch.log(third[:, None] / (n * _power(motion.ddq))),
-            "gip.log_velocity": torch.log(third.sqrt()[:, None] / (n * _power(motion.dq))),
+            "gip.log_constant": torch.log(power(tau) / position),
+            "gip.log_row": half,
+            "gip.log_column": half.clone(),
+            "gip.log_acceleration": zeros((n, n)),
+            "gip.log_speed": zeros(n),
+            "gip.log_velocity": zeros((n, n)),
             "gip.logits": logits,
+            "gip.logits_deviation": zeros((n, n, DEGREE, 2)),
         }
+
+    def prior_std(self) -> dict[str, float]:
+        """How far the weights and shares may stray from their pattern, and the pattern from its start."""
+        return dict(PRIOR_STD)
+
+    def _log_weights(self, params: Params) -> tuple[Tensor, Tensor]:
+        """log w and log u, each (n, n), joint i × joint a."""
+        pattern = params["gip.log_row"][:, None] + params["gip.log_column"]
+        log_w = 2 * pattern + params["gip.log_acceleration"]
+        return log_w, 0.5 * log_w + params["gip.log_speed"][:, None] + params["gip.log_velocity"]
 
     def _position(self, logits: Tensor, q: Tensor, q2: Tensor) -> Tensor:
         """Π_b p_{i,b,1} p_{i,b,2} of every joint i: (n, *batch)."""
@@ -71,9 +105,3 @@ class GeometricallyInspiredKernel(PairKernel):
                 sigma, alpha, beta = (per_joint(share, first) for share in shares[:, b, factor].unbind(1))
                 total = total * (sigma + alpha * one + beta * two)
         return total
-
-
-def _power(values: Tensor) -> Tensor:
-    """Mean square of each joint's values, (N, n) to (n,), floored for joints that stand still."""
-    mean = values.square().mean(0)
-    return torch.maximum(mean, SPREAD_SHARE**2 * mean.max()).clamp_min(SPREAD_FLOOR**2)

@@ -12,6 +12,13 @@ SPREAD_SHARE = 0.1
 """Smallest spread credited to a joint, relative to that of the joint that moves most: some joints stand still."""
 SPREAD_FLOOR = 1e-3
 """Smallest spread credited to any input, in its own unit."""
+LEAST_LENGTHSCALES = (2.0, 4.0, 40.0)
+"""Shortest lengthscales to start from, rad, rad/s and rad/s² (m): a turn of gravity, and speeds and accelerations at
+which inertia bears as much torque as weight. Motion within a small range tells nothing of shorter ones."""
+WEIGHTLESS_SHARE = 0.05
+"""A joint with less than this share of the torque of the joints behind it bears inertia rather than weight."""
+PRIOR_STD = {"se.log_scale": 2.0, "se.log_lengthscales": 1.0}
+"""Tighter than usual: 3 n lengthscales a joint, and a motion from which few of them can be told."""
 
 
 class SquaredExponentialKernel(PairKernel):
@@ -31,10 +38,26 @@ class SquaredExponentialKernel(PairKernel):
         return independent_blocks(torch.exp(per_joint(params["se.log_scale"], exponent) - 0.5 * exponent))
 
     def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
-        """The measured power; every input's spread, times √(3 n) since squared distances add up over 3 n inputs."""
-        n = self.n_joints
+        """The measured power; every input's spread, times √(3 n) since squared distances add up over 3 n inputs.
+
+        Those of dq and ddq have a floor that is lower for a joint that bears no weight: its torque is small already at
+        the accelerations seen.
+        """
+        n, rms = self.n_joints, power(tau).sqrt()
         lengthscales = torch.cat([spread(motion.q), spread(motion.dq), spread(motion.ddq)]) * (3 * n) ** 0.5
-        return {"se.log_scale": torch.log(power(tau)), "se.log_lengthscales": torch.log(lengthscales).repeat(n, 1)}
+        weight = (rms / (WEIGHTLESS_SHARE * largest_behind(rms))).clamp_max(1.0)
+        factors = torch.stack([torch.ones_like(weight), weight.sqrt(), weight], dim=1)
+        least = (factors * torch.tensor(LEAST_LENGTHSCALES, dtype=tau.dtype, device=tau.device)).repeat_interleave(
+            n, dim=1
+        )
+        return {
+            "se.log_scale": torch.log(power(tau)),
+            "se.log_lengthscales": torch.log(torch.maximum(lengthscales, least)),
+        }
+
+    def prior_std(self) -> dict[str, float]:
+        """How far scales and lengthscales may stray from their start."""
+        return dict(PRIOR_STD)
 
 
 def independent_blocks(diagonal: Tensor) -> Tensor:
@@ -56,3 +79,8 @@ def spread(values: Tensor) -> Tensor:
 def power(tau: Tensor) -> Tensor:
     """Mean square torque of each joint, (N, n) to (n,), (N·m)², kept above zero."""
     return tau.square().mean(0).clamp_min(1e-12)
+
+
+def largest_behind(values: Tensor) -> Tensor:
+    """Largest value of each joint and those after it, (n,): what they carry, it must carry too."""
+    return values.flip(0).cummax(0).values.flip(0)

@@ -47,9 +47,13 @@ def shapes(name: str, n: int) -> dict[str, tuple[int, ...]]:
         "se": {"se.log_scale": (n,), "se.log_lengthscales": (n, 3 * n)},
         "gip": {
             "gip.log_constant": (n,),
+            "gip.log_row": (n,),
+            "gip.log_column": (n,),
             "gip.log_acceleration": (n, n),
+            "gip.log_speed": (n,),
             "gip.log_velocity": (n, n),
-            "gip.logits": (n, n, 2, 2),
+            "gip.logits": (n, 2, 2),
+            "gip.logits_deviation": (n, n, 2, 2),
         },
         "lse": {
             "lse.log_scale": (),
@@ -146,14 +150,17 @@ def gip_loop(joint_types: Sequence[str], params: Mapping[str, np.ndarray], x: np
     out = np.zeros((n, n))
     for i in range(n):
         value = math.exp(params["gip.log_constant"][i])
-        weights = np.exp(params["gip.log_velocity"][i])
+        inertia = [math.exp(params["gip.log_row"][i] + params["gip.log_column"][a]) for a in range(n)]
+        squares = [inertia[a] ** 2 * math.exp(params["gip.log_acceleration"][i, a]) for a in range(n)]
+        speed = params["gip.log_speed"][i] + params["gip.log_velocity"][i]
+        weights = [math.sqrt(squares[a]) * math.exp(speed[a]) for a in range(n)]
         for a in range(n):
-            value += math.exp(params["gip.log_acceleration"][i, a]) * x[2, a] * y[2, a]
+            value += squares[a] * x[2, a] * y[2, a]
             for b in range(n):
                 value += weights[a] * weights[b] * (x[1, a] * x[1, b]) * (y[1, a] * y[1, b])
         for b, kind in enumerate(joint_types):
             for factor in range(2):
-                alpha, beta = np.exp(params["gip.logits"][i, b, factor])
+                alpha, beta = np.exp(params["gip.logits"][b, factor] + params["gip.logits_deviation"][i, b, factor])
                 q, q2 = x[0, b], y[0, b]
                 if kind == "revolute":
                     p = 1 + alpha * math.cos(q) * math.cos(q2) + beta * math.sin(q) * math.sin(q2)

@@ -49,21 +49,19 @@ class Case:
         n = len(joint_types)
         x = 1.5 * rng.standard_normal((3, rows, n))
         params = {
-            "potential.log_scale": torch.tensor(0.4),
-            "potential.logits": torch.tensor(rng.standard_normal(n)),
-            "kinetic.logits": torch.tensor(rng.standard_normal(n)),
+            "chain.logits": torch.tensor(rng.standard_normal(n)),
+            "potential.log_scales": torch.tensor(rng.standard_normal(n)),
             "weights": torch.tensor(np.tril(np.exp(0.5 * rng.standard_normal((n, n))))),
         }
         y = x if columns is None else 1.5 * rng.standard_normal((3, columns, n))
-        return cls(joint_types, x, y, {k: p.double() for k, p in params.items()}, columns is None)
+        return cls(joint_types, x, y, params, columns is None)
 
     def arguments(self) -> tuple:
         """Arguments of the compiled functions."""
         prismatic = np.array([kind == "prismatic" for kind in self.joint_types])
-        kinetic, potential = (torch.sigmoid(self.params[f"{part}.logits"]).numpy() for part in ("kinetic", "potential"))
-        weights = self.params["weights"].numpy()
-        scale = math.exp(self.params["potential.log_scale"].item())
-        return (*self.x, *self.y, prismatic, kinetic, weights, potential, scale, self.symmetric)
+        alpha = torch.sigmoid(self.params["chain.logits"]).numpy()
+        scales = torch.exp(self.params["potential.log_scales"]).numpy()
+        return (*self.x, *self.y, prismatic, alpha, self.params["weights"].numpy(), scales, self.symmetric)
 
     def reference(self, params: dict[str, Tensor] | None = None) -> Tensor:
         """The Gram matrix in PyTorch, (N, n, M, n)."""
@@ -90,15 +88,14 @@ def check_gradient(case: Case) -> None:
     leaves = {name: value.clone().requires_grad_(True) for name, value in case.params.items()}
     weight = case.weight()
     (torch.tensor(weight) * case.reference(leaves)).sum().backward()
-    kinetic, weights, potential, scale = chain_gradient(*case.arguments(), weight)
+    d_alpha, d_weights, d_scales = chain_gradient(*case.arguments(), weight)
 
     # by the unconstrained hyperparameters of ChainKernel: dα/dlogit = α (1 − α)
-    _, kinetic_alpha, _, potential_alpha, potential_scale, _ = case.arguments()[6:]
+    _, alpha, _, scales, _ = case.arguments()[6:]
     actual = {
-        "potential.log_scale": scale * potential_scale,
-        "potential.logits": potential * potential_alpha * (1 - potential_alpha),
-        "kinetic.logits": kinetic * kinetic_alpha * (1 - kinetic_alpha),
-        "weights": weights,
+        "chain.logits": d_alpha * alpha * (1 - alpha),
+        "potential.log_scales": d_scales * scales,
+        "weights": d_weights,
     }
     for name, leaf in leaves.items():
         expected = leaf.grad.numpy()
@@ -129,7 +126,7 @@ def test_base_kernels_may_be_zero(robot: str) -> None:
     case = Case.random(ROBOTS[robot], 4, 9)
     n = len(case.joint_types)
     # p = 1/2 + cos(q − q') / 2 is zero half a turn away, p = 1/2 + q q' / 2 at q' = −1 / q
-    case.params |= {"kinetic.logits": torch.zeros(n).double(), "potential.logits": torch.zeros(n).double()}
+    case.params["chain.logits"] = torch.zeros(n).double()
     opposite = [
         -1 / q if kind == "prismatic" else q + math.pi for kind, q in zip(case.joint_types, case.x[0, 0], strict=True)
     ]
@@ -143,7 +140,7 @@ def test_base_kernels_may_be_zero(robot: str) -> None:
 
 def test_many_joints() -> None:
     case = Case.random(("revolute", "prismatic", "revolute", "revolute") * 4, 2, 3)
-    case.params["kinetic.logits"] -= 3.0
+    case.params["chain.logits"] -= 3.0
     check_gram(case)
     check_gradient(case)
 

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
-from lipcore.kernels.base import State
+from lipcore.kernels.base import Params, State
 from lipcore.kernels.compiled_lip import PAIRS, lip_gradient, lip_gram
 from lipcore.kernels.lip import LipKernel, shares
 from lipcore.motion import JointType, Motion
@@ -23,23 +24,29 @@ ROBOTS = [REVOLUTE7, MIXED, ("revolute",), ("prismatic",)]
 SIZES = [3, PAIRS + 5]
 
 
+class FreeWeights(LipKernel):
+    """The kernel with every velocity weight a hyperparameter of its own: a lower triangular matrix."""
+
+    def weights(self, params: Params) -> Tensor:
+        return params["weights"]
+
+
 class Case:
     """One problem as both implementations take it: torch leaves of shares and weights, and arrays."""
 
     def __init__(self, joint_types: Sequence[JointType], x: Motion, y: Motion, tied: bool, seed: int) -> None:
         n = len(joint_types)
-        problem = random_problem(joint_types, 1, seed, tied)
+        problem = random_problem(joint_types, 1, seed, "tied" if tied else "untied")
         self.joint_types, self.x, self.y, self.n = joint_types, x, y, n
         params = problem.params
         self.kinetic = torch.full((n, n, 3), 1 / 3, dtype=torch.float64)
-        self.weights = torch.zeros((n, n), dtype=torch.float64)
+        self.weights = torch.from_numpy(np.tril(np.random.default_rng(seed).uniform(0.2, 2.7, (n, n))))
         for link in range(n):
             logits = params["kinetic.logits"] if tied else params[f"kinetic.{link + 1}.logits"]
             if tied:
                 self.kinetic[link] = shares(logits)
             else:
                 self.kinetic[link, : link + 1] = shares(logits)
-            self.weights[link, : link + 1] = torch.exp(params[f"kinetic.{link + 1}.log_weights"])
         self.potential = shares(params["potential.logits"])
         self.scale = torch.exp(params["potential.log_scale"])
 
@@ -50,12 +57,11 @@ class Case:
         return (*x, *y, prismatic, *tables, symmetric)
 
     def params(self) -> dict[str, torch.Tensor]:
-        """An untied kernel's hyperparameters as functions of shares and weights; logits know their ratios only."""
+        """An untied kernel's hyperparameters as functions of shares; logits know their ratios only."""
         params = {"potential.log_scale": torch.log(self.scale), "potential.logits": logits(self.potential)}
         for link in range(self.n):
-            params[f"kinetic.{link + 1}.log_weights"] = torch.log(self.weights[link, : link + 1])
             params[f"kinetic.{link + 1}.logits"] = logits(self.kinetic[link, : link + 1])
-        return params
+        return params | {"weights": self.weights}
 
     def expected(self) -> torch.Tensor:
         """The Gram matrix from PyTorch, (N, n, M, n).
@@ -65,11 +71,9 @@ class Case:
         """
         params = self.params()
         params["potential.log_scale"] = params["potential.log_scale"] + torch.log(self.potential.sum(1)).sum()
-        for link in range(self.n):
-            total = torch.log(self.kinetic[link, : link + 1].sum(1)).sum()
-            name = f"kinetic.{link + 1}.log_weights"
-            params[name] = params[name] + total
-        kernel = LipKernel(self.joint_types, tied=False)
+        totals = [self.kinetic[link, : link + 1].sum(1).prod() for link in range(self.n)]
+        params["weights"] = self.weights * torch.stack(totals)[:, None]
+        kernel = FreeWeights(self.joint_types, tied=False)
         return kernel.blocks(params, State.rows(self.x), State.columns(self.y)).permute(2, 0, 3, 1)
 
 

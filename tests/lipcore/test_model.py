@@ -16,7 +16,7 @@ from lipcore.simulation import Stream, simulate
 pytest.importorskip("pinocchio", reason="simulation needs the extra `sim`")
 
 JOINT_TYPES = ("revolute", "revolute")
-OPTIONS = FitOptions(hyperparameter_samples=20, posterior_samples=50, max_iterations=10, device="cpu")
+OPTIONS = FitOptions(hyperparameter_samples=20, posterior_samples=50, max_iterations=10, starts=1, device="cpu")
 
 
 @pytest.fixture(scope="module")

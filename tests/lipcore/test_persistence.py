@@ -26,10 +26,11 @@ def samples() -> Samples:
     return simulate(load_robot("double-pendulum"), Stream(n_samples=60, speed=10, noise=0.01), seed=1)
 
 
-@pytest.fixture(scope="module", params=[True, False], ids=["tied", "untied"])
+@pytest.fixture(scope="module", params=["lip-chain", "lip", "lip untied"])
 def model(request: pytest.FixtureRequest, samples: Samples) -> TorqueModel:
-    options = FitOptions(hyperparameter_samples=20, max_iterations=10, tied=request.param, device="cpu")
-    return train(samples, ("revolute",) * 2, options=options, torque_convention="gravity_compensated")
+    name, *untied = request.param.split()
+    options = FitOptions(hyperparameter_samples=20, max_iterations=10, starts=1, tied=not untied, device="cpu")
+    return train(samples, ("revolute",) * 2, name, options, torque_convention="gravity_compensated")
 
 
 @pytest.fixture
@@ -60,7 +61,7 @@ def test_loaded_model_answers_as_the_saved_one(model: TorqueModel, samples: Samp
     before, after = model.predict(*query), again.predict(*query)
     for name in ("tau", "tau_std", "noise_std", "covariance"):
         assert np.array_equal(getattr(before, name), getattr(after, name)), name
-    for name in ("joint_names", "joint_types", "torque_convention", "options", "fit"):
+    for name in ("joint_names", "joint_types", "torque_convention", "options", "fit", "calibration"):
         assert getattr(again, name) == getattr(model, name)
     assert again.estimator.name == model.estimator.name
 
@@ -71,7 +72,7 @@ def test_manifest_can_be_read_and_vouches_for_the_tensors(model: TorqueModel, fo
     assert manifest == persistence.read_manifest(folder)
     assert manifest["tensors"]["sha256"] == hashlib.sha256(payload).hexdigest()
     assert manifest["tensors"]["bytes"] == len(payload)
-    assert (manifest["format"], manifest["format_version"]) == ("lipserve-model", 1)
+    assert (manifest["format"], manifest["format_version"]) == ("lipserve-model", 2)
     assert manifest["joint_names"] == list(model.joint_names)
     assert manifest["noise_std"] == model.noise_std.tolist()
     assert manifest["torque_convention"] == "gravity_compensated"
@@ -152,7 +153,7 @@ def test_manifest_that_is_not_json_is_refused(folder: Path) -> None:
     ("changes", "message"),
     [
         ({"format": "zip"}, "not a manifest of format 'lipserve-model'"),
-        ({"format_version": 2}, "format_version is 2, expected 1"),
+        ({"format_version": 1}, "format_version is 1, expected 2"),
         ({"estimator": 7}, "estimator is 7, expected a str"),
         ({"estimator": "oracle"}, "estimator is 'oracle'"),
         ({"joint_names": "joint1"}, "joint_names is 'joint1', expected a list"),
@@ -162,6 +163,10 @@ def test_manifest_that_is_not_json_is_refused(folder: Path) -> None:
         ({"joint_types": ["revolute"] * 3}, "does not hold a valid model"),
         ({"torque_convention": "unsaid"}, "torque_convention is 'unsaid'"),
         ({"options": []}, r"options is \[\], expected a dict"),
+        ({"calibration": None}, "calibration is None, expected a dict"),
+        ({"calibration": {"function_std_factor": 0.9}}, "function_std_factor is 0.9, expected a number from 1 to 100"),
+        ({"calibration": {"function_std_factor": "2"}}, "does not hold a valid model"),
+        ({"calibration": {"factor": 2.0}}, "does not hold a valid model"),
         ({"tensors": {}}, "sha256"),
     ],
     ids=str,
@@ -175,14 +180,10 @@ def test_wrong_manifest_entry_is_named(folder: Path, changes: dict[str, Any], me
 @pytest.mark.parametrize(
     ("name", "replacement", "message"),
     [
-        (
-            "params/potential.logits",
-            torch.zeros(3, 2).double(),
-            r"'potential.logits' has shape \(3, 2\), expected \(2, 2\)",
-        ),
+        ("params/kinetic.log_gap", torch.zeros(3).double(), r"'kinetic.log_gap' has shape \(3,\), expected \(2,\)"),
         ("params/noise.log_std", torch.zeros(1).double(), r"'noise.log_std' has shape \(1,\), expected \(2,\)"),
         ("params/surprise", torch.zeros(1).double(), r"'surprise' has shape \(1,\), expected None"),
-        ("params/potential.log_scale", None, r"'potential.log_scale' has shape None, expected \(\)"),
+        ("params/kinetic.log_scale", None, r"'kinetic.log_scale' has shape None, expected \(\)"),
         ("params/noise.log_std", torch.full((2,), torch.nan).double(), "'params/noise.log_std' is not made of finite"),
         ("samples/tau", torch.full((60, 2), torch.inf).double(), "'samples/tau' is not made of finite"),
         ("samples/tau", torch.zeros(60, 2), "'samples/tau' is not made of finite float64"),

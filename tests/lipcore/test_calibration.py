@@ -1,0 +1,122 @@
+"""The calibration of a model: every standard deviation of the function times one factor, and nothing else."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lipcore import FitOptions, Samples, TorqueModel, dynamics, load, model, save, train
+from lipcore.calibration import FUNCTION_STD_FACTOR, NO_CALIBRATION, Calibration, calibrate
+from lipcore.estimators import ESTIMATORS
+from lipcore.parameters import friction_coefficients, inertial_parameters, weight_posterior
+from lipcore.robots import load_robot
+from lipcore.simulation import Stream, simulate
+from lipcore.urdf import RigidBody
+
+pytest.importorskip("pinocchio", reason="simulation needs the extra `sim`")
+
+FACTOR = 1.75
+OPTIONS = FitOptions(hyperparameter_samples=30, max_iterations=20, starts=1, device="cpu", prior="zero")
+
+
+@pytest.fixture(scope="module")
+def samples() -> Samples:
+    return simulate(load_robot("double-pendulum"), Stream(n_samples=60, speed=10, noise=1e-4, viscous=0.1), seed=1)
+
+
+@pytest.fixture(scope="module", params=["lip-chain", "lip", "rigid-body"])
+def plain(request: pytest.FixtureRequest, samples: Samples) -> TorqueModel:
+    robot = None
+    if request.param == "rigid-body":
+        robot = RigidBody.from_profile("double-pendulum", samples.joint_names, ("revolute",) * 2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(model, "calibrate", lambda name: NO_CALIBRATION)
+        return train(samples, ("revolute",) * 2, request.param, OPTIONS, robot=robot)
+
+
+@pytest.fixture(scope="module")
+def corrected(plain: TorqueModel, samples: Samples) -> TorqueModel:
+    """The same training, with a factor for its estimator."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(FUNCTION_STD_FACTOR, plain.estimator.name, FACTOR)
+        return train(samples, plain.joint_types, plain.estimator.name, OPTIONS, robot=plain.robot)
+
+
+def test_predictions(plain: TorqueModel, corrected: TorqueModel, samples: Samples) -> None:
+    assert corrected.calibration == Calibration(FACTOR)
+    query = samples.q + 0.3, samples.dq, 2 * samples.ddq
+    one, other = plain.predict(*query), corrected.predict(*query)
+    assert np.array_equal(one.tau, other.tau)
+    assert np.array_equal(one.noise_std, other.noise_std)
+    np.testing.assert_allclose(other.tau_std, FACTOR * one.tau_std, rtol=1e-12)
+    np.testing.assert_allclose(other.covariance, FACTOR**2 * one.covariance, rtol=1e-12, atol=1e-300)
+    assert (one.tau_std > 0).all()
+
+
+def test_a_term_alone(plain: TorqueModel, corrected: TorqueModel, samples: Samples) -> None:
+    for name in plain.estimator.terms:
+        one, other = (m.posterior.predict(samples.motion()[:5], m.estimator.terms[name]) for m in (plain, corrected))
+        assert torch.equal(one.mean, other.mean)
+        torch.testing.assert_close(other.std, FACTOR * one.std, rtol=1e-12, atol=0)
+
+
+def test_components(plain: TorqueModel, corrected: TorqueModel, samples: Samples) -> None:
+    motion, tau = samples.motion()[10:15], samples.torque()[10:15]
+    one, other = (dynamics.components(m, motion, dynamics.COMPONENTS, tau) for m in (plain, corrected))
+    for name in dynamics.COMPONENTS:
+        assert torch.equal(one[name].mean, other[name].mean), name
+        torch.testing.assert_close(other[name].std, FACTOR * one[name].std, rtol=1e-12, atol=0)
+        assert (one[name].std > 0).any(), name
+
+
+def test_parameters(plain: TorqueModel, corrected: TorqueModel) -> None:
+    one, other = (friction_coefficients(m.posterior, m.estimator) for m in (plain, corrected))
+    for name in ("viscous", "coulomb", "offset"):
+        assert np.array_equal(getattr(one, name), getattr(other, name))
+        np.testing.assert_allclose(getattr(other, f"{name}_std"), FACTOR * getattr(one, f"{name}_std"), rtol=1e-12)
+    if plain.robot is not None:
+        bodies, scaled = (inertial_parameters(m.posterior, m.estimator) for m in (plain, corrected))
+        assert np.array_equal(bodies.mean, scaled.mean)
+        np.testing.assert_allclose(scaled.std, FACTOR * bodies.std, rtol=1e-9)
+        weights, more = (weight_posterior(m.posterior, m.estimator.terms["rigid_body"]) for m in (plain, corrected))
+        assert np.array_equal(weights.scale, more.scale)  # the prior's own
+
+
+def test_it_is_saved_and_loaded(corrected: TorqueModel, samples: Samples, tmp_path: Path) -> None:
+    manifest = save(corrected, tmp_path / "model")
+    assert manifest["calibration"] == {"function_std_factor": FACTOR}
+    again = load(tmp_path / "model")
+    assert again.calibration == corrected.calibration
+    query = samples.q, samples.dq, samples.ddq
+    for name in ("tau", "tau_std", "covariance", "noise_std"):
+        assert np.array_equal(getattr(again.predict(*query), name), getattr(corrected.predict(*query), name)), name
+    # what a model was saved with counts, not what its estimator has by now
+    assert calibrate(corrected.estimator.name).function_std_factor != FACTOR
+
+
+def test_the_manifest_decides(plain: TorqueModel, samples: Samples, tmp_path: Path) -> None:
+    save(plain, tmp_path / "model")
+    path = tmp_path / "model" / "manifest.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"calibration": {"function_std_factor": 3.0}}))
+    query = samples.q, samples.dq, samples.ddq
+    np.testing.assert_allclose(load(path.parent).predict(*query).tau_std, 3 * plain.predict(*query).tau_std, rtol=1e-12)
+
+
+@pytest.mark.parametrize("factor", [0.999, 0.0, -2.0, float("nan"), float("inf"), 100.0])
+def test_factor_out_of_range_is_refused(factor: float) -> None:
+    with pytest.raises(ValueError, match=f"function_std_factor is {factor!r}, expected a number from 1 to 100"):
+        Calibration(factor)
+
+
+def test_every_factor_belongs_to_an_estimator_and_can_be_used() -> None:
+    assert FUNCTION_STD_FACTOR.keys() <= ESTIMATORS.keys()
+    for name in ESTIMATORS:
+        assert calibrate(name).function_std_factor == FUNCTION_STD_FACTOR.get(name, 1.0)
+    assert NO_CALIBRATION.function_std_factor == 1.0
+    with pytest.raises(ValueError, match="function_std_factor"):
+        replace(NO_CALIBRATION, function_std_factor=0.5)

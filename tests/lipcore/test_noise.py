@@ -1,0 +1,132 @@
+"""The noise that all samples tell: draws of a prior whose noise is known, and a search by brute force."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import minimize
+from torch import Tensor
+
+from lipcore import noise
+from lipcore.evidence import negative_log_evidence
+from lipcore.kernels.base import SumKernel
+from lipcore.kernels.friction import FrictionKernel
+from lipcore.linalg import NotPositiveDefiniteError
+from lipcore.motion import Motion
+from lipcore.posterior import noisy_gram
+from lipcore.samples import Samples
+from tests.lipcore.problems import random_problem
+
+JOINTS = ("revolute", "prismatic", "revolute")
+TRUE = np.array([0.02, 0.3, 0.08])
+NO_FLOOR = torch.full((3,), -30.0, dtype=torch.float64)
+
+
+class Draw(NamedTuple):
+    """Torques drawn from a prior with noise TRUE."""
+
+    kernel: SumKernel
+    params: dict[str, Tensor]
+    motion: Motion
+    tau: Tensor
+
+    def starting_at(self, std: np.ndarray) -> dict[str, Tensor]:
+        """The true hyperparameters with another noise, (n,) N·m."""
+        return {**self.params, "noise.log_std": torch.from_numpy(np.log(std))}
+
+
+def draw(samples: int, seed: int) -> Draw:
+    problem = random_problem(JOINTS, samples, seed, "chain")
+    both = SumKernel(problem.kernel, FrictionKernel(3))
+    params = {**problem.params, "noise.log_std": torch.from_numpy(np.log(TRUE))}
+    lower = torch.linalg.cholesky(noisy_gram(both, params, problem.motion))
+    white = torch.from_numpy(np.random.default_rng(seed).standard_normal(3 * samples))
+    return Draw(both, params, problem.motion, (lower @ white).reshape(samples, 3))
+
+
+def refined(case: Draw, begin: np.ndarray, centre: np.ndarray | None = None, floor: Tensor = NO_FLOOR) -> np.ndarray:
+    """Noise std (n,) after `refine` from `begin`, the prior centred there too unless said otherwise."""
+    params = case.starting_at(begin)
+    middle = params["noise.log_std"] if centre is None else torch.from_numpy(np.log(centre))
+    out = noise.refine(case.kernel, params, case.motion, case.tau, middle, floor)
+    assert out.keys() == params.keys()
+    assert all(out[name] is params[name] for name in params if name != "noise.log_std")
+    return np.exp(out["noise.log_std"].numpy())
+
+
+@pytest.mark.parametrize("factor", [1 / 3, 1 / 2, 1.0, 2.0, 3.0])
+@pytest.mark.parametrize("seed", [0, 2, 3])
+def test_known_noise_is_recovered_from_a_wrong_start(seed: int, factor: float) -> None:
+    assert np.allclose(refined(draw(200, seed), factor * TRUE), TRUE, rtol=0.15)
+
+
+def test_joints_that_start_too_low_and_too_high_do_not_disturb_each_other() -> None:
+    assert np.allclose(refined(draw(200, 0), np.array([3.0, 1 / 3, 1.0]) * TRUE), TRUE, rtol=0.15)
+
+
+def penalised(case: Draw, log_std: np.ndarray, centre: np.ndarray) -> float:
+    """−log evidence − log prior of the noise, by the evidence that fits maximise."""
+    evidence = negative_log_evidence(case.kernel, case.starting_at(np.exp(log_std)), case.motion, case.tau).value
+    return evidence + 0.5 * float(np.sum((log_std - np.log(centre)) ** 2)) / noise.PRIOR_STD**2
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+@pytest.mark.parametrize("seed", [5, 6])
+def test_refinement_climbs_to_the_maximum_that_brute_force_finds(
+    seed: int, factor: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    case, centre = draw(12, seed), 2.5 * TRUE
+    options = {"xatol": 1e-7, "fatol": 1e-11, "maxiter": 4000, "maxfev": 4000}
+    best = minimize(lambda x: penalised(case, x, centre), np.log(TRUE), method="Nelder-Mead", options=options)
+    begin = factor * np.exp(best.x)
+    # a few steps end near enough to gain nothing that matters by more of them
+    near = np.log(refined(case, begin, centre))
+    assert penalised(case, near, centre) < best.fun + 0.1
+    monkeypatch.setattr(noise, "REFINEMENTS", 100)
+    assert np.allclose(refined(case, begin, centre), np.exp(best.x), rtol=1e-4)
+
+
+def test_noise_never_falls_below_its_floor() -> None:
+    case = draw(60, 0)
+    floor = torch.from_numpy(np.log(np.array([2.0, 0.1, 1.0]) * TRUE))
+    for begin in (TRUE, 3 * TRUE, 0.01 * TRUE):
+        assert (refined(case, begin, floor=floor) >= np.exp(floor.numpy()) * (1 - 1e-12)).all()
+    # the floor of the first joint lies above what the data say
+    assert refined(case, np.array([2.0, 1.0, 1.0]) * TRUE, floor=floor)[0] == pytest.approx(2 * TRUE[0], rel=1e-12)
+
+
+def test_steps_are_bounded_where_the_start_is_absurd() -> None:
+    std = refined(draw(40, 0), 1e-4 * TRUE)
+    assert np.allclose(std, 1e-4 * TRUE * np.exp(noise.REFINEMENTS * noise.LARGEST_STEP), rtol=1e-9)
+
+
+def test_covariance_that_cannot_be_factored_is_reported() -> None:
+    case = draw(5, 0)
+    with pytest.raises(NotPositiveDefiniteError):
+        refined(case, np.full(3, np.nan))
+
+
+def table(tau: np.ndarray) -> Samples:
+    zeros = np.zeros_like(tau)
+    names = tuple(f"joint{k}" for k in range(tau.shape[1]))
+    return Samples(names, np.arange(len(tau)) / 10, np.zeros(len(tau), dtype=np.int64), zeros, zeros, zeros, tau)
+
+
+def test_start_is_the_white_noise_or_a_hundredth_of_the_spread() -> None:
+    t, rng = np.arange(500) / 100, np.random.default_rng(0)
+    wave = 10 * np.sin(2 * np.pi * 0.5 * t)
+    std = noise.start(table(np.stack([wave, wave + 0.5 * rng.standard_normal(500)], axis=1)))
+    assert std[0] == pytest.approx(0.01 * wave.std(), rel=1e-6)
+    assert std[1] == pytest.approx(0.5, rel=0.15)
+
+
+def test_floor_is_a_share_of_the_spread_and_of_the_strongest_joint() -> None:
+    t = np.arange(100)[:, None] / 10
+    strong, weak, still = 100 * np.sin(t), 1e-3 * np.sin(t), 0 * t
+    floor = noise.floor(table(np.hstack([strong, weak, still])))
+    largest = np.sqrt(np.mean(strong**2))
+    assert floor.tolist() == pytest.approx([1e-4 * strong.std(), 1e-5 * largest, 1e-5 * largest])
+    assert (noise.floor(table(np.zeros((20, 2)))) > 0).all()
