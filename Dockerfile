@@ -1,4 +1,4 @@
-# The serving image: no simulator, no compiler, no CUDA.
+# The serving image: no robot descriptions, no C compiler, no CUDA.
 FROM python:3.11-slim AS build
 WORKDIR /src
 RUN python -m venv /opt/lipserve
@@ -13,14 +13,18 @@ RUN /opt/lipserve/bin/python -m pip install --no-cache-dir --disable-pip-version
     && site=$(echo /opt/lipserve/lib/python3*/site-packages) \
     && rm -rf "$site"/torch/include "$site"/torch/share "$site"/torch/test \
     && find /opt/lipserve -name __pycache__ -prune -exec rm -rf {} + \
-    && find "$site"/numpy "$site"/scipy "$site"/sympy "$site"/networkx -type d -name tests -prune -exec rm -rf {} +
+    && find "$site"/numpy "$site"/scipy "$site"/sympy "$site"/networkx -type d -name tests -prune -exec rm -rf {} + \
+    && NUMBA_CACHE_DIR=/opt/numba /opt/lipserve/bin/python -B -m lipcore.warm_up
 
 FROM python:3.11-slim
 RUN useradd --system --uid 10001 --no-create-home --shell /usr/sbin/nologin lipserve \
     && mkdir /data && chown lipserve /data
 COPY --from=build /opt/lipserve /opt/lipserve
+# compiled kernels; writable, since another processor than the build's compiles its own
+COPY --from=build --chown=lipserve /opt/numba /opt/numba
 ENV PATH=/opt/lipserve/bin:$PATH \
     PYTHONUNBUFFERED=1 \
+    NUMBA_CACHE_DIR=/opt/numba \
     LIPSERVE_HOME=/data \
     LIPSERVE_HOST=0.0.0.0 \
     LIPSERVE_INSECURE=1

@@ -33,7 +33,8 @@ PRIOR_STD = {
     "gip.logits": 1.0,
     "gip.logits_deviation": 1.0,
 }
-"""Chosen on fits to simulated data of a Panda, six seeds other than those of the tests."""
+"""Chosen on fits to simulated data of a Panda. With logits tied more closely, a torque cannot tell the joints that do
+not turn it."""
 
 
 class GeometricallyInspiredKernel(PairKernel):
@@ -42,10 +43,10 @@ class GeometricallyInspiredKernel(PairKernel):
     p = σ + α cos q cos q' + β sin q sin q' for revolute, σ + β + α q q' for prismatic joints, with σ + α + β = 1: the
     scale lives in c, w and u. The square weighs dq_a dq_b by u_a u_b, the paper every product by a number of its own.
 
-    The weights are pooled, log w_{i,a} = 2 (r_i + m_a) + δ_{i,a} and log u_{i,a} = ½ log w_{i,a} + s_i + ε_{i,a}: inertia
-    is large where both joints bear much, and velocity products have the size of an inertia. So are the position factors:
-    their logits are those of joint b, the same for all torques, plus a deviation of joint i. The pattern is a prior: the
-    joints' functions are independent, and their data make none of them more certain of another's.
+    The weights are pooled, log w_{i,a} = 2 (r_i + m_a) + δ_{i,a} and log u_{i,a} = ½ log w_{i,a} + s_i + ε_{i,a}:
+    inertia is large where both joints bear much, and velocity products have the size of an inertia. So are the position
+    factors: their logits are those of joint b, the same for all torques, plus a deviation of joint i. Joints share
+    nothing but hyperparameters.
 
     Hyperparameters: `gip.log_constant` (n,), log c; `gip.log_row` (n,), r; `gip.log_column` (n,), m;
     `gip.log_acceleration` (n, n), δ; `gip.log_speed` (n,), s; `gip.log_velocity` (n, n), ε; `gip.logits` (n, 2, 2),

@@ -147,7 +147,7 @@ def test_uncertainty_of_forward_dynamics_is_that_of_its_linearization(case: Case
         return torch.linalg.solve(inertia, tau - torques[0])
 
     jacobian = jacrev(solve)(posterior.mean(stack)).reshape(n, -1)
-    expected = (jacobian @ covariance @ jacobian.T).diagonal().sqrt()
+    expected = posterior.std_factor * (jacobian @ covariance @ jacobian.T).diagonal().sqrt()
     torch.testing.assert_close(case.found["forward_dynamics"].std[row], expected, rtol=1e-2, atol=0)
 
 

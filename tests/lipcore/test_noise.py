@@ -75,9 +75,10 @@ def penalised(case: Draw, log_std: np.ndarray, centre: np.ndarray) -> float:
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 @pytest.mark.parametrize("seed", [5, 6])
-def test_refinement_climbs_to_the_maximum_that_brute_force_finds(
+def test_first_step_climbs_to_the_maximum_that_brute_force_finds(
     seed: int, factor: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(noise, "TOLERATED", np.inf)  # no second step
     case, centre = draw(12, seed), 2.5 * TRUE
     options = {"xatol": 1e-7, "fatol": 1e-11, "maxiter": 4000, "maxfev": 4000}
     best = minimize(lambda x: penalised(case, x, centre), np.log(TRUE), method="Nelder-Mead", options=options)
@@ -87,6 +88,52 @@ def test_refinement_climbs_to_the_maximum_that_brute_force_finds(
     assert penalised(case, near, centre) < best.fun + 0.1
     monkeypatch.setattr(noise, "REFINEMENTS", 100)
     assert np.allclose(refined(case, begin, centre), np.exp(best.x), rtol=1e-4)
+
+
+@pytest.mark.parametrize("samples", [10, 24, 25, 26, 61])
+def test_second_step_judges_stretches_predicted_from_all_others(samples: int) -> None:
+    """Each stretch conditioned on the rest by plain linear algebra; fewer samples than stretches too."""
+    case = draw(samples, 4)
+    gram = noisy_gram(case.kernel, case.params, case.motion).numpy()
+    y = case.tau.numpy().ravel()
+    ratios = []
+    for rows in np.array_split(np.arange(samples), noise.STRETCHES):
+        out = (3 * rows[:, None] + np.arange(3)).ravel()
+        rest = np.setdiff1d(np.arange(3 * samples), out)
+        gain = np.linalg.solve(gram[np.ix_(rest, rest)], gram[np.ix_(rest, out)]).T
+        covariance = gram[np.ix_(out, out)] - gain @ gram[np.ix_(rest, out)]
+        ratios.append(((y[out] - gain @ y[rest]) ** 2 / covariance.diagonal()).reshape(-1, 3))
+    expected = np.concatenate(ratios).mean(0)
+    dense = torch.from_numpy(np.linalg.inv(gram))
+    found = noise._left_out(dense, dense @ torch.from_numpy(y), 3)
+    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-6)
+
+
+def test_noise_that_lasts_over_samples_is_not_taken_for_the_function() -> None:
+    """Filtered noise is smooth: along a recording it looks like torque, until a stretch of it is left out."""
+    rng, samples = np.random.default_rng(2), 250
+    t = np.arange(samples)[:, None] / 20
+    speeds = rng.uniform(0.5, 2.0, 3)
+    q = np.sin(speeds * t)
+    motion = Motion.from_arrays(q, speeds * np.cos(speeds * t), -(speeds**2) * q)
+    case = draw(samples, 2)
+    lower = torch.linalg.cholesky(noisy_gram(case.kernel, case.starting_at(1e-4 * np.ones(3)), motion)).numpy()
+    clean = (lower @ rng.standard_normal(3 * samples)).reshape(samples, 3)
+    white = rng.standard_normal((samples, 3))
+    window = np.hanning(22)[1:-1] / np.linalg.norm(np.hanning(22)[1:-1])
+    lasting = np.stack([np.convolve(column, window, mode="same") for column in white.T], axis=1)
+    level = np.array([0.1, 0.3, 0.1])
+    found = {}
+    for name, error in (("white", white), ("lasting", lasting)):
+        noisy = case._replace(motion=motion, tau=torch.from_numpy(clean + level * error))
+        found[name] = refined(noisy, level) / level
+    assert np.allclose(found["white"], 1.0, rtol=0.2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(noise, "TOLERATED", np.inf)
+        first = refined(noisy, level) / level
+    print(f"\nwhite {found['white']}, lasting {found['lasting']}, first step alone {first}")  # noqa: T201
+    assert (found["lasting"] >= first).all()
+    assert found["lasting"].mean() > 1.2 * first.mean()
 
 
 def test_noise_never_falls_below_its_floor() -> None:
@@ -100,7 +147,9 @@ def test_noise_never_falls_below_its_floor() -> None:
 
 def test_steps_are_bounded_where_the_start_is_absurd() -> None:
     std = refined(draw(40, 0), 1e-4 * TRUE)
-    assert np.allclose(std, 1e-4 * TRUE * np.exp(noise.REFINEMENTS * noise.LARGEST_STEP), rtol=1e-9)
+    farthest = 2 * noise.REFINEMENTS * noise.LARGEST_STEP
+    assert (std <= 1e-4 * TRUE * np.exp(farthest) * (1 + 1e-9)).all()
+    assert (std > 5e-4 * TRUE).all()
 
 
 def test_covariance_that_cannot_be_factored_is_reported() -> None:

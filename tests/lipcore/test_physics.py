@@ -39,19 +39,19 @@ CASES = {
         "ur5",
         Stream(n_samples=200, motion="middle", speed=10, noise=0.0),
         5,
-        FitOptions(hyperparameter_samples=50, max_iterations=60, device="cpu"),
-        nmse=0.03,
-        inertia=0.01,
-        gravity=0.0008,
+        FitOptions(hyperparameter_samples=100, max_iterations=100, starts=1, device="cpu"),
+        nmse=0.001,
+        inertia=0.02,
+        gravity=0.0001,
     ),
     "panda": Case(
         "panda",
         Stream(n_samples=500, motion="middle", speed=10, noise=0.0),
         5,
-        FitOptions(hyperparameter_samples=150, max_iterations=120, device="cpu"),
-        nmse=0.015,
-        inertia=0.05,
-        gravity=0.002,
+        FitOptions(hyperparameter_samples=100, max_iterations=100, starts=1, device="cpu"),
+        nmse=0.004,
+        inertia=0.025,
+        gravity=0.001,
     ),
 }
 
@@ -87,6 +87,7 @@ def test_torque_on_an_unseen_trajectory(trained: Trained) -> None:
     metrics = evaluate(unseen.tau, answer.tau, answer.tau_std, answer.noise_std)
     print(f"\n{trained.case.robot}: nMSE {metrics.nmse.round(6)}, coverage {metrics.coverage.round(3)}")  # noqa: T201
     assert (metrics.nmse < trained.case.nmse).all()
+    assert (metrics.coverage > 0.9).all()  # of 95 %: 0.954 and more was measured
 
 
 def test_torque_is_affine_in_acceleration(trained: Trained) -> None:
@@ -123,10 +124,13 @@ def test_inertia_is_symmetric_and_positive_definite_everywhere(trained: Trained)
 
 def test_inertia_is_that_of_pinocchio(trained: Trained) -> None:
     model, data = trained.robot.model, trained.robot.model.createData()
+    worst = 0.0
     for k in range(0, 501, 10):
         upper = np.triu(pin.crba(model, data, trained.robot.configuration(trained.unseen.q[k])))
         expected = upper + np.triu(upper, 1).T
-        assert np.abs(trained.inertia[k] - expected).max() < trained.case.inertia * np.abs(expected).max()
+        worst = max(worst, float(np.abs(trained.inertia[k] - expected).max() / np.abs(expected).max()))
+    print(f"\n{trained.case.robot}: inertia off by {worst:.2e}")  # noqa: T201
+    assert worst < trained.case.inertia
 
 
 def test_gravity_is_that_of_pinocchio(trained: Trained) -> None:
@@ -136,7 +140,9 @@ def test_gravity_is_that_of_pinocchio(trained: Trained) -> None:
     ).numpy()
     model, data = trained.robot.model, trained.robot.model.createData()
     expected = [pin.computeGeneralizedGravity(model, data, trained.robot.configuration(x)) for x in q]
-    assert np.abs(learnt - expected).max() < trained.case.gravity * np.abs(expected).max()
+    worst = float(np.abs(learnt - expected).max() / np.abs(expected).max())
+    print(f"\n{trained.case.robot}: gravity off by {worst:.2e}")  # noqa: T201
+    assert worst < trained.case.gravity
 
 
 def test_rate_of_energy_is_power(trained: Trained) -> None:
