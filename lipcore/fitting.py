@@ -142,7 +142,7 @@ def fit(
     motion, tau = samples.motion(device), samples.torque(device)
     floor = torch.from_numpy(np.log(noise.floor(samples))).to(device)
     start = kernel.initial(motion, tau)
-    start["noise.log_std"] = torch.maximum(torch.from_numpy(np.log(noise.start(samples))).to(device), floor)
+    start["noise.log_std"] = torch.from_numpy(np.log(noise.start(samples))).to(device)
     stop = cancelled or (lambda: False)
     rows = spread_out(motion, options.hyperparameter_samples)
     search = _Search(kernel, start, floor, motion[rows], tau[rows], stop)
@@ -160,7 +160,7 @@ def fit(
         iteration += 1
         report_progress("hyperparameters", float(intermediate_result.fun))
 
-    few = spread_out(motion, SCREENING_SAMPLES)
+    few = spread_out(motion, min(SCREENING_SAMPLES, options.hyperparameter_samples))
     screening = _Search(kernel, start, floor, motion[few], tau[few], stop)
     chosen, origin = _best_start(screening, options.starts)
     result = search.run(origin, options.max_iterations, callback)
@@ -175,7 +175,7 @@ def fit(
     report = FitReport(
         objective=float(result.fun),
         iterations=int(result.nit),
-        evaluations=search.evaluations,
+        evaluations=search.evaluations + screening.evaluations,
         rejected_steps=search.rejected,
         converged=bool(result.success),
         start=chosen,

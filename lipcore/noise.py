@@ -22,7 +22,8 @@ below the second, a Gram matrix in float64 can no longer be factored faithfully.
 PRIOR_STD = 1.0
 """Width of the prior on the logarithm: a small data set cannot tell noise from misfit."""
 LARGEST_STEP = 0.7
-REFINEMENTS = 3
+NEWTON_STEPS, SMALLEST_STEP = 8, 0.01
+WIDENINGS = 3
 STRETCHES = 25
 """Contiguous parts of the samples that are left out one after another."""
 TOLERATED = 1.15
@@ -34,7 +35,7 @@ SAMPLES = 250
 def start(samples: Samples) -> Array:
     """Noise std that a fit starts from, (n,) N·m: the white noise of the signals, or a share of their spread."""
     level = noise_level([samples.tau[part] for part in samples.episodes()])
-    return np.asarray(np.maximum(level, START_SHARE * samples.tau.std(axis=0)))
+    return np.asarray(np.maximum.reduce([level, START_SHARE * samples.tau.std(axis=0), floor(samples)]))
 
 
 def floor(samples: Samples) -> Array:
@@ -60,15 +61,17 @@ def refine(
     n, gram = kernel.n_joints, kernel.symmetric_gram(params, motion)
     y = (tau - kernel.mean(motion)).reshape(-1)
     log_std = params["noise.log_std"]
-    for _ in range(REFINEMENTS):
+    for _ in range(NEWTON_STEPS):
         inverse, alpha = _inverse(gram, log_std, y)
         variance = torch.exp(2 * log_std)
         free = variance * inverse.diagonal().reshape(-1, n).sum(0)
         explained = variance * alpha.reshape(-1, n).square().sum(0)
         slope = explained - free - (log_std - centre) / PRIOR_STD**2
-        step = slope / (2 * free + 1 / PRIOR_STD**2)
-        log_std = torch.maximum(log_std + step.clamp(-LARGEST_STEP, LARGEST_STEP), lowest)
-    for _ in range(REFINEMENTS):
+        step = (slope / (2 * free + 1 / PRIOR_STD**2)).clamp(-LARGEST_STEP, LARGEST_STEP)
+        before, log_std = log_std, torch.maximum(log_std + step, lowest)
+        if bool(((log_std - before).abs() < SMALLEST_STEP).all()):
+            break
+    for _ in range(WIDENINGS):
         excess = _left_out(*_inverse(gram, log_std, y), n)
         if bool((excess <= TOLERATED).all()):
             break

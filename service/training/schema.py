@@ -27,7 +27,10 @@ class Options(BaseModel):
         _DEFAULTS.posterior_samples, ge=10, description="Samples the model stands on: of more, the most spread-out"
     )
     max_iterations: int = Field(_DEFAULTS.max_iterations, ge=1, le=10_000)
-    tied: bool = Field(_DEFAULTS.tied, description="Links share kernel shapes; false is the paper's form")
+    starts: int = Field(
+        _DEFAULTS.starts, ge=1, le=20, description="Points the search is tried from; the best by evidence is followed"
+    )
+    tied: bool = Field(_DEFAULTS.tied, description="Of `lip`: links share kernel shapes; false is the paper's form")
     prior: Literal["urdf", "zero"] = Field(
         "urdf", description="Of rigid bodies: expect the URDF's inertial parameters, or none"
     )

@@ -93,11 +93,10 @@ def test_awkward_data_end_in_a_model(name: str, data: str) -> None:
         assert (np.abs(answer.tau - samples.tau).mean(0) <= samples.tau.std(0) + 3 * answer.noise_std).all()
 
 
-@pytest.mark.parametrize("prior", ["urdf", "zero"])
-@every_estimator
+@pytest.mark.parametrize(
+    ("name", "prior"), [*((n, "urdf") for n in ESTIMATORS), *((n, "zero") for n in ROBOT_ESTIMATORS)]
+)
 def test_gradient_of_the_evidence_equals_finite_differences(name: str, prior: str) -> None:
-    if prior == "zero" and name not in ROBOT_ESTIMATORS:
-        pytest.skip("the prior is one of rigid bodies")
     samples = recorded().rows(np.arange(7))
     kernel = make_estimator(name, TYPES, robot=robot_of(name, samples), prior=prior).kernel
     motion, tau, rng = samples.motion(), samples.torque(), np.random.default_rng(3)

@@ -13,6 +13,7 @@ from tests.lipcore.agreement import RELATIVE, opposite, worst_block_error, worst
 from tests.lipcore.oracles import base_kernel, shares_of
 from tests.lipcore.problems import Problem, lip_shapes, problems, random_problem
 
+
 @given(problems(kernels=("tied", "untied")))
 def test_blocks_equal_automatic_differentiation_for_drawn_robots(problem: Problem) -> None:
     assert worst_block_error(problem) < RELATIVE

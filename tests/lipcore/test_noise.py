@@ -83,10 +83,11 @@ def test_first_step_climbs_to_the_maximum_that_brute_force_finds(
     options = {"xatol": 1e-7, "fatol": 1e-11, "maxiter": 4000, "maxfev": 4000}
     best = minimize(lambda x: penalised(case, x, centre), np.log(TRUE), method="Nelder-Mead", options=options)
     begin = factor * np.exp(best.x)
-    # a few steps end near enough to gain nothing that matters by more of them
+    # steps that are small end near enough to gain nothing that matters by more of them
     near = np.log(refined(case, begin, centre))
     assert penalised(case, near, centre) < best.fun + 0.1
-    monkeypatch.setattr(noise, "REFINEMENTS", 100)
+    monkeypatch.setattr(noise, "NEWTON_STEPS", 100)
+    monkeypatch.setattr(noise, "SMALLEST_STEP", 1e-6)
     assert np.allclose(refined(case, begin, centre), np.exp(best.x), rtol=1e-4)
 
 
@@ -147,7 +148,7 @@ def test_noise_never_falls_below_its_floor() -> None:
 
 def test_steps_are_bounded_where_the_start_is_absurd() -> None:
     std = refined(draw(40, 0), 1e-4 * TRUE)
-    farthest = 2 * noise.REFINEMENTS * noise.LARGEST_STEP
+    farthest = (noise.NEWTON_STEPS + noise.WIDENINGS) * noise.LARGEST_STEP
     assert (std <= 1e-4 * TRUE * np.exp(farthest) * (1 + 1e-9)).all()
     assert (std > 5e-4 * TRUE).all()
 

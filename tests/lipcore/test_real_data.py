@@ -67,8 +67,9 @@ def test_panda_predicts_the_rest_of_its_trajectory(options: FitOptions, lowest_c
     training, held_out = (from_signals(names, 30.0, *part) for part in (signals[:, :cut], signals[:, cut:]))
     metrics = learn_and_judge("Panda", training, held_out, options)
     # joint 1 turns about the vertical and carries next to nothing: friction rules it
-    assert (metrics.nmse < [1.0, 0.002, 0.006, 0.08, 0.6, 0.02, 0.12]).all()
-    # the default fit is overconfident on joint 5: uncertainty is not calibrated yet
+    assert (metrics.nmse < [0.7, 0.001, 0.004, 0.04, 0.3, 0.015, 0.07]).all()
+    # joint 5 errs by more than its intervals admit: 0.42 and 0.36 were measured, and no less than 0.72 elsewhere
+    assert np.delete(metrics.coverage, 4).min() > 0.65
     assert metrics.coverage.min() > lowest_coverage
     assert metrics.coverage.mean() > 0.8
 
@@ -89,5 +90,5 @@ def test_schunk_predicts_episodes_held_out(options: FitOptions) -> None:
     assert len(training.episodes()) == 75
     assert len(held_out.episodes()) == 25
     metrics = learn_and_judge("Schunk", training, held_out, options)
-    assert (metrics.nmse < [0.1, 0.12, 0.05, 0.12, 0.02, 0.03]).all()
-    assert (metrics.coverage > 0.8).all()
+    assert (metrics.nmse < [0.06, 0.1, 0.03, 0.1, 0.005, 0.015]).all()
+    assert (metrics.coverage > 0.88).all()

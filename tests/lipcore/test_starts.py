@@ -73,7 +73,7 @@ def test_one_start_is_the_kernels_own() -> None:
 
 
 class FarOff(ChainKernel):
-    """The chain kernel, started where half of the joints seem not to matter and inertia is a million times too large."""
+    """The chain kernel, started where joints seem not to turn anything and inertia is a million times too large."""
 
     def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
         """Those of the chain kernel, moved away."""
