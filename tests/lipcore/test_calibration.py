@@ -18,8 +18,6 @@ from lipcore.robots import load_robot
 from lipcore.simulation import Stream, simulate
 from lipcore.urdf import RigidBody
 
-pytest.importorskip("pinocchio", reason="simulation needs the extra `sim`")
-
 FACTOR = 1.75
 OPTIONS = FitOptions(hyperparameter_samples=30, max_iterations=20, starts=1, device="cpu", prior="zero")
 

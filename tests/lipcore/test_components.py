@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
 import pytest
 import torch
 from torch.func import jacrev
@@ -15,8 +16,6 @@ from lipcore.motion import Motion
 from lipcore.robots import Robot, load_robot
 from lipcore.simulation import Stream, simulate
 from lipcore.urdf import RigidBody
-
-pin = pytest.importorskip("pinocchio", reason="simulation needs the extra `sim`")
 
 
 class Setting(NamedTuple):

@@ -17,8 +17,6 @@ from lipcore.robots import load_robot
 from lipcore.simulation import Stream, simulate
 from lipcore.urdf import RigidBody
 
-pytest.importorskip("pinocchio", reason="simulation needs the extra `sim`")
-
 ROBOT = "double-pendulum"
 TYPES = ("revolute", "revolute")
 OPTIONS = FitOptions(hyperparameter_samples=40, max_iterations=40, starts=1, device="cpu")

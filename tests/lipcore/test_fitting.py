@@ -19,8 +19,6 @@ from lipcore.samples import Samples
 from lipcore.signals import low_pass
 from lipcore.simulation import Stream, simulate
 
-pytest.importorskip("pinocchio", reason="simulation needs the extra `sim`")
-
 SMALL = FitOptions(hyperparameter_samples=25, posterior_samples=60, max_iterations=12, starts=1, device="cpu")
 
 

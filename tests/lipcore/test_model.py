@@ -13,8 +13,6 @@ from lipcore.model import training_range
 from lipcore.robots import load_robot
 from lipcore.simulation import Stream, simulate
 
-pytest.importorskip("pinocchio", reason="simulation needs the extra `sim`")
-
 JOINT_TYPES = ("revolute", "revolute")
 OPTIONS = FitOptions(hyperparameter_samples=20, posterior_samples=50, max_iterations=10, starts=1, device="cpu")
 

@@ -18,8 +18,6 @@ from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, copy_mod
 from lipcore.robots import load_robot
 from lipcore.simulation import Stream, simulate
 
-pytest.importorskip("pinocchio", reason="simulation needs the extra `sim`")
-
 
 @pytest.fixture(scope="module")
 def samples() -> Samples:

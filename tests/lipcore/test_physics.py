@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
 import pytest
 import torch
 
@@ -13,8 +14,6 @@ from lipcore.metrics import evaluate
 from lipcore.motion import Motion
 from lipcore.robots import Robot, load_robot
 from lipcore.simulation import Stream, simulate
-
-pin = pytest.importorskip("pinocchio", reason="simulation needs the extra `sim`")
 
 
 class Case(NamedTuple):

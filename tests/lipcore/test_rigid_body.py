@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 import torch
 
@@ -27,8 +28,6 @@ from lipcore.parameters import (
 from lipcore.robots import load_robot, profile_urdf
 from lipcore.simulation import Stream, simulate
 from lipcore.urdf import JointMismatchError, RigidBody
-
-pin = pytest.importorskip("pinocchio", reason="rigid bodies need Pinocchio")
 
 VISCOUS, COULOMB = 0.5, 0.3
 OPTIONS = FitOptions(hyperparameter_samples=80, max_iterations=60, device="cpu")

@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from lipcore.robots import ROBOTS, Robot, UnknownRobotError, load_robot
 from lipcore.simulation import Payload, Stream, simulate
-
-pin = pytest.importorskip("pinocchio", reason="simulation needs the extra `sim`")
 
 JOINTS = {
     "panda": (7, "panda_joint1", "panda_joint7"),

@@ -23,7 +23,6 @@ from lipcore.robots import load_robot
 from lipcore.samples import Samples
 from lipcore.simulation import Stream, simulate
 
-pytest.importorskip("pinocchio", reason="simulation needs the extra `sim`")
 if "starts" not in FitOptions.__dataclass_fields__:
     pytest.skip("fits have one start only", allow_module_level=True)
 

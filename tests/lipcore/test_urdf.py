@@ -9,8 +9,6 @@ from lipcore.estimators import MissingRobotError, UnknownEstimatorError, make_es
 from lipcore.robots import ROBOTS, UnknownRobotError, load_robot, profile_urdf
 from lipcore.urdf import MAX_LINKS, JointMismatchError, RigidBody, UrdfError, describe
 
-pytest.importorskip("pinocchio", reason="rigid bodies need Pinocchio")
-
 TWO = ("revolute", "revolute")
 
 
