@@ -39,3 +39,4 @@ $(VENV)/.installed: pyproject.toml .ci/install-torch
 
 clean:
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis dist build
+	find lipcore service tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lipcore.kernels.base import Params, State
-from lipcore.kernels.compiled import Array, CompiledKernel, arrays, inner
-from lipcore.kernels.compiled_chain import chain_gradient, chain_gram
+from lipcore.kernels.compiled.chain import chain_gradient, chain_gram
+from lipcore.kernels.compiled.kernel import Array, CompiledKernel, arrays, inner
 from lipcore.kernels.energy import potential_blocks, potential_energy_torque
 from lipcore.kernels.polynomial import BaseKernels, Derivatives, base_kernels, chain_sum
 from lipcore.kernels.weights import PRIOR_STD as WEIGHTS_PRIOR_STD

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lipcore.kernels.base import Params, State
-from lipcore.kernels.compiled import Array, CompiledKernel, arrays, inner
-from lipcore.kernels.compiled_lip import lip_gradient, lip_gram
+from lipcore.kernels.compiled.kernel import Array, CompiledKernel, arrays, inner
+from lipcore.kernels.compiled.lip import lip_gradient, lip_gram
 from lipcore.kernels.energy import (
     kinetic_blocks,
     kinetic_energy_torque,

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lipcore.kernels.base import Params, State
 from lipcore.kernels.chain import ChainKernel
-from lipcore.kernels.compiled_chain import chain_gradient, chain_gram
+from lipcore.kernels.compiled.chain import chain_gradient, chain_gram
 
 RELATIVE = 1e-11
 ROBOTS = {

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from lipcore.kernels.base import Params, State
-from lipcore.kernels.compiled_lip import PAIRS, lip_gradient, lip_gram
+from lipcore.kernels.compiled.lip import lip_gradient, lip_gram
+from lipcore.kernels.compiled.lip_data import PAIRS
 from lipcore.kernels.lip import LipKernel, shares
 from lipcore.motion import JointType, Motion
 from tests.lipcore.problems import random_problem

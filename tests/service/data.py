@@ -19,7 +19,7 @@ from service.training.states import ACTIVE
 QUICK = {"hyperparameter_samples": 20, "posterior_samples": 60, "max_iterations": 4}
 """Options of a fit that takes a fraction of a second."""
 ENDLESS = {"hyperparameter_samples": 200, "posterior_samples": 60, "max_iterations": 10_000}
-"""Options of a fit that takes minutes on `panda`: it runs until somebody ends it."""
+"""Options of a fit that takes about half a minute on 200 samples of `panda`: far longer than a test needs to end it."""
 DEADLINE = 60.0
 """Seconds after which a condition that a test waits for has failed."""
 

@@ -34,14 +34,14 @@ def test_a_job_is_accepted_and_found_at_its_location(api, pendulum):
 def test_a_succeeded_job_says_what_it_made(two_versions):
     for version, seen in enumerate(two_versions[0], start=1):
         assert (seen["state"], seen["version"], seen["attempts"], seen["error"]) == ("succeeded", version, 1, None)
-        assert (seen["model"], seen["estimator"]) == ("twice", "lip")
+        assert (seen["model"], seen["estimator"]) == ("twice", "lip-chain")
         assert (seen["progress"]["stage"], seen["progress"]["fraction"]) == ("done", 1.0)
         assert seen["created_at"] <= seen["started_at"] <= seen["heartbeat_at"] <= seen["finished_at"]
 
 
 def test_progress_moves_while_the_objective_falls(api):
-    dataset = upload(api, stream("panda", 150))["id"]
-    seen = queue(api, "progress", dataset, options={**ENDLESS, "hyperparameter_samples": 60})
+    dataset = upload(api, stream("panda", 200))["id"]
+    seen = queue(api, "progress", dataset, options=ENDLESS)
     first = running(api, seen["id"])
     assert (first["state"], first["progress"]["stage"]) == ("running", "hyperparameters")
     assert first["progress"]["max_iterations"] == 10_000
@@ -68,7 +68,7 @@ def test_lineage_names_the_data_with_their_hashes(api, two_versions):
 
 def test_version_shows_how_it_was_made(api, two_versions):
     shown = api.get("/v1/models/twice/versions/1").json()
-    assert (shown["model"], shown["version"], shown["estimator"]) == ("twice", 1, "lip")
+    assert (shown["model"], shown["version"], shown["estimator"]) == ("twice", 1, "lip-chain")
     assert shown["joint_names"] == ["joint1", "joint2"]
     assert shown["joint_types"] == ["revolute", "revolute"]
     assert shown["torque_convention"] == "gravity_included"
@@ -83,7 +83,7 @@ def test_version_shows_how_it_was_made(api, two_versions):
 def test_model_lists_its_versions(api, two_versions):
     shown = api.get("/v1/models/twice").json()
     assert (shown["name"], shown["latest_version"]) == ("twice", 2)
-    assert [(v["version"], v["estimator"]) for v in shown["versions"]] == [(1, "lip"), (2, "lip")]
+    assert [(v["version"], v["estimator"]) for v in shown["versions"]] == [(1, "lip-chain"), (2, "lip-chain")]
     assert shown in api.get("/v1/models", params={"limit": 100}).json()["items"]
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
+from hashlib import sha256
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from numba import njit
@@ -12,6 +15,11 @@ _F = TypeVar("_F", bound=Callable[..., object])
 
 # Fused multiply-add and sums in any order; NaN and infinity keep their meaning.
 _FASTMATH = {"contract", "reassoc", "nsz"}
+
+# Numba takes machine code from disk while the function's own file is unchanged, whatever became of the functions it
+# calls. Here it is taken while every file of this package is. (Should a later Numba not know `_source_stamp`: after
+# editing a function that is called from another file, run `make clean` or delete __pycache__.)
+_SOURCES = sha256(b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))).hexdigest()
 
 
 class _NoAlias(Compiler):
@@ -45,9 +53,12 @@ def _compile(function: _F, **options: Any) -> _F:
     # entry points for C are never used, and take a fifth of the compile time
     options |= {"fastmath": _FASTMATH, "error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
     try:
-        return cast(_F, njit(cache=True, **options)(function))
+        dispatcher = njit(cache=True, **options)(function)
     except RuntimeError as error:
         # raised at decoration time, so without this the import itself would fail
         if "no locator available" not in str(error):
             raise
-        return cast(_F, njit(cache=False, **options)(function))
+        dispatcher = njit(cache=False, **options)(function)
+    with suppress(AttributeError):
+        dispatcher._cache._cache_file._source_stamp = _SOURCES
+    return cast(_F, dispatcher)
