@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from lipcore.dynamics import COMPONENTS
+from lipcore.estimators import DEFAULT_ESTIMATOR, ESTIMATORS
 from lipcore.robots import ROBOTS, SimulationUnavailableError, load_robot
 from lipcore.simulation import FAST, Payload, Stream, simulate
 from service import __version__, recordings
@@ -131,12 +132,18 @@ def train(
     files: Files,
     model: Annotated[str, typer.Option(help="Name of the model; a new version of it is made.")],
     url: Url = DEFAULT_URL,
-    estimator: Annotated[str | None, typer.Option(help="Kernel family.")] = None,
+    estimator: Annotated[
+        str | None, typer.Option(help=f"One of {', '.join(ESTIMATORS)}; {DEFAULT_ESTIMATOR} by default.")
+    ] = None,
     joint_types: Annotated[
         str | None, typer.Option(help="One a joint, separated by commas; all revolute by default.")
     ] = None,
     robot: Annotated[
         str | None, typer.Option(help="For rigid bodies: a profile such as panda, the id of a URDF, or a .urdf file.")
+    ] = None,
+    prior: Annotated[
+        str | None,
+        typer.Option(help="Of rigid bodies: around the parameters of the `urdf` (default) or around `zero`."),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -146,7 +153,8 @@ def train(
         types = None if joint_types is None else [kind.strip() for kind in joint_types.split(",")]
         if robot is not None and robot.endswith(".urdf"):
             robot = client.upload_robot(Path(robot)).id
-        job = client.train(model, datasets, estimator, types, robot=robot)
+        options = None if prior is None else {"prior": prior}
+        job = client.train(model, datasets, estimator, types, options, robot=robot)
         job = follow(client, job, err)
     if as_json:
         out.print_json(job.model_dump_json())
