@@ -25,10 +25,10 @@ FACTORS = (1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.75, 2.0, 2.5, 3.0)
 Z95 = 1.959964
 
 
-def randomised(robot: Robot, seed: int) -> Robot:
-    """The same arm with every link's mass and inertia scaled by its own random number."""
+def randomised(robot: Robot, seed: int, low: float = 0.4, high: float = 2.5) -> Robot:
+    """The same arm with every link's mass and inertia scaled by its own random number from `low` to `high`."""
     pin, model = pinocchio(), robot.model.copy()
-    scales = np.exp(np.random.default_rng(seed).uniform(np.log(0.4), np.log(2.5), model.njoints))
+    scales = np.exp(np.random.default_rng(seed).uniform(np.log(low), np.log(high), model.njoints))
     for index in range(1, model.njoints):
         body = model.inertias[index]
         model.inertias[index] = pin.Inertia(body.mass * scales[index], body.lever, body.inertia * scales[index])

@@ -4,28 +4,17 @@ The arm's links weigh 0.7 to 1.4 times what the URDF says, each its own; 5 train
 in `lipserve reproduce`. nMSE is against the torque without noise, coverage of the 95 % interval that of measurements.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import torch
+from calibration import randomised
 
 import lipcore
 from lipcore.metrics import evaluate
-from lipcore.robots import Robot, load_robot, pinocchio
+from lipcore.robots import load_robot
 from lipcore.simulation import FAST, Stream, inverse_dynamics, simulate
 from lipcore.urdf import RigidBody
 
 SEEDS, TESTS, STRIDE = range(1, 6), range(1001, 1005), 5
-
-
-def heavier(robot: Robot, seed: int) -> Robot:
-    """The same arm with every link's mass and inertia scaled by its own random number from 0.7 to 1.4."""
-    pin, model = pinocchio(), robot.model.copy()
-    scales = np.exp(np.random.default_rng(seed).uniform(np.log(0.7), np.log(1.4), model.njoints))
-    for index in range(1, model.njoints):
-        body = model.inertias[index]
-        model.inertias[index] = pin.Inertia(body.mass * scales[index], body.lever, body.inertia * scales[index])
-    return replace(robot, model=model)
 
 
 def main() -> None:
@@ -37,7 +26,7 @@ def main() -> None:
         for prior in ("urdf", "zero"):
             nmse, coverage = [], []
             for seed in SEEDS:
-                robot, options = heavier(nominal, seed), lipcore.FitOptions(prior=prior)
+                robot, options = randomised(nominal, seed, 0.7, 1.4), lipcore.FitOptions(prior=prior)
                 samples = simulate(robot, Stream(speed=speed), seed)
                 model = lipcore.train(samples, robot.joint_types, "rigid-body", options, robot=bodies)
                 for test_seed in TESTS:
