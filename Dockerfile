@@ -17,6 +17,8 @@ RUN /opt/lipserve/bin/python -m pip install --no-cache-dir --disable-pip-version
     && NUMBA_CACHE_DIR=/opt/numba /opt/lipserve/bin/python -B -m lipcore.warm_up
 
 FROM python:3.11-slim
+# Pinocchio's OpenMP runtime, which slim images lack
+RUN apt-get update && apt-get install --yes --no-install-recommends libgomp1 && rm -rf /var/lib/apt/lists/*
 RUN useradd --system --uid 10001 --no-create-home --shell /usr/sbin/nologin lipserve \
     && mkdir /data && chown lipserve /data
 COPY --from=build /opt/lipserve /opt/lipserve
