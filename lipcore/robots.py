@@ -104,7 +104,10 @@ def pinocchio() -> Any:
     try:
         return importlib.import_module("pinocchio")
     except ImportError as error:
-        raise SimulationUnavailableError("rigid-body dynamics need Pinocchio: pip install pin") from error
+        raise SimulationUnavailableError(
+            f"rigid-body dynamics need Pinocchio, which cannot be imported ({error}): pip install pin; a minimal system "
+            "may also lack its OpenMP runtime, libgomp1"
+        ) from error
 
 
 def load_robot(name: str) -> Robot:
