@@ -105,8 +105,8 @@ def pinocchio() -> Any:
         return importlib.import_module("pinocchio")
     except ImportError as error:
         raise SimulationUnavailableError(
-            f"rigid-body dynamics need Pinocchio, which cannot be imported ({error}): pip install pin; a minimal "
-            "system may also lack its OpenMP runtime, libgomp1"
+            "rigid-body dynamics need Pinocchio: pip install pin; a minimal system may also lack its OpenMP runtime, "
+            f"libgomp1 ({error})"
         ) from error
 
 
