@@ -246,9 +246,8 @@ class _Search:
 
     def run(self, begin: Array, iterations: int, callback: Callable[..., None] | None = None) -> Any:
         """Minimise by L-BFGS-B from `begin`; scipy's result. The noise stays above its floor."""
-        lower = self.pack({name: torch.full_like(value, -np.inf) for name, value in self.start.items()})
-        lowest = self.pack({**self.start, "noise.log_std": self.floor})
-        lower = np.where(self._is_noise(), lowest, lower)
+        free = {name: torch.full_like(value, -np.inf) for name, value in self.start.items()}
+        lower = self.pack({**free, "noise.log_std": self.floor})
         return minimize(
             self,
             np.maximum(begin, lower),
@@ -262,10 +261,6 @@ class _Search:
     def width_tensors(self) -> dict[str, Tensor]:
         """Width of the prior of every hyperparameter."""
         return {name: torch.full_like(value, self.widths[name]) for name, value in self.start.items()}
-
-    def _is_noise(self) -> NDArray[np.bool_]:
-        flags = {name: torch.full_like(value, float(name == "noise.log_std")) for name, value in self.start.items()}
-        return self.pack(flags) > 0
 
     def pack(self, params: Params) -> Array:
         return np.concatenate([params[name].detach().cpu().numpy().ravel() for name in self.start])

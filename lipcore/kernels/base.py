@@ -218,11 +218,6 @@ class SumKernel(TorqueKernel):
         """Union of the terms' hyperparameters."""
         return {name: value for term in self.terms for name, value in term.initial(motion, tau).items()}
 
-    def names(self) -> list[str]:
-        """Names of the kernel's hyperparameters."""
-        one = torch.ones((2, self.n_joints), dtype=torch.float64)
-        return list(self.initial(Motion(one, one, one), one))
-
     def prior_std(self) -> dict[str, float]:
         """Union of the terms' widths."""
         return {name: value for term in self.terms for name, value in term.prior_std().items()}
