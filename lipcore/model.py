@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Literal, get_args
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
@@ -29,13 +30,13 @@ class TorquePrediction:
     """Answer for N queries of n joints, N·m.
 
     tau: (N, n) mean; tau_std: (N, n) standard deviation of the function; noise_std: (n,) of the measurement; an
-    interval for measurements needs both. covariance: (N, n, n) of the function between joints.
+    interval for measurements needs both. covariance: (N, n, n) of the function between joints, where asked for.
     """
 
     tau: Array
     tau_std: Array
     noise_std: Array
-    covariance: Array
+    covariance: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class TorqueModel:
         std: Array = noise.sqrt().numpy()
         return std
 
-    def predict(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> TorquePrediction:
+    def predict(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike, covariance: bool = False) -> TorquePrediction:
         """Torque with uncertainty for arrays of shape (n,) or (N, n).
 
         Raise ValueError for a wrong number of joints, differing shapes or a value that is not finite.
@@ -78,7 +79,21 @@ class TorqueModel:
         if query.n_joints != self.n_joints:
             raise ValueError(f"q has {query.n_joints} joints, expected {self.n_joints}: {', '.join(self.joint_names)}")
         answer = self.posterior.predict(query)
-        return TorquePrediction(answer.mean.numpy(), answer.std.numpy(), self.noise_std, answer.covariance.numpy())
+        between = answer.covariance.numpy() if covariance else None
+        return TorquePrediction(answer.mean.numpy(), answer.std.numpy(), self.noise_std, between)
+
+    def answer(self, motion: Array, std: bool = True) -> tuple[Array, Array | None]:
+        """Torque at one instant, and its standard deviation where asked for: both (n,) N·m. For control loops.
+
+        motion: q, dq and ddq as a C-contiguous float64 array (3, n). Neither shape nor finiteness is checked; what is
+        not finite ends in what is not finite.
+        """
+        answer = self.posterior.predict(Motion(*(torch.from_numpy(part[None]) for part in motion)))
+        return answer.mean[0].numpy(), answer.std[0].numpy() if std else None
+
+    def warm_up(self) -> None:
+        """Do all that the first answer would otherwise wait for."""
+        self.answer(np.zeros((3, self.n_joints)))
 
 
 def train(

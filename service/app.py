@@ -90,7 +90,7 @@ def _open(settings: Settings) -> Service:
     registry.install_shipped(database, files)
     loaded = LoadedModels(database, files, settings.max_loaded_models)
     logger.info("loaded %d models", loaded.preload())
-    jobs = JobQueue(settings, database)
+    jobs = JobQueue(settings, database, loaded.adopt)
     if recovered := jobs.recover():
         logger.warning("queued again after an interruption: %s", ", ".join(recovered))
     limiter = CapacityLimiter(settings.max_concurrent_predictions)

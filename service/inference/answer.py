@@ -19,13 +19,11 @@ from service.inference.schema import (
     Reliability,
 )
 
-REVISION = 0
-"""Versions are not updated online yet: every version is at its first revision."""
-
 
 def predict(service: Service, model: str, request: PredictRequest) -> PredictResponse:
     """Torque with uncertainty at the queries; raise InvalidRequestError or NotFoundError."""
-    row, loaded = service.loaded.get(model, request.version)
+    served = service.loaded.get(model, request.version)
+    loaded = served.model
     single = request.q.ndim == 1
     components.check(loaded, request, service.settings.max_component_batch)
     for name in ("q", "dq", "ddq", "tau"):
@@ -42,25 +40,26 @@ def predict(service: Service, model: str, request: PredictRequest) -> PredictRes
         raise invalid_request("q", f"{len(queries)} queries", f"at most {service.settings.max_batch} in one request")
     _check_positions(queries, single, service.settings.max_position)
 
-    answer = loaded.predict(queries, np.atleast_2d(request.dq), np.atleast_2d(request.ddq))
+    answer = loaded.predict(queries, np.atleast_2d(request.dq), np.atleast_2d(request.ddq), request.covariance)
     tau, std, covariance = answer.tau, answer.tau_std, answer.covariance
     return PredictResponse(
-        model=row.model,
-        version=row.version,
-        revision=REVISION,
+        model=served.name,
+        version=served.version,
+        revision=served.revision,
         joint_names=list(loaded.joint_names),
         torque_convention=loaded.torque_convention,
         tau=(tau[0] if single else tau).tolist(),
         tau_std=(std[0] if single else std).tolist(),
         noise_std=answer.noise_std.tolist(),
-        covariance=(covariance[0] if single else covariance).tolist() if request.covariance else None,
+        covariance=None if covariance is None else (covariance[0] if single else covariance).tolist(),
         components=components.answer(loaded, request) if request.components else None,
     )
 
 
 def evaluate(service: Service, model: str, request: EvaluateRequest) -> EvaluateResponse:
     """Compare a model with a data set; raise InvalidRequestError or NotFoundError."""
-    row, loaded = service.loaded.get(model, request.version)
+    served = service.loaded.get(model, request.version)
+    loaded = served.model
     dataset = store.find(service.database, request.dataset)
     if tuple(dataset.joint_names) != loaded.joint_names:
         expected = f"the joints of the model, {list(loaded.joint_names)}"
@@ -74,9 +73,9 @@ def evaluate(service: Service, model: str, request: EvaluateRequest) -> Evaluate
     answer = loaded.predict(used.q, used.dq, used.ddq)
     metrics = compare(used.tau, answer.tau, answer.tau_std, answer.noise_std)
     return EvaluateResponse(
-        model=row.model,
-        version=row.version,
-        revision=REVISION,
+        model=served.name,
+        version=served.version,
+        revision=served.revision,
         dataset=dataset.id,
         joint_names=list(loaded.joint_names),
         samples=len(samples),
@@ -92,7 +91,7 @@ def evaluate(service: Service, model: str, request: EvaluateRequest) -> Evaluate
             for each, coverage, width in zip(LEVELS, metrics.coverages, metrics.widths, strict=True)
         ],
         reliability=Reliability(nominal=list(RELIABILITY_LEVELS), observed=metrics.reliability.T.tolist()),
-        in_training=any(item["id"] == dataset.id for item in row.manifest["lineage"].get("datasets", [])),
+        in_training=dataset.id in served.datasets,
     )
 
 

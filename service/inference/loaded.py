@@ -1,10 +1,12 @@
-"""Model versions in memory: loaded once, the least recently used dropped."""
+"""Model versions in memory: what hot routes answer from, without a lock and without the database."""
 
 from __future__ import annotations
 
+import itertools
 import logging
 import threading
-from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import lipcore
 from lipcore.model import TorqueModel
@@ -14,46 +16,111 @@ from service.models import registry
 
 logger = logging.getLogger(__name__)
 
+Key = tuple[str, int]
+
+
+@dataclass(frozen=True)
+class Served:
+    """One version in memory, immutable: whoever holds it answers from it whatever is trained or dropped meanwhile.
+
+    revision: online updates applied to it; datasets: ids of the data sets it was trained on.
+    """
+
+    name: str
+    version: int
+    model: TorqueModel
+    datasets: frozenset[str]
+    revision: int = 0
+
+
+@dataclass(frozen=True)
+class _Snapshot:
+    """What is in memory, and which version of each model answers; replaced as a whole, never changed."""
+
+    served: Mapping[Key, Served] = field(default_factory=dict)
+    latest: Mapping[str, int] = field(default_factory=dict)
+
 
 class LoadedModels:
-    """Cache of loaded versions; safe to share between threads. Versions never change, so neither do its entries."""
+    """Cache of loaded versions; safe to share between threads. The least recently used are dropped beyond `capacity`.
+
+    A version becomes the one that answers once it is in memory and warm, by one assignment: queries in flight keep
+    theirs, and none waits.
+    """
 
     def __init__(self, database: Database, files: Files, capacity: int) -> None:
         self.database, self.files, self.capacity = database, files, capacity
-        self._models: OrderedDict[str, TorqueModel] = OrderedDict()
+        self._snapshot = _Snapshot()
         self._lock = threading.Lock()
-        self._loading: dict[str, threading.Lock] = {}
+        self._loading: dict[Key, threading.Lock] = {}
+        self._clock = itertools.count()
+        self._used: dict[Key, int] = {}
 
-    def get(self, model: str, version: int | None) -> tuple[VersionRow, TorqueModel]:
-        """Return a version, the latest where None, and its model, loaded if need be; raise NotFoundError."""
-        row = registry.find(self.database, model, version)
-        return row, self._load(row.folder)
+    def hot(self, model: str, version: int | None) -> Served | None:
+        """Return a version, the latest where None, if it is in memory; never waits."""
+        snapshot = self._snapshot
+        number = snapshot.latest.get(model) if version is None else version
+        if number is None:
+            return None
+        key = (model, number)
+        found = snapshot.served.get(key)
+        if found is not None:
+            self._used[key] = next(self._clock)
+        return found
+
+    def get(self, model: str, version: int | None) -> Served:
+        """Return a version, the latest where None, loaded if need be; raise NotFoundError. Not for the event loop."""
+        return self.hot(model, version) or self._load(registry.find(self.database, model, version), version is None)
+
+    def announce(self, model: str, version: int) -> None:
+        """Never again answer with an older version than this one. Not for the event loop."""
+        known = self._snapshot.latest.get(model)
+        if known is not None and version > known:  # a model without an answer yet is loaded when it is asked
+            self.adopt(model, version)
+
+    def adopt(self, model: str, version: int) -> None:
+        """Load a new version, and answer with it if it is the newest. Not for the event loop."""
+        try:
+            self._load(registry.find(self.database, model, version), latest=True)
+        except lipcore.ModelFormatError as error:  # who asks for it is told; the version before goes on answering
+            logger.error("version %d of model %s cannot be loaded: %s", version, model, error)
 
     def preload(self) -> int:
         """Load the latest versions of the models that changed last, as many as fit; return how many."""
         loaded = 0
         for row in registry.recent(self.database, self.capacity):
             try:
-                self._load(row.folder)
+                self._load(row, latest=True)
                 loaded += 1
             except lipcore.ModelFormatError as error:  # the others shall answer all the same
                 logger.error("version %d of model %s cannot be loaded: %s", row.version, row.model, error)
         return loaded
 
-    def _load(self, folder: str) -> TorqueModel:
+    def _load(self, row: VersionRow, latest: bool) -> Served:
+        key = (row.model, row.version)
         with self._lock:
-            if folder in self._models:
-                self._models.move_to_end(folder)
-                return self._models[folder]
-            loading = self._loading.setdefault(folder, threading.Lock())
+            loading = self._loading.setdefault(key, threading.Lock())
         with loading:  # a second request for the same version waits for the first, others do not
+            served = self._snapshot.served.get(key)
+            if served is None:
+                model = lipcore.load(self.files.versions / row.folder)
+                model.warm_up()
+                datasets = frozenset(item["id"] for item in row.manifest["lineage"].get("datasets", []))
+                served = Served(row.model, row.version, model, datasets)
+            self._publish(served, latest)
             with self._lock:
-                if folder in self._models:
-                    return self._models[folder]
-            model = lipcore.load(self.files.versions / folder)
-            with self._lock:
-                self._models[folder] = model
-                self._loading.pop(folder, None)
-                while len(self._models) > self.capacity:
-                    self._models.popitem(last=False)
-            return model
+                self._loading.pop(key, None)
+        return served
+
+    def _publish(self, served: Served, latest: bool) -> None:
+        key = (served.name, served.version)
+        with self._lock:
+            self._used[key] = next(self._clock)
+            entries, newest = {**self._snapshot.served, key: served}, dict(self._snapshot.latest)
+            if latest:
+                newest[served.name] = max(served.version, newest.get(served.name, 0))
+            while len(entries) > self.capacity:
+                oldest = min(entries, key=lambda each: self._used.get(each, -1))
+                del entries[oldest]
+                self._used.pop(oldest, None)
+            self._snapshot = replace(self._snapshot, served=entries, latest=newest)

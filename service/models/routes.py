@@ -16,13 +16,18 @@ router = APIRouter(prefix="/v1/models", tags=["models"], responses=responses(Inv
 @router.get("", summary="List models, newest first")
 def list_models(service: ServiceDep, page: PageQuery) -> ModelPage:
     """One page of models with their versions."""
-    return registry.page(service.database, page)
+    found = registry.page(service.database, page)
+    for item in found.items:
+        service.loaded.announce(item.name, item.latest_version)
+    return found
 
 
 @router.get("/{model}", summary="One model and its versions", responses=responses(NotFoundError))
 def show(service: ServiceDep, model: str) -> Model:
     """Which versions there are and which one answers."""
-    return registry.show(service.database, model)
+    found = registry.show(service.database, model)
+    service.loaded.announce(found.name, found.latest_version)
+    return found
 
 
 @router.get("/{model}/versions/{version}", summary="One version", responses=responses(NotFoundError))

@@ -52,19 +52,24 @@ def create(service: Service, request: JobRequest) -> Job:
     return _show(job)
 
 
-def show(database: Database, job: str) -> Job:
-    """Return one job; raise NotFoundError."""
-    with database.session() as session:
+def show(service: Service, job: str) -> Job:
+    """Return one job; raise NotFoundError. Who sees it succeed is answered by its version from then on."""
+    with service.database.session() as session:
         row = session.scalar(select(JobRow).where(JobRow.id == job))
     if row is None:
         raise not_found("job", job)
+    if row.version is not None:
+        service.loaded.announce(row.model, row.version)
     return _show(row)
 
 
-def page(database: Database, part: Page) -> JobPage:
-    """List jobs, newest first."""
-    with database.session() as session:
+def page(service: Service, part: Page) -> JobPage:
+    """List jobs, newest first. Who sees one succeed is answered by its version from then on."""
+    with service.database.session() as session:
         rows, following = newest(session, JobRow, part)
+    for row in rows:
+        if row.version is not None:
+            service.loaded.announce(row.model, row.version)
     return JobPage(items=[_show(row) for row in rows], next_cursor=following)
 
 

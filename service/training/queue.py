@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import threading
+from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 
@@ -13,16 +14,19 @@ from sqlalchemy import select
 from service.database import Database, JobRow, now
 from service.settings import Settings
 from service.training import worker
-from service.training.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING
+from service.training.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED
 
 logger = logging.getLogger(__name__)
 
 
 class JobQueue:
-    """Hands queued jobs to training processes and takes back what an interruption left."""
+    """Hands queued jobs to training processes and takes back what an interruption left.
 
-    def __init__(self, settings: Settings, database: Database) -> None:
-        self.settings, self.database = settings, database
+    trained: called with the model and the version that a job has made, in a thread of its own.
+    """
+
+    def __init__(self, settings: Settings, database: Database, trained: Callable[[str, int], None]) -> None:
+        self.settings, self.database, self.trained = settings, database, trained
         self._lock = threading.Lock()
         self._closing = False
         self._pool = self._new_pool()
@@ -93,11 +97,18 @@ class JobQueue:
             return
         error = future.exception()
         if error is None:
+            threading.Thread(target=self._succeeded, args=(job,), daemon=True).start()
             return
         # the process died or could not reach the database: the job's row still says queued or running
         logger.error("the training process of job %s ended early: %r", job, error)
         # a broken pool calls back while it holds a lock that submitting needs: from another thread then
         threading.Thread(target=self._retry, args=(job,)).start()
+
+    def _succeeded(self, job: str) -> None:
+        with self.database.session() as session:
+            row = session.scalar(select(JobRow).where(JobRow.id == job, JobRow.state == SUCCEEDED))
+        if row is not None and row.version is not None:
+            self.trained(row.model, row.version)
 
     def _retry(self, job: str) -> None:
         with self.database.transaction() as session:

@@ -29,13 +29,13 @@ def create(service: ServiceDep, request: JobRequest, response: Response) -> Job:
 @router.get("", summary="List jobs, newest first")
 def list_jobs(service: ServiceDep, page: PageQuery) -> JobPage:
     """One page of jobs with their progress."""
-    return jobs.page(service.database, page)
+    return jobs.page(service, page)
 
 
 @router.get("/{job}", summary="One job and its progress", responses=responses(NotFoundError))
 def show(service: ServiceDep, job: str) -> Job:
     """State, progress, and the version it made or why it failed."""
-    return jobs.show(service.database, job)
+    return jobs.show(service, job)
 
 
 @router.post("/{job}/cancel", summary="Cancel a job", responses=responses(NotFoundError, ConflictError))

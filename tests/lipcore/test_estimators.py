@@ -79,7 +79,7 @@ AWKWARD: dict[str, Callable[[], Samples]] = {
 def test_awkward_data_end_in_a_model(name: str, data: str) -> None:
     samples = AWKWARD[data]()
     model = trained(name, samples, replace(OPTIONS, hyperparameter_samples=25, max_iterations=15))
-    answer = model.predict(samples.q, samples.dq, samples.ddq)
+    answer = model.predict(samples.q, samples.dq, samples.ddq, covariance=True)
     for part in (answer.tau, answer.tau_std, answer.covariance, answer.noise_std):
         assert np.isfinite(part).all()
     assert (answer.noise_std > 0).all()

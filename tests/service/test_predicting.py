@@ -27,7 +27,7 @@ def ask(api, model, motion, **request):
 
 def test_a_batch_is_answered_as_lipcore_does(api, trained, motion):
     answer = ask(api, trained.name, motion, covariance=True)
-    expected = trained.model.predict(**motion)
+    expected = trained.model.predict(**motion, covariance=True)
     np.testing.assert_allclose(answer["tau"], expected.tau, **EXACT)
     np.testing.assert_allclose(answer["tau_std"], expected.tau_std, **EXACT)
     np.testing.assert_allclose(answer["covariance"], expected.covariance, **EXACT)
