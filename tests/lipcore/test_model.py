@@ -28,12 +28,12 @@ def model(samples: Samples) -> TorqueModel:
 
 
 def test_answer_for_many_is_the_answers_for_each(model: TorqueModel, samples: Samples) -> None:
-    many = model.predict(samples.q, samples.dq, samples.ddq)
+    many = model.predict(samples.q, samples.dq, samples.ddq, covariance=True)
     assert many.tau.shape == many.tau_std.shape == (60, 2)
     assert many.covariance.shape == (60, 2, 2)
     assert many.noise_std.shape == (2,)
     for k in (0, 31, 59):
-        one = model.predict(samples.q[k], samples.dq[k], samples.ddq[k])
+        one = model.predict(samples.q[k], samples.dq[k], samples.ddq[k], covariance=True)
         assert np.allclose(one.tau[0], many.tau[k], rtol=1e-8, atol=1e-10)
         assert np.allclose(one.covariance[0], many.covariance[k], rtol=1e-6, atol=1e-12)
     assert np.allclose(many.tau_std**2, np.diagonal(many.covariance, axis1=1, axis2=2), rtol=1e-12)

@@ -122,5 +122,5 @@ def test_more_models_than_fit_in_memory_all_answer(api, trained, motion):
     for number in range(loaded.capacity):
         train(api, f"another{number}", trained.dataset)
         ask(api, f"another{number}", motion)
-        assert len(loaded._models) <= loaded.capacity
+        assert len(loaded._snapshot.served) <= loaded.capacity
     assert ask(api, trained.name, motion) == before
