@@ -13,13 +13,13 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from lipcore.energies import EnergyKernel, kinetic_energy, potential_energy, prior_mean, with_torque
+from lipcore.energies import EnergyKernel, kinetic_energy, potential_energy, prior_mean, with_anchors
 from lipcore.estimators import Estimator
 from lipcore.functionals import Estimate, combine_torques
 from lipcore.kernels.base import SumKernel, TorqueKernel
 from lipcore.model import TorqueModel
 from lipcore.motion import Motion
-from lipcore.posterior import ExactPosterior
+from lipcore.posterior import Posterior
 
 ComponentName = Literal[
     "inertia_matrix",
@@ -107,8 +107,8 @@ def components(
 
 def reference_posture(model: TorqueModel) -> Tensor:
     """Where potential energy counts from, (n,): the middle of each joint's range in the training samples."""
-    q = model.posterior.motion.q
-    return 0.5 * (q.amin(0) + q.amax(0))
+    q = model.training_range["q"]
+    return 0.5 * torch.tensor([q["min"], q["max"]], dtype=torch.float64).sum(0)
 
 
 def forward_dynamics(model: TorqueModel, motion: Motion, tau: Tensor) -> Estimate:
@@ -131,7 +131,7 @@ def forward_dynamics(model: TorqueModel, motion: Motion, tau: Tensor) -> Estimat
     return Estimate(ddq, variance.clamp_min(0.0).sqrt())
 
 
-def inertia_matrix(posterior: ExactPosterior, dynamics: TorqueKernel, q: Tensor) -> Tensor:
+def inertia_matrix(posterior: Posterior, dynamics: TorqueKernel, q: Tensor) -> Tensor:
     """Posterior mean of M(q), (N, n, n): the torque per unit acceleration, exact since torque is affine in ddq."""
     n = q.shape[1]
     zero = torch.zeros_like(q)
@@ -140,20 +140,20 @@ def inertia_matrix(posterior: ExactPosterior, dynamics: TorqueKernel, q: Tensor)
     return torch.stack([posterior.mean(push, dynamics) - rest for push in pushes], dim=2)
 
 
-def gravity(posterior: ExactPosterior, dynamics: TorqueKernel, q: Tensor) -> Tensor:
+def gravity(posterior: Posterior, dynamics: TorqueKernel, q: Tensor) -> Tensor:
     """Posterior mean of the gravity torque g(q), (N, n) N·m: the torque at standstill, friction excluded."""
     zero = torch.zeros_like(q)
     return posterior.mean(Motion(q, zero, zero), dynamics)
 
 
-def energies(posterior: ExactPosterior, dynamics: EnergyKernel, query: Motion) -> Energies:
+def energies(posterior: Posterior, dynamics: EnergyKernel, query: Motion) -> Energies:
     """Posterior means of kinetic and potential energy, learnt without a label on either."""
-    kinetic, potential = prior_mean([dynamics], query) + posterior.weights @ with_torque(posterior, [dynamics], query)
+    kinetic, potential = prior_mean([dynamics], query) + posterior.weights @ with_anchors(posterior, [dynamics], query)
     return Energies(kinetic, potential)
 
 
 def _torque_parts(
-    posterior: ExactPosterior, kernel: TorqueKernel, motion: Motion, names: Sequence[ComponentName]
+    posterior: Posterior, kernel: TorqueKernel, motion: Motion, names: Sequence[ComponentName]
 ) -> dict[str, Estimate]:
     """The components of `_TORQUES` and the inertia matrix, from one joint posterior."""
     n, zero = motion.n_joints, torch.zeros_like(motion.q)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -13,22 +14,22 @@ from lipcore.kernels.chain import ChainKernel
 from lipcore.kernels.lip import LipKernel
 from lipcore.kernels.rigid_body import RigidBodyKernel
 from lipcore.motion import Motion
-from lipcore.posterior import ExactPosterior
+from lipcore.posterior import Posterior
 
 EnergyKernel = LipKernel | ChainKernel | RigidBodyKernel
 """Priors of torques that come from priors of the energies."""
 KINETIC, POTENTIAL = 0, 1
 
 
-def kinetic_energy(posterior: ExactPosterior, kernels: Sequence[EnergyKernel], query: Motion) -> Estimate:
+def kinetic_energy(posterior: Posterior, kernels: Sequence[EnergyKernel], query: Motion) -> Estimate:
     """Posterior of the kinetic energy at N queries, summed over the kernels: (N,) J."""
     mean = prior_mean(kernels, query)[KINETIC]
     variance = covariance(posterior.params, kernels, query, query)[KINETIC]
-    return condition(posterior, mean, variance, with_torque(posterior, kernels, query)[KINETIC])
+    return condition(posterior, mean, variance, with_anchors(posterior, kernels, query)[KINETIC])
 
 
 def potential_energy(
-    posterior: ExactPosterior, kernels: Sequence[EnergyKernel], query: Motion, reference: Tensor
+    posterior: Posterior, kernels: Sequence[EnergyKernel], query: Motion, reference: Tensor
 ) -> Estimate:
     """Posterior of V(q) − V(reference) at N queries, summed over the kernels: (N,) J. reference: (n,).
 
@@ -42,7 +43,7 @@ def potential_energy(
         + covariance(params, kernels, origin, origin)
     )
     mean = prior_mean(kernels, query) - prior_mean(kernels, origin)
-    cross = with_torque(posterior, kernels, query) - with_torque(posterior, kernels, origin)
+    cross = with_anchors(posterior, kernels, query) - with_anchors(posterior, kernels, origin)
     return condition(posterior, mean[POTENTIAL], variance[POTENTIAL], cross[POTENTIAL])
 
 
@@ -67,17 +68,25 @@ def covariance(params: Params, kernels: Sequence[EnergyKernel], x: Motion, y: Mo
     return total
 
 
-def with_torque(posterior: ExactPosterior, kernels: Sequence[EnergyKernel], query: Motion) -> Tensor:
-    """Prior covariance of both energies at N queries with the m torques of the posterior: (2, m, N) J·N·m."""
-    params, motion = posterior.params, posterior.motion
-    m, columns = len(posterior.weights), State.columns(motion)
-    total = torch.zeros((2, m, len(query)), dtype=torch.float64)
+def with_anchors(posterior: Posterior, kernels: Sequence[EnergyKernel], query: Motion) -> Tensor:
+    """Prior covariance of both energies at N queries with the M anchors of the posterior: (2, M, N)."""
+    total = torch.zeros((2, len(posterior.weights), len(query)), dtype=torch.float64)
     for kernel in kernels:
         if isinstance(kernel, RigidBodyKernel):
-            scaled = kernel.energy_features(query) @ kernel.covariance(params)  # (N, 2, p)
-            total += (scaled @ kernel.features(motion).reshape(m, -1).T).permute(1, 2, 0)
-            continue
-        for rows in row_chunks(len(query), len(motion)):
-            cross = kernel.energies(params, State.rows(query[rows]), columns)  # (2, n, rows, M)
-            total[:, :, rows] += cross.permute(0, 3, 1, 2).reshape(2, m, -1)
+            scaled = kernel.energy_features(query) @ kernel.covariance(posterior.params)  # (N, 2, p)
+            parts = [posterior.with_weights(kernel, scaled[:, energy].T) for energy in (KINETIC, POTENTIAL)]
+        else:
+            anchors = posterior.with_torques(kernel, partial(_with_torques, kernel, posterior.params, query))
+            parts = list(anchors.reshape(len(anchors), 2, -1).unbind(1))
+        total += torch.stack(parts)
     return total
+
+
+def _with_torques(kernel: LipKernel | ChainKernel, params: Params, query: Motion, motion: Motion) -> Tensor:
+    """Covariance of all torques of S samples with both energies at N queries: (S n, 2 N)."""
+    n, size, columns = kernel.n_joints, len(motion), State.columns(motion)
+    out = torch.empty((size, n, 2, len(query)), dtype=torch.float64)
+    for rows in row_chunks(len(query), size):
+        cross = kernel.energies(params, State.rows(query[rows]), columns)  # (2, n, rows, S)
+        out[..., rows] = cross.permute(3, 1, 0, 2)
+    return out.reshape(size * n, -1)

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 from torch import Tensor
 
 from lipcore import noise
@@ -46,7 +45,9 @@ class FitOptions:
     hyperparameter_samples: samples that hyperparameters are fitted on; posterior_samples: samples the posterior is
     conditioned on, where there are more the most spread-out ones; starts: points that the search for hyperparameters is
     tried from, the best of which is followed; tied: links share kernel shapes (see LipKernel);
-    device: "cpu", "cuda" or "auto"; prior: of rigid bodies, "urdf" or "zero" (see RigidBodyKernel).
+    device: "cpu", "cuda" or "auto"; prior: of rigid bodies, "urdf" or "zero" (see RigidBodyKernel);
+    compact_tolerance: largest deviation of the compact posterior from the exact one, in standard deviations;
+    max_inducing_outputs: where that would take more, the compact posterior deviates more, and answers stay fast.
     """
 
     hyperparameter_samples: int = 150
@@ -56,6 +57,8 @@ class FitOptions:
     tied: bool = True
     device: str = "auto"
     prior: str = "urdf"
+    compact_tolerance: float = 0.02
+    max_inducing_outputs: int = 1500
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -63,12 +66,15 @@ class FitOptions:
             ("posterior_samples", 10, 5000),
             ("max_iterations", 1, 10000),
             ("starts", 1, 100),
+            ("max_inducing_outputs", 1, 20000),
         ):
             value = getattr(self, name)
             if type(value) is not int or not low <= value <= high:
                 raise ValueError(f"{name} is {value!r}, expected a whole number from {low} to {high}")
         if self.device not in ("auto", "cpu", "cuda"):
             raise ValueError(f"device is {self.device!r}, expected auto, cpu or cuda")
+        if not (isinstance(self.compact_tolerance, float) and 0 < self.compact_tolerance <= 1):
+            raise ValueError(f"compact_tolerance is {self.compact_tolerance!r}, expected a number above 0, 1 at most")
         if self.prior not in PRIORS:
             raise ValueError(f"prior is {self.prior!r}, expected one of {', '.join(PRIORS)}")
 
@@ -246,6 +252,8 @@ class _Search:
 
     def run(self, begin: Array, iterations: int, callback: Callable[..., None] | None = None) -> Any:
         """Minimise by L-BFGS-B from `begin`; scipy's result. The noise stays above its floor."""
+        from scipy.optimize import minimize  # noqa: PLC0415 - serving does without it
+
         free = {name: torch.full_like(value, -np.inf) for name, value in self.start.items()}
         lower = self.pack({**free, "noise.log_std": self.floor})
         return minimize(

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lipcore.kernels.base import TorqueKernel
 from lipcore.motion import Motion
-from lipcore.posterior import ExactPosterior
+from lipcore.posterior import Posterior
 
 COLUMNS_PER_CHUNK = 512
 """Right-hand sides whitened together: enough for fast matrix products, few enough to stay within tens of MB."""
@@ -24,18 +24,18 @@ class Estimate:
     std: Tensor
 
 
-def condition(posterior: ExactPosterior, prior_mean: Tensor, prior_variance: Tensor, cross: Tensor) -> Estimate:
-    """Posterior of K quantities s: E s + cᵀ K⁻¹ (y − E y) and var s − cᵀ K⁻¹ c, with c = cov(torques, s).
+def condition(posterior: Posterior, prior_mean: Tensor, prior_variance: Tensor, cross: Tensor) -> Estimate:
+    """Posterior of K quantities from their covariance with the posterior's anchors (see `Posterior`).
 
-    prior_mean, prior_variance: (K,); cross: (m, K) for the m torques that the posterior is conditioned on.
+    prior_mean, prior_variance: (K,); cross: (M, K).
     """
-    explained = posterior.factor.whiten(cross).square().sum(0)
+    explained = posterior.whiten(cross).square().sum(0)
     std = (prior_variance - explained).clamp_min(0.0).sqrt()  # rounding may end below zero where all is known
     return Estimate(prior_mean + posterior.weights @ cross, posterior.std_factor * std)
 
 
 def combine_torques(
-    posterior: ExactPosterior, kernel: TorqueKernel, motions: Sequence[Motion], coefficients: Tensor
+    posterior: Posterior, kernel: TorqueKernel, motions: Sequence[Motion], coefficients: Tensor
 ) -> Estimate:
     """Posterior of F linear combinations of a kernel's torques at S motions a query, (N, F).
 
@@ -49,7 +49,7 @@ def combine_torques(
     for start in range(0, count, step):
         stack = Motion(*(part[start : start + step].reshape(-1, n) for part in stacked))
         queries = len(stack) // size
-        cross = kernel.gram(posterior.params, posterior.motion, stack)  # (m, queries S n)
+        cross = posterior.cross(kernel, stack)  # (M, queries S n)
         cross = cross.reshape(-1, size * n) @ coefficients.T
         grams = [kernel.symmetric_gram(posterior.params, stack[k * size : (k + 1) * size]) for k in range(queries)]
         variance = torch.stack([(coefficients @ gram * coefficients).sum(1) for gram in grams])

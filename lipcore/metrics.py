@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
-from scipy.stats import norm
 
 from lipcore.samples import Array
 
@@ -71,4 +71,4 @@ def _width(total: Array, level: float) -> Array:
 
 
 def _quantile(level: float) -> float:
-    return float(norm.ppf(0.5 + level / 2))
+    return NormalDist().inv_cdf(0.5 + level / 2)

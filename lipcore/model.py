@@ -4,17 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Literal, get_args
 
-import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
 from lipcore.calibration import NO_CALIBRATION, Calibration, calibrate
+from lipcore.compact.basis import Basis
+from lipcore.compact.compress import compress
+from lipcore.compact.posterior import CompactPosterior
+from lipcore.compact.statistics import Statistics
 from lipcore.estimators import DEFAULT_ESTIMATOR, Estimator, make_estimator
+from lipcore.evaluator import Evaluator
 from lipcore.fitting import Cancelled, FitOptions, Progress, fit
-from lipcore.motion import JointType, Motion, check_finite, check_joint_types
+from lipcore.motion import JointType, Motion, check_finite, check_joint_types, motion_arrays
 from lipcore.posterior import ExactPosterior
 from lipcore.samples import Array, Samples
 from lipcore.urdf import JointMismatchError, RigidBody
@@ -39,11 +44,15 @@ class TorquePrediction:
     covariance: Array | None = None
 
 
+TrainingRange = dict[str, dict[str, list[float]]]
+"""Smallest (`min`) and largest (`max`) q, dq and ddq of the samples behind a posterior, per joint."""
+
+
 @dataclass(frozen=True)
 class TorqueModel:
     """Fitted inverse dynamics of one robot: immutable, safe to share between threads.
 
-    motion, tau: the samples that the posterior is conditioned on; fit: what the fit reported, for the manifest;
+    fit: what the fit reported, compact: how near the compact posterior comes to the exact one, both for the manifest;
     robot: the rigid bodies of an estimator that has them; calibration: how the posterior's deviations are corrected.
     """
 
@@ -51,10 +60,11 @@ class TorqueModel:
     joint_names: tuple[str, ...]
     joint_types: tuple[JointType, ...]
     torque_convention: TorqueConvention
-    options: dict[str, int | bool | str]
+    options: dict[str, int | float | bool | str]
     fit: dict[str, float | int | bool | str]
-    tau: Tensor
-    posterior: ExactPosterior
+    posterior: CompactPosterior
+    training_range: TrainingRange
+    compact: dict[str, float | int | bool]
     robot: RigidBody | None = None
     calibration: Calibration = NO_CALIBRATION
 
@@ -66,8 +76,7 @@ class TorqueModel:
     @property
     def noise_std(self) -> Array:
         """Standard deviation of the measured torque around the function, (n,) N·m, jitter included."""
-        noise = self.posterior.params["noise.log_std"].exp().square() + self.posterior.factor.jitter
-        std: Array = noise.sqrt().numpy()
+        std: Array = self.posterior.noise_variance.sqrt().numpy()
         return std
 
     def predict(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike, covariance: bool = False) -> TorquePrediction:
@@ -75,25 +84,39 @@ class TorqueModel:
 
         Raise ValueError for a wrong number of joints, differing shapes or a value that is not finite.
         """
-        query = Motion.from_arrays(q, dq, ddq)
-        if query.n_joints != self.n_joints:
-            raise ValueError(f"q has {query.n_joints} joints, expected {self.n_joints}: {', '.join(self.joint_names)}")
-        answer = self.posterior.predict(query)
-        between = answer.covariance.numpy() if covariance else None
-        return TorquePrediction(answer.mean.numpy(), answer.std.numpy(), self.noise_std, between)
+        query = motion_arrays(q, dq, ddq)
+        joints = query[0].shape[1]
+        if joints != self.n_joints:
+            raise ValueError(f"q has {joints} joints, expected {self.n_joints}: {', '.join(self.joint_names)}")
+        tau, std, between = self.evaluator.many(*query, covariance)
+        return TorquePrediction(tau, std, self.noise_std, between)
 
     def answer(self, motion: Array, std: bool = True) -> tuple[Array, Array | None]:
         """Torque at one instant, and its standard deviation where asked for: both (n,) N·m. For control loops.
 
-        motion: q, dq and ddq as a C-contiguous float64 array (3, n). Neither shape nor finiteness is checked; what is
-        not finite ends in what is not finite.
+        motion: q, dq and ddq as a float64 array (3, n). Neither shape nor finiteness is checked; what is not finite
+        ends in what is not finite.
         """
-        answer = self.posterior.predict(Motion(*(torch.from_numpy(part[None]) for part in motion)))
-        return answer.mean[0].numpy(), answer.std[0].numpy() if std else None
+        return self.evaluator.one(motion, std)
 
     def warm_up(self) -> None:
         """Do all that the first answer would otherwise wait for."""
-        self.answer(np.zeros((3, self.n_joints)))
+        self.evaluator.warm_up()
+
+    @cached_property
+    def evaluator(self) -> Evaluator:
+        """The compiled form of the posterior, which answers queries."""
+        posterior, basis = self.posterior, self.posterior.basis
+        return Evaluator(
+            basis.term,
+            posterior.params,
+            None if basis.term is None else basis.inducing,
+            basis.outputs.numpy(),
+            basis.linear,
+            posterior.weights.numpy(),
+            posterior.root.numpy(),
+            posterior.std_factor,
+        )
 
 
 def train(
@@ -131,25 +154,25 @@ def train(
     used = samples.rows(fitted.rows)
     motion, tau = used.motion(), used.torque()
     calibration = calibrate(estimator)
-    posterior = ExactPosterior.fit(chosen.kernel, fitted.params, motion, tau, calibration.function_std_factor)
-    report = {**asdict(fitted.report), "jitter": posterior.factor.jitter}
+    exact = ExactPosterior.fit(chosen.kernel, fitted.params, motion, tau, calibration.function_std_factor)
+    compression = compress(exact, tau, options.compact_tolerance, options.max_inducing_outputs)
     return TorqueModel(
         chosen,
         samples.joint_names,
         types,
         torque_convention,
         asdict(options),
-        report,
-        tau,
-        posterior,
+        {**asdict(fitted.report), "jitter": exact.factor.jitter},
+        compression.posterior,
+        training_range(motion),
+        compression.report(),
         robot,
         calibration,
     )
 
 
-def training_range(model: TorqueModel) -> dict[str, dict[str, list[float]]]:
-    """Smallest and largest q, dq and ddq of the samples behind the posterior, per joint."""
-    motion = model.posterior.motion
+def training_range(motion: Motion) -> TrainingRange:
+    """Smallest and largest q, dq and ddq of N samples."""
     return {
         name: {"min": values.min(0).values.tolist(), "max": values.max(0).values.tolist()}
         for name, values in (("q", motion.q), ("dq", motion.dq), ("ddq", motion.ddq))
@@ -161,29 +184,40 @@ def restore(
     joint_names: Sequence[str],
     joint_types: Sequence[str],
     torque_convention: TorqueConvention,
-    options: dict[str, int | bool | str],
+    options: dict[str, int | float | bool | str],
     fit_report: dict[str, float | int | bool | str],
     params: dict[str, Tensor],
-    motion: Motion,
-    tau: Tensor,
+    inducing: Motion,
+    outputs: Tensor,
+    statistics: Statistics,
+    training_range: TrainingRange,
+    compact: dict[str, float | int | bool],
     robot: RigidBody | None = None,
     calibration: Calibration = NO_CALIBRATION,
 ) -> TorqueModel:
-    """Rebuild a model from its parts; the posterior is computed anew from hyperparameters and samples.
+    """Rebuild a model from its parts: hyperparameters, inducing outputs (see `Basis`) and statistics.
 
-    Raise ValueError naming the hyperparameter that is missing, unknown or of the wrong shape.
+    Raise ValueError naming what is missing, unknown or of the wrong shape.
     """
     tied, prior = bool(options.get("tied", True)), str(options.get("prior", "urdf"))
     gravity = torque_convention == "gravity_included"
     chosen = make_estimator(estimator, joint_types, tied, robot, prior, gravity)
-    expected = {name: value.shape for name, value in chosen.kernel.initial(motion, tau).items()}
-    expected["noise.log_std"] = torch.Size([len(joint_names)])
+    kernel, n = chosen.kernel, len(joint_names)
+    expected = {**kernel.shapes(), "noise.log_std": torch.Size([n])}
     for name in expected.keys() | params.keys():
         found = tuple(params[name].shape) if name in params else None
         wanted = tuple(expected[name]) if name in expected else None
         if found != wanted:
             raise ValueError(f"hyperparameter {name!r} has shape {found}, expected {wanted}")
-    posterior = ExactPosterior.fit(chosen.kernel, params, motion, tau, calibration.function_std_factor)
+    basis = Basis.build(kernel, params, inducing, outputs)
+    size = len(basis)
+    if statistics.a.shape != (size, size) or statistics.b.shape != (size,):
+        raise ValueError(
+            f"statistics have shapes {tuple(statistics.a.shape)} and {tuple(statistics.b.shape)}, "
+            f"expected {(size, size)} and {(size,)}"
+        )
+    noise = torch.exp(2 * params["noise.log_std"]) + float(fit_report.get("jitter", 0.0))
+    posterior = CompactPosterior.build(kernel, basis, statistics, noise, calibration.function_std_factor)
     return TorqueModel(
         chosen,
         tuple(joint_names),
@@ -191,8 +225,9 @@ def restore(
         torque_convention,
         options,
         fit_report,
-        tau,
         posterior,
+        training_range,
+        compact,
         robot,
         calibration,
     )

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+Array = NDArray[np.float64]
 JointType = Literal["revolute", "prismatic"]
 JOINT_TYPES: tuple[JointType, ...] = get_args(JointType)
 
@@ -32,6 +33,21 @@ def check_finite(name: str, array: NDArray[np.float64]) -> None:
         raise ValueError(f"{name}[{sample}, {joint}] is {array[sample, joint]}, expected a finite number")
 
 
+def motion_arrays(q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> tuple[Array, Array, Array]:
+    """q, dq and ddq as arrays (N, n); raise ValueError where shapes differ or a value is not finite."""
+    arrays = []
+    for name, values in (("q", q), ("dq", dq), ("ddq", ddq)):
+        array = np.atleast_2d(np.asarray(values, dtype=np.float64))
+        if array.ndim != 2 or array.size == 0:
+            raise ValueError(f"{name} has shape {array.shape}, expected (N, n) or (n,), neither of them 0")
+        check_finite(name, array)
+        arrays.append(array)
+    for name, array in zip(("dq", "ddq"), arrays[1:], strict=True):
+        if array.shape != arrays[0].shape:
+            raise ValueError(f"{name} has shape {array.shape}, expected {arrays[0].shape} as q has")
+    return arrays[0], arrays[1], arrays[2]
+
+
 @dataclass(frozen=True)
 class Motion:
     """N instants of motion of n joints, float64 tensors on one device.
@@ -46,18 +62,7 @@ class Motion:
     @classmethod
     def from_arrays(cls, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike, device: torch.device | str = "cpu") -> Motion:
         """Build from arrays of shape (N, n) or (n,); raise ValueError where shapes differ or a value is not finite."""
-        tensors = []
-        for name, values in (("q", q), ("dq", dq), ("ddq", ddq)):
-            array = np.atleast_2d(np.asarray(values, dtype=np.float64))
-            if array.ndim != 2 or array.size == 0:
-                raise ValueError(f"{name} has shape {array.shape}, expected (N, n) or (n,), neither of them 0")
-            check_finite(name, array)
-            tensors.append(torch.from_numpy(array.copy()).to(device))
-        shape = tensors[0].shape
-        for name, tensor in zip(("dq", "ddq"), tensors[1:], strict=True):
-            if tensor.shape != shape:
-                raise ValueError(f"{name} has shape {tuple(tensor.shape)}, expected {tuple(shape)} as q has")
-        return cls(*tensors)
+        return cls(*(torch.from_numpy(array.copy()).to(device) for array in motion_arrays(q, dq, ddq)))
 
     def __len__(self) -> int:
         return self.q.shape[0]

@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.optimize import least_squares
 from torch import Tensor
 
 from lipcore.estimators import Estimator
 from lipcore.kernels.base import LinearKernel
 from lipcore.kernels.friction import FRICTION_TERMS, FrictionKernel
 from lipcore.kernels.rigid_body import RigidBodyKernel
-from lipcore.posterior import ExactPosterior
+from lipcore.posterior import Posterior
 from lipcore.robots import pinocchio
 from lipcore.samples import Array
 from lipcore.urdf import PARAMETERS
@@ -75,12 +74,11 @@ class InertialParameters:
     mean_is_plausible: bool
 
 
-def weight_posterior(posterior: ExactPosterior, term: LinearKernel) -> WeightPosterior:
-    """Posterior of a term's weights: mean μ + Λ Φᵀ α, covariance Λ − Λ Φᵀ K⁻¹ Φ Λ with α = K⁻¹ (y − mean)."""
-    features = term.features(posterior.motion)
+def weight_posterior(posterior: Posterior, term: LinearKernel) -> WeightPosterior:
+    """Posterior of a linear term's weights, whose prior is N(μ, Λ)."""
     prior = term.covariance(posterior.params).detach()
-    cross = features.reshape(-1, features.shape[-1]) @ prior  # (N n, p)
-    white = posterior.factor.whiten(cross)
+    cross = posterior.with_weights(term, prior)  # (M, p)
+    white = posterior.whiten(cross)
     mean = cross.T @ posterior.weights
     if (centre := term.prior_weights()) is not None:
         mean = mean + centre.to(mean.device)
@@ -88,7 +86,7 @@ def weight_posterior(posterior: ExactPosterior, term: LinearKernel) -> WeightPos
     return WeightPosterior(_numpy(mean), _numpy(0.5 * (covariance + covariance.T)), _numpy(prior.diagonal().sqrt()))
 
 
-def friction_coefficients(posterior: ExactPosterior, estimator: Estimator) -> Friction:
+def friction_coefficients(posterior: Posterior, estimator: Estimator) -> Friction:
     """Friction of each joint with standard deviations; raise ValueError for an estimator without friction."""
     term = estimator.terms.get("friction")
     if not isinstance(term, FrictionKernel):
@@ -101,7 +99,7 @@ def friction_coefficients(posterior: ExactPosterior, estimator: Estimator) -> Fr
     return Friction(**named)
 
 
-def inertial_parameters(posterior: ExactPosterior, estimator: Estimator) -> InertialParameters:
+def inertial_parameters(posterior: Posterior, estimator: Estimator) -> InertialParameters:
     """Inertial parameters of each body; raise ValueError for an estimator without rigid bodies."""
     term = estimator.terms.get("rigid_body")
     if not isinstance(term, RigidBodyKernel):
@@ -113,7 +111,7 @@ def inertial_parameters(posterior: ExactPosterior, estimator: Estimator) -> Iner
     return InertialParameters(term.robot.joint_names, mean, std, nearest, plausible)
 
 
-def report(posterior: ExactPosterior, estimator: Estimator) -> dict[str, Any]:
+def report(posterior: Posterior, estimator: Estimator) -> dict[str, Any]:
     """All parameters of an estimator as plain numbers, for a manifest."""
     friction = friction_coefficients(posterior, estimator)
     out: dict[str, Any] = {
@@ -180,6 +178,8 @@ def nearest_plausible(weights: WeightPosterior, start: Array) -> Array:
             columns = slice(index * PARAMETERS, (index + 1) * PARAMETERS)
             out[:, columns] = metric[:, columns] @ log_cholesky(part).calculateJacobian()
         return out
+
+    from scipy.optimize import least_squares  # noqa: PLC0415 - serving does without it
 
     limits = (low.reshape(-1), high.reshape(-1))
     begin = np.array([_log_cholesky(body, total / n) for body in start])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import shutil
 import tempfile
@@ -20,13 +21,14 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
 from lipcore.calibration import Calibration
-from lipcore.model import TORQUE_CONVENTIONS, TorqueModel, restore, training_range
+from lipcore.compact.statistics import Statistics
+from lipcore.model import TORQUE_CONVENTIONS, TorqueModel, restore
 from lipcore.motion import Motion
 from lipcore.parameters import report
 from lipcore.urdf import RigidBody
 
 FORMAT = "lipserve-model"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 MANIFEST, TENSORS, ROBOT = "manifest.json", "model.safetensors", "robot.urdf"
 
 
@@ -41,9 +43,10 @@ def save(model: TorqueModel, folder: Path, lineage: Mapping[str, Any] | None = N
     """
     if folder.exists():
         raise FileExistsError(f"{folder} exists: a saved model is never overwritten")
-    motion = model.posterior.motion
+    basis, statistics = model.posterior.basis, model.posterior.statistics
     tensors = {f"params/{name}": value for name, value in model.posterior.params.items()}
-    tensors |= {"samples/q": motion.q, "samples/dq": motion.dq, "samples/ddq": motion.ddq, "samples/tau": model.tau}
+    tensors |= {f"inducing/{name}": getattr(basis.inducing, name) for name in ("q", "dq", "ddq")}
+    tensors |= {"inducing/outputs": basis.outputs, "statistics/a": _pack(statistics.a), "statistics/b": statistics.b}
     payload = save_tensors({name: value.contiguous() for name, value in tensors.items()})
     manifest = {
         "format": FORMAT,
@@ -55,9 +58,10 @@ def save(model: TorqueModel, folder: Path, lineage: Mapping[str, Any] | None = N
         "noise_std": model.noise_std.tolist(),
         "options": model.options,
         "fit": model.fit,
+        "compact": {**model.compact, "data_samples": statistics.samples},
         "calibration": asdict(model.calibration),
         "parameters": report(model.posterior, model.estimator),
-        "training_range": training_range(model),
+        "training_range": model.training_range,
         "lineage": dict(lineage or {}),
         "tensors": {"file": TENSORS, "bytes": len(payload), "sha256": hashlib.sha256(payload).hexdigest()},
     }
@@ -97,9 +101,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise ModelFormatError(f"{folder / MANIFEST} is not a manifest of format {FORMAT!r}")
     if manifest.get("format_version") != FORMAT_VERSION:
-        raise ModelFormatError(f"format_version is {manifest.get('format_version')!r}, expected {FORMAT_VERSION}")
+        found = manifest.get("format_version")
+        raise ModelFormatError(f"format_version is {found!r}, expected {FORMAT_VERSION}: train the model again")
     kinds: dict[str, type] = {"estimator": str, "joint_names": list, "joint_types": list}
-    kinds |= dict.fromkeys(("options", "fit", "calibration", "tensors"), dict)
+    kinds |= dict.fromkeys(("options", "fit", "compact", "calibration", "training_range", "tensors"), dict)
     for name, kind in kinds.items():
         if not isinstance(manifest.get(name), kind):
             raise ModelFormatError(f"{name} is {manifest.get(name)!r}, expected a {kind.__name__}")
@@ -116,14 +121,20 @@ def load(folder: Path) -> TorqueModel:
     payload = _read_tensors(folder, manifest)
     try:
         tensors = load_tensors(payload)
+        outputs = tensors.pop("inducing/outputs")
+        if outputs.dtype != torch.int64:
+            raise ValueError(f"tensor 'inducing/outputs' is of {outputs.dtype}, expected int64")
         for name, value in tensors.items():
             if value.dtype != torch.float64 or not torch.isfinite(value).all():
                 raise ValueError(f"tensor {name!r} is not made of finite float64 numbers")
-        samples = {name: tensors.pop(f"samples/{name}") for name in ("q", "dq", "ddq", "tau")}
+        inducing = {name: tensors.pop(f"inducing/{name}") for name in ("q", "dq", "ddq")}
         n = len(manifest["joint_names"])
-        for name, value in samples.items():
-            if value.dim() != 2 or value.shape != samples["q"].shape or value.shape[1] != n or len(value) < 1:
-                raise ValueError(f"samples/{name} has shape {tuple(value.shape)}, expected (N, {n})")
+        for name, value in inducing.items():
+            if value.dim() != 2 or value.shape != inducing["q"].shape or value.shape[1] != n:
+                raise ValueError(f"inducing/{name} has shape {tuple(value.shape)}, expected (S, {n})")
+        a, b = _unpack(tensors.pop("statistics/a")), tensors.pop("statistics/b")
+        compact = dict(manifest["compact"])
+        statistics = Statistics(a, b, int(compact.pop("data_samples")))
         return restore(
             manifest["estimator"],
             manifest["joint_names"],
@@ -132,8 +143,11 @@ def load(folder: Path) -> TorqueModel:
             manifest["options"],
             manifest["fit"],
             {name.removeprefix("params/"): value for name, value in tensors.items()},
-            Motion(samples["q"], samples["dq"], samples["ddq"]),
-            samples["tau"],
+            Motion(**inducing),
+            outputs,
+            statistics,
+            manifest["training_range"],
+            compact,
             _read_robot(folder, manifest),
             Calibration(**manifest["calibration"]),
         )
@@ -141,6 +155,23 @@ def load(folder: Path) -> TorqueModel:
         raise
     except Exception as error:
         raise ModelFormatError(f"{folder} does not hold a valid model: {error}") from error
+
+
+def _pack(symmetric: torch.Tensor) -> torch.Tensor:
+    """Upper triangle of a symmetric matrix (M, M), row by row: (M (M + 1) / 2,)."""
+    rows, columns = torch.triu_indices(*symmetric.shape)
+    return symmetric[rows, columns]
+
+
+def _unpack(packed: torch.Tensor) -> torch.Tensor:
+    """Inverse of `_pack`; raise ValueError for a length that no triangle has."""
+    size = math.isqrt(2 * packed.numel())
+    if packed.dim() != 1 or size * (size + 1) // 2 != len(packed):
+        raise ValueError(f"statistics/a has shape {tuple(packed.shape)}, expected M (M + 1) / 2 numbers")
+    rows, columns = torch.triu_indices(size, size)
+    full = torch.empty((size, size), dtype=packed.dtype)
+    full[rows, columns] = full[columns, rows] = packed
+    return full
 
 
 def _read_tensors(folder: Path, manifest: Mapping[str, Any]) -> bytes:

@@ -1,13 +1,15 @@
-"""The exact multi-output Gaussian process posterior of the joint torques."""
+"""Gaussian process posteriors of the joint torques: what all have in common, and the exact one."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from lipcore.kernels.base import Params, TorqueKernel
+from lipcore.kernels.base import LinearKernel, Params, SumKernel, TorqueKernel
 from lipcore.linalg import Factor, cholesky
 from lipcore.motion import Motion
 
@@ -28,33 +30,52 @@ class Prediction:
 
 
 @dataclass(frozen=True)
-class ExactPosterior:
-    """Posterior of f given N noisy torques: K = k(X, X) + R, weights α = K⁻¹ y, with R one variance a joint.
+class Posterior(ABC):
+    """What is known of anything jointly Gaussian with M anchors u, which hold all that the data said.
 
-    motion: the N training samples; factor: Cholesky of K, (N n, N n); weights: (N n,), sample by sample; std_factor:
-    calibration of every standard deviation that is not noise (see `calibration`).
+    A quantity s with prior mean E s, prior variance var s and c = cov(u, s) has the posterior mean E s + cᵀ weights and
+    the posterior variance var s − |whiten(c)|².
+
+    kernel: prior of the torques; std_factor: calibration of every standard deviation that is not noise (see
+    `calibration`); weights: (M,).
     """
 
     kernel: TorqueKernel
     params: Params
-    motion: Motion
-    factor: Factor
+    std_factor: float
     weights: Tensor
-    std_factor: float = 1.0
 
-    @classmethod
-    def fit(
-        cls, kernel: TorqueKernel, params: Params, motion: Motion, tau: Tensor, std_factor: float = 1.0
-    ) -> ExactPosterior:
-        """Condition the prior on torques tau (N, n) at `motion`; raise NotPositiveDefiniteError if K is singular."""
-        factor = cholesky(noisy_gram(kernel, params, motion))
-        return cls(kernel, params, motion, factor, factor.solve((tau - kernel.mean(motion)).reshape(-1)), std_factor)
+    @abstractmethod
+    def whiten(self, cross: Tensor) -> Tensor:
+        """Columns whose squared length is what the data explain: (M, K) to (r, K)."""
+
+    @abstractmethod
+    def with_torques(self, term: TorqueKernel, covariance: Callable[[Motion], Tensor]) -> Tensor:
+        """Covariance of the anchors with K quantities that belong to one term of the kernel: (M, K).
+
+        covariance: that of the term's torques at N motions with the quantities, (N n, K).
+        """
+
+    @abstractmethod
+    def with_weights(self, term: LinearKernel, covariance: Tensor) -> Tensor:
+        """Covariance of the anchors with K quantities, from that of a linear term's weights with them: (p, K)."""
+
+    def cross(self, kernel: TorqueKernel, query: Motion) -> Tensor:
+        """Covariance of the anchors with all torques of N queries, or with one term's share of them: (M, N n)."""
+        total = torch.zeros((len(self.weights), len(query) * kernel.n_joints), dtype=torch.float64)
+        for term in kernel.terms if isinstance(kernel, SumKernel) else (kernel,):
+            if isinstance(term, LinearKernel):
+                features = term.features(query)
+                scaled = term.covariance(self.params) @ features.reshape(-1, features.shape[-1]).T
+                total += self.with_weights(term, scaled)
+            else:
+                total += self.with_torques(term, lambda anchor, k=term: k.gram(self.params, anchor, query))  # type: ignore[misc]
+        return total
 
     def mean(self, query: Motion, component: TorqueKernel | None = None) -> Tensor:
         """Posterior mean torque, (N, n) N·m; with `component`, a term of the kernel, that term's share of it."""
         kernel = component or self.kernel
-        learnt = (kernel.gram(self.params, query, self.motion) @ self.weights).reshape(len(query), -1)
-        return kernel.mean(query) + learnt
+        return kernel.mean(query) + (self.weights @ self.cross(kernel, query)).reshape(len(query), -1)
 
     def predict(self, query: Motion, component: TorqueKernel | None = None) -> Prediction:
         """Posterior mean and n×n covariance of the torques at each of N queries, or of one term of the kernel."""
@@ -62,12 +83,46 @@ class ExactPosterior:
         means, covariances = [], []
         for start in range(0, len(query), QUERIES_PER_CHUNK):
             part = query[start : start + QUERIES_PER_CHUNK]
-            cross = kernel.gram(self.params, self.motion, part)  # (N n, M n)
+            cross = self.cross(kernel, part)
             means.append(kernel.mean(part) + (self.weights @ cross).reshape(-1, n))
-            white = self.factor.whiten(cross).reshape(-1, len(part), n)
+            white = self.whiten(cross).reshape(-1, len(part), n)
             explained = torch.einsum("kmi,kmj->mij", white, white)
             covariances.append(self.std_factor**2 * (kernel.variance(self.params, part) - explained))
         return Prediction(torch.cat(means), torch.cat(covariances))
+
+
+@dataclass(frozen=True)
+class ExactPosterior(Posterior):
+    """Posterior of f given N noisy torques: K = k(X, X) + R, weights α = K⁻¹ y, with R one variance a joint.
+
+    The anchors are the torques themselves, so cost and memory grow with N: the reference for `CompactPosterior`.
+    motion: the N training samples; factor: Cholesky of K, (N n, N n); weights: (N n,), sample by sample.
+    """
+
+    motion: Motion
+    factor: Factor
+
+    @classmethod
+    def fit(
+        cls, kernel: TorqueKernel, params: Params, motion: Motion, tau: Tensor, std_factor: float = 1.0
+    ) -> ExactPosterior:
+        """Condition the prior on torques tau (N, n) at `motion`; raise NotPositiveDefiniteError if K is singular."""
+        factor = cholesky(noisy_gram(kernel, params, motion))
+        weights = factor.solve((tau - kernel.mean(motion)).reshape(-1))
+        return cls(kernel, params, std_factor, weights, motion, factor)
+
+    def whiten(self, cross: Tensor) -> Tensor:
+        """L⁻¹ c with K = L Lᵀ."""
+        return self.factor.whiten(cross)
+
+    def with_torques(self, term: TorqueKernel, covariance: Callable[[Motion], Tensor]) -> Tensor:
+        """Covariance of the training torques with K quantities."""
+        return covariance(self.motion)
+
+    def with_weights(self, term: LinearKernel, covariance: Tensor) -> Tensor:
+        """Φ(X) cov(w, s)."""
+        features = term.features(self.motion)
+        return features.reshape(-1, features.shape[-1]) @ covariance
 
 
 def noisy_gram(kernel: TorqueKernel, params: Params, motion: Motion) -> Tensor:

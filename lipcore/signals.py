@@ -8,7 +8,6 @@ from __future__ import annotations
 from math import comb
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
 
 from lipcore.samples import Array
 
@@ -24,6 +23,8 @@ def low_pass(signal: Array, rate: float, cutoff: float = CUTOFF) -> Array:
     signal: (N, k), evenly sampled at `rate` Hz. Raise ValueError where the cut-off is not below half the rate or the
     signal is too short for the filter.
     """
+    from scipy.signal import butter, sosfiltfilt  # noqa: PLC0415 - half a second, for recordings to be filtered only
+
     if not 0 < cutoff < rate / 2:
         raise ValueError(f"cutoff is {cutoff:g} Hz, expected between 0 and half the sampling rate, {rate / 2:g} Hz")
     sections = butter(ORDER, cutoff, fs=rate, output="sos")

@@ -6,10 +6,16 @@ first fit on a machine waits some twenty seconds for it.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
+from lipcore.evaluator import Evaluator
 from lipcore.kernels.chain import ChainKernel
+from lipcore.kernels.friction import FrictionKernel
+from lipcore.kernels.gip import GeometricallyInspiredKernel
 from lipcore.kernels.lip import LipKernel
+from lipcore.kernels.lse import LagrangianSEKernel
+from lipcore.kernels.se import SquaredExponentialKernel
 from lipcore.motion import Motion
 
 
@@ -21,6 +27,13 @@ def warm_up() -> None:
         params = kernel.initial(motion, ones)
         kernel.gram(params, motion, motion)
         kernel.gradient(params, motion, kernel.symmetric_gram(params, motion))
+        friction = FrictionKernel(2)
+        both = {**params, **friction.initial(motion, ones)}
+        Evaluator(kernel, both, motion, np.arange(4), [friction], np.ones(10), np.eye(10)).warm_up()
+    types = ("revolute", "revolute")
+    for baseline in (SquaredExponentialKernel(2), GeometricallyInspiredKernel(types), LagrangianSEKernel(types)):
+        cross = baseline.cross(baseline.initial(motion, ones), motion)
+        cross.fill(np.zeros((3, 2)), np.empty((3, 2, 2)))
 
 
 if __name__ == "__main__":

@@ -15,7 +15,11 @@ from lipcore.simulation import Stream, simulate
 
 FOLDER = Path(__file__).parent / "panda-sim"
 SPEEDS = (1.0, 2.0, 5.0, 10.0)
-STREAMS = [(Stream(motion="full", speed=SPEEDS[k % 4]), 100 + k) for k in range(16)]
+NOISE = 0.05
+"""N·m, about what an arm's torque sensors have."""
+OPTIONS = lipcore.FitOptions(hyperparameter_samples=200, compact_tolerance=0.05)
+"""The tolerance keeps the file small."""
+STREAMS = [(Stream(speed=SPEEDS[k % 4], noise=NOISE), 100 + k) for k in range(16)]
 
 
 def main() -> None:
@@ -27,12 +31,10 @@ def main() -> None:
     def show(progress: lipcore.FitProgress) -> None:
         print(f"\r{progress.stage} {progress.iteration}: {progress.objective:.1f}", end="", file=sys.stderr)
 
-    model = lipcore.train(
-        samples, robot.joint_types, options=lipcore.FitOptions(hyperparameter_samples=200), on_progress=show
-    )
+    model = lipcore.train(samples, robot.joint_types, options=OPTIONS, on_progress=show)
     print(f"\nspeed  joint  {'nMSE':>9}  {'RMSE N·m':>9}  coverage of 95 %")
     for speed in SPEEDS:
-        tests = [simulate(robot, Stream(motion="full", speed=speed, n_sinusoids=100), seed) for seed in (900, 901, 902)]
+        tests = [simulate(robot, Stream(speed=speed, n_sinusoids=100, noise=NOISE), seed) for seed in (900, 901, 902)]
         test = lipcore.Samples.concatenate(tests)
         answer = model.predict(test.q, test.dq, test.ddq)
         metrics = evaluate(test.tau, answer.tau, answer.tau_std, answer.noise_std)
@@ -46,7 +48,7 @@ def main() -> None:
         "made_by": "models/train_panda_sim.py",
     }
     lipcore.save(model, FOLDER, lineage)
-    print(f"noise {np.round(model.noise_std, 4)} N·m; wrote {FOLDER.name}")
+    print(f"noise {np.round(model.noise_std, 4)} N·m; {model.compact}; wrote {FOLDER.name}")
 
 
 if __name__ == "__main__":

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from lipcore.kernels.compiled.cross import Cross
+from lipcore.kernels.regressor import Regressor
 from lipcore.motion import Motion
 
 Params = Mapping[str, Tensor]
@@ -79,8 +81,12 @@ class TorqueKernel(ABC):
 
     def names(self) -> list[str]:
         """Names of the kernel's hyperparameters."""
+        return list(self.shapes())
+
+    def shapes(self) -> dict[str, torch.Size]:
+        """Shapes of the kernel's hyperparameters by name."""
         one = torch.ones((2, self.n_joints), dtype=torch.float64)
-        return list(self.initial(Motion(one, one, one), one))
+        return {name: value.shape for name, value in self.initial(Motion(one, one, one), one).items()}
 
     def prior_std(self) -> dict[str, float]:
         """Width of the Gaussian prior around the start, for hyperparameters whose width is not the usual one."""
@@ -97,6 +103,10 @@ class PairKernel(TorqueKernel):
     @abstractmethod
     def blocks(self, params: Params, x: State, y: State) -> Tensor:
         """Covariance of torque i at x with torque j at y: (n, n, *batch), (N·m)²."""
+
+    @abstractmethod
+    def cross(self, params: Params, inducing: Motion) -> Cross:
+        """Compiled covariance of one query with the inducing samples, for serving."""
 
     def variance(self, params: Params, x: Motion) -> Tensor:
         """Prior covariance of the torques at each sample: (N, n, n)."""
@@ -147,6 +157,10 @@ class LinearKernel(TorqueKernel):
     @abstractmethod
     def features(self, x: Motion) -> Tensor:
         """Φ at each sample: (N, n, p)."""
+
+    @abstractmethod
+    def regressor(self) -> Regressor:
+        """Φ of one query, for serving."""
 
     @abstractmethod
     def covariance(self, params: Params) -> Tensor:

@@ -22,6 +22,8 @@ from torch import Tensor
 
 from lipcore.kernels.base import Params, State
 from lipcore.kernels.compiled.chain import chain_gradient, chain_gram
+from lipcore.kernels.compiled.chain_cross import ChainCross
+from lipcore.kernels.compiled.cross import Cross
 from lipcore.kernels.compiled.kernel import Array, CompiledKernel, arrays, inner
 from lipcore.kernels.energy import potential_blocks, potential_energy_torque
 from lipcore.kernels.polynomial import BaseKernels, Derivatives, base_kernels, chain_sum
@@ -63,6 +65,11 @@ class ChainKernel(CompiledKernel):
         tensors, both = self._arguments(leaves), (*arrays(x), *arrays(x))
         alpha, weights, scales = _contiguous(tensors)
         return inner(tensors, list(chain_gradient(*both, self._prismatic(), alpha, weights, scales, True, weight)))
+
+    def cross(self, params: Params, inducing: Motion) -> Cross:
+        """Compiled covariance of one query with the inducing samples, for serving."""
+        alpha, weights, scales = _contiguous(self._arguments(params))
+        return ChainCross(*arrays(inducing.to("cpu")), self._prismatic(), alpha, weights, scales)
 
     def _prismatic(self) -> NDArray[np.bool_]:
         return np.array([kind == "prismatic" for kind in self.joint_types])
@@ -113,7 +120,7 @@ class ChainKernel(CompiledKernel):
 
 
 def _contiguous(arguments: list[Tensor]) -> list[Array]:
-    return [np.ascontiguousarray(part.detach().numpy()) for part in arguments]
+    return [np.ascontiguousarray(part.detach().cpu().numpy()) for part in arguments]
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 
 from lipcore.kernels.base import LinearKernel, Params
+from lipcore.kernels.compiled.friction import friction_rows
+from lipcore.kernels.regressor import Array, Regressor
 from lipcore.motion import Motion
 
 SIGN_WIDTH = 0.02
@@ -36,6 +38,10 @@ class FrictionKernel(LinearKernel):
         out[:, joints, joints] = features
         return out.reshape(len(x), n, 3 * n)
 
+    def regressor(self) -> Regressor:
+        """The same features of one query, for serving."""
+        return FrictionRegressor(self.n_joints)
+
     def covariance(self, params: Params) -> Tensor:
         """Prior variances on the diagonal: (3 n, 3 n)."""
         return torch.diag(torch.exp(2 * params["friction.log_std"]).reshape(-1))
@@ -45,3 +51,14 @@ class FrictionKernel(LinearKernel):
         usual = tau.square().mean(0).sqrt().clamp_min(1e-6) * 0.1
         speed = motion.dq.square().mean(0).sqrt().clamp_min(1e-3)
         return {"friction.log_std": torch.log(torch.stack([usual / speed, usual, usual], dim=1))}
+
+
+class FrictionRegressor(Regressor):
+    """Features of `FrictionKernel`, compiled."""
+
+    def __init__(self, n_joints: int) -> None:
+        self.n_joints, self.size = n_joints, len(FRICTION_TERMS) * n_joints
+
+    def fill(self, motion: Array, out: Array) -> None:
+        """Write Φᵀ of the query, (3 n, n)."""
+        friction_rows(motion, SIGN_WIDTH, out)

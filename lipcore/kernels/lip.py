@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lipcore.kernels.base import Params, State
+from lipcore.kernels.compiled.cross import Cross
 from lipcore.kernels.compiled.kernel import Array, CompiledKernel, arrays, inner
 from lipcore.kernels.compiled.lip import lip_gradient, lip_gram
+from lipcore.kernels.compiled.lip_cross import LipCross
 from lipcore.kernels.energy import (
     kinetic_blocks,
     kinetic_energy_torque,
@@ -63,6 +65,11 @@ class LipKernel(CompiledKernel):
             *both, self._prismatic(), kinetic, weights, potential, float(scale), symmetric=True, weight=weight
         )
         return inner(tensors, list(derivatives))
+
+    def cross(self, params: Params, inducing: Motion) -> Cross:
+        """Compiled covariance of one query with the inducing samples, for serving."""
+        kinetic, weights, potential, scale = (part.detach().cpu().numpy() for part in self._arguments(params))
+        return LipCross(*arrays(inducing.to("cpu")), self._prismatic(), kinetic, weights, potential, float(scale))
 
     def _prismatic(self) -> NDArray[np.bool_]:
         return np.array([kind == "prismatic" for kind in self.joint_types])

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from lipcore.kernels.base import LinearKernel, Params
+from lipcore.kernels.regressor import Regressor
+from lipcore.kernels.rigid_body_regressor import RigidBodyRegressor
 from lipcore.motion import Motion
 from lipcore.robots import pinocchio
 from lipcore.samples import Array
@@ -64,6 +66,10 @@ class RigidBodyKernel(LinearKernel):
         features = torch.from_numpy(self._regressor(*(part.cpu().numpy() for part in (x.q, x.dq, x.ddq)))).to(x.device)
         self._recent = ((x, features), *self._recent[: REMEMBERED - 1])
         return features
+
+    def regressor(self) -> Regressor:
+        """The same features of one query, for serving."""
+        return RigidBodyRegressor(self._model, self._order)
 
     def covariance(self, params: Params) -> Tensor:
         """Prior variances of the parameters on the diagonal: (10 n, 10 n)."""

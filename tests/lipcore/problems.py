@@ -13,6 +13,7 @@ from torch import Tensor
 
 from lipcore.kernels.base import PairKernel, Params, State
 from lipcore.kernels.chain import ChainKernel
+from lipcore.kernels.compiled.cross import Cross
 from lipcore.kernels.lip import LipKernel
 from lipcore.motion import Motion
 from tests.lipcore.oracles import Energy, chain_energies, lip_energies
@@ -43,6 +44,10 @@ class TorchForm(PairKernel):
     def blocks(self, params: Params, x: State, y: State) -> Tensor:
         """Blocks of the kernel itself."""
         return self.kernel.blocks(params, x, y)
+
+    def cross(self, params: Params, inducing: Motion) -> Cross:
+        """Compiled all the same."""
+        return self.kernel.cross(params, inducing)
 
     def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
         """Start of the kernel itself."""

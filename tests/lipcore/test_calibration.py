@@ -48,7 +48,7 @@ def corrected(plain: TorqueModel, samples: Samples) -> TorqueModel:
 def test_predictions(plain: TorqueModel, corrected: TorqueModel, samples: Samples) -> None:
     assert corrected.calibration == Calibration(FACTOR)
     query = samples.q + 0.3, samples.dq, 2 * samples.ddq
-    one, other = plain.predict(*query), corrected.predict(*query)
+    one, other = (model.predict(*query, covariance=True) for model in (plain, corrected))
     assert np.array_equal(one.tau, other.tau)
     assert np.array_equal(one.noise_std, other.noise_std)
     np.testing.assert_allclose(other.tau_std, FACTOR * one.tau_std, rtol=1e-12)

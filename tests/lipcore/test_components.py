@@ -138,7 +138,7 @@ def test_uncertainty_of_forward_dynamics_is_that_of_its_linearization(case: Case
     tau = torch.from_numpy(case.unseen.tau[row])
     ddq = torch.cat([torch.zeros((1, n), dtype=torch.float64), torch.eye(n, dtype=torch.float64)])
     stack = Motion(motion.q.repeat(n + 1, 1), motion.dq.repeat(n + 1, 1), ddq)
-    white = posterior.factor.whiten(posterior.kernel.gram(posterior.params, posterior.motion, stack))
+    white = posterior.whiten(posterior.cross(posterior.kernel, stack))
     covariance = posterior.kernel.symmetric_gram(posterior.params, stack) - white.T @ white
 
     def solve(torques: torch.Tensor) -> torch.Tensor:

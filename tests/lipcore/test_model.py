@@ -9,7 +9,6 @@ import pytest
 
 from lipcore import FitOptions, Samples, TorqueModel, train
 from lipcore.estimators import ESTIMATORS, UnknownEstimatorError
-from lipcore.model import training_range
 from lipcore.robots import load_robot
 from lipcore.simulation import Stream, simulate
 
@@ -44,19 +43,25 @@ def test_model_says_what_it_was_made_of(model: TorqueModel, samples: Samples) ->
     assert model.joint_types == JOINT_TYPES
     assert model.torque_convention == "gravity_included"
     assert model.options["hyperparameter_samples"] == 20
-    assert model.fit["samples_posterior"] == len(model.tau) == 50
-    ranges = training_range(model)
-    assert set(ranges) == {"q", "dq", "ddq"}
-    for name, limits in ranges.items():
-        values = getattr(model.posterior.motion, name).numpy()
+    assert model.fit["samples_posterior"] == model.posterior.statistics.samples == 50
+    basis = model.posterior.basis
+    sizes = model.compact["inducing_outputs"], model.compact["inducing_samples"], model.compact["weights"]
+    assert sizes == (len(basis.outputs), len(basis.inducing), len(basis))
+    assert model.compact["tolerance_reached"] is True
+
+
+def test_training_range_is_that_of_the_samples_it_stands_on(samples: Samples) -> None:
+    every = train(samples, JOINT_TYPES, options=replace(OPTIONS, posterior_samples=len(samples), max_iterations=1))
+    assert set(every.training_range) == {"q", "dq", "ddq"}
+    for name, limits in every.training_range.items():
+        values = getattr(samples, name)
         assert limits == {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
 
 
-def test_posterior_stands_on_rows_of_the_data(model: TorqueModel, samples: Samples) -> None:
-    rows = {tuple(row) for row in np.hstack([samples.q, samples.dq, samples.ddq, samples.tau])}
-    motion = model.posterior.motion
-    used = np.hstack([motion.q, motion.dq, motion.ddq, model.tau])
-    assert {tuple(row) for row in used} <= rows
+def test_inducing_samples_are_rows_of_the_data(model: TorqueModel, samples: Samples) -> None:
+    rows = {tuple(row) for row in np.hstack([samples.q, samples.dq, samples.ddq])}
+    inducing = model.posterior.basis.inducing
+    assert {tuple(row) for row in np.hstack([inducing.q, inducing.dq, inducing.ddq])} <= rows
 
 
 @pytest.mark.parametrize(
@@ -114,9 +119,3 @@ def test_a_torque_that_never_changes_is_learnt_as_offset(samples: Samples) -> No
     answer = trained.predict(samples.q, samples.dq, samples.ddq)
     assert np.abs(answer.tau - 3.0).max() < 1e-2
     assert trained.fit["jitter"] == 0.0
-
-
-def test_jitter_that_was_needed_counts_as_noise(model: TorqueModel) -> None:
-    factor = replace(model.posterior.factor, jitter=0.25)
-    shaken = replace(model, posterior=replace(model.posterior, factor=factor))
-    assert np.allclose(shaken.noise_std**2, model.noise_std**2 + 0.25, rtol=1e-12)

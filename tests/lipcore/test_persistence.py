@@ -56,10 +56,19 @@ def edit_tensors(folder: Path, edit: Callable[[dict[str, torch.Tensor]], object]
 def test_loaded_model_answers_as_the_saved_one(model: TorqueModel, samples: Samples, folder: Path) -> None:
     again = load(folder)
     query = samples.q + 0.1, 0.5 * samples.dq, samples.ddq
-    before, after = model.predict(*query), again.predict(*query)
+    before, after = model.predict(*query, covariance=True), again.predict(*query, covariance=True)
     for name in ("tau", "tau_std", "noise_std", "covariance"):
         assert np.array_equal(getattr(before, name), getattr(after, name)), name
-    for name in ("joint_names", "joint_types", "torque_convention", "options", "fit", "calibration"):
+    for name in (
+        "joint_names",
+        "joint_types",
+        "torque_convention",
+        "options",
+        "fit",
+        "compact",
+        "training_range",
+        "calibration",
+    ):
         assert getattr(again, name) == getattr(model, name)
     assert again.estimator.name == model.estimator.name
 
@@ -70,7 +79,7 @@ def test_manifest_can_be_read_and_vouches_for_the_tensors(model: TorqueModel, fo
     assert manifest == persistence.read_manifest(folder)
     assert manifest["tensors"]["sha256"] == hashlib.sha256(payload).hexdigest()
     assert manifest["tensors"]["bytes"] == len(payload)
-    assert (manifest["format"], manifest["format_version"]) == ("lipserve-model", 2)
+    assert (manifest["format"], manifest["format_version"]) == ("lipserve-model", 3)
     assert manifest["joint_names"] == list(model.joint_names)
     assert manifest["noise_std"] == model.noise_std.tolist()
     assert manifest["torque_convention"] == "gravity_compensated"
@@ -151,16 +160,19 @@ def test_manifest_that_is_not_json_is_refused(folder: Path) -> None:
     ("changes", "message"),
     [
         ({"format": "zip"}, "not a manifest of format 'lipserve-model'"),
-        ({"format_version": 1}, "format_version is 1, expected 2"),
+        ({"format_version": 2}, "format_version is 2, expected 3: train the model again"),
         ({"estimator": 7}, "estimator is 7, expected a str"),
         ({"estimator": "oracle"}, "estimator is 'oracle'"),
         ({"joint_names": "joint1"}, "joint_names is 'joint1', expected a list"),
-        ({"joint_names": ["joint1"]}, r"samples/q has shape \(60, 2\), expected \(N, 1\)"),
+        ({"joint_names": ["joint1"]}, r"inducing/\w+ has shape \(\d+, 2\), expected \(S, 1\)"),
         ({"joint_types": ["revolute", "ball"]}, r"joint_types\[1\] is 'ball'"),
         ({"joint_types": ["revolute"]}, "does not hold a valid model"),
         ({"joint_types": ["revolute"] * 3}, "does not hold a valid model"),
         ({"torque_convention": "unsaid"}, "torque_convention is 'unsaid'"),
         ({"options": []}, r"options is \[\], expected a dict"),
+        ({"compact": 3}, "compact is 3, expected a dict"),
+        ({"compact": {}}, "does not hold a valid model"),
+        ({"training_range": []}, r"training_range is \[\], expected a dict"),
         ({"calibration": None}, "calibration is None, expected a dict"),
         ({"calibration": {"function_std_factor": 0.9}}, "function_std_factor is 0.9, expected a number from 1 to 100"),
         ({"calibration": {"function_std_factor": "2"}}, "does not hold a valid model"),
@@ -183,10 +195,18 @@ def test_wrong_manifest_entry_is_named(folder: Path, changes: dict[str, Any], me
         ("params/surprise", torch.zeros(1).double(), r"'surprise' has shape \(1,\), expected None"),
         ("params/kinetic.log_scale", None, r"'kinetic.log_scale' has shape None, expected \(\)"),
         ("params/noise.log_std", torch.full((2,), torch.nan).double(), "'params/noise.log_std' is not made of finite"),
-        ("samples/tau", torch.full((60, 2), torch.inf).double(), "'samples/tau' is not made of finite"),
-        ("samples/tau", torch.zeros(60, 2), "'samples/tau' is not made of finite float64"),
-        ("samples/ddq", torch.zeros(59, 2).double(), r"samples/ddq has shape \(59, 2\)"),
-        ("samples/q", None, "samples/q"),
+        ("statistics/b", torch.full((40,), torch.inf).double(), "'statistics/b' is not made of finite"),
+        ("statistics/b", torch.zeros(40), "'statistics/b' is not made of finite float64"),
+        ("statistics/b", torch.zeros(3).double(), r"statistics have shapes \(\d+, \d+\) and \(3,\)"),
+        ("statistics/a", torch.zeros(6).double(), r"statistics have shapes \(3, 3\)"),
+        ("statistics/a", torch.zeros(5).double(), r"statistics/a has shape \(5,\), expected M \(M \+ 1\) / 2 numbers"),
+        ("inducing/ddq", torch.zeros(59, 2).double(), r"inducing/ddq has shape \(59, 2\)"),
+        ("inducing/q", None, "inducing/q"),
+        ("inducing/outputs", None, "inducing/outputs"),
+        ("inducing/outputs", torch.zeros(2).double(), "'inducing/outputs' is of torch.float64, expected int64"),
+        ("inducing/outputs", torch.tensor([0, 0]), "expected distinct places of torques"),
+        ("inducing/outputs", torch.tensor([0, 5000]), "outputs reaches from 0 to 5000"),
+        ("inducing/outputs", torch.tensor([-1, 0]), "outputs reaches from -1 to 0"),
     ],
     ids=lambda value: value if isinstance(value, str) and "/" in value else "",
 )
@@ -197,3 +217,8 @@ def test_wrong_tensor_is_named(folder: Path, name: str, replacement: torch.Tenso
         edit_tensors(folder, lambda tensors: tensors.update({name: replacement}))
     with pytest.raises(ModelFormatError, match=message):
         load(folder)
+
+
+def test_jitter_that_was_needed_counts_as_noise(model: TorqueModel, folder: Path) -> None:
+    edit_manifest(folder, fit={**model.fit, "jitter": 0.25})
+    assert np.allclose(load(folder).noise_std ** 2, model.noise_std**2 - model.fit["jitter"] + 0.25, rtol=1e-12)

@@ -90,7 +90,7 @@ def _gram(x: Samples, y: Samples, hyper: Hyper, symmetric: bool, work: Work, out
     for block in range(y.v.shape[0]):
         start = block * LANES
         for k in range(min(rows, start + LANES) if symmetric else rows):
-            _forward(x, k, y, block, hyper, work)
+            forward(x, k, y, block, hyper, work)
             kinetic_blocks(hyper.weights, x.v[k], x.a[k], y.v[block], y.a[block], work)
             first = max(0, k - start) if symmetric else 0
             _write(work.kinetic, work.potential.block, k, start, first, min(LANES, size - start), symmetric, out)
@@ -105,7 +105,7 @@ def _gradient(
         start = block * LANES
         for k in range(min(rows, start + LANES) if symmetric else rows):
             v, a, v2, a2 = x.v[k], x.a[k], y.v[block], y.a[block]
-            _forward(x, k, y, block, hyper, work)
+            forward(x, k, y, block, hyper, work)
             _clear(back)
             first = max(0, k - start) if symmetric else 0
             _read(weight, k, start, first, min(LANES, size - start), symmetric, back.potential.block)
@@ -121,7 +121,7 @@ def _gradient(
 
 
 @compiled
-def _forward(x: Samples, k: int, y: Samples, block: int, hyper: Hyper, work: Work) -> None:
+def forward(x: Samples, k: int, y: Samples, block: int, hyper: Hyper, work: Work) -> None:
     """Everything but the kinetic blocks, for sample k of x and one block of y."""
     v, a, v2, a2 = x.v[k], x.a[k], y.v[block], y.a[block]
     unit_kernels(x.x1[k], x.x2[k], x.d1[k], x.d2[k], y.x1[block], y.x2[block], y.d1[block], y.d2[block], work.unit)

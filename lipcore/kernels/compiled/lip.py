@@ -45,7 +45,7 @@ def lip_gram(
     rows, n = q.shape
     columns = q2.shape[0]
     x, y = features(q, v, a, prismatic), features(q2, v2, a2, prismatic)
-    out, s, changes = np.empty((rows, n, columns, n)), scratch(n), _changes(kinetic_shares)
+    out, s, changes = np.empty((rows, n, columns, n)), scratch(n), changed_links(kinetic_shares)
     for row in range(rows):
         for start in range(row if symmetric else 0, columns, PAIRS):
             width = min(PAIRS, columns - start)
@@ -91,7 +91,7 @@ def lip_gradient(
     rows, n = q.shape
     columns = q2.shape[0]
     x, y = features(q, v, a, prismatic), features(q2, v2, a2, prismatic)
-    s, d, changes = scratch(n), adjoints(n), _changes(kinetic_shares)
+    s, d, changes = scratch(n), adjoints(n), changed_links(kinetic_shares)
     # one sum for each pair of a block, added up at the very end
     d_kinetic, d_potential = np.zeros((n, n, 3, PAIRS)), np.zeros((n, 3, PAIRS))
     d_weights, d_scale = np.zeros((n, n, PAIRS)), np.zeros(PAIRS)
@@ -121,7 +121,7 @@ def lip_gradient(
 
 
 @compiled
-def _changes(shares: Array) -> Flags:
+def changed_links(shares: Array) -> Flags:
     """Whether a link's shares differ from the next link's: where not, its products are those already computed."""
     n = shares.shape[0]
     changes = np.ones(n, dtype=np.bool_)

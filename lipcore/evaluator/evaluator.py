@@ -1,0 +1,134 @@
+"""The compiled evaluator of a compact posterior: NumPy and Numba only once it is made."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lipcore.evaluator.constants import check, lay_out, linear_prior
+from lipcore.kernels.base import LinearKernel, PairKernel, Params
+from lipcore.kernels.compiled.answer import COVARIANCE, MEAN, STD, answer
+from lipcore.kernels.compiled.panels import ROWS, WIDTH
+from lipcore.motion import Motion
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+QUERIES = 16
+"""Queries answered together: enough that each panel of the root is read once for many, few enough for the cache."""
+
+
+class _Scratch(threading.local):
+    """One thread's memory for a number of queries: each thread gets its own when it first asks."""
+
+    def __init__(self, queries: int, samples: int, anchors: int, linear: int, n: int) -> None:
+        groups = -(-n // WIDTH)
+        self.motions = np.zeros((queries, 3, n))
+        self.blocks = np.zeros((queries, samples + 1, n, n))
+        self.features = np.zeros((queries, linear, n))
+        self.memory = np.zeros(groups * WIDTH * (queries * anchors + ROWS))
+        self.std = np.zeros((queries, n))
+        self.covariance = np.zeros((queries, n, n))
+
+
+class Evaluator:
+    """Posterior torques of a robot with n joints from M = m + P anchors: m inducing outputs, then all linear weights.
+
+    With g(x) the covariance of the anchors with the torques at x, (M, n), the mean is E f(x) + gᵀ weights and the
+    covariance std_factor² (k(x, x) − (Q g)ᵀ (Q g)).
+
+    term: the kernel's nonlinear term, None if it has none. params: hyperparameters of all terms. inducing: S samples,
+    None without `term`. outputs: (m,), which of their torques, as sample · n + joint. linear: the linear terms in the
+    order of the anchors. weights: (M,). root: Q, (M, M) upper triangular. std_factor: see `calibration`.
+
+    Safe from several threads, which answer at the same time: compiled code runs without the GIL and every thread has
+    memory of its own. Raises ValueError naming the argument that does not fit.
+    """
+
+    def __init__(
+        self,
+        term: PairKernel | None,
+        params: Params,
+        inducing: Motion | None,
+        outputs: Indices,
+        linear: Sequence[LinearKernel],
+        weights: Array,
+        root: Array,
+        std_factor: float = 1.0,
+    ) -> None:
+        if (term is None) != (inducing is None):
+            raise ValueError("term and inducing: expected both of them or neither")
+        if term is None and not linear:
+            raise ValueError("neither term nor linear: expected at least one of them")
+        self.n_joints = n = linear[0].n_joints if term is None else term.n_joints
+        self._cross = None if term is None or inducing is None else term.cross(params, inducing)
+        samples = 0 if self._cross is None else self._cross.size
+        self._outputs = np.array(outputs, dtype=np.int64)
+        means, variances = linear_prior(linear, params)
+        check(self._outputs, samples * n, weights, root, len(means))
+        self._fixed = lay_out(weights, root, means, variances)
+        self._regressors = []
+        first = 0
+        for kernel in linear:
+            regressor = kernel.regressor()
+            self._regressors.append((slice(first, first + regressor.size), regressor))
+            first += regressor.size
+        self._std_factor = float(std_factor)
+        sizes = samples, len(self._outputs) + len(means), len(means), n
+        self._one, self._many = _Scratch(1, *sizes), _Scratch(QUERIES, *sizes)
+
+    def one(self, motion: Array, std: bool = True) -> tuple[Array, Array | None]:
+        """Torque (n,) and, if asked for, its standard deviation (n,) at one query, (3, n): q, dq and ddq.
+
+        Neither shape nor finiteness is checked. The same numbers as of `many`, to the last bit.
+        """
+        scratch, tau = self._one, np.empty((1, self.n_joints))
+        scratch.motions[0] = motion
+        deviation = np.empty((1, self.n_joints)) if std else scratch.std
+        self._answer(scratch, 1, STD if std else MEAN, tau, deviation, scratch.covariance)
+        return tau[0], deviation[0] if std else None
+
+    def many(self, q: Array, dq: Array, ddq: Array, covariance: bool = False) -> tuple[Array, Array, Array | None]:
+        """Torques (N, n), their standard deviations (N, n) and, if asked for, covariances (N, n, n) of N queries.
+
+        q, dq, ddq: (N, n); neither shapes nor finiteness are checked.
+        """
+        scratch, (size, n) = self._many, q.shape
+        tau, std = np.empty((size, n)), np.empty((size, n))
+        covariances = np.empty((size, n, n)) if covariance else None
+        for start in range(0, size, QUERIES):
+            rows = slice(start, min(start + QUERIES, size))
+            count = rows.stop - start
+            for part, values in enumerate((q, dq, ddq)):
+                scratch.motions[:count, part] = values[rows]
+            work = scratch.covariance[:count] if covariances is None else covariances[rows]
+            self._answer(scratch, count, STD if covariances is None else COVARIANCE, tau[rows], std[rows], work)
+        return tau, std, covariances
+
+    def warm_up(self) -> None:
+        """Compile everything that an answer takes, or load it from Numba's cache."""
+        zeros = np.zeros((1, self.n_joints))
+        self.many(zeros, zeros, zeros, covariance=True)
+
+    def _answer(self, scratch: _Scratch, count: int, what: int, tau: Array, std: Array, covariance: Array) -> None:
+        motions, blocks, features = scratch.motions[:count], scratch.blocks[:count], scratch.features[:count]
+        if self._cross is not None:
+            self._cross.fill_many(motions, blocks)
+        for rows, regressor in self._regressors:
+            for motion, target in zip(motions, features, strict=True):
+                regressor.fill(motion, target[rows])
+        answer(
+            self._fixed,
+            self._outputs,
+            blocks,
+            features,
+            self._std_factor,
+            what,
+            scratch.memory,
+            tau,
+            std,
+            covariance,
+        )

@@ -1,0 +1,103 @@
+"""Mean and covariance of the torques at a few queries, from their covariances with the anchors (see `Evaluator`)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lipcore.kernels.compiled.compile import compiled
+from lipcore.kernels.compiled.panels import ROWS, WIDTH, multiply
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+MEAN, STD, COVARIANCE = range(3)  # how much to answer: each takes what is before it, too
+
+
+@compiled
+def answer(
+    fixed: Array,
+    outputs: Indices,
+    blocks: Array,
+    features: Array,
+    std_factor: float,
+    what: int,
+    memory: Array,
+    tau: Array,
+    std: Array,
+    covariance: Array,
+) -> None:
+    """Write the torques of N queries, and as much of their uncertainty as `what` says.
+
+    fixed: variances of the P linear weights, the panel of the mean, then those of the root; blocks: (N, S + 1, n, n)
+    from `Cross`; features: (N, P, n), Φᵀ; tau, std: (N, n); covariance: (N, n, n), work unless asked for.
+    """
+    queries, n = tau.shape
+    chosen, linear = outputs.shape[0], features.shape[1]
+    size, groups = chosen + linear, (n + WIDTH - 1) // WIDTH
+    step = groups * size * WIDTH
+    products = queries * step
+    for query in range(queries):
+        _gather(blocks[query].reshape(-1), outputs, features[query], n, query * step, memory)
+        for group in range(groups):
+            multiply(fixed, linear, memory, query * step + group * size * WIDTH, size, memory, products)
+            for j in range(min(WIDTH, n - group * WIDTH)):
+                tau[query, group * WIDTH + j] = memory[products + j]
+    if what == MEAN:
+        return
+
+    full = what == COVARIANCE
+    covariance[:] = 0.0
+    panel = linear + ROWS * size
+    for first in range(0, size, ROWS):  # all queries meet a panel while the cache holds it
+        for query in range(queries):
+            for group in range(groups):
+                columns = query * step + (group * size + first) * WIDTH
+                multiply(fixed, panel, memory, columns, size - first, memory, products + group * ROWS * WIDTH)
+            _add_squares(memory, products, full, covariance[query])
+        panel += ROWS * (size - first)
+    for query in range(queries):
+        _subtract(blocks[query, -1], fixed, features[query], std_factor * std_factor, full, covariance[query])
+        for j in range(n):
+            std[query, j] = np.sqrt(max(covariance[query, j, j], 0.0))
+
+
+@compiled
+def _gather(rows: Array, outputs: Indices, features: Array, n: int, at: int, memory: Array) -> None:
+    """Covariances of the query's torques with all anchors, (groups, M, WIDTH); columns past the last are never read."""
+    chosen, linear = outputs.shape[0], features.shape[0]
+    for group in range(0, n, WIDTH):
+        count = min(WIDTH, n - group)
+        for row in range(chosen):
+            for j in range(count):
+                memory[at + j] = rows[outputs[row] * n + group + j]
+            at += WIDTH
+        for row in range(linear):
+            for j in range(count):
+                memory[at + j] = features[row, group + j]
+            at += WIDTH
+
+
+@compiled
+def _add_squares(memory: Array, products: int, full: bool, out: Array) -> None:
+    """Add Vᵀ V of one panel's products V, (groups, ROWS, WIDTH); unless `full` only its diagonal."""
+    for i in range(out.shape[0]):
+        left = products + (i // WIDTH) * ROWS * WIDTH + i % WIDTH
+        for r in range(ROWS):
+            out[i, i] += memory[left + r * WIDTH] * memory[left + r * WIDTH]
+        if full:
+            for j in range(i):
+                right = products + (j // WIDTH) * ROWS * WIDTH + j % WIDTH
+                for r in range(ROWS):
+                    out[i, j] += memory[left + r * WIDTH] * memory[right + r * WIDTH]
+
+
+@compiled
+def _subtract(prior: Array, variances: Array, features: Array, scale: float, full: bool, out: Array) -> None:
+    """What the data explain becomes what they leave: scale (prior + Φ Λ Φᵀ − out); unless `full` only its diagonal."""
+    for i in range(prior.shape[0]):
+        for j in range(0 if full else i, i + 1):
+            total = prior[i, j]
+            for row in range(features.shape[0]):
+                total += variances[row] * features[row, i] * features[row, j]
+            out[i, j] = out[j, i] = scale * (total - out[i, j])

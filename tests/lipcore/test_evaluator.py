@@ -1,0 +1,268 @@
+"""The compiled evaluator against the dense formulas in PyTorch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from threading import Barrier
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from lipcore.evaluator import Evaluator
+from lipcore.evaluator.evaluator import QUERIES
+from lipcore.kernels.base import LinearKernel, PairKernel, SumKernel
+from lipcore.kernels.friction import FrictionKernel
+from lipcore.kernels.rigid_body import RigidBodyKernel
+from lipcore.motion import Motion
+from lipcore.robots import load_robot
+from lipcore.urdf import RigidBody
+from tests.lipcore.problems import random_problem
+
+RELATIVE = 1e-10
+FACTOR = 1.3
+MIXED = ("revolute", "prismatic", "revolute", "prismatic", "revolute")
+
+
+@dataclass
+class Case:
+    """Arguments of an evaluator, random, and queries."""
+
+    term: PairKernel | None
+    linear: list[LinearKernel]
+    params: dict[str, Tensor]
+    inducing: Motion | None
+    outputs: np.ndarray
+    weights: np.ndarray
+    root: np.ndarray
+    query: Motion
+
+    def evaluator(self) -> Evaluator:
+        return Evaluator(
+            self.term, self.params, self.inducing, self.outputs, self.linear, self.weights, self.root, FACTOR
+        )
+
+    def dense(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean (N, n) and covariance (N, n, n) by the formulas of `Evaluator`, matrix by matrix."""
+        mean, prior, explained = self.parts()
+        return mean, FACTOR**2 * (prior - explained)
+
+    def parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Mean, and the covariances a priori and explained by the data."""
+        query, n = self.query, self.query.n_joints
+        prior = SumKernel(*([] if self.term is None else [self.term]), *self.linear)
+        rows = []
+        if self.term is not None and self.inducing is not None:
+            rows.append(self.term.gram(self.params, self.inducing, query)[self.outputs])
+        for each in self.linear:
+            features = each.features(query)
+            rows.append(each.covariance(self.params) @ features.reshape(len(query) * n, -1).T)
+        cross = torch.cat(rows)
+        mean = prior.mean(query) + (torch.from_numpy(self.weights) @ cross).reshape(-1, n)
+        white = (torch.from_numpy(self.root) @ cross).reshape(-1, len(query), n)
+        explained = torch.einsum("kmi,kmj->mij", white, white)
+        return mean.numpy(), prior.variance(self.params, query).numpy(), explained.numpy()
+
+
+def rigid_body(name: str, order: tuple[int, ...] | None = None, **options: object) -> RigidBodyKernel:
+    """Kernel of a robot whose data name the joints in another order."""
+    robot = load_robot(name)
+    order = order or tuple(range(robot.n_joints))
+    names, types = (tuple(parts[i] for i in order) for parts in (robot.joint_names, robot.joint_types))
+    return RigidBodyKernel(RigidBody.from_profile(name, names, types), **options)
+
+
+def case(
+    joint_types: tuple[str, ...],
+    kernel: str | None = "chain",
+    linear: tuple[LinearKernel, ...] = (),
+    *,
+    samples: int = 20,
+    queries: int = 5,
+    seed: int = 0,
+) -> Case:
+    """About half of the torques of `samples` are inducing outputs, of the first three samples one and none at all."""
+    rng, n = np.random.default_rng(seed), len(joint_types)
+    problem = random_problem(joint_types, samples + queries, seed, kernel or "chain")
+    params, size = dict(problem.params), sum(len(each.features(problem.motion[:1])[0, 0]) for each in linear)
+    for each in linear:
+        params |= each.initial(problem.motion, torch.from_numpy(rng.uniform(0.5, 2.0, (samples + queries, n))))
+    chosen = rng.random((samples, n)) < 0.5
+    chosen[:2], chosen[2, 1:], chosen[2, 0] = False, False, True
+    outputs = np.flatnonzero(chosen) if kernel else np.zeros(0, dtype=np.int64)
+    anchors = len(outputs) + size
+    root = np.triu(rng.standard_normal((anchors, anchors)) + 4 * np.eye(anchors))
+    made = Case(
+        term=problem.kernel if kernel else None,
+        linear=list(linear),
+        params=params,
+        inducing=problem.motion[:samples] if kernel else None,
+        outputs=outputs,
+        weights=rng.standard_normal(anchors),
+        root=root,
+        query=problem.motion[samples:],
+    )
+    _, prior, explained = made.parts()
+    # up to half of a variance is explained: an error in that half would show, and little cancels
+    made.root = root * np.sqrt(0.5 / (explained / prior).diagonal(axis1=1, axis2=2).max())
+    return made
+
+
+def friction(n: int) -> tuple[LinearKernel, ...]:
+    return (FrictionKernel(n),)
+
+
+PANDA, KINOVA, TIAGO = ("revolute",) * 7, ("revolute",) * 6, ("prismatic", *("revolute",) * 7)
+CASES: dict[str, Callable[[], Case]] = {
+    "chain": lambda: case(PANDA, "chain", friction(7)),
+    "lip": lambda: case(PANDA, "tied", friction(7)),
+    "lip-untied": lambda: case(MIXED, "untied", friction(5)),
+    "prismatic": lambda: case(MIXED, "chain", friction(5)),
+    "frictionless": lambda: case(MIXED, "chain"),
+    "rigid-body": lambda: case(PANDA, None, (rigid_body("panda"), FrictionKernel(7))),
+    "rigid-body alone, from zero": lambda: case(PANDA, None, (rigid_body("panda", prior="zero", gravity=False),)),
+    "rigid-body and chain": lambda: case(PANDA, "chain", (rigid_body("panda"), FrictionKernel(7))),
+    "unbounded joints in another order": lambda: case(
+        KINOVA, "chain", (rigid_body("kinova", (3, 0, 5, 1, 4, 2)), FrictionKernel(6))
+    ),
+    "prismatic rigid body in another order": lambda: case(
+        TIAGO[1:] + TIAGO[:1], None, (rigid_body("tiago", (1, 2, 3, 4, 5, 6, 7, 0)), FrictionKernel(8))
+    ),
+    **{
+        f"{n} joints": lambda n=n: case((("revolute", "prismatic") * 5)[:n], "chain", friction(n))
+        for n in (1, 2, 3, 4, 6, 8, 9, 10)
+    },
+}
+
+
+@pytest.fixture(params=CASES)
+def any_case(request: pytest.FixtureRequest) -> Case:
+    return CASES[request.param]()
+
+
+def asked(query: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return query.q.numpy(), query.dq.numpy(), query.ddq.numpy()
+
+
+def agree(found: np.ndarray | None, expected: np.ndarray) -> None:
+    assert found is not None
+    np.testing.assert_allclose(found, expected, rtol=0, atol=RELATIVE * np.abs(expected).max())
+
+
+def test_many_equals_the_dense_formulas(any_case: Case) -> None:
+    mean, covariance = any_case.dense()
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    assert (variance > 0).all()
+    tau, std, found = any_case.evaluator().many(*asked(any_case.query), covariance=True)
+    agree(tau, mean)
+    agree(std, np.sqrt(variance))
+    agree(found, covariance)
+    assert np.array_equal(found, found.transpose(0, 2, 1))
+
+
+def test_one_query_gives_the_same_bits_as_many(any_case: Case) -> None:
+    evaluator, query = any_case.evaluator(), np.stack(asked(any_case.query))
+    tau, std, nothing = evaluator.many(*query)
+    assert nothing is None
+    for k in range(query.shape[1]):
+        one, deviation = evaluator.one(np.ascontiguousarray(query[:, k]))
+        assert np.array_equal(one, tau[k])
+        assert deviation is not None
+        assert np.array_equal(deviation, std[k])
+        mean_only, nothing = evaluator.one(np.ascontiguousarray(query[:, k]), std=False)
+        assert nothing is None
+        assert np.array_equal(mean_only, tau[k])
+
+
+@pytest.mark.parametrize("queries", [1, QUERIES - 1, QUERIES, QUERIES + 1, 2 * QUERIES + 3])
+def test_batches_of_any_size(queries: int) -> None:
+    chain = case(MIXED, "chain", friction(5), queries=queries)
+    mean, covariance = chain.dense()
+    tau, std, found = chain.evaluator().many(*asked(chain.query), covariance=True)
+    agree(tau, mean)
+    agree(found, covariance)
+    same, deviation, nothing = chain.evaluator().many(*asked(chain.query))
+    assert nothing is None
+    assert np.array_equal(same, tau)
+    agree(deviation, std)
+
+
+def test_a_variance_that_rounding_makes_negative_is_a_std_of_zero() -> None:
+    chain = case(MIXED)
+    chain.root *= 100
+    _, std, covariance = chain.evaluator().many(*asked(chain.query), covariance=True)
+    assert covariance is not None
+    assert (np.diagonal(covariance, axis1=1, axis2=2) < 0).all()
+    assert (std == 0).all()
+
+
+def test_threads_get_the_same_bits_and_nobody_elses_answer() -> None:
+    threads, rounds = 4, 30
+    both = case(PANDA, "chain", (rigid_body("panda"), FrictionKernel(7)), queries=threads)
+    evaluator, query = both.evaluator(), np.stack(asked(both.query))
+    tau, std, covariance = evaluator.many(*query, covariance=True)
+    assert covariance is not None
+    start = Barrier(threads)
+
+    def work(k: int) -> bool:
+        start.wait(timeout=60)
+        mine, same = np.ascontiguousarray(query[:, k]), True
+        for _ in range(rounds):
+            one, deviation = evaluator.one(mine)
+            same &= np.array_equal(one, tau[k]) and deviation is not None and np.array_equal(deviation, std[k])
+            many = evaluator.many(*mine[:, None], covariance=True)[2]
+            same &= many is not None and np.array_equal(many[0], covariance[k])
+        return same
+
+    with ThreadPoolExecutor(threads) as pool:
+        assert all(pool.map(work, range(threads)))
+
+
+def test_inputs_stay_as_they_are_and_answers_are_the_callers() -> None:
+    chain = case(MIXED, "chain", friction(5))
+    arrays = {name: getattr(chain, name) for name in ("outputs", "weights", "root")}
+    evaluator, query = chain.evaluator(), np.stack(asked(chain.query))
+    kept = {name: array.copy() for name, array in arrays.items()}
+    motion = np.ascontiguousarray(query[:, 0])
+    motion.flags.writeable = False  # as bytes off a socket are
+    first, deviation = evaluator.one(motion)
+    assert deviation is not None
+    before = first.copy(), deviation.copy()
+    evaluator.one(np.ascontiguousarray(query[:, 1]))
+    evaluator.many(*query)
+    assert np.array_equal(first, before[0])
+    assert np.array_equal(deviation, before[1])
+    assert all(np.array_equal(kept[name], array) for name, array in arrays.items())
+    for array in arrays.values():
+        array[:] = 0
+    assert np.array_equal(evaluator.one(motion)[0], first)  # no view of the arguments is kept
+
+
+def test_warm_up_answers_nothing_and_changes_nothing() -> None:
+    chain = case(MIXED, "chain", friction(5))
+    warm, cold, motion = chain.evaluator(), chain.evaluator(), np.ascontiguousarray(np.stack(asked(chain.query))[:, 0])
+    warm.warm_up()
+    assert np.array_equal(warm.one(motion)[0], cold.one(motion)[0])
+
+
+def test_arguments_that_do_not_fit_are_named() -> None:
+    def refused(**changes: object) -> str:
+        chain = case(MIXED, "chain", friction(5))
+        for name, value in changes.items():
+            setattr(chain, name, value)
+        with pytest.raises(ValueError, match="expected") as error:
+            chain.evaluator()
+        return str(error.value)
+
+    good = case(MIXED, "chain", friction(5))
+    anchors = len(good.weights)
+    assert "outputs are" in refused(outputs=np.append(good.outputs[:-1], 100))
+    assert "outputs are" in refused(outputs=np.append(-1, good.outputs[1:]))
+    assert f"weights have shape (3,), expected ({anchors},)" in refused(weights=np.zeros(3))
+    assert f"expected ({anchors}, {anchors})" in refused(root=np.zeros((anchors, anchors - 1)))
+    assert "below the diagonal" in refused(root=np.ones((anchors, anchors)))
+    assert "term and inducing" in refused(inducing=None)
+    assert "neither term nor linear" in refused(term=None, inducing=None, linear=[])
