@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 import uvicorn
@@ -17,19 +19,16 @@ from lipcore.dynamics import COMPONENTS
 from lipcore.estimators import DEFAULT_ESTIMATOR, ESTIMATORS
 from lipcore.robots import ROBOTS, SimulationUnavailableError, load_robot
 from lipcore.simulation import FAST, Payload, Stream, simulate
-from service import __version__, recordings
+from service import __version__, recordings, sockets
 from service.app import create_app
-from service.client import DEFAULT_URL, ApiError, Client, ServiceUnreachableError
-from service.demo import DemoError
-from service.demo import run as run_demo
 from service.home import HomeInUseError, hold_home
-from service.progress import follow
-from service.reproduce import command as reproduction
-from service.reproduce.figures import FiguresUnavailableError
-from service.reproduce.running import ReproductionError
-from service.settings import Settings
+from service.settings import DEFAULT_URL, Settings
+from service.stream.protocol import StreamProtocol
 from service.tables import prediction_tables
 from service.training.states import SUCCEEDED
+
+if TYPE_CHECKING:
+    from service.client import ApiError, Client
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -41,24 +40,15 @@ out, err = Console(soft_wrap=True), Console(stderr=True, soft_wrap=True)
 Url = Annotated[str, typer.Option("--url", envvar="LIPSERVE_URL", help="Address of the service.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
 Files = Annotated[list[Path], typer.Argument(exists=True, dir_okay=False, help="Recordings, .csv or .npz.")]
+_PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
+"""Of commands whose own modules, loaded only for them, read their options."""
 
 
 def main() -> None:
     """Run the command line; errors that a user can act on are printed without a traceback."""
     try:
         app()
-    except ApiError as error:
-        _fail(f"{error.message} ({error.code}, {error.status})")
-    except (
-        ServiceUnreachableError,
-        HomeInUseError,
-        DemoError,
-        FiguresUnavailableError,
-        ReproductionError,
-        SimulationUnavailableError,
-        ValueError,
-        OSError,
-    ) as error:
+    except (HomeInUseError, SimulationUnavailableError, ValueError, OSError) as error:
         _fail(str(error))
 
 
@@ -73,15 +63,16 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
 def serve(
     host: Annotated[str | None, typer.Option(help="Address to listen on (LIPSERVE_HOST).")] = None,
     port: Annotated[int | None, typer.Option(help="Port to listen on (LIPSERVE_PORT).")] = None,
+    uds: Annotated[Path | None, typer.Option(help="Unix-domain socket to listen on too (LIPSERVE_UDS).")] = None,
 ) -> None:
     """Serve models and run training jobs."""
-    given = {name: value for name, value in (("host", host), ("port", port)) if value is not None}
+    given = {name: value for name, value in (("host", host), ("port", port), ("uds", uds)) if value is not None}
     try:
         settings = Settings(**given)  # type: ignore[arg-type]  # validated here
     except ValidationError as error:
         _fail("; ".join(f"{'.'.join(map(str, e['loc'])) or 'settings'}: {e['msg']}" for e in error.errors()))
     hold_home(settings.home).close()  # the app holds it for good; asking first gives a message without a traceback
-    uvicorn.run(
+    config = uvicorn.Config(
         create_app(settings),
         host=settings.host,
         port=settings.port,
@@ -90,8 +81,11 @@ def serve(
         access_log=settings.log_level == "debug",
         loop="uvloop",
         http="httptools",
-        ws="websockets-sansio",
+        ws=StreamProtocol,
+        ws_max_size=settings.max_stream_frame_bytes,
+        ws_per_message_deflate=False,
     )
+    sockets.serve(config, settings.uds, settings.uds_mode)
 
 
 @app.command("simulate")
@@ -148,7 +142,9 @@ def train(
     as_json: Json = False,
 ) -> None:
     """Upload recordings and train a model on them. Ctrl-C cancels the job."""
-    with Client(url) as client:
+    from service.progress import follow  # noqa: PLC0415 - serving does without the client
+
+    with _client(url) as client:
         datasets = [client.upload(path).id for path in files]
         types = None if joint_types is None else [kind.strip() for kind in joint_types.split(",")]
         if robot is not None and robot.endswith(".urdf"):
@@ -180,7 +176,7 @@ def predict(
     """Ask a model for the torque at one motion."""
     position = _numbers("--q", q)
     zeros = [0.0] * len(position)
-    with Client(url) as client:
+    with _client(url) as client:
         answer = client.predict(
             model,
             position,
@@ -203,10 +199,53 @@ def demo(
     plot: Annotated[Path | None, typer.Option(help="Also draw measured and predicted torque, .png or .svg.")] = None,
 ) -> None:
     """Run the main job: serve, simulate a Panda, upload, train, evaluate on unseen trajectories, ask."""
-    run_demo(port, once, plot, out)
+    from service.client import ApiError  # noqa: PLC0415 - serving does without the demo
+    from service.demo import DemoError, run  # noqa: PLC0415
+
+    try:
+        run(port, once, plot, out)
+    except ApiError as error:
+        _fail(_said(error))
+    except DemoError as error:
+        _fail(str(error))
 
 
-app.command()(reproduction.reproduce)
+@app.command(add_help_option=False, context_settings=_PASS_ON)
+def reproduce(context: typer.Context) -> None:
+    """Run the paper's experiment: every estimator on training × test sets of a simulated robot; tables and figures."""
+    from service.reproduce import command  # noqa: PLC0415 - serving does without the experiment
+
+    try:
+        command.app(context.args, prog_name="lipserve reproduce")
+    except command.ERRORS as error:
+        _fail(str(error))
+
+
+@app.command(add_help_option=False, context_settings=_PASS_ON)
+def bench(context: typer.Context) -> None:
+    """Measure how long answers take: `lipserve bench latency --help`."""
+    from service.bench import command  # noqa: PLC0415 - the service does without it
+
+    try:
+        command.app(context.args, prog_name="lipserve bench")
+    except command.ERRORS as error:
+        _fail(str(error))
+
+
+@contextmanager
+def _client(url: str) -> Iterator[Client]:
+    """A client of the service at `url`; what the service refuses is printed."""
+    from service.client import ApiError, Client  # noqa: PLC0415 - serving does without httpx
+
+    try:
+        with Client(url) as client:
+            yield client
+    except ApiError as error:
+        _fail(_said(error))
+
+
+def _said(error: ApiError) -> str:
+    return f"{error.message} ({error.code}, {error.status})"
 
 
 def _numbers(name: str, text: str) -> list[float]:

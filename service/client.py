@@ -16,12 +16,15 @@ from service.datasets.schema import Dataset
 from service.inference.schema import EvaluateResponse, PredictResponse
 from service.models.schema import Model, Version
 from service.robots.schema import Robot
+from service.settings import DEFAULT_URL
 from service.training.schema import Job
 from service.training.states import ACTIVE
 
-DEFAULT_URL = "http://127.0.0.1:8000"
 MEDIA_TYPES = {".csv": "text/csv", ".npz": "application/x-npz"}
 POLL_SECONDS = 0.3
+UNIX = "unix://"
+NO_HOST = "http://localhost"
+"""What HTTP says the host is where a socket leads to the service."""
 
 
 class ServiceUnreachableError(ConnectionError):
@@ -37,11 +40,18 @@ class ApiError(RuntimeError):
 
 
 class Client:
-    """Synchronous client; use it as a context manager or close it."""
+    """Synchronous client; use it as a context manager or close it.
+
+    url: http://host:port, or unix:///path of the service's Unix-domain socket.
+    """
 
     def __init__(self, url: str = DEFAULT_URL, timeout: float = 120.0) -> None:
         self.url = url
-        self._http = httpx.Client(base_url=url, timeout=timeout)
+        path = url.removeprefix(UNIX) if url.startswith(UNIX) else None
+        if path is not None and not path.startswith("/"):
+            raise ValueError(f"url is {url!r}, expected unix:// and an absolute path, as unix:///run/lipserve.sock")
+        transport = None if path is None else httpx.HTTPTransport(uds=path)
+        self._http = httpx.Client(base_url=url if path is None else NO_HOST, timeout=timeout, transport=transport)
 
     def __enter__(self) -> Self:
         return self

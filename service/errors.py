@@ -1,4 +1,4 @@
-"""One error shape for every route: {"error": {code, message, detail}}."""
+"""One error shape for every route, {"error": {code, message, detail}}; below /v2 it is {"error": message}."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
 logger = logging.getLogger(__name__)
+
+OPEN_INFERENCE = "/v2"
+"""Routes below it speak the Open Inference Protocol, whose errors have a shape of their own."""
 
 
 class Problem(BaseModel):
@@ -96,6 +99,12 @@ class NotReadyError(ServiceError):
     status, code = 503, "not_ready"
 
 
+class UnreadableVersionError(ServiceError):
+    """The version's files are damaged, or of a format that this release does not read."""
+
+    status, code = 500, "unreadable_version"
+
+
 def problem(field: str, value: object, expected: str) -> Problem:
     """Describe one wrong value; long values are cut."""
     text = value if isinstance(value, str) else repr(value)
@@ -152,21 +161,23 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(Exception, _unexpected_error)
 
 
-def _answer(status: int, code: str, message: str, detail: Sequence[Problem] = ()) -> JSONResponse:
+def _answer(request: Request, status: int, code: str, message: str, detail: Sequence[Problem] = ()) -> JSONResponse:
+    if f"{request.scope['path']}/".startswith(f"{OPEN_INFERENCE}/"):
+        return JSONResponse({"error": message}, 400 if status == 422 else status)
     body = ErrorResponse(error=ErrorBody(code=code, message=message, detail=list(detail)))
     return JSONResponse(body.model_dump(), status)
 
 
-async def _service_error(_: Request, error: Exception) -> JSONResponse:
+async def _service_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, ServiceError)
-    return _answer(error.status, error.code, error.message, error.detail)
+    return _answer(request, error.status, error.code, error.message, error.detail)
 
 
-async def _validation_error(_: Request, error: Exception) -> JSONResponse:
+async def _validation_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
     detail = [_explain(item) for item in error.errors()[:20]]
     message = sentence(detail[0]) if detail else "the request is not valid"
-    return _answer(422, "invalid_request", message, detail)
+    return _answer(request, 422, "invalid_request", message, detail)
 
 
 def _explain(item: dict[str, Any]) -> Problem:
@@ -190,11 +201,11 @@ async def _http_error(request: Request, error: Exception) -> JSONResponse:
     message = str(error.detail)
     if error.status_code in (404, 405):
         message = f"no route {request.method} {request.url.path[:200]}: /docs lists all"
-    answer = _answer(error.status_code, codes.get(error.status_code, "http_error"), message)
+    answer = _answer(request, error.status_code, codes.get(error.status_code, "http_error"), message)
     answer.headers.update(error.headers or {})
     return answer
 
 
 async def _unexpected_error(request: Request, error: Exception) -> JSONResponse:
     logger.error("unexpected error at %s %s", request.method, request.url.path, exc_info=error)
-    return _answer(500, "internal_error", "an unexpected error; the service's log says more")
+    return _answer(request, 500, "internal_error", "an unexpected error; the service's log says more")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -26,8 +25,8 @@ class BodyLimit:
             return
         path: str = scope["path"]
         limit = next((most for prefix, most in self.limits.items() if path.startswith(prefix)), self.others)
-        length = Headers(scope=scope).get("content-length", "")
-        refused = length.isascii() and length.isdigit() and int(length) > limit
+        length: bytes = next((value for name, value in scope["headers"] if name == b"content-length"), b"")
+        refused = length.isdigit() and int(length) > limit
         seen = 0
 
         async def limited() -> Message:

@@ -4,16 +4,30 @@ from __future__ import annotations
 
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 CHECKOUT_MODELS = Path(__file__).resolve().parents[1] / "models"
 PACKAGED_MODELS = Path(__file__).resolve().parent / "shipped"
+DEFAULT_URL = "http://127.0.0.1:8000"
+"""Where a service listens by default, for its clients."""
 
 MiB = 1024 * 1024
 Count = Annotated[int, Field(ge=1)]
+
+
+def _octal(mode: object) -> object:
+    if not isinstance(mode, str):
+        return mode
+    try:
+        return int(mode, 8)
+    except ValueError:
+        raise ValueError("expected an octal number such as 660") from None
+
+
+FileMode = Annotated[int, BeforeValidator(_octal)]
 
 
 def shipped_models() -> Path:
@@ -33,6 +47,10 @@ class Settings(BaseSettings):
     home: Path = Field(default_factory=_default_home, description="Folder of the database and all files.")
     host: str = Field("127.0.0.1", description="Address to listen on; anything but loopback needs `insecure`.")
     port: int = Field(8000, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
+    uds: Path | None = Field(None, description="Unix-domain socket to listen on too, for clients on the same host.")
+    uds_mode: FileMode = Field(
+        0o660, ge=0, le=0o777, description="File mode of that socket, octal: whoever may write to it may ask."
+    )
     insecure: bool = Field(False, description="Allow requests without keys from other hosts.")
     log_level: str = Field("info", pattern="^(critical|error|warning|info|debug)$")
 
@@ -48,17 +66,30 @@ class Settings(BaseSettings):
     )
     max_batch: Count = Field(1000, description="Most queries in one prediction request.")
     max_component_batch: Count = Field(100, description="Most queries in one prediction request with components.")
+    max_streams: Count = Field(32, description="Most WebSocket connections at a time; more are answered 429.")
+    max_stream_frame_bytes: int = Field(64 * 1024, ge=1024, description="Largest frame that a stream reads.")
+    stream_idle_s: float = Field(3600.0, gt=0, description="Seconds without a frame after which a stream is closed.")
+    stream_write_s: float = Field(10.0, gt=0, description="Longest wait in s for a client to read an answer.")
     max_evaluation_samples: Count = Field(5000, description="Most samples of one evaluation; more are thinned evenly.")
     max_page: Count = Field(100, description="Most items of one page of a list.")
     max_job_datasets: Count = Field(100, description="Most data sets of one training job.")
     max_hyperparameter_samples: Count = Field(500, description="Most samples that hyperparameters are fitted on.")
     max_posterior_samples: Count = Field(1000, description="Most samples a posterior is conditioned on.")
+    max_inducing_outputs: Count = Field(4000, description="Most inducing outputs that a training job may ask for.")
     max_queued_jobs: Count = Field(100, description="Most jobs that may wait; more are answered 429.")
     max_loaded_models: Count = Field(4, description="Model versions kept in memory, about 100 MB each at 500 samples.")
 
     training_workers: Count = Field(1, description="Training processes.")
     training_threads: Count = Field(1, description="Threads of each training process.")
     training_niceness: int = Field(10, ge=0, le=19, description="Niceness of training processes.")
+    training_policy: Literal["other", "idle"] = Field(
+        "other",
+        description="Scheduling policy of training processes, on Linux. `idle` helps where serving and training share "
+        "one CPU, but stands still while anything else on the machine computes.",
+    )
+    training_cpus: Count | None = Field(
+        None, description="CPUs that training processes may use, on Linux: all but one where not set."
+    )
     max_job_attempts: Count = Field(3, description="Times a job is started before an interruption fails it.")
     serving_threads: Count = Field(1, description="Threads of one prediction.")
     max_concurrent_predictions: Count = Field(2, description="Predictions computed at the same time.")

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from math import isfinite
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from lipcore.metrics import LEVELS, RELIABILITY_LEVELS
 from lipcore.metrics import evaluate as compare
@@ -10,18 +14,27 @@ from service.context import Service
 from service.datasets import store
 from service.errors import invalid_request
 from service.inference import components
-from service.inference.schema import (
-    EvaluateRequest,
-    EvaluateResponse,
-    Interval,
-    PredictRequest,
-    PredictResponse,
-    Reliability,
-)
+from service.inference.loaded import Served
+from service.inference.schema import EvaluateRequest, EvaluateResponse, Interval, PredictRequest, Reliability
+from service.inference.wire import Prediction
+
+Array = NDArray[np.float64]
 
 
-def predict(service: Service, model: str, request: PredictRequest) -> PredictResponse:
-    """Torque with uncertainty at the queries; raise InvalidRequestError or NotFoundError."""
+def at_once(served: Served, motion: Array, max_position: float) -> Prediction | None:
+    """Torque at one motion (3, n), for the event loop; None where the motion or the answer is not as it should be."""
+    if motion.shape[1] != served.model.n_joints or abs(motion[0]).max() > max_position:
+        return None
+    mean, deviation = served.model.answer(motion)
+    assert deviation is not None  # it is, unless declined
+    tau, tau_std = mean.tolist(), deviation.tolist()
+    if not isfinite(sum(tau) + sum(tau_std)):
+        return None
+    return _prediction(served, tau, tau_std)
+
+
+def predict(service: Service, model: str, request: PredictRequest) -> Prediction:
+    """Torque with uncertainty at the queries; raise InvalidRequestError or NotFoundError. Not for the event loop."""
     served = service.loaded.get(model, request.version)
     loaded = served.model
     single = request.q.ndim == 1
@@ -42,17 +55,26 @@ def predict(service: Service, model: str, request: PredictRequest) -> PredictRes
 
     answer = loaded.predict(queries, np.atleast_2d(request.dq), np.atleast_2d(request.ddq), request.covariance)
     tau, std, covariance = answer.tau, answer.tau_std, answer.covariance
-    return PredictResponse(
+    _check_answer(tau, std, covariance)
+    prediction = _prediction(served, (tau[0] if single else tau).tolist(), (std[0] if single else std).tolist())
+    if covariance is not None:
+        prediction.covariance = (covariance[0] if single else covariance).tolist()
+    if request.components:
+        prediction.components = components.answer(loaded, request)
+    return prediction
+
+
+def _prediction(served: Served, tau: list[Any], tau_std: list[Any]) -> Prediction:
+    model = served.model
+    return Prediction(
         model=served.name,
         version=served.version,
         revision=served.revision,
-        joint_names=list(loaded.joint_names),
-        torque_convention=loaded.torque_convention,
-        tau=(tau[0] if single else tau).tolist(),
-        tau_std=(std[0] if single else std).tolist(),
-        noise_std=answer.noise_std.tolist(),
-        covariance=None if covariance is None else (covariance[0] if single else covariance).tolist(),
-        components=components.answer(loaded, request) if request.components else None,
+        joint_names=model.joint_names,
+        torque_convention=model.torque_convention,
+        tau=tau,
+        tau_std=tau_std,
+        noise_std=served.noise_std,
     )
 
 
@@ -100,3 +122,9 @@ def _check_positions(q: np.ndarray[tuple[int, int], np.dtype[np.float64]], singl
     if abs(q[row, joint]) > limit:
         field = f"q[{joint}]" if single else f"q[{row}][{joint}]"
         raise invalid_request(field, f"{q[row, joint]:g}", f"radians (or metres) within ±{limit:g}: are these degrees?")
+
+
+def _check_answer(*parts: Array | None) -> None:
+    if not all(part is None or np.isfinite(part).all() for part in parts):
+        expected = "a motion whose torque is: are dq in rad/s and ddq in rad/s²?"
+        raise invalid_request("the answer", "not finite", expected)

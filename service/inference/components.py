@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -11,7 +13,7 @@ from lipcore.dynamics import ComponentName
 from lipcore.model import TorqueModel
 from lipcore.motion import Motion
 from service.errors import invalid_request
-from service.inference.schema import ComponentValues, PredictRequest
+from service.inference.schema import PredictRequest
 
 
 def check(model: TorqueModel, request: PredictRequest, limit: int) -> None:
@@ -30,8 +32,8 @@ def check(model: TorqueModel, request: PredictRequest, limit: int) -> None:
         raise invalid_request("tau", "given", "no tau, or forward_dynamics among the components")
 
 
-def answer(model: TorqueModel, request: PredictRequest) -> dict[ComponentName, ComponentValues]:
-    """Components by name, shaped as the query; raise InvalidRequestError where inertia cannot be inverted."""
+def answer(model: TorqueModel, request: PredictRequest) -> dict[ComponentName, dict[str, Any]]:
+    """Mean and std by name, shaped as the query; raise InvalidRequestError where inertia cannot be inverted."""
     single = request.q.ndim == 1
     motion = Motion(_rows(request.q), _rows(request.dq), _rows(request.ddq))
     tau = None if request.tau is None else _rows(request.tau)
@@ -45,10 +47,10 @@ def answer(model: TorqueModel, request: PredictRequest) -> dict[ComponentName, C
             "for forward_dynamics a posture whose inertia the training data tell",
         ) from error
     return {
-        name: ComponentValues(
-            mean=(found[name].mean[0] if single else found[name].mean).tolist(),
-            std=(found[name].std[0] if single else found[name].std).tolist(),
-        )
+        name: {
+            "mean": (found[name].mean[0] if single else found[name].mean).tolist(),
+            "std": (found[name].std[0] if single else found[name].std).tolist(),
+        }
         for name in request.components
     }
 

@@ -2,27 +2,65 @@
 
 from __future__ import annotations
 
-from anyio import to_thread
-from fastapi import APIRouter
+from enum import Enum
 
-from service.context import ServiceDep
+from anyio import to_thread
+from fastapi import APIRouter, Response
+from starlette.types import Scope
+
+from service.context import Service, ServiceDep
 from service.errors import InvalidRequestError, NotFoundError, TooLargeError, responses
 from service.inference import answer
+from service.inference.hot import Reply, hot_route, is_json
 from service.inference.schema import EvaluateRequest, EvaluateResponse, PredictRequest, PredictResponse
+from service.inference.wire import decode, encode
 
 _ERRORS = responses(InvalidRequestError, NotFoundError, TooLargeError)
 
-router = APIRouter(prefix="/v1/models", tags=["inference"], responses=_ERRORS)
+_TAGS: list[str | Enum] = ["inference"]
+router = APIRouter(prefix="/v1/models", tags=_TAGS, responses=_ERRORS)
+hot = APIRouter(prefix="/v1/models", tags=_TAGS, responses=_ERRORS)
+"""The route of a control loop, which the application tries first."""
 
 
-@router.post(
-    "/{model}/predict",
-    summary="Torque at a motion, with its uncertainty",
-    response_model_exclude_none=True,
-)
-async def predict(service: ServiceDep, model: str, request: PredictRequest) -> PredictResponse:
+async def _answer(scope: Scope, body: bytes) -> Reply | None:
+    """Answer a query that can be read as it stands: one of a control loop here, any other in a thread."""
+    query = decode(body) if is_json(scope) else None
+    if query is None:
+        return None
+    service: Service = scope["app"].state.service
+    model: str = scope["path_params"]["model"]
+    served, motion = service.loaded.hot(model, query.version), query.single()
+    if served is not None and motion is not None:
+        at_once = answer.at_once(served, motion, service.settings.max_position)
+        if at_once is not None:
+            return Reply(encode(at_once))
+    request = query.request()
+    return None if request is None else Reply(await _in_thread(service, model, request))
+
+
+async def _in_thread(service: Service, model: str, request: PredictRequest) -> bytes:
+    return await to_thread.run_sync(_encoded, service, model, request, limiter=service.predictions)
+
+
+def _encoded(service: Service, model: str, request: PredictRequest) -> bytes:
+    return encode(answer.predict(service, model, request))
+
+
+async def predict(service: ServiceDep, model: str, request: PredictRequest) -> Response:
     """Answer one query or a batch. Nothing is clipped; `tau_std` grows where the model knows little."""
-    return await to_thread.run_sync(answer.predict, service, model, request, limiter=service.predictions)
+    # a right query has been answered before: this reads the others, to say what is wrong, or in JSON of other dialects
+    return Response(await _in_thread(service, model, request), media_type="application/json")
+
+
+hot.add_api_route(
+    "/{model}/predict",
+    predict,
+    methods=["POST"],
+    summary="Torque at a motion, with its uncertainty",
+    response_model=PredictResponse,
+    route_class_override=hot_route(_answer),
+)
 
 
 @router.post("/{model}/evaluate", summary="Compare a model with a data set")

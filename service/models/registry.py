@@ -9,6 +9,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 import lipcore
+from lipcore.persistence import read_manifest
 from service.database import Database, ModelRow, VersionRow, now
 from service.errors import not_found
 from service.files import Files, new_id
@@ -34,16 +35,25 @@ def publish(session: Session, model: str, folder: str, manifest: dict[str, Any],
 
 
 def install_shipped(database: Database, files: Files) -> None:
-    """Register the model that comes with LIPServe, once a home."""
-    with database.session() as session:
-        if session.scalar(select(ModelRow).where(ModelRow.name == SHIPPED)) is not None:
-            return
+    """Register the model that comes with LIPServe; where an upgrade brings another one, as a new version.
+
+    Not if the user has trained a version of that name since, which goes on answering.
+    """
     source = shipped_models() / SHIPPED
+    query = select(VersionRow).where(VersionRow.model == SHIPPED).order_by(VersionRow.version.desc()).limit(1)
+    with database.session() as session:
+        newest = session.scalars(query).first()
+    if newest is not None and (newest.job is not None or _same_tensors(newest.manifest, read_manifest(source))):
+        return
     folder = new_id("mv")
     manifest = lipcore.copy_model(source, files.versions / folder)
     with database.transaction() as session:
-        publish(session, SHIPPED, folder, manifest, None)
-    logger.info("registered the shipped model %s", SHIPPED)
+        version = publish(session, SHIPPED, folder, manifest, None)
+    logger.info("registered the shipped model %s as version %d", SHIPPED, version)
+
+
+def _same_tensors(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    return bool(one["tensors"]["sha256"] == other["tensors"]["sha256"])
 
 
 def find(database: Database, model: str, version: int | None) -> VersionRow:

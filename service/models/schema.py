@@ -29,6 +29,11 @@ class Version(BaseModel):
     training_range: dict[str, dict[str, list[float]]] = Field(description="Where the samples lie that it stands on")
     options: dict[str, Any]
     fit: dict[str, Any] = Field(description="What the fit reported")
+    compact: dict[str, Any] | None = Field(
+        None,
+        description="Size of the served posterior, and how far it deviates from the exact one: `mean_rms`, `mean_max`, "
+        "`std_max` in standard deviations of the function, at `queries` motions; null for versions of model format 2",
+    )
     calibration: dict[str, Any] = Field(
         description="`function_std_factor`: what `tau_std` was multiplied by so that intervals hold on unseen motion"
     )

@@ -16,6 +16,7 @@ from service.models import registry
 from service.settings import Settings
 from tests.service.data import service_of, stream, train, upload
 from tests.service.server import Server
+from tests.service.streams import Streaming, saved_model
 
 LIMITS = {
     "max_upload_bytes": 200_000,
@@ -64,6 +65,15 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     limits = {f"LIPSERVE_{name.upper()}": str(LIMITS[name]) for name in ("max_upload_bytes", "max_request_bytes")}
     with Server(tmp_path_factory.mktemp("server"), **limits) as started:
         yield started
+
+
+@pytest.fixture(scope="session")
+def streaming(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Streaming]:
+    """A service in a process of its own that streams torques of a double pendulum."""
+    with Server(tmp_path_factory.mktemp("streaming")) as started:
+        dataset = upload(started.client, stream())["id"]
+        train(started.client, "pendulum", dataset)
+        yield Streaming(started, dataset, saved_model(started, "pendulum", 1))
 
 
 @pytest.fixture(scope="session")

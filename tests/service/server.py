@@ -26,7 +26,7 @@ class Server:
         self.client = httpx.Client(base_url=self.url, timeout=DEADLINE)
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "service.cli", "serve", "--port", str(self.port)],
+                [sys.executable, "-m", "service", "serve", "--port", str(self.port)],
                 env={**os.environ, "LIPSERVE_HOME": str(home), **settings},
                 stdout=log,
                 stderr=log,

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy import select
 
 import lipcore
 from service.app import create_app
-from service.database import Database, JobRow, now
+from service.database import Database, JobRow, VersionRow, now
 from service.files import Files
 from service.home import HomeInUseError
 from service.models import registry
@@ -139,4 +141,35 @@ def test_a_damaged_version_does_not_keep_the_others_from_answering(home):
     with TestClient(create_app(Settings(home=home)), raise_server_exceptions=False) as api:
         assert api.get("/health/ready").status_code == 200
         assert api.post("/v1/models/panda-sim/predict", json=zero).status_code == 200
-        error(api.post("/v1/models/damaged/predict", json=zero), 500, "internal_error")
+        said = error(api.post("/v1/models/damaged/predict", json=zero), 500, "unreadable_version")
+        assert said["message"].startswith("version 1 of model 'damaged' cannot be loaded: ")
+        assert "does not match the sha256 of its manifest" in said["message"]
+
+
+def earlier_release(home, job):
+    """A home whose newest version of the shipped model is of a format that is no longer read."""
+    database, files = Database(home), Files(home)
+    registry.install_shipped(database, files)
+    with database.transaction() as session:
+        row = session.scalar(select(VersionRow))
+        row.job, row.manifest = job, {**row.manifest, "format_version": 2, "tensors": {"sha256": "of another"}}
+        path = files.versions / row.folder / "manifest.json"
+        path.write_text(json.dumps(row.manifest))
+    database.close()
+
+
+def test_an_upgrade_brings_its_shipped_model(home):
+    earlier_release(home, job=None)
+    with TestClient(create_app(Settings(home=home))) as api:
+        assert api.get("/v1/models/panda-sim").json()["latest_version"] == 2
+        query = {"q": [0.0] * 7, "dq": [0.0] * 7, "ddq": [0.0] * 7}
+        assert api.post("/v1/models/panda-sim/predict", json=query).json()["version"] == 2
+        said = error(api.post("/v1/models/panda-sim/predict", json=query | {"version": 1}), 500, "unreadable_version")
+        assert "format_version is 2, expected 3: train the model again" in said["message"]
+        assert api.get("/v1/models/panda-sim/versions/1").status_code == 200
+
+
+def test_an_upgrade_leaves_a_model_alone_that_the_user_has_trained(home):
+    earlier_release(home, job="job_of_the_user")
+    with TestClient(create_app(Settings(home=home))) as api:
+        assert api.get("/v1/models/panda-sim").json()["latest_version"] == 1

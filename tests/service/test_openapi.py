@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 import re
 
+import numpy as np
 import pytest
 
 METHODS = ("get", "post", "put", "patch", "delete")
 ERROR = {"$ref": "#/components/schemas/ErrorResponse"}
+FAILURE = {"$ref": "#/components/schemas/Failure"}
+INFER = ("POST /v2/models/{model}/infer", "POST /v2/models/{model}/versions/{version}/infer")
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +70,15 @@ def test_every_route_of_the_design_is_there(operations):
         "GET /v1/models/{model}/versions/{version}",
         "POST /v1/models/{model}/predict",
         "POST /v1/models/{model}/evaluate",
+        "POST /v1/echo",
+        "GET /v2",
+        "GET /v2/health/live",
+        "GET /v2/health/ready",
+        "GET /v2/models/{model}",
+        "GET /v2/models/{model}/ready",
+        "GET /v2/models/{model}/versions/{version}",
+        "GET /v2/models/{model}/versions/{version}/ready",
+        *INFER,
     }
 
 
@@ -114,9 +126,11 @@ def test_every_parameter_has_a_type_and_a_description(operations):
 def test_every_documented_error_has_the_one_shape(operations):
     for name, operation in operations.items():
         errors = {status: response for status, response in operation["responses"].items() if int(status) >= 400}
+        of_v2 = " /v2" in name
         for status, response in errors.items():
-            assert response["content"] == {"application/json": {"schema": ERROR}}, (name, status)
-            assert response["description"].startswith("`"), (name, status)
+            schema = FAILURE if of_v2 else ERROR
+            assert response["content"] == {"application/json": {"schema": schema}}, (name, status)
+            assert of_v2 or response["description"].startswith("`"), (name, status)
 
 
 @pytest.mark.parametrize(
@@ -137,6 +151,12 @@ def test_every_documented_error_has_the_one_shape(operations):
         ("GET /v1/models/{model}/versions/{version}", {404, 422}),
         ("POST /v1/models/{model}/predict", {404, 413, 422}),
         ("POST /v1/models/{model}/evaluate", {404, 413, 422}),
+        ("POST /v1/echo", {413}),
+        ("GET /v2/health/ready", {503}),
+        ("GET /v2/models/{model}", {404}),
+        ("GET /v2/models/{model}/versions/{version}/ready", {404, 503}),
+        (INFER[0], {400, 404, 413, 415}),
+        (INFER[1], {400, 404, 413, 415}),
     ],
 )
 def test_errors_that_a_route_answers_are_documented(operations, operation, statuses):
@@ -151,6 +171,8 @@ def test_requests_have_examples(document, operations):
         "POST /v1/jobs",
         "POST /v1/models/{model}/predict",
         "POST /v1/models/{model}/evaluate",
+        "POST /v1/echo",
+        *INFER,
     }
     for name, body in bodies.items():
         assert body["required"] is True
@@ -163,6 +185,22 @@ def test_requests_have_examples(document, operations):
 def test_the_example_of_a_query_is_answered(api, document):
     (example,) = document["components"]["schemas"]["PredictRequest"]["examples"]
     assert api.post("/v1/models/panda-sim/predict", json=example).status_code == 200
+
+
+@pytest.mark.parametrize("operation", INFER)
+def test_the_example_of_an_inference_is_answered_as_documented(api, operations, operation):
+    documented = operations[operation]
+    answered = documented["responses"]["200"]["content"]
+    assert (
+        set(documented["requestBody"]["content"]) == set(answered) == {"application/json", "application/octet-stream"}
+    )
+    path = operation.removeprefix("POST ").format(model="panda-sim", version=1)
+    answer = api.post(path, json=documented["requestBody"]["content"]["application/json"]["example"])
+    assert answer.status_code == 200, answer.text
+    found, expected = answer.json(), answered["application/json"]["example"]
+    numbers, shown = ([each.pop("data") for each in body["outputs"]] for body in (found, expected))
+    assert found == expected
+    assert np.allclose(numbers, shown, atol=0.1)
 
 
 def test_media_types_of_an_upload(operations):

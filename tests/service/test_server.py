@@ -38,7 +38,7 @@ def test_a_client_that_goes_away_leaves_nothing_behind(server):
 
 def test_a_second_server_on_the_same_home_says_why_it_ends(server):
     ended = subprocess.run(
-        [sys.executable, "-m", "service.cli", "serve", "--port", str(free_port())],
+        [sys.executable, "-m", "service", "serve", "--port", str(free_port())],
         env={**os.environ, "LIPSERVE_HOME": str(server.home)},
         capture_output=True,
         text=True,

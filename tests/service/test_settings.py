@@ -27,6 +27,9 @@ def clean(monkeypatch):
         ("max_upload_bytes", "1000", 1000),
         ("max_position", "100.5", 100.5),
         ("training_niceness", "0", 0),
+        ("uds", "/run/lipserve.sock", Path("/run/lipserve.sock")),
+        ("uds_mode", "600", 0o600),
+        ("uds_mode", "0o666", 0o666),
     ],
 )
 def test_environment_variables_are_read(monkeypatch, name, text, value):
@@ -88,6 +91,9 @@ def test_loopback(host, loopback):
         ("training_workers", "0"),
         ("max_job_attempts", "0"),
         ("insecure", "perhaps"),
+        ("uds_mode", "rw-rw----"),
+        ("uds_mode", "680"),
+        ("uds_mode", "1777"),
     ],
 )
 def test_wrong_values_are_named(monkeypatch, name, text):

@@ -1,0 +1,92 @@
+"""Routes that are answered before FastAPI looks at the request: its validation and dependencies cost 0.3 ms."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from typing import NamedTuple
+
+from fastapi.routing import APIRoute
+from starlette.types import Message, Receive, Scope, Send
+
+JSON = b"application/json"
+
+
+class Reply(NamedTuple):
+    """An answer of status 200."""
+
+    body: bytes
+    media_type: bytes = JSON
+
+
+Answerer = Callable[[Scope, bytes], Awaitable[Reply | None]]
+"""Answers a request from its scope and body, or None where it is not as usual."""
+
+
+def hot_route(answer: Answerer) -> type[APIRoute]:
+    """Make a route class whose POST requests `answer` sees first.
+
+    What it does not answer goes on to the endpoint as if it had not been seen. So the endpoint is what explains a
+    wrong request, and its signature is what documents the route; `answer` only has to know a right one.
+    """
+
+    class HotRoute(APIRoute):
+        async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+            if scope["method"] != "POST":
+                await super().handle(scope, receive, send)
+                return
+            body = await _read(receive)
+            if body is None:  # the client went away
+                return
+            reply = await answer(scope, body)
+            if reply is None:
+                await super().handle(scope, _again(body, receive), send)
+                return
+            await send(
+                {
+                    "type": "http.response.start",
+                    "status": 200,
+                    "headers": [
+                        (b"content-length", b"%d" % len(reply.body)),
+                        (b"content-type", reply.media_type),
+                        (b"x-content-type-options", b"nosniff"),
+                    ],
+                }
+            )
+            await send({"type": "http.response.body", "body": reply.body})
+
+    return HotRoute
+
+
+def media_type(scope: Scope) -> bytes:
+    """The content-type of a request, empty where none is given."""
+    return next((value for name, value in scope["headers"] if name == b"content-type"), b"")
+
+
+def is_json(scope: Scope) -> bool:
+    """Whether the body is announced as JSON, in one of the usual ways."""
+    given = media_type(scope)
+    return given == JSON or given.partition(b";")[0].strip().lower() == JSON
+
+
+async def _read(receive: Receive) -> bytes | None:
+    message = await receive()
+    if not message.get("more_body") and message["type"] == "http.request":
+        whole: bytes = message.get("body", b"")
+        return whole
+    parts: list[bytes] = []
+    while message["type"] == "http.request":
+        parts.append(message.get("body", b""))
+        if not message.get("more_body"):
+            return b"".join(parts)
+        message = await receive()
+    return None
+
+
+def _again(body: bytes, receive: Receive) -> Receive:
+    """Receive a body that has been read before, then what comes after it."""
+    pending: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
+
+    async def replay() -> Message:
+        return pending.pop() if pending else await receive()
+
+    return replay

@@ -1,0 +1,183 @@
+"""From tensors to a query: names, datatypes, shapes and numbers are checked, and nothing is guessed."""
+
+from __future__ import annotations
+
+from math import prod
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lipcore.dynamics import available
+from lipcore.model import TorqueModel
+from service.errors import invalid_request
+from service.oip.outputs import DEFAULT, FORWARD, NEED_TORQUE, PARTS, QUICK, Array, shapes
+from service.oip.schema import BINARY, DATATYPES, INPUTS, TORQUE, InferInput, InferOutput, InferRequest
+from service.oip.wire import HEADER, Message
+from service.settings import Settings
+
+_DTYPES: dict[str, np.dtype[np.floating]] = {"FP64": np.dtype("<f8"), "FP32": np.dtype("<f4")}
+_NO_TENSORS = f"tensors in the body: of the extensions, {BINARY} is supported"
+
+
+class Query(NamedTuple):
+    """What to compute, and how to answer it.
+
+    motion: q, dq and ddq, (3, N, n); tau: (N, n) or None; single: the query has no axis of queries, nor has its answer;
+    outputs: names in the order asked for, each with whether it is answered in binary.
+    """
+
+    motion: Array
+    tau: Array | None
+    single: bool
+    outputs: dict[str, bool]
+
+    @property
+    def quick(self) -> bool:
+        """Whether the answer is one of a control loop: one query, and of it torques alone."""
+        return self.motion.shape[1] == 1 and self.outputs.keys() <= QUICK
+
+
+def read(message: Message, body: bytes, model: TorqueModel, settings: Settings) -> Query:
+    """Turn a request into a query; raise InvalidRequestError."""
+    request, offset = message
+    outputs = _outputs(request, model)
+    tensors = _inputs(request, bool(NEED_TORQUE & outputs.keys()))
+    shape = request.inputs[0].shape
+    _check_shape(request.inputs[0], shape, model, settings, bool(PARTS.keys() & outputs.keys()))
+    _check_payload(request, len(body) - offset)
+    single, rows = len(shape) == 1, 1 if len(shape) == 1 else shape[0]
+    found = np.empty((len(tensors), rows, model.n_joints))
+    places = {name: place for place, name in enumerate(tensors)}
+    for tensor in request.inputs:  # binary data lie in this order, whatever the order of the names
+        if tensor.shape != shape:
+            raise invalid_request(f"{tensor.name}.shape", tensor.shape, f"that of {request.inputs[0].name}, {shape}")
+        values, offset = _values(tensor, body, offset)
+        found[places[tensor.name]] = values.reshape(rows, -1)
+    _check_numbers(found, tensors, request, single, settings.max_position)
+    return Query(found[:3], found[3] if len(tensors) > 3 else None, single, outputs)
+
+
+def _outputs(request: InferRequest, model: TorqueModel) -> dict[str, bool]:
+    usual = bool(request.parameters and request.parameters.binary_data_output)
+    if not request.outputs:
+        return dict.fromkeys(DEFAULT, usual)
+    found: dict[str, bool] = {}
+    for index, output in enumerate(request.outputs):
+        name, field = output.name, f"outputs[{index}]"
+        if name in found:
+            raise invalid_request(f"{field}.name", name, "each output once")
+        part = PARTS.get(name)
+        if (part is None or part.component not in available(model.estimator)) and name not in (*QUICK, "covariance"):
+            expected = f"what a model with the estimator {model.estimator.name} offers: {', '.join(shapes(model))}"
+            raise invalid_request(f"{field}.name", name, expected)
+        found[name] = _binary(output, field, usual)
+    return found
+
+
+def _binary(output: InferOutput, field: str, usual: bool) -> bool:
+    asked = output.parameters
+    if asked is None:
+        return usual
+    for name, value in (("classification", asked.classification), ("shared_memory_region", asked.shared_memory_region)):
+        if value is not None:
+            raise invalid_request(f"{field}.parameters.{name}", value, _NO_TENSORS)
+    return usual if asked.binary_data is None else asked.binary_data
+
+
+def _inputs(request: InferRequest, forward: bool) -> tuple[str, ...]:
+    """Names of the tensors that the query needs; they are all there, each once, and no other."""
+    needed = (*INPUTS, TORQUE) if forward else INPUTS
+    names = [tensor.name for tensor in request.inputs]
+    for index, name in enumerate(names):
+        if name == TORQUE and not forward:
+            raise invalid_request(TORQUE, "given", f"no tau, or {FORWARD} among the outputs")
+        if name not in needed:
+            raise invalid_request(f"inputs[{index}].name", name, f"one of {', '.join(needed)}")
+        if name in names[:index]:
+            raise invalid_request(f"inputs[{index}].name", name, "each input once")
+    for name in needed:
+        if name not in names:
+            torque = f"the torque that {FORWARD} is asked for, shaped as q"
+            raise invalid_request(name, "missing", torque if name == TORQUE else f"the inputs {', '.join(needed)}")
+    return needed
+
+
+def _check_shape(
+    tensor: InferInput, shape: list[int], model: TorqueModel, settings: Settings, components: bool
+) -> None:
+    n, field = model.n_joints, f"{tensor.name}.shape"
+    if len(shape) not in (1, 2) or shape[-1] != n or shape[0] == 0:
+        joints = ", ".join(model.joint_names)
+        raise invalid_request(field, shape, f"[{n}] for one query or [N, {n}] for a batch: the joints are {joints}")
+    if len(shape) == 2 and shape[0] > settings.max_batch:
+        raise invalid_request(field, shape, f"at most {settings.max_batch} queries in one request")
+    if len(shape) == 2 and components and shape[0] > settings.max_component_batch:
+        expected = f"at most {settings.max_component_batch} queries in one request with components"
+        raise invalid_request(field, shape, expected)
+
+
+def _check_payload(request: InferRequest, present: int) -> None:
+    """Compare the bytes after the JSON with those that the inputs announce."""
+    announced = sum(each.parameters.binary_data_size or 0 for each in request.inputs if each.parameters)
+    if announced != present:
+        expected = f"{announced} bytes, the sum of every binary_data_size, after the JSON whose length {HEADER} gives"
+        raise invalid_request("the binary data", f"{present} bytes", expected)
+
+
+def _values(tensor: InferInput, body: bytes, offset: int) -> tuple[Array, int]:
+    """Numbers of a tensor, flat or in rows, and where the next one's binary data begin."""
+    name, count, given = tensor.name, prod(tensor.shape), tensor.parameters
+    dtype = _DTYPES.get(tensor.datatype)
+    if dtype is None:
+        raise invalid_request(f"{name}.datatype", tensor.datatype, " or ".join(DATATYPES))
+    if given is not None and given.shared_memory_region is not None:
+        raise invalid_request(f"{name}.parameters.shared_memory_region", given.shared_memory_region, _NO_TENSORS)
+    size = None if given is None else given.binary_data_size
+    if (size is None) == (tensor.data is None):
+        found = "missing" if size is None else "given, and binary_data_size too"
+        raise invalid_request(f"{name}.data", found, "numbers in data, or binary_data_size and binary data")
+    if size is None:
+        return _as_read(_listed(tensor, count), dtype), offset
+    if size != count * dtype.itemsize:
+        expected = f"{count * dtype.itemsize} bytes: the shape {tensor.shape} of {tensor.datatype}"
+        raise invalid_request(f"{name}.parameters.binary_data_size", size, expected)
+    return _as_read(np.frombuffer(body, dtype, count, offset), dtype), offset + size
+
+
+def _as_read(values: NDArray[np.floating], dtype: np.dtype[np.floating]) -> Array:
+    """The numbers that the datatype makes of what was sent, as FP64."""
+    if dtype == np.float64:
+        return values.astype(np.float64, copy=False)
+    with np.errstate(over="ignore", invalid="ignore"):  # what it cannot hold becomes infinite and is refused as such
+        return values.astype(dtype).astype(np.float64)
+
+
+def _listed(tensor: InferInput, count: int) -> Array:
+    field, expected = f"{tensor.name}.data", f"{count} numbers or rows of them, as the shape {tensor.shape} has"
+    try:
+        values = np.array(tensor.data, np.float64)
+    except ValueError:
+        raise invalid_request(field, "numbers and lists, or lists of different lengths", expected) from None
+    if values.size != count or (values.ndim == 2 and list(values.shape) != tensor.shape):
+        found = f"{values.size} numbers" if values.ndim == 1 else f"rows of shape {list(values.shape)}"
+        raise invalid_request(field, found, expected)
+    return values
+
+
+def _check_numbers(values: Array, names: tuple[str, ...], request: InferRequest, single: bool, limit: float) -> None:
+    finite = np.isfinite(values)
+    if not finite.all():
+        place, row, joint = np.argwhere(~finite)[0]
+        datatype = next(each.datatype for each in request.inputs if each.name == names[place])
+        field = _element(names[place], row, joint, single)
+        raise invalid_request(field, f"{values[place, row, joint]:g}", f"a finite number of {datatype}")
+    q = np.abs(values[0])
+    if q.max() > limit:
+        row, joint = np.unravel_index(q.argmax(), q.shape)
+        expected = f"radians (or metres) within ±{limit:g}: are these degrees?"
+        raise invalid_request(_element("q", row, joint, single), f"{values[0, row, joint]:g}", expected)
+
+
+def _element(name: str, row: np.intp, joint: np.intp, single: bool) -> str:
+    return f"{name}[{joint}]" if single else f"{name}[{row}][{joint}]"

@@ -1,0 +1,79 @@
+"""Models and versions as the protocol names and describes them."""
+
+from __future__ import annotations
+
+from anyio import to_thread
+
+import lipcore
+from lipcore.model import TorqueModel
+from service.context import Service
+from service.errors import NotFoundError, NotReadyError, problem, sentence
+from service.inference.loaded import Served
+from service.models import registry
+from service.oip.outputs import FORWARD, shapes
+from service.oip.schema import INPUTS, TORQUE, ModelMetadata, TensorMetadata
+
+_LISTED = 20
+
+
+async def find(service: Service, name: str, version: str | None) -> Served:
+    """Return a version, the latest where None, loaded if need be; raise NotFoundError naming those there are."""
+    number = None if version is None else _number(version)
+    found = service.loaded.hot(name, number)
+    if found is not None:
+        return found
+    return await to_thread.run_sync(_load, service, name, version, number, limiter=service.predictions)
+
+
+async def ready(service: Service, name: str, version: str | None) -> Served:
+    """Like `find`, but raise NotReadyError where the version cannot be loaded."""
+    try:
+        return await find(service, name, version)
+    except lipcore.ModelFormatError as error:
+        raise NotReadyError(f"model {name!r} cannot be loaded: {error}") from error
+
+
+def metadata(service: Service, served: Served) -> ModelMetadata:
+    """Describe a version and name all of its model; raise NotFoundError. Not for the event loop."""
+    model = served.model
+    inputs = [TensorMetadata(name=each, shape=[-1, model.n_joints]) for each in INPUTS]
+    outputs = shapes(model)
+    if FORWARD in outputs:
+        inputs.append(TensorMetadata(name=TORQUE, shape=[-1, model.n_joints], parameters={"optional": True}))
+    return ModelMetadata(
+        name=served.name,
+        versions=_known(service, served.name),
+        platform=f"lipserve_{model.estimator.name}",
+        inputs=inputs,
+        outputs=[TensorMetadata(name=each, shape=list(shape)) for each, shape in outputs.items()],
+        parameters=_parameters(served, model),
+    )
+
+
+def _parameters(served: Served, model: TorqueModel) -> dict[str, str | int]:
+    return {
+        "version": str(served.version),
+        "revision": served.revision,
+        "torque_convention": model.torque_convention,
+        "joint_names": ",".join(model.joint_names),
+    }
+
+
+def _number(version: str) -> int:
+    """A version's number; 0, which no version has, for what is none."""
+    number = int(version) if version.isascii() and version.isdigit() and len(version) < 10 else 0
+    return number if str(number) == version else 0
+
+
+def _load(service: Service, name: str, version: str | None, number: int | None) -> Served:
+    try:
+        return service.loaded.get(name, number)
+    except NotFoundError as error:
+        if error.detail[0].field == "model":
+            raise NotFoundError(f"no model {name[:200]!r}: GET /v1/models lists all", error.detail) from error
+        item = problem("version", version, f"one of {', '.join(_known(service, name)[-_LISTED:])}")
+        raise NotFoundError(f"{sentence(item)}, of model {name!r}", [item]) from error
+
+
+def _known(service: Service, name: str) -> list[str]:
+    return [str(each.version) for each in registry.show(service.database, name).versions]

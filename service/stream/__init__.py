@@ -1,0 +1,1 @@
+"""Binary WebSocket frames for control loops."""

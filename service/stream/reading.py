@@ -1,0 +1,59 @@
+"""Request frames into motions, with errors that name what is wrong."""
+
+from __future__ import annotations
+
+from math import inf
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from service.errors import InvalidRequestError, invalid_request
+from service.stream.frames import ASK_LEARN, ASK_STD, NUMBER, REQUEST, request_bytes
+
+if TYPE_CHECKING:
+    from lipcore.samples import Array
+
+FIELDS = ("q", "dq", "ddq")
+
+
+class FrameReader:
+    """Reads frames of one robot into a single buffer, which the next frame overwrites."""
+
+    def __init__(self, joint_names: tuple[str, ...], max_position: float) -> None:
+        self.joint_names, self.n_joints, self.max_position = joint_names, len(joint_names), max_position
+        self.motion: Array = np.zeros((3, self.n_joints))
+        self._numbers, self._positions = self.motion.reshape(-1), self.motion[0]
+        self._length = request_bytes(self.n_joints)
+
+    def read(self, data: bytes, flags: int, n: int, budget: float) -> Array:
+        """Return q, dq, ddq of a frame, (3, n), whose header is already read; raise InvalidRequestError."""
+        if flags & ~ASK_STD:
+            raise _wrong_flags(flags)
+        if n != self.n_joints:
+            raise invalid_request("n", n, f"{self.n_joints} joints: {', '.join(self.joint_names)}")
+        if len(data) != self._length:
+            raise invalid_request("frame", f"{len(data)} bytes long", f"{self._length} bytes for {n} joints")
+        if not 0.0 <= budget < inf:
+            raise invalid_request("deadline", budget, "seconds, or 0 for none")
+        # a copy, because the model takes aligned and writable memory, and the message is neither for certain
+        self._numbers[:] = np.frombuffer(data, NUMBER, offset=REQUEST.size)
+        if not np.isfinite(self._numbers).all():
+            raise self._not_finite()
+        if np.abs(self._positions).max() > self.max_position:
+            raise self._too_far()
+        return self.motion
+
+    def _not_finite(self) -> InvalidRequestError:
+        row, joint = np.argwhere(~np.isfinite(self.motion))[0]
+        return invalid_request(f"{FIELDS[row]}[{joint}]", f"{self.motion[row, joint]:g}", "a finite number")
+
+    def _too_far(self) -> InvalidRequestError:
+        joint = int(np.abs(self._positions).argmax())
+        expected = f"radians (or metres) within ±{self.max_position:g}: are these degrees?"
+        return invalid_request(f"q[{joint}]", f"{self._positions[joint]:g}", expected)
+
+
+def _wrong_flags(flags: int) -> InvalidRequestError:
+    if flags & ASK_LEARN:
+        return invalid_request("flags", flags, f"no {ASK_LEARN}: models do not learn from a stream yet")
+    return invalid_request("flags", flags, f"0, or {ASK_STD} to be answered tau_std")

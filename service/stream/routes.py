@@ -1,0 +1,129 @@
+"""WebSocket routes: streams of torque queries, and an echo as the floor of their latency."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from urllib.parse import parse_qsl
+
+from anyio import to_thread
+from fastapi import APIRouter
+from starlette.datastructures import Headers
+from starlette.types import Receive, Scope, Send
+
+from service.context import Service
+from service.errors import BusyError, NotFoundError, NotReadyError, ServiceError, invalid_request
+from service.stream.conversation import Conversation, Echo
+from service.stream.protocol import CONNECTION, StreamProtocol
+from service.stream.session import Session
+
+PATH, ECHO_PATH = "/v1/models/{model}/stream", "/v1/echo/stream"
+
+
+class ForeignOriginError(ServiceError):
+    """A web page of another site asks: browsers let it open sockets without asking anyone."""
+
+    status, code = 403, "forbidden"
+
+
+def router() -> APIRouter:
+    """Return the routes, which count their connections together."""
+    streams = Streams()
+    found = APIRouter()
+    # objects, not functions: those Starlette would wrap in its own WebSocket
+    found.add_websocket_route(PATH, StreamRoute(streams), name="stream")  # type: ignore[arg-type]
+    found.add_websocket_route(ECHO_PATH, EchoRoute(streams), name="echo")  # type: ignore[arg-type]
+    found.add_websocket_route("/{path:path}", NoRoute(), name="no stream")  # type: ignore[arg-type]
+    return found
+
+
+class Streams:
+    """How many connections are open."""
+
+    def __init__(self) -> None:
+        self.open = 0
+
+    @contextmanager
+    def one_more(self, most: int) -> Iterator[None]:
+        """Count a connection while it lasts; raise BusyError beyond `most`."""
+        if self.open >= most:
+            raise BusyError(f"{self.open} streams are open, the most there may be: close one, or try again later")
+        self.open += 1
+        try:
+            yield
+        finally:
+            self.open -= 1
+
+
+class EchoRoute:
+    """ASGI application of the echo."""
+
+    def __init__(self, streams: Streams) -> None:
+        self.streams = streams
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Talk with one client. What is raised before it is accepted is answered in HTTP."""
+        _check_origin(scope)
+        service: Service = scope["app"].state.service
+        with self.streams.one_more(service.settings.max_streams):
+            conversation = await self.conversation(service, scope, receive, send)
+            await conversation.run()
+
+    async def conversation(self, service: Service, scope: Scope, receive: Receive, send: Send) -> Conversation:
+        """Return what talks with the client; raise ServiceError where the address is wrong."""
+        return Echo(_connection(scope), receive, send, service.settings)
+
+
+class StreamRoute(EchoRoute):
+    """ASGI application of torque streams."""
+
+    async def conversation(self, service: Service, scope: Scope, receive: Receive, send: Send) -> Conversation:
+        """Return what talks with the client; raise InvalidRequestError, NotFoundError or UnreadableVersionError."""
+        version, std = _parameters(scope["query_string"])
+        model = scope["path_params"]["model"]
+        served = service.loaded.hot(model, version)
+        if served is None:
+            served = await to_thread.run_sync(service.loaded.get, model, version)
+        return Session(_connection(scope), receive, send, service, served, version is not None, std)
+
+
+class NoRoute:
+    """ASGI application of all other addresses, which Starlette would refuse without a word. To be the last."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Refuse to talk: raise NotFoundError."""
+        raise NotFoundError(f"no stream at {scope['path'][:200]}: streams are at {PATH}")
+
+
+def _parameters(query: bytes) -> tuple[int | None, bool]:
+    """Read version and std; raise InvalidRequestError."""
+    version, std = None, False
+    for name, value in parse_qsl(query.decode("ascii", "backslashreplace"), keep_blank_values=True):
+        if name == "version":
+            if not re.fullmatch("[0-9]{1,10}", value) or not 0 < int(value) < 2**31:
+                raise invalid_request("version", value, "the number of a version")
+            version = int(value)
+        elif name == "std":
+            if value not in ("0", "1"):
+                raise invalid_request("std", value, "0 or 1")
+            std = value == "1"
+        else:
+            raise invalid_request(name, value, "no parameter but version and std")
+    return version, std
+
+
+def _check_origin(scope: Scope) -> None:
+    headers = Headers(scope=scope)
+    origin = headers.get("origin")
+    if origin is not None and origin.partition("://")[2] != headers.get("host"):
+        raise ForeignOriginError(
+            f"the origin {origin[:200]!r} is not this service: web pages of other sites may not ask"
+        )
+
+
+def _connection(scope: Scope) -> StreamProtocol:
+    found = scope.get("state", {}).get(CONNECTION)
+    if not isinstance(found, StreamProtocol):
+        raise NotReadyError("streams need the server that `lipserve serve` starts")
+    return found

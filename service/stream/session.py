@@ -1,0 +1,123 @@
+"""A stream of torque queries to one model."""
+
+from __future__ import annotations
+
+import json
+import logging
+from math import inf
+from time import perf_counter
+
+import numpy as np
+from anyio import to_thread
+from starlette.types import Message, Receive, Send
+
+from service.context import Service
+from service.errors import ErrorBody, ErrorResponse, ServiceError, invalid_request
+from service.inference.loaded import Served
+from service.stream.conversation import Conversation
+from service.stream.frames import ANSWER, ASK_STD, ERROR, HAS_STD, LATE, LAYOUT, REQUEST, UNREAD
+from service.stream.protocol import StreamProtocol
+from service.stream.reading import FrameReader
+
+logger = logging.getLogger(__name__)
+
+
+class Session(Conversation):
+    """Answers every frame from the version that is current when the frame is taken; holds that version in memory.
+
+    pinned: whether it stays with this version; std: whether every answer carries tau_std.
+    """
+
+    def __init__(
+        self,
+        connection: StreamProtocol,
+        receive: Receive,
+        send: Send,
+        service: Service,
+        served: Served,
+        pinned: bool,
+        std: bool,
+    ) -> None:
+        super().__init__(connection, receive, send, service.settings)
+        self._loaded, self._name = service.loaded, served.name
+        self._pin = served.version if pinned else None
+        self._std, self._late, self._due = std, 0, inf
+        self._take(served)
+
+    async def greet(self) -> None:
+        """Send what holds for all answers of the version."""
+        model = self._served.model
+        hello = {
+            "layout": LAYOUT,
+            "model": self._served.name,
+            "version": self._served.version,
+            "revision": self._served.revision,
+            "joint_names": list(model.joint_names),
+            "torque_convention": model.torque_convention,
+            "noise_std": self._served.noise_std,
+            "max_position": self.settings.max_position,
+        }
+        await self.send({"type": "websocket.send", "text": json.dumps(hello)})
+
+    async def reply(self, message: Message, arrived: float) -> bytes:
+        """Return the answer frame; whatever is wrong becomes an error frame."""
+        if self.left > self._due:  # the last answer left in time, but its client did not read it
+            self._late += 1
+        self._due = inf
+        sequence, flags = 0, UNREAD
+        try:
+            data = message.get("bytes")
+            if data is None:
+                raise invalid_request("frame", "a text message", "a binary message")
+            if len(data) < REQUEST.size:
+                expected = f"a header of {REQUEST.size} bytes, and numbers"
+                raise invalid_request("frame", f"{len(data)} bytes long", expected)
+            sequence, asked, n, budget = REQUEST.unpack_from(data)
+            flags = 0
+            current = self._loaded.hot(self._name, self._pin)
+            if current is not self._served:
+                await self._follow(current)
+            motion = self._reader.read(data, asked, n, budget)
+            tau, std = self._answer(motion, self._std or asked == ASK_STD)
+            if not np.isfinite(tau).all():
+                joint = int(np.argmin(np.isfinite(tau)))
+                raise invalid_request(f"tau[{joint}]", f"{tau[joint]:g}", "finite: are dq and ddq those of a robot?")
+        except ServiceError as error:
+            return self._refuse(sequence, flags, arrived, error)
+        except Exception as error:  # the next frame may be answered
+            logger.error("unexpected error in a stream of model %s", self._name, exc_info=error)
+            said = ServiceError("an unexpected error; the service's log says more")
+            return self._refuse(sequence, flags, arrived, said)
+        numbers = tau.tobytes()
+        if std is not None:
+            flags = HAS_STD
+            numbers += std.tobytes()
+        now = perf_counter()
+        if budget:
+            self._due = arrived + budget
+            if now > self._due:
+                self._late, self._due = self._late + 1, inf
+                flags |= LATE
+        served = self._served
+        return ANSWER.pack(sequence, flags, n, served.version, self._late, served.revision, now - arrived) + numbers
+
+    def _refuse(self, sequence: int, flags: int, arrived: float, error: ServiceError) -> bytes:
+        body = ErrorResponse(error=ErrorBody(code=error.code, message=error.message, detail=error.detail))
+        served, seconds = self._served, perf_counter() - arrived
+        header = ANSWER.pack(sequence, flags | ERROR, 0, served.version, self._late, served.revision, seconds)
+        return header + body.model_dump_json().encode()
+
+    async def _follow(self, current: Served | None) -> None:
+        """Take the version that is current; None: it has been dropped from memory, maybe for a newer one."""
+        if current is None:
+            if self._pin is not None or self._loaded.newest(self._name) == self._served.version:
+                return  # it is held here
+            current = await to_thread.run_sync(self._loaded.get, self._name, None)
+        known = self._served.version
+        self._take(current)
+        if current.version != known:
+            await self.greet()
+
+    def _take(self, served: Served) -> None:
+        self._served, self._answer = served, served.model.answer
+        self._reader = FrameReader(served.model.joint_names, self.settings.max_position)

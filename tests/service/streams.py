@@ -1,0 +1,110 @@
+"""Frames of a torque stream, packed and read as the README documents them, without the service's own code."""
+
+from __future__ import annotations
+
+import json
+import socket
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from websockets.sync.client import ClientConnection, connect
+
+import lipcore
+from lipcore import TorqueModel
+from service.database import Database
+from service.models import registry
+from tests.service.data import DEADLINE
+from tests.service.server import Server
+
+STD, LATE, ERROR, UNREAD = 1, 2, 4, 8
+STREAM = "/v1/models/pendulum/stream"
+MOTION = np.array([[0.3, -0.2], [0.1, 0.4], [1.0, -0.5]])
+
+
+@dataclass(frozen=True)
+class Streaming:
+    """A server with a model "pendulum" of version 1 that no test adds versions to, and lipcore's own copy of it."""
+
+    server: Server
+    dataset: str
+    model: TorqueModel
+
+
+@dataclass(frozen=True)
+class Answer:
+    """An answer frame; error: what it says instead of numbers."""
+
+    sequence: int
+    flags: int
+    version: int
+    late: int
+    revision: int
+    seconds: float
+    tau: np.ndarray | None = None
+    std: np.ndarray | None = None
+    error: dict[str, Any] | None = None
+
+
+def frame(
+    motion: Any = MOTION, sequence: int = 1, flags: int = STD, n: int | None = None, budget: float = 0.0
+) -> bytes:
+    """A request frame; motion: q, dq, ddq."""
+    numbers = np.asarray(motion, "<f8")
+    n = numbers.shape[-1] if n is None else n
+    return struct.pack("<IHHd", sequence, flags, n, budget) + numbers.tobytes()
+
+
+def read(data: bytes) -> Answer:
+    """Read an answer frame, and check that its length is what its header says."""
+    assert isinstance(data, bytes)
+    sequence, flags, n, version, late, revision, seconds = struct.unpack_from("<IHHIIQd", data)
+    assert flags & ~(STD | LATE | ERROR | UNREAD) == 0
+    assert seconds >= 0
+    said = Answer(sequence, flags, version, late, revision, seconds)
+    if flags & ERROR:
+        assert n == 0
+        body = json.loads(data[32:])
+        assert set(body) == {"error"}
+        assert set(body["error"]) == {"code", "message", "detail"}
+        return Answer(**{**vars(said), "error": body["error"]})
+    vectors = 2 if flags & STD else 1
+    assert len(data) == 32 + 8 * n * vectors
+    numbers = np.frombuffer(data, "<f8", offset=32).reshape(vectors, n)
+    return Answer(**{**vars(said), "tau": numbers[0], "std": numbers[1] if vectors == 2 else None})
+
+
+def dial(server: Server, path: str = STREAM, **options: Any) -> connect:
+    """A connection to enter as a context, its first message unread."""
+    made = socket.create_connection(("127.0.0.1", server.port), DEADLINE)
+    made.settimeout(None)
+    url = f"ws://127.0.0.1:{server.port}{path}"
+    return connect(url, sock=made, legacy=False, close_timeout=DEADLINE, **{"compression": None, **options})
+
+
+def hello(connection: ClientConnection) -> dict[str, Any]:
+    """The next message, which has to be text: what the service says of the version that answers."""
+    said = connection.recv(DEADLINE)
+    assert isinstance(said, str)
+    return json.loads(said)
+
+
+def ask(connection: ClientConnection, request: bytes | str) -> Answer:
+    """Send a frame and read its answer."""
+    connection.send(request)
+    return read(connection.recv(DEADLINE))
+
+
+def saved_model(server: Server, name: str, version: int) -> TorqueModel:
+    """A version that a server has stored, loaded by lipcore here."""
+    database = Database(server.home)
+    try:
+        return lipcore.load(server.home / "versions" / registry.find(database, name, version).folder)
+    finally:
+        database.close()
+
+
+def motions(count: int, n: int = 2, seed: int = 0) -> np.ndarray:
+    """Motions (count, 3, n) near those that the models are trained on."""
+    return np.random.default_rng(seed).uniform(-0.5, 0.5, (count, 3, n))

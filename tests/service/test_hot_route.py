@@ -1,0 +1,277 @@
+"""The hot route: what it answers at once, and that whatever it leaves to FastAPI is answered as if it were not there.
+
+The oracle is the endpoint that pydantic reads for: `application/x+json` is JSON which the hot route does not take up.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import random
+import subprocess
+import sys
+import weakref
+
+import msgspec
+import numpy as np
+import pytest
+
+from service.inference import answer as inference
+from service.inference.schema import PredictRequest, PredictResponse
+from service.inference.wire import Prediction, Query
+from tests.service.data import DEADLINE, error, service_of
+
+QUERY = {"q": [0.25, -1.5], "dq": [1, 0.125], "ddq": [-2.0, 3e-1]}
+BATCH = {name: [values, values[::-1], [0.5, 0]] for name, values in QUERY.items()}
+
+
+def post(api, model, body, media_type="application/json"):
+    content = body if isinstance(body, bytes | str) else json.dumps(body)
+    return api.post(f"/v1/models/{model}/predict", content=content, headers={"content-type": media_type})
+
+
+def as_fastapi_does(api, model, body):
+    """Check that a body is answered as the endpoint answers it; return the answer."""
+    found, expected = post(api, model, body), post(api, model, body, "application/x+json")
+    assert (found.status_code, found.json()) == (expected.status_code, expected.json())
+    assert found.headers["content-type"] == expected.headers["content-type"] == "application/json"
+    return found
+
+
+@pytest.fixture
+def no_thread(api, monkeypatch):
+    """A service that can answer on the event loop only."""
+
+    def broken(*_):
+        raise AssertionError("computed in a thread")
+
+    monkeypatch.setattr(inference, "predict", broken)
+    return api
+
+
+def test_one_query_is_answered_on_the_event_loop(no_thread, trained):
+    for body in (QUERY, QUERY | {"version": 1}, QUERY | {"components": [], "covariance": False, "tau": None}):
+        assert post(no_thread, trained.name, body).status_code == 200
+    for body in (BATCH, QUERY | {"covariance": True}, QUERY | {"components": ["gravity"]}):
+        with pytest.raises(AssertionError, match="computed in a thread"):
+            post(no_thread, trained.name, body)
+
+
+def test_numbers_are_those_of_the_model_to_the_last_bit(api, trained):
+    motions = np.random.default_rng(8).uniform(-2, 2, (50, 3, 2))
+    motions[1] *= 1e-300
+    for motion in motions:
+        found = post(api, trained.name, dict(zip(("q", "dq", "ddq"), motion.tolist(), strict=True))).json()
+        tau, tau_std = trained.model.answer(motion)
+        assert found["tau"] == tau.tolist()
+        assert found["tau_std"] == tau_std.tolist()
+        assert found["noise_std"] == trained.model.noise_std.tolist()
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        QUERY,
+        BATCH,
+        {name: values[:1] for name, values in BATCH.items()},
+        QUERY | {"covariance": True, "version": 1},
+        BATCH | {"covariance": True, "components": ["friction", "gravity"]},
+        QUERY | {"components": ["forward_dynamics"], "tau": [0.1, 0]},
+        QUERY | {"version": None, "tau": None},
+        # what pydantic takes for a number or a truth value
+        QUERY | {"version": "1"},
+        QUERY | {"version": 1.0, "covariance": "yes"},
+        QUERY | {"version": True, "covariance": 1},
+        json.dumps(QUERY).encode("utf-16"),
+        json.dumps(QUERY).encode("utf-8-sig"),
+        f" \n{json.dumps(QUERY, indent=3)}\t",
+        '{"q": [9, 9], "q": [0.25, -1.5], "dq": [1, 0.125], "ddq": [-2e0, 3E-1]}',
+        '{"\\u0071": [0.25, -1.5], "dq": [1, 0.125], "ddq": [-2e0, 3E-1]}',
+        '{"q": [-0, -0.0], "dq": [9007199254740993, 1e-400], "ddq": [0.1000000000000000055511151231257827, 1e22]}',
+    ],
+)
+def test_right_queries(api, trained, body):
+    assert as_fastapi_does(api, trained.name, body).status_code == 200
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        QUERY | {"q": []},
+        QUERY | {"q": [[]], "dq": [[]], "ddq": [[]]},
+        QUERY | {"q": [0.1]},
+        QUERY | {"q": [0.1, 0.2, 0.3]},
+        {name: [*values, 0.1] for name, values in QUERY.items()},
+        QUERY | {"q": [QUERY["q"]]},
+        QUERY | {"q": BATCH["q"]},
+        BATCH | {"dq": QUERY["dq"]},
+        BATCH | {"ddq": [[0, 0], [0, 0]]},
+        BATCH | {"ddq": [[0, 0], [0], [0, 0]]},
+        BATCH | {"ddq": [[0, 0], 0, [0, 0]]},
+        BATCH | {"ddq": [0, [0, 0], [0, 0]]},
+        QUERY | {"q": [[0.1], [0.2]], "dq": [[0.1], [0.2]], "ddq": [[0.1], [0.2]]},
+        QUERY | {"q": [13, 0]},
+        QUERY | {"q": [0, -12.61]},
+        QUERY | {"tau": [0, 0]},
+        QUERY | {"tau": []},
+        QUERY | {"components": ["forward_dynamics"], "tau": []},
+        QUERY | {"components": ["forward_dynamics"], "tau": [[0], 0]},
+        QUERY | {"components": ["gravity", "gravity"]},
+        QUERY | {"components": ["gravity", "mass"]},
+        QUERY | {"components": None},
+        QUERY | {"version": 2},
+        QUERY | {"version": 0},
+        QUERY | {"version": 2**31},
+        QUERY | {"dq": [1e200, 0]},
+        BATCH | {"dq": [[0, 0], [0, 1e200], [0, 0]]},
+        {name: [values] * 1001 for name, values in QUERY.items()},
+    ],
+)
+def test_wrong_queries(api, trained, body):
+    said = as_fastapi_does(api, trained.name, body).json()["error"]
+    assert said["detail"][0]["field"]
+
+
+def test_bodies_with_a_fault_anywhere(api, trained):
+    """A byte of a right query is replaced, left out or doubled: half a thousand times."""
+    rng = random.Random(3)
+    right = json.dumps(QUERY | {"version": 1, "covariance": False, "components": ["friction"], "tau": None})
+    statuses = set()
+    for _ in range(500):
+        body = bytearray(right.encode())
+        at = rng.randrange(len(body))
+        match rng.randrange(3):
+            case 0:
+                body[at] = rng.choice(b'"{}[]:,.-+eE0123456789ntfNI \\\xff\x00')
+            case 1:
+                del body[at]
+            case _:
+                body.insert(at, body[at])
+        statuses.add(as_fastapi_does(api, trained.name, bytes(body)).status_code)
+    assert {200, 400, 422} <= statuses
+
+
+def test_unknown_models(api):
+    for model in ("nobody", "PANDA-SIM", "%2e%2e", "pända"):
+        error(as_fastapi_does(api, model, QUERY), 404, "not_found")
+
+
+@pytest.mark.parametrize(
+    "media_type",
+    ["application/json", "application/json; charset=utf-8", "application/json ;x=y", "Application/JSON"],
+)
+def test_json_by_its_names(no_thread, trained, media_type):
+    assert post(no_thread, trained.name, QUERY, media_type).status_code == 200
+
+
+@pytest.mark.parametrize("media_type", ["text/json", "application/jsonx", "json", "", "multipart/form-data"])
+def test_what_is_not_announced_as_json_is_not_read(api, trained, media_type):
+    said = error(post(api, trained.name, QUERY, media_type), 422, "invalid_request")
+    assert "application/json" in said["message"]
+
+
+def test_a_body_may_come_in_pieces(no_thread, trained):
+    body = json.dumps(QUERY).encode()
+    whole = post(no_thread, trained.name, body).json()
+    pieces = (body[at : at + 7] for at in range(0, len(body), 7))
+    assert post(no_thread, trained.name, b"".join(pieces)).json() == whole
+    answer = no_thread.post(
+        f"/v1/models/{trained.name}/predict",
+        content=(body[at : at + 7] for at in range(0, len(body), 7)),
+        headers={"content-type": "application/json"},
+    )
+    assert answer.json() == whole
+
+
+@pytest.mark.parametrize("dq", [[1e200, 0], [[0, 0], [0, -1e250]]])
+def test_an_answer_that_is_no_number_is_refused(api, trained, dq):
+    body = {"q": dq, "dq": dq, "ddq": dq} | {"q": np.zeros_like(dq).tolist(), "ddq": np.zeros_like(dq).tolist()}
+    said = error(post(api, trained.name, body), 422, "invalid_request")
+    assert said["message"] == (
+        "the answer is not finite, expected a motion whose torque is: are dq in rad/s and ddq in rad/s²?"
+    )
+
+
+def test_a_version_that_is_not_in_memory_is_loaded(api, trained):
+    before = post(api, trained.name, QUERY).json()
+    loaded = service_of(api).loaded
+    loaded._snapshot = type(loaded._snapshot)()
+    assert loaded.hot(trained.name, None) is None
+    assert post(api, trained.name, QUERY).json() == before
+    assert loaded.hot(trained.name, None) is not None
+
+
+def test_what_is_decoded_and_encoded_is_what_is_documented():
+    for wire, documented in ((Query, PredictRequest), (Prediction, PredictResponse)):
+        fields = {item.name: item.required for item in msgspec.structs.fields(wire)}
+        assert fields == {name: field.is_required() for name, field in documented.model_fields.items()}
+
+
+def test_hot_routes_are_looked_at_first(api):
+    assert {route.path for route in api.app.routes[:2]} == {"/v1/models/{model}/predict", "/v1/echo"}
+
+
+@pytest.mark.parametrize(
+    ("body", "media_type"), [(b'{"q": 1}', "application/json"), (b"\x00\xff" * 500, "application/x-any"), (b"", "a/b")]
+)
+def test_the_echo(api, body, media_type):
+    answer = api.post("/v1/echo", content=body, headers={"content-type": media_type})
+    assert (answer.status_code, answer.content, answer.headers["content-type"]) == (200, body, media_type)
+    assert answer.headers["x-content-type-options"] == "nosniff"
+
+
+def test_the_echo_of_what_has_no_media_type(api):
+    answer = api.post("/v1/echo", content=b"abc")
+    assert (answer.content, answer.headers["content-type"]) == (b"abc", "application/octet-stream")
+
+
+def test_the_echo_is_limited_as_queries_are(strict):
+    assert strict.post("/v1/echo", content=b"x" * 20_000, headers={"content-type": "a/b"}).status_code == 200
+    for body in (b"x" * 20_001, (b"x" * 100 for _ in range(201))):
+        answer = strict.post("/v1/echo", content=body, headers={"content-type": "a/b"})
+        assert "20000 bytes" in error(answer, 413, "too_large")["message"]
+
+
+COUNT_THREADS = """
+import asyncio, sys
+import torch
+from anyio import to_thread
+from threadpoolctl import threadpool_info
+from service.app import create_app
+from service.settings import Settings
+
+async def main():
+    app = create_app(Settings(home=sys.argv[1]))
+    async with app.router.lifespan_context(app):
+        print(torch.get_num_threads(), await to_thread.run_sync(torch.get_num_threads))
+        print(*(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"))
+
+asyncio.run(main())
+"""
+
+
+def test_serving_has_one_thread_of_linear_algebra(home):
+    """In a process of its own: the first thread that sets the number for BLAS is the only one that may."""
+    said = subprocess.run(
+        [sys.executable, "-c", COUNT_THREADS, str(home)],
+        env={**os.environ, "OMP_NUM_THREADS": "2"},
+        capture_output=True,
+        text=True,
+        timeout=DEADLINE,
+        check=True,
+    )
+    assert set(said.stdout.split()) == {"1"}
+
+
+def test_loaded_versions_are_kept_from_the_collector_and_freed_when_they_are_dropped(api, trained):
+    loaded = service_of(api).loaded
+    counts, models = [], []
+    for _ in range(6):
+        loaded._snapshot = type(loaded._snapshot)()
+        models.append(weakref.ref(loaded.get(trained.name, None).model))
+        counts.append(gc.get_freeze_count())
+        assert not any(each is models[-1]() for each in gc.get_objects())
+    assert counts[0] > 1000
+    assert counts[-1] - counts[0] < 1000
+    assert [model() is None for model in models] == [True] * 5 + [False]

@@ -1,0 +1,203 @@
+"""The Unix-domain socket beside the port: who may ask, what is replaced, what is left alone."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import socket
+import stat
+import subprocess
+import sys
+
+import httpx
+import numpy as np
+import pytest
+from websockets.sync.client import unix_connect
+
+from service.client import Client, ServiceUnreachableError
+from service.sockets import SocketError, UnixSocket
+from tests.service.data import DEADLINE, eventually
+from tests.service.server import Server
+
+QUERY = {"q": [0, -0.5, 0, -2, 0, 1.5, 0.7], "dq": [0.1] * 7, "ddq": [0.2] * 7}
+
+
+@pytest.fixture
+def path(tmp_path):
+    """A path that nothing lies at."""
+    return tmp_path / "lip.sock"
+
+
+@pytest.fixture
+def listening(path):
+    """A socket at the path that somebody listens on."""
+    with socket.socket(socket.AF_UNIX) as other:
+        other.bind(str(path))
+        other.listen()
+        yield path
+
+
+def dead(path):
+    """Leave at the path what a service that was killed leaves."""
+    with socket.socket(socket.AF_UNIX) as other:
+        other.bind(str(path))
+
+
+def refused(path):
+    with pytest.raises(SocketError) as caught:
+        UnixSocket(path, 0o660)
+    assert f"uds is {str(path)!r}" in str(caught.value)
+    return str(caught.value)
+
+
+def connects(path):
+    with socket.socket(socket.AF_UNIX) as client:
+        return client.connect_ex(str(path)) == 0
+
+
+@pytest.mark.parametrize("mode", [0o660, 0o600, 0o666])
+def test_the_file_has_the_mode_whatever_the_umask(path, mode):
+    before = os.umask(0o077)
+    try:
+        opened = UnixSocket(path, mode)
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(path.lstat().st_mode) == mode
+    opened.close()
+    assert not path.exists()
+
+
+def test_what_a_dead_service_left_is_replaced(path):
+    dead(path)
+    assert not connects(path)
+    opened = UnixSocket(path, 0o660)
+    assert connects(path)
+    opened.close()
+
+
+def test_a_live_socket_is_left_alone(listening):
+    assert "another service listens: stop it, or set another path" in refused(listening)
+    assert connects(listening)
+
+
+def test_a_live_socket_whose_queue_is_full_is_left_alone(path):
+    with socket.socket(socket.AF_UNIX) as other:
+        other.bind(str(path))
+        other.listen(0)
+        with socket.socket(socket.AF_UNIX) as first:
+            first.connect(str(path))
+            assert "another service listens" in refused(path)
+    assert path.is_socket()
+
+
+def test_a_socket_of_another_kind_is_left_alone(path):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as other:
+        other.bind(str(path))
+        assert "does not answer" in refused(path)
+        assert path.is_socket()
+
+
+@pytest.mark.parametrize("kind", ["file", "folder", "link to nothing", "link to a dead socket"])
+def test_what_is_no_socket_is_left_alone(path, tmp_path, kind):
+    if kind == "file":
+        path.write_text("precious")
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        if kind == "link to a dead socket":
+            dead(tmp_path / "target")
+        path.symlink_to(tmp_path / "target")
+    before = path.lstat()
+    assert "something lies that is no socket" in refused(path)
+    assert path.lstat() == before
+
+
+@pytest.mark.parametrize("folder", ["nowhere", "x" * 150])
+def test_where_there_can_be_no_socket_is_said(tmp_path, folder):
+    if len(folder) > 100:
+        (tmp_path / folder).mkdir()
+    assert re.search("No such file or directory|too long", refused(tmp_path / folder / "lip.sock"))
+
+
+def test_the_socket_of_a_successor_is_not_removed(path):
+    opened = UnixSocket(path, 0o660)
+    path.unlink()
+    successor = UnixSocket(path, 0o660)
+    opened.close()
+    assert connects(path)
+    successor.close()
+
+
+def test_a_service_listens_on_both(home, path):
+    """Then it is killed, started again on what it left, and asked to end."""
+    with Server(home, LIPSERVE_UDS=str(path)) as server, Client(f"unix://{path}") as client:
+        answer = client._send("POST", "/v1/models/panda-sim/predict", json=QUERY)
+        assert answer == server.client.post("/v1/models/panda-sim/predict", json=QUERY).json()
+        assert stat.S_IMODE(path.lstat().st_mode) == 0o660
+        with unix_connect(str(path), "ws://localhost/v1/echo/stream") as stream:
+            stream.send(b"12345678")
+            assert stream.recv() == b"12345678"
+        server.kill()
+    assert path.is_socket()
+
+    with Server(home, LIPSERVE_UDS=str(path), LIPSERVE_UDS_MODE="600") as server, Client(f"unix://{path}") as client:
+        assert stat.S_IMODE(path.lstat().st_mode) == 0o600
+        zero = np.zeros(7)
+        assert client.predict("panda-sim", zero, zero, zero).model == "panda-sim"
+        second = start(home.with_name("other"), "--port", "0", "--uds", path)
+        said, _ = second.communicate(timeout=DEADLINE)
+        assert (second.returncode, "another service listens" in said, "Traceback" in said) == (1, True, False)
+        assert client.ready()
+        assert server.terminate() == -signal.SIGTERM
+        assert not path.exists()
+
+
+def test_a_free_port_is_printed_beside_the_socket(home, path, tmp_path):
+    log = tmp_path / "log"
+    process = start(home, "--port", "0", "--uds", path, stdout=log.open("w"))
+    try:
+        url = eventually(lambda: re.search(r"running on (http://127\.0\.0\.1:\d+)", log.read_text()))[1]
+        assert not url.endswith(":0")
+        eventually(lambda: f"listening on the Unix-domain socket {path}" in log.read_text())
+        assert httpx.get(f"{url}/health/ready").status_code == 200
+        with Client(f"unix://{path}") as client:
+            assert client.ready()
+        process.send_signal(signal.SIGINT)
+        process.wait(DEADLINE)
+        assert not path.exists()
+    finally:
+        process.kill()
+        process.wait(DEADLINE)
+
+
+def test_a_taken_port_leaves_no_socket(home, path, server):
+    process = start(home, "--port", server.port, "--uds", path)
+    said, _ = process.communicate(timeout=DEADLINE)
+    assert process.returncode not in (0, None)
+    assert "address already in use" in said
+    assert not path.exists()
+
+
+def test_a_client_says_that_nobody_listens(path):
+    with Client(f"unix://{path}") as client:
+        assert client.ready() is False
+        with pytest.raises(ServiceUnreachableError, match=f"no service answers at unix://{path}"):
+            client.model("panda-sim")
+
+
+@pytest.mark.parametrize("url", ["unix://lip.sock", "unix://"])
+def test_a_client_needs_an_absolute_path(url):
+    with pytest.raises(ValueError, match="expected unix:// and an absolute path"):
+        Client(url)
+
+
+def start(home, *arguments, stdout=subprocess.PIPE):
+    """`lipserve serve` with arguments."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "service.cli", "serve", *map(str, arguments)],
+        env={**os.environ, "LIPSERVE_HOME": str(home)},
+        stdout=stdout,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )

@@ -1,0 +1,63 @@
+"""What a start imports: a restart is quick, and nothing is loaded that serving does without."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from importlib.metadata import entry_points
+
+import pytest
+
+from service import __version__
+from service.settings import shipped_models
+
+NUMERICS = ("numpy", "torch", "scipy", "numba")
+FITTING = ("scipy.optimize", "scipy.signal", "scipy.stats")
+CLIENTS = ("httpx", "service.client", "service.demo", "service.reproduce", "service.bench", "matplotlib", "pandas")
+SERVING = ("fastapi", "uvicorn", "sqlalchemy", "pydantic", "service")
+
+
+def imported(statement):
+    """Modules that a fresh interpreter has imported after a statement."""
+    script = f"import json, sys\n{statement}\nprint(json.dumps(sorted(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+def test_the_serving_application_imports_neither_fitting_nor_robots():
+    found = imported("import service.app")
+    assert {"torch", "fastapi"} <= found
+    assert found.isdisjoint((*FITTING, *CLIENTS, "pinocchio"))
+
+
+def test_the_command_line_imports_no_client_and_no_experiment():
+    found = imported("import service.cli")
+    assert "service.app" in found
+    assert found.isdisjoint((*FITTING, *CLIENTS, "pinocchio"))
+
+
+def test_a_controller_that_loads_a_model_imports_neither_fitting_nor_service():
+    folder, zeros = str(shipped_models() / "panda-sim"), [0.0] * 7
+    found = imported(
+        f"import lipcore, pathlib\nlipcore.load(pathlib.Path({folder!r})).predict({zeros}, {zeros}, {zeros})"
+    )
+    assert "lipcore.model" in found
+    assert found.isdisjoint((*FITTING, *SERVING, "pinocchio", "matplotlib"))
+
+
+@pytest.mark.parametrize("module", ["service.__main__", "service.training.process"])
+def test_a_training_process_takes_its_place_before_numerics_start_their_threads(module):
+    """A spawned process imports its parent's main module, then what its initializer needs, then the job."""
+    found = imported(f"import {module}")
+    assert module in found
+    assert found.isdisjoint((*NUMERICS, "lipcore", "fastapi"))
+
+
+def test_the_command_starts_in_the_light_main_module():
+    """Any other entry point would be imported again by every training process, with all that it imports."""
+    (found,) = entry_points(group="console_scripts", name="lipserve")
+    assert found.value == "service.__main__:main"
+    done = subprocess.run([sys.executable, "-m", "service", "--version"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.strip()) == (0, __version__)

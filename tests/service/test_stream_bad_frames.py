@@ -1,0 +1,100 @@
+"""Frames that cannot be answered: what is said, and that the stream goes on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosedError
+
+from tests.service.data import DEADLINE
+from tests.service.streams import ERROR, MOTION, UNREAD, ask, dial, frame, hello, read
+
+
+def changed(row, joint, value):
+    """The motion with one number changed."""
+    motion = MOTION.copy()
+    motion[row, joint] = value
+    return motion
+
+
+BAD = {
+    "text": ("what is the torque?", "frame", "a text message", "a binary message"),
+    "empty": (b"", "frame", "0 bytes long", "a header of 16 bytes"),
+    "short header": (frame()[:15], "frame", "15 bytes long", "a header of 16 bytes"),
+    "header alone": (frame()[:16], "frame", "16 bytes long", "64 bytes for 2 joints"),
+    "one byte less": (frame()[:-1], "frame", "63 bytes long", "64 bytes for 2 joints"),
+    "one byte more": (frame() + b"x", "frame", "65 bytes long", "64 bytes for 2 joints"),
+    "ten thousand bytes": (frame() + b"x" * 10_000, "frame", "10064 bytes long", "64 bytes for 2 joints"),
+    "wrong n": (frame(n=3), "n", "3", "2 joints: "),
+    "another robot": (frame(np.zeros((3, 7))), "n", "7", "2 joints: "),
+    "no joints": (frame(np.zeros((3, 0))), "n", "0", "2 joints: "),
+    "unknown flag": (frame(flags=4), "flags", "4", "0, or 1 to be answered tau_std"),
+    "all flags": (frame(flags=0xFFFC), "flags", "65532", "0, or 1 to be answered tau_std"),
+    "learn": (frame(flags=2), "flags", "2", "models do not learn from a stream yet"),
+    "learn with std": (frame(flags=3), "flags", "3", "models do not learn from a stream yet"),
+    "nan deadline": (frame(budget=float("nan")), "deadline", "nan", "seconds, or 0 for none"),
+    "endless deadline": (frame(budget=float("inf")), "deadline", "inf", "seconds, or 0 for none"),
+    "past deadline": (frame(budget=-1e-3), "deadline", "-0.001", "seconds, or 0 for none"),
+    "nan in q": (frame(changed(0, 1, np.nan)), "q[1]", "nan", "a finite number"),
+    "inf in dq": (frame(changed(1, 0, np.inf)), "dq[0]", "inf", "a finite number"),
+    "-inf in ddq": (frame(changed(2, 1, -np.inf)), "ddq[1]", "-inf", "a finite number"),
+    "degrees": (frame(changed(0, 0, -90.0)), "q[0]", "-90", "radians (or metres) within ±12.6: are these degrees?"),
+    "beyond numbers": (frame(changed(1, 0, 1e300)), "tau[", "", "finite: are dq and ddq those of a robot?"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_a_bad_frame_is_explained_and_the_stream_goes_on(streaming, kind):
+    request, field, value, expected = BAD[kind]
+    with dial(streaming.server) as connection:
+        hello(connection)
+        before = ask(connection, frame(sequence=5))
+        refused = ask(connection, request)
+        after = ask(connection, frame(sequence=6))
+    unread = isinstance(request, str) or len(request) < 16
+    assert (refused.flags, refused.sequence) == ((ERROR | UNREAD, 0) if unread else (ERROR, 1))
+    assert refused.error["code"] == "invalid_request"
+    (problem,) = refused.error["detail"]
+    assert problem["field"].startswith(field)
+    assert problem["value"].startswith(value)
+    assert expected in problem["expected"]
+    assert refused.error["message"] == f"{problem['field']} is {problem['value']}, expected {problem['expected']}"
+    assert after.sequence == 6
+    np.testing.assert_array_equal(after.tau, before.tau)
+    np.testing.assert_array_equal(after.std, before.std)
+
+
+def test_the_joints_are_named_to_who_sends_too_many(streaming):
+    with dial(streaming.server) as connection:
+        hello(connection)
+        said = ask(connection, frame(np.zeros((3, 7)))).error["message"]
+    assert all(name in said for name in streaming.model.joint_names)
+
+
+def test_the_largest_position_is_allowed_on_both_sides(streaming):
+    with dial(streaming.server) as connection:
+        hello(connection)
+        assert ask(connection, frame([[12.6, -12.6], [0, 0], [0, 0]])).error is None
+        assert ask(connection, frame([[0, -np.nextafter(12.6, 13)], [0, 0], [0, 0]])).error is not None
+
+
+def test_a_refused_frame_keeps_its_place_among_others(streaming):
+    with dial(streaming.server) as connection:
+        hello(connection)
+        for request in (frame(sequence=1), frame(n=9, sequence=2), b"?", frame(sequence=4)):
+            connection.send(request)
+        seen = [read(connection.recv(DEADLINE)) for _ in range(4)]
+    assert [answer.sequence for answer in seen] == [1, 2, 0, 4]
+    assert [answer.error is None for answer in seen] == [True, False, False, True]
+
+
+def test_a_giant_frame_ends_the_stream_before_it_is_read(streaming):
+    with dial(streaming.server) as connection:
+        hello(connection)
+        connection.send(bytes(64 * 1024 + 1))
+        with pytest.raises(ConnectionClosedError) as ended:
+            connection.recv(DEADLINE)
+    assert ended.value.rcvd.code == 1009
+    with dial(streaming.server) as connection:
+        hello(connection)
+        assert ask(connection, bytes(64 * 1024)).error["code"] == "invalid_request"

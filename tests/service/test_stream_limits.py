@@ -1,0 +1,133 @@
+"""Bounds of torque streams: connections, memory, idle and unread streams, and a server that stops."""
+
+from __future__ import annotations
+
+import json
+import socket
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from websockets.client import ClientProtocol
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.uri import parse_uri
+
+from tests.service.data import DEADLINE, eventually
+from tests.service.server import Server
+from tests.service.streams import ask, dial, frame, hello
+
+PANDA, ECHO = "/v1/models/panda-sim/stream", "/v1/echo/stream"
+MiB = 1024 * 1024
+
+
+@pytest.fixture(scope="module")
+def bounded(tmp_path_factory):
+    """A server with room for two streams, which soon gives up those that do not read."""
+    home = tmp_path_factory.mktemp("bounded")
+    with Server(home, LIPSERVE_MAX_STREAMS="2", LIPSERVE_STREAM_WRITE_S="1.0") as started:
+        yield started
+
+
+class Unread:
+    """A client that never reads: WebSocket frames over a bare socket."""
+
+    def __init__(self, server: Server, path: str) -> None:
+        self.socket = socket.create_connection(("127.0.0.1", server.port), DEADLINE)
+        self.protocol = ClientProtocol(parse_uri(f"ws://127.0.0.1:{server.port}{path}"), max_size=None)
+        self.protocol.send_request(self.protocol.connect())
+        self.flush()
+        while not self.protocol.events_received():
+            self.protocol.receive_data(self.socket.recv(4096))
+        if self.protocol.handshake_exc is not None:
+            raise self.protocol.handshake_exc
+
+    def flush(self) -> int:
+        data = b"".join(self.protocol.data_to_send())
+        self.socket.sendall(data)
+        return len(data)
+
+    def send(self, *messages: bytes) -> int:
+        for message in messages:
+            self.protocol.send_binary(message)
+        return self.flush()
+
+    def send_until_stuck(self, message: bytes) -> None:
+        """Fill the buffers of both sides."""
+        self.socket.settimeout(0.2)
+        with suppress(TimeoutError):
+            while True:
+                self.send(message)
+
+
+def opened(server: Server, path: str) -> Unread | None:
+    """A client that never reads, None while the server has no room."""
+    try:
+        return Unread(server, path)
+    except InvalidStatus:
+        return None
+
+
+def memory(pid: int) -> int:
+    """Resident bytes of a process."""
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        if line.startswith("VmRSS:"):
+            return int(line.split()[1]) * 1024
+    raise AssertionError("no VmRSS")
+
+
+def test_more_streams_than_allowed_are_refused_until_one_ends(bounded):
+    with dial(bounded, PANDA) as first, dial(bounded, ECHO):
+        hello(first)
+        with pytest.raises(InvalidStatus) as refused, dial(bounded, PANDA):
+            pass
+        response = refused.value.response
+        assert response.status_code == 429
+        assert json.loads(response.body)["error"]["code"] == "busy"
+        assert "2 streams are open" in json.loads(response.body)["error"]["message"]
+
+    def another():
+        try:
+            with dial(bounded, PANDA) as connection:
+                return hello(connection)
+        except InvalidStatus:
+            return None
+
+    assert eventually(another)["version"] == 1
+
+
+@pytest.mark.parametrize(("path", "size"), [(PANDA, 0), (ECHO, 60_000)], ids=["tiny frames", "large frames"])
+def test_a_client_that_never_reads_is_slowed_down_and_then_cut_off(bounded, path, size):
+    with dial(bounded, ECHO) as other:
+        before = memory(bounded.process.pid)
+        unread = eventually(lambda: opened(bounded, path))
+        sent, most = 0, 0
+        with suppress(ConnectionError):
+            while sent < 64 * MiB:
+                sent += unread.send(*[bytes(size)] * 10)
+                most = max(most, memory(bounded.process.pid))
+        # the buffers of two sockets, with room to spare: what is sent beyond them would be in the server's memory
+        assert sent < 64 * MiB
+        assert most - before < 48 * MiB
+        other.send(b"still here")
+        assert other.recv(DEADLINE) == b"still here"
+    assert "ERROR" not in bounded.log.read_text()
+
+
+def test_a_server_that_stops_says_so_and_waits_for_nobody(home):
+    with Server(home, LIPSERVE_STREAM_WRITE_S="3600") as server:
+        with dial(server, PANDA) as stream, dial(server, ECHO) as echo:
+            hello(stream)
+            ask(stream, frame([[0.0] * 7] * 3))
+            unread = Unread(server, ECHO)
+            unread.send_until_stuck(bytes(60_000))
+            server.process.terminate()
+            for connection in (stream, echo):
+                with pytest.raises(ConnectionClosed) as ended:
+                    connection.recv(DEADLINE)
+                assert ended.value.rcvd.code == 1001
+                assert ended.value.rcvd.reason == "the service stops"
+        server.process.wait(DEADLINE)
+        unread.socket.close()
+        said = server.log.read_text()
+    assert "Application shutdown complete" in said
+    assert "ERROR" not in said

@@ -1,0 +1,211 @@
+"""A stream without a server: what depends on time, on what is in memory, and on who else waits."""
+
+from __future__ import annotations
+
+import asyncio
+from time import perf_counter
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from service.settings import Settings
+from service.stream.conversation import Echo
+from service.stream.session import Session
+from tests.service.data import DEADLINE
+from tests.service.streams import ERROR, LATE, STD, frame, read
+
+
+class Model:
+    """A model whose torque is q times a factor."""
+
+    joint_names, torque_convention = ("a", "b"), "gravity_included"
+
+    def __init__(self, factor=1.0):
+        self.factor = factor
+
+    def answer(self, motion, std=True):
+        return self.factor * motion[0], np.ones_like(motion[0]) if std else None
+
+
+class Loaded:
+    """Versions in memory and on disk."""
+
+    def __init__(self, **stored):
+        self.stored = {int(name[1:]): served(int(name[1:]), model) for name, model in stored.items()}
+        self.memory, self.latest, self.loads = dict(self.stored), max(self.stored), 0
+
+    def hot(self, name, version):
+        return self.memory.get(self.latest if version is None else version)
+
+    def newest(self, name):
+        return self.latest
+
+    def get(self, name, version):
+        self.loads += 1
+        return self.memory.setdefault(self.latest, self.stored[self.latest])
+
+
+def served(version, model, revision=0):
+    return SimpleNamespace(name="m", version=version, revision=revision, model=model, noise_std=[0.1, 0.2])
+
+
+def session(loaded, version, pinned=False):
+    """A session and the texts that it sends."""
+    said = []
+
+    async def send(message):
+        said.append(message["text"])
+
+    service = SimpleNamespace(settings=Settings(), loaded=loaded)
+    return Session(None, None, send, service, loaded.stored[version], pinned, std=False), said
+
+
+def reply(talk, request=None, arrived=None):
+    request = frame([[1.0, 2.0], [0, 0], [0, 0]]) if request is None else request
+    message = {"type": "websocket.receive", "bytes": request}
+    return read(asyncio.run(talk.reply(message, perf_counter() if arrived is None else arrived)))
+
+
+def test_time_counts_from_the_arrival_of_the_frame():
+    talk, _ = session(Loaded(v1=Model()), 1)
+    waited = reply(talk, frame(budget=5.0), perf_counter() - 10.0)
+    assert waited.flags == STD | LATE
+    assert waited.late == 1
+    assert waited.seconds >= 10.0
+
+
+def test_an_answer_that_its_client_did_not_read_in_time_counts_with_the_next():
+    talk, _ = session(Loaded(v1=Model()), 1)
+    first = reply(talk, frame(budget=5.0))
+    talk.left = perf_counter() + 10.0  # as if writing it had taken that long
+    second, third = reply(talk, frame(budget=60.0)), reply(talk)
+    assert [first.late, second.late, third.late] == [0, 1, 1]
+    assert not (first.flags | second.flags | third.flags) & LATE
+
+
+def test_a_version_dropped_from_memory_goes_on_answering_its_stream():
+    loaded = Loaded(v1=Model())
+    talk, said = session(loaded, 1)
+    loaded.memory.clear()
+    assert reply(talk).tau.tolist() == [1.0, 2.0]
+    assert (loaded.loads, said) == (0, [])
+
+
+def test_a_newer_version_is_taken_though_it_is_no_more_in_memory():
+    loaded = Loaded(v1=Model(), v2=Model(3.0))
+    talk, said = session(loaded, 1)
+    loaded.memory.clear()
+    found = reply(talk)
+    assert (found.version, found.tau.tolist(), loaded.loads) == (2, [3.0, 6.0], 1)
+    assert '"version": 2' in said[0]
+
+
+def test_a_pinned_version_is_kept_whatever_is_newer():
+    loaded = Loaded(v1=Model(), v2=Model(3.0))
+    talk, said = session(loaded, 1, pinned=True)
+    assert reply(talk).version == 1
+    loaded.memory.clear()
+    assert (reply(talk).tau.tolist(), loaded.loads, said) == ([1.0, 2.0], 0, [])
+
+
+def test_a_revision_is_named_without_a_new_hello():
+    loaded = Loaded(v1=Model())
+    talk, said = session(loaded, 1)
+    loaded.memory[1] = served(1, Model(2.0), revision=2**40)
+    found = reply(talk)
+    assert (found.version, found.revision, found.tau.tolist(), said) == (1, 2**40, [2.0, 4.0], [])
+
+
+def test_a_version_of_another_robot_says_how_many_joints_it_has():
+    other = Model()
+    other.joint_names = ("a", "b", "c")
+    loaded = Loaded(v1=Model(), v2=other)
+    talk, said = session(loaded, 1)
+    assert reply(talk).error["message"] == "n is 2, expected 3 joints: a, b, c"
+    assert '"joint_names": ["a", "b", "c"]' in said[0]
+    assert reply(talk, frame(np.ones((3, 3)))).tau.tolist() == [1.0, 1.0, 1.0]
+
+
+def test_an_unexpected_error_is_answered_logged_and_survived(caplog):
+    model = Model()
+    talk, _ = session(Loaded(v1=model), 1)
+    model.answer = None
+    talk._answer = lambda *_: 1 / 0
+    failed = reply(talk)
+    assert failed.flags == ERROR
+    assert failed.error == {
+        "code": "internal_error",
+        "message": "an unexpected error; the service's log says more",
+        "detail": [],
+    }
+    assert "ZeroDivisionError" in caplog.text
+    talk._answer = Model().answer
+    assert reply(talk).tau.tolist() == [1.0, 2.0]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_torque_that_is_no_number_is_never_answered(value):
+    talk, _ = session(Loaded(v1=Model()), 1)
+    talk._answer = lambda *_: (np.array([0.0, value]), np.ones(2))
+    said = reply(talk).error
+    assert said["detail"][0]["field"] == "tau[1]"
+    assert said["detail"][0]["value"] == f"{value:g}"
+
+
+def test_finite_numbers_that_add_up_to_infinity_are_answered():
+    talk, _ = session(Loaded(v1=Model()), 1)
+    assert reply(talk, frame([[1.0, 2.0], [1e308, 1e308], [1e308, 1e308]])).tau.tolist() == [1.0, 2.0]
+
+
+def test_the_buffer_of_one_frame_does_not_reach_the_answer_of_another():
+    talk, _ = session(Loaded(v1=Model()), 1)
+    talk._answer = lambda motion, std: (motion[0], None)  # a view of the buffer
+    first = asyncio.run(talk.reply({"bytes": frame([[1.0, 1.0], [0, 0], [0, 0]])}, 0.0))
+    reply(talk)
+    assert read(first).tau.tolist() == [1.0, 1.0]
+
+
+def test_a_stream_without_frames_is_closed():
+    messages, said = asyncio.Queue(), []
+
+    async def send(message):
+        said.append(message)
+        if message["type"] == "websocket.close":
+            messages.put_nowait({"type": "websocket.disconnect", "code": message["code"]})
+
+    async def idle():
+        messages.put_nowait({"type": "websocket.connect"})
+        settings = Settings(stream_idle_s=0.01)
+        await asyncio.wait_for(Echo(SimpleNamespace(arrived=0.0), messages.get, send, settings).run(), DEADLINE)
+
+    asyncio.run(idle())
+    assert said == [
+        {"type": "websocket.accept"},
+        {"type": "websocket.close", "code": 1000, "reason": "no frame for 0.01 s (LIPSERVE_STREAM_IDLE_S)"},
+    ]
+
+
+def test_others_have_their_turn_between_frames_sent_ahead():
+    turns = []
+    messages = [{"type": "websocket.connect"}]
+    messages += [{"type": "websocket.receive", "bytes": bytes([number])} for number in range(5)]
+    messages += [{"type": "websocket.disconnect", "code": 1000}]
+
+    async def receive():
+        return messages.pop(0)
+
+    async def send(message):
+        if message["type"] == "websocket.send":
+            turns.append(message["bytes"][0])
+
+    async def other():
+        for _ in range(5):
+            turns.append("other")
+            await asyncio.sleep(0)
+
+    async def both():
+        await asyncio.gather(Echo(SimpleNamespace(arrived=0.0), receive, send, Settings()).run(), other())
+
+    asyncio.run(both())
+    assert turns == [0, "other", 1, "other", 2, "other", 3, "other", 4, "other"]
