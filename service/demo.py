@@ -44,7 +44,7 @@ class ServiceProcess:
     def __init__(self, port: int, env: dict[str, str] | None = None) -> None:
         self.port = port if port and _free(port) else _free_port()
         self.url = f"http://127.0.0.1:{self.port}"
-        command = [sys.executable, "-m", "service.cli", "serve", "--host", "127.0.0.1", "--port", str(self.port)]
+        command = [sys.executable, "-m", "service", "serve", "--host", "127.0.0.1", "--port", str(self.port)]
         self.process = subprocess.Popen(command, env={**os.environ, **(env or {})})  # noqa: S603 - our own command
 
     def wait_ready(self, client: Client) -> float:

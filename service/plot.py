@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from statistics import NormalDist
 
 import numpy as np
-from scipy.stats import norm
 
 from lipcore.samples import Samples
 from service.inference.schema import PredictResponse
@@ -19,7 +19,7 @@ def draw(path: Path, samples: Samples, answer: PredictResponse, level: float = 0
     from matplotlib import pyplot as plt  # noqa: PLC0415
 
     mean = np.array(answer.tau)
-    half = norm.ppf(0.5 + level / 2) * np.hypot(np.array(answer.tau_std), np.array(answer.noise_std))
+    half = NormalDist().inv_cdf(0.5 + level / 2) * np.hypot(np.array(answer.tau_std), np.array(answer.noise_std))
     figure, axes = plt.subplots(samples.n_joints, 1, sharex=True, figsize=(9, 1.5 * samples.n_joints))
     for j, axis in enumerate(np.atleast_1d(axes)):
         band = (mean[:, j] - half[:, j], mean[:, j] + half[:, j])

@@ -27,6 +27,12 @@ CURVE_SETS = 5
 """Training sets of the learning curve, which are costly; `--quick` has one."""
 
 
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+ERRORS = (ReproductionError, figures.FiguresUnavailableError)
+"""What a user is told without a traceback."""
+
+
+@app.command()
 def reproduce(
     robot: Annotated[str, typer.Option(help=f"One of {', '.join(ROBOTS)}.")] = "panda",
     out: Annotated[

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from service.reproduce.experiment import Cell, CellResult, Experiment, run_cell
 from service.reproduce.results import Results
-from service.training.worker import start_process
-
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+from service.training.process import Place, start_process
 
 
 class ReproductionError(RuntimeError):
@@ -34,10 +30,9 @@ def run(experiment: Experiment, cells: Sequence[Cell], results: Results, workers
     others = set(multiprocessing.active_children())
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with (
-        _one_thread_each(),
         Progress(*columns, TextColumn("{task.fields[left]}"), console=console, disable=not console.is_terminal) as bar,
         ProcessPoolExecutor(
-            min(workers, max(len(todo), 1)), multiprocessing.get_context("spawn"), start_process, (0, 1)
+            min(workers, max(len(todo), 1)), multiprocessing.get_context("spawn"), start_process, (Place(threads=1),)
         ) as pool,
     ):
         task = bar.add_task("training", total=len(cells), completed=len(cells) - len(todo), left="")
@@ -105,18 +100,3 @@ class _Clock:
 
 def _duration(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Let processes started meanwhile use one thread for linear algebra, which reads this before Python runs."""
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

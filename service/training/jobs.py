@@ -119,8 +119,8 @@ def _check_estimator(database: Database, request: JobRequest, joint_names: list[
 
 
 def _check_options(options: Options, settings: Settings) -> None:
-    for name in ("hyperparameter_samples", "posterior_samples"):
-        most = getattr(settings, f"max_{name}")
+    for name in ("hyperparameter_samples", "posterior_samples", "max_inducing_outputs"):
+        most = getattr(settings, name if name.startswith("max_") else f"max_{name}")
         if getattr(options, name) > most:
             raise invalid_request(f"options.{name}", getattr(options, name), f"at most {most}")
 

@@ -14,6 +14,7 @@ from sqlalchemy import select
 from service.database import Database, JobRow, now
 from service.settings import Settings
 from service.training import worker
+from service.training.process import start_process, training_place
 from service.training.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED
 
 logger = logging.getLogger(__name__)
@@ -65,12 +66,11 @@ class JobQueue:
                 row.state, row.attempts, row.progress = QUEUED, row.attempts - 1, {"stage": "waiting"}
 
     def _new_pool(self) -> ProcessPoolExecutor:
-        settings = self.settings
         return ProcessPoolExecutor(
-            settings.training_workers,
+            self.settings.training_workers,
             mp_context=multiprocessing.get_context("spawn"),
-            initializer=worker.start_process,
-            initargs=(settings.training_niceness, settings.training_threads),
+            initializer=start_process,
+            initargs=(training_place(self.settings),),
         )
 
     @staticmethod

@@ -35,6 +35,18 @@ class Options(BaseModel):
         "urdf", description="Of rigid bodies: expect the URDF's inertial parameters, or none"
     )
     device: Literal["auto", "cpu", "cuda"] = "auto"
+    compact_tolerance: float = Field(
+        _DEFAULTS.compact_tolerance,
+        gt=0,
+        le=1,
+        description="Largest deviation of the served posterior from the exact one, in its standard deviations",
+    )
+    max_inducing_outputs: int = Field(
+        _DEFAULTS.max_inducing_outputs,
+        ge=1,
+        description="Most inducing outputs, which answers take the longer for; with fewer than the tolerance needs, "
+        "the version's `compact` says how far it deviates",
+    )
 
 
 class JobRequest(BaseModel):

@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 import logging
-import multiprocessing
-import os
 import resource
-import signal
 import sys
-import threading
 import time
 from dataclasses import dataclass
-from multiprocessing.process import BaseProcess
 from typing import Any
 
-import torch
 from sqlalchemy import select
 
 import lipcore
@@ -35,21 +29,6 @@ REPORT_EVERY = 0.5
 
 class SupersededError(RuntimeError):
     """The job is no longer this attempt's."""
-
-
-def start_process(niceness: int, threads: int) -> None:
-    """Prepare a training process: lower priority, few threads, and an end with the service that started it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the service ends its processes
-    os.nice(niceness)
-    torch.set_num_threads(threads)
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-
-
-def _end_with(parent: BaseProcess) -> None:
-    parent.join()
-    os._exit(1)
 
 
 def run(settings: Settings, job: str) -> None:
