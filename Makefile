@@ -2,8 +2,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-# one thread a process: the tests' matrices are small, and several processes share the machine
-TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+# two processes of one thread each: the tests' matrices are small
+TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 
 .PHONY: demo test test-all lint install serve image clean
 

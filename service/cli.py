@@ -35,7 +35,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Learn a manipulator's inverse dynamics and serve torques with uncertainty.",
 )
-out, err = Console(soft_wrap=True), Console(stderr=True, soft_wrap=True)
+PIPE_WIDTH = 160
+"""Columns of a table that no terminal shows: room for the inertia matrix of seven joints."""
+out = Console(soft_wrap=True, width=None if sys.stdout.isatty() else PIPE_WIDTH)
+err = Console(stderr=True, soft_wrap=True)
 
 Url = Annotated[str, typer.Option("--url", envvar="LIPSERVE_URL", help="Address of the service.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]

@@ -13,7 +13,7 @@ from lipcore.metrics import evaluate as compare
 from service.context import Service
 from service.datasets import store
 from service.errors import invalid_request
-from service.inference import components
+from service.inference import checks, components
 from service.inference.loaded import Served
 from service.inference.schema import EvaluateRequest, EvaluateResponse, Interval, PredictRequest, Reliability
 from service.inference.wire import Prediction
@@ -51,20 +51,24 @@ def predict(service: Service, model: str, request: PredictRequest) -> Prediction
     queries = np.atleast_2d(request.q)
     if len(queries) > service.settings.max_batch:
         raise invalid_request("q", f"{len(queries)} queries", f"at most {service.settings.max_batch} in one request")
-    _check_positions(queries, single, service.settings.max_position)
+    checks.positions(request.q, service.settings.max_position)
 
     answer = loaded.predict(queries, np.atleast_2d(request.dq), np.atleast_2d(request.ddq), request.covariance)
-    tau, std, covariance = answer.tau, answer.tau_std, answer.covariance
-    _check_answer(tau, std, covariance)
-    prediction = _prediction(served, (tau[0] if single else tau).tolist(), (std[0] if single else std).tolist())
-    if covariance is not None:
-        prediction.covariance = (covariance[0] if single else covariance).tolist()
+    parts = {"tau": answer.tau, "tau_std": answer.tau_std}
+    if answer.covariance is not None:
+        parts["covariance"] = answer.covariance
+    found: dict[str, list[Any]] = {}
+    for name, values in parts.items():
+        shaped = values[0] if single else values
+        checks.answer(name, shaped)
+        found[name] = shaped.tolist()
+    prediction = _prediction(served, **found)
     if request.components:
         prediction.components = components.answer(loaded, request)
     return prediction
 
 
-def _prediction(served: Served, tau: list[Any], tau_std: list[Any]) -> Prediction:
+def _prediction(served: Served, tau: list[Any], tau_std: list[Any], covariance: list[Any] | None = None) -> Prediction:
     model = served.model
     return Prediction(
         model=served.name,
@@ -75,6 +79,7 @@ def _prediction(served: Served, tau: list[Any], tau_std: list[Any]) -> Predictio
         tau=tau,
         tau_std=tau_std,
         noise_std=served.noise_std,
+        covariance=covariance,
     )
 
 
@@ -115,16 +120,3 @@ def evaluate(service: Service, model: str, request: EvaluateRequest) -> Evaluate
         reliability=Reliability(nominal=list(RELIABILITY_LEVELS), observed=metrics.reliability.T.tolist()),
         in_training=dataset.id in served.datasets,
     )
-
-
-def _check_positions(q: np.ndarray[tuple[int, int], np.dtype[np.float64]], single: bool, limit: float) -> None:
-    row, joint = np.unravel_index(np.abs(q).argmax(), q.shape)
-    if abs(q[row, joint]) > limit:
-        field = f"q[{joint}]" if single else f"q[{row}][{joint}]"
-        raise invalid_request(field, f"{q[row, joint]:g}", f"radians (or metres) within ±{limit:g}: are these degrees?")
-
-
-def _check_answer(*parts: Array | None) -> None:
-    if not all(part is None or np.isfinite(part).all() for part in parts):
-        expected = "a motion whose torque is: are dq in rad/s and ddq in rad/s²?"
-        raise invalid_request("the answer", "not finite", expected)

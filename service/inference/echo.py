@@ -8,12 +8,11 @@ from fastapi import APIRouter, Request, Response
 from starlette.types import Scope
 
 from service.errors import TooLargeError, responses
-from service.inference.hot import Reply, hot_route, media_type
+from service.hot import OCTETS, Reply, hot_route, media_type
 
-_OCTETS = "application/octet-stream"
 _CONTENT: dict[str, Any] = {
     "application/json": {"schema": {}, "example": {"q": [0.0, -0.5], "dq": [0.1, 0.0], "ddq": [0.0, 0.5]}},
-    _OCTETS: {"schema": {"type": "string", "format": "binary"}},
+    "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
 }
 _DOCUMENTED: dict[str, Any] = {
     "requestBody": {"required": True, "content": _CONTENT},
@@ -33,7 +32,7 @@ async def echo(request: Request) -> Response:
 
     What a query takes longer is what the service computes; what the echo takes is HTTP, and the measuring client.
     """
-    return Response(await request.body(), media_type=_OCTETS)  # with a media type, it has been answered before
+    return Reply(await request.body(), OCTETS).response()  # with a media type, it has been answered before
 
 
 hot.add_api_route(

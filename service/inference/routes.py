@@ -10,8 +10,8 @@ from starlette.types import Scope
 
 from service.context import Service, ServiceDep
 from service.errors import InvalidRequestError, NotFoundError, TooLargeError, responses
+from service.hot import Reply, hot_route, is_json
 from service.inference import answer
-from service.inference.hot import Reply, hot_route, is_json
 from service.inference.schema import EvaluateRequest, EvaluateResponse, PredictRequest, PredictResponse
 from service.inference.wire import decode, encode
 
@@ -50,7 +50,7 @@ def _encoded(service: Service, model: str, request: PredictRequest) -> bytes:
 async def predict(service: ServiceDep, model: str, request: PredictRequest) -> Response:
     """Answer one query or a batch. Nothing is clipped; `tau_std` grows where the model knows little."""
     # a right query has been answered before: this reads the others, to say what is wrong, or in JSON of other dialects
-    return Response(await _in_thread(service, model, request), media_type="application/json")
+    return Reply(await _in_thread(service, model, request)).response()
 
 
 hot.add_api_route(

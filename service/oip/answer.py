@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from service.errors import invalid_request
+from service.hot import Reply
+from service.inference import checks
 from service.inference.loaded import Served
 from service.oip import outputs, wire
 from service.oip.outputs import Array
@@ -13,11 +13,8 @@ from service.oip.schema import AnswerParameters, InferRequest, InferResponse, In
 from service.oip.wire import Headers, Message
 from service.settings import Settings
 
-Answer = tuple[bytes, dict[str, str]]
-"""Body and headers."""
 
-
-def infer(served: Served, body: bytes, headers: Headers, settings: Settings) -> Answer:
+def infer(served: Served, body: bytes, headers: Headers, settings: Settings) -> Reply:
     """Answer a request; raise InvalidRequestError or UnsupportedMediaTypeError. Not for the event loop."""
     message = wire.decode(body, headers)
     return respond(served, message.request, question(served, message, body, settings))
@@ -35,7 +32,7 @@ def question(served: Served, message: Message, body: bytes, settings: Settings) 
     return read(message, body, served.model, settings)
 
 
-def respond(served: Served, request: InferRequest, query: Query) -> Answer:
+def respond(served: Served, request: InferRequest, query: Query) -> Reply:
     """Compute the answer to a query and encode it; raise InvalidRequestError."""
     found = outputs.compute(served.model, query.motion, frozenset(query.outputs), query.tau)
     tensors: list[InferTensor] = []
@@ -44,8 +41,7 @@ def respond(served: Served, request: InferRequest, query: Query) -> Answer:
         values = found[name]
         if query.single and name != "noise_std":
             values = values[0]
-        if not np.isfinite(values).all():
-            raise invalid_request(name, "not finite", "a motion whose answer is: are dq in rad/s and ddq in rad/s²?")
+        checks.answer(name, values)
         tensors.append(_tensor(name, values, payload if binary else None))
     response = InferResponse(
         served.name,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lipcore.dynamics import available
 from lipcore.model import TorqueModel
 from service.errors import invalid_request
+from service.inference import checks
 from service.oip.outputs import DEFAULT, FORWARD, NEED_TORQUE, PARTS, QUICK, Array, shapes
 from service.oip.schema import BINARY, DATATYPES, INPUTS, TORQUE, InferInput, InferOutput, InferRequest
 from service.oip.wire import HEADER, Message
@@ -170,14 +171,6 @@ def _check_numbers(values: Array, names: tuple[str, ...], request: InferRequest,
     if not finite.all():
         place, row, joint = np.argwhere(~finite)[0]
         datatype = next(each.datatype for each in request.inputs if each.name == names[place])
-        field = _element(names[place], row, joint, single)
+        field = checks.element(names[place], *((joint,) if single else (row, joint)))
         raise invalid_request(field, f"{values[place, row, joint]:g}", f"a finite number of {datatype}")
-    q = np.abs(values[0])
-    if q.max() > limit:
-        row, joint = np.unravel_index(q.argmax(), q.shape)
-        expected = f"radians (or metres) within ±{limit:g}: are these degrees?"
-        raise invalid_request(_element("q", row, joint, single), f"{values[0, row, joint]:g}", expected)
-
-
-def _element(name: str, row: np.intp, joint: np.intp, single: bool) -> str:
-    return f"{name}[{joint}]" if single else f"{name}[{row}][{joint}]"
+    checks.positions(values[0, 0] if single else values[0], limit)

@@ -6,35 +6,17 @@ from enum import Enum
 
 from anyio import to_thread
 from fastapi import APIRouter, Request, Response
-from fastapi.routing import APIRoute
-from starlette.requests import ClientDisconnect
-from starlette.types import Receive, Scope, Send
+from starlette.types import Scope
 
 from service import __version__, health
 from service.context import Service, ServiceDep
-from service.inference.loaded import Served
+from service.hot import Reply, hot_route
 from service.oip import answer, versions, wire
 from service.oip.openapi import MODEL, VERSION, failures, infer_answer, infer_body
 from service.oip.schema import BINARY, ModelMetadata, ModelReady, ServerLive, ServerMetadata, ServerReady
 
 SMALL = 16 * 1024
 """Bytes of a body that is decoded on the event loop: one query of the largest robot fits many times."""
-
-
-class HotRoute(APIRoute):
-    """A POST route that FastAPI documents and that handles requests itself: no dependencies, validation or encoding."""
-
-    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request with the endpoint's response; errors are those of the application to handle."""
-        if scope["method"] != "POST":
-            await super().handle(scope, receive, send)
-            return
-        try:
-            response: Response = await self.endpoint(Request(scope, receive))
-        except ClientDisconnect:
-            return
-        await response(scope, receive, send)
-
 
 _ONE, _VERSIONED = {"parameters": [MODEL]}, {"parameters": [MODEL, VERSION]}
 _TAGS: list[str | Enum] = ["open inference protocol"]
@@ -80,7 +62,9 @@ def ready(service: ServiceDep) -> ServerReady:
 async def model_metadata(request: Request) -> ModelMetadata:
     """Inputs that a request brings, outputs that it may ask for, and the versions there are."""
     service: Service = request.app.state.service
-    return await to_thread.run_sync(versions.metadata, service, await _served(service, request))
+    where = request.path_params
+    served = await versions.find(service, where["model"], where.get("version"))
+    return await to_thread.run_sync(versions.metadata, service, served)
 
 
 @router.get(
@@ -103,30 +87,28 @@ async def model_ready(request: Request) -> ModelReady:
     return ModelReady(name=served.name)
 
 
+async def _answer(scope: Scope, body: bytes) -> Reply:
+    """Answer any request, a wrong one with the error that it raises: one query here, all else in a thread."""
+    service: Service = scope["app"].state.service
+    limiter, settings = service.predictions, service.settings
+    headers, where = scope["headers"], scope["path_params"]
+    served = await versions.find(service, where["model"], where.get("version"))
+    if len(body) > SMALL:
+        return await to_thread.run_sync(answer.infer, served, body, headers, settings, limiter=limiter)
+    message = wire.decode(body, headers)
+    query = answer.question(served, message, body, settings)
+    if query.quick:
+        return answer.respond(served, message.request, query)
+    return await to_thread.run_sync(answer.respond, served, message.request, query, limiter=limiter)
+
+
 async def infer(request: Request) -> Response:
     """Answer one query, [n], or a batch, [N, n], in JSON or binary. Only what `outputs` names is computed: `tau` and
     `tau_std` where it names nothing. Nothing is clipped. `noise_std` [n] is the measurement's own deviation; an
     interval that shall hold measurements needs both.
     """
-    service: Service = request.app.state.service
-    limiter, settings = service.predictions, service.settings
-    body, headers = await request.body(), request.scope["headers"]
-    served = await _served(service, request)
-    if len(body) > SMALL:
-        content, head = await to_thread.run_sync(answer.infer, served, body, headers, settings, limiter=limiter)
-        return Response(content, headers=head)
-    message = wire.decode(body, headers)
-    query = answer.question(served, message, body, settings)
-    if query.quick:
-        content, head = answer.respond(served, message.request, query)
-    else:
-        content, head = await to_thread.run_sync(answer.respond, served, message.request, query, limiter=limiter)
-    return Response(content, headers=head)
-
-
-async def _served(service: Service, request: Request) -> Served:
-    where = request.path_params
-    return await versions.find(service, where["model"], where.get("version"))
+    reply = await _answer(request.scope, await request.body())  # for the documentation: all has been answered before
+    return reply.response()
 
 
 for _path, _summary, _parameters in (
@@ -141,5 +123,5 @@ for _path, _summary, _parameters in (
         response_class=Response,
         responses={200: infer_answer(), **failures(400, 404, 413, 415)},
         openapi_extra=infer_body(_parameters),
-        route_class_override=HotRoute,
+        route_class_override=hot_route(_answer),
     )

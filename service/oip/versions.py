@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from anyio import to_thread
 
-import lipcore
 from lipcore.model import TorqueModel
 from service.context import Service
-from service.errors import NotFoundError, NotReadyError, problem, sentence
+from service.errors import NotFoundError, NotReadyError, UnreadableVersionError, problem, sentence
 from service.inference.loaded import Served
 from service.models import registry
 from service.oip.outputs import FORWARD, shapes
@@ -29,8 +28,8 @@ async def ready(service: Service, name: str, version: str | None) -> Served:
     """Like `find`, but raise NotReadyError where the version cannot be loaded."""
     try:
         return await find(service, name, version)
-    except lipcore.ModelFormatError as error:
-        raise NotReadyError(f"model {name!r} cannot be loaded: {error}") from error
+    except UnreadableVersionError as error:
+        raise NotReadyError(error.message) from error
 
 
 def metadata(service: Service, served: Served) -> ModelMetadata:

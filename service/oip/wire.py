@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from service.errors import InvalidRequestError, UnsupportedMediaTypeError, invalid_request, problem, sentence
+from service.hot import OCTETS, Reply
 from service.oip.schema import InferRequest, InferResponse
 
 HEADER = "Inference-Header-Content-Length"
@@ -63,12 +64,12 @@ def decode(body: bytes, headers: Headers) -> Message:
         raise _explain(error, bytes(text), length is None) from error
 
 
-def encode(response: InferResponse, tensors: list[bytes]) -> tuple[bytes, dict[str, str]]:
-    """Encode a response with its binary tensors; return the body and its headers."""
+def encode(response: InferResponse, tensors: list[bytes]) -> Reply:
+    """Encode a response with its binary tensors."""
     text = _encode(response)
     if not tensors:
-        return text, {"content-type": "application/json"}
-    return b"".join([text, *tensors]), {"content-type": "application/octet-stream", HEADER: str(len(text))}
+        return Reply(text)
+    return Reply(b"".join([text, *tensors]), OCTETS, ((_HEADER, b"%d" % len(text)),))
 
 
 def _length(value: bytes, total: int) -> int:

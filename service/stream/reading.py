@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from service.errors import InvalidRequestError, invalid_request
+from service.inference import checks
 from service.stream.frames import ASK_LEARN, ASK_STD, NUMBER, REQUEST, request_bytes
 
 if TYPE_CHECKING:
@@ -39,18 +40,12 @@ class FrameReader:
         self._numbers[:] = np.frombuffer(data, NUMBER, offset=REQUEST.size)
         if not np.isfinite(self._numbers).all():
             raise self._not_finite()
-        if np.abs(self._positions).max() > self.max_position:
-            raise self._too_far()
+        checks.positions(self._positions, self.max_position)
         return self.motion
 
     def _not_finite(self) -> InvalidRequestError:
         row, joint = np.argwhere(~np.isfinite(self.motion))[0]
-        return invalid_request(f"{FIELDS[row]}[{joint}]", f"{self.motion[row, joint]:g}", "a finite number")
-
-    def _too_far(self) -> InvalidRequestError:
-        joint = int(np.abs(self._positions).argmax())
-        expected = f"radians (or metres) within ±{self.max_position:g}: are these degrees?"
-        return invalid_request(f"q[{joint}]", f"{self._positions[joint]:g}", expected)
+        return invalid_request(checks.element(FIELDS[row], joint), f"{self.motion[row, joint]:g}", "a finite number")
 
 
 def _wrong_flags(flags: int) -> InvalidRequestError:

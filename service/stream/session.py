@@ -7,12 +7,12 @@ import logging
 from math import inf
 from time import perf_counter
 
-import numpy as np
 from anyio import to_thread
 from starlette.types import Message, Receive, Send
 
 from service.context import Service
 from service.errors import ErrorBody, ErrorResponse, ServiceError, invalid_request
+from service.inference import checks
 from service.inference.loaded import Served
 from service.stream.conversation import Conversation
 from service.stream.frames import ANSWER, ASK_STD, ERROR, HAS_STD, LATE, LAYOUT, REQUEST, UNREAD
@@ -79,9 +79,9 @@ class Session(Conversation):
                 await self._follow(current)
             motion = self._reader.read(data, asked, n, budget)
             tau, std = self._answer(motion, self._std or asked == ASK_STD)
-            if not np.isfinite(tau).all():
-                joint = int(np.argmin(np.isfinite(tau)))
-                raise invalid_request(f"tau[{joint}]", f"{tau[joint]:g}", "finite: are dq and ddq those of a robot?")
+            checks.answer("tau", tau)
+            if std is not None:
+                checks.answer("tau_std", std)
         except ServiceError as error:
             return self._refuse(sequence, flags, arrived, error)
         except Exception as error:  # the next frame may be answered

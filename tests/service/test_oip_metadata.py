@@ -113,10 +113,10 @@ def test_a_version_that_cannot_be_loaded_is_not_ready(api, trained, monkeypatch)
     def broken(*_):
         raise lipcore.ModelFormatError("the manifest is missing")
 
-    monkeypatch.setattr(service_of(api).loaded, "hot", lambda *_: None)
-    monkeypatch.setattr(service_of(api).loaded, "get", broken)
+    monkeypatch.setattr(lipcore, "load", broken)
+    monkeypatch.setattr(service_of(api).loaded, "_snapshot", type(service_of(api).loaded._snapshot)())
     said = refused(api.get(f"/v2/models/{trained.name}/ready"), 503)
-    assert said == f"model {trained.name!r} cannot be loaded: the manifest is missing"
+    assert said == f"version 1 of model {trained.name!r} cannot be loaded: the manifest is missing"
 
 
 @pytest.mark.parametrize("path", ["", "/ready", "/versions/1", "/versions/1/ready"])

@@ -39,7 +39,8 @@ BAD = {
     "inf in dq": (frame(changed(1, 0, np.inf)), "dq[0]", "inf", "a finite number"),
     "-inf in ddq": (frame(changed(2, 1, -np.inf)), "ddq[1]", "-inf", "a finite number"),
     "degrees": (frame(changed(0, 0, -90.0)), "q[0]", "-90", "radians (or metres) within ±12.6: are these degrees?"),
-    "beyond numbers": (frame(changed(1, 0, 1e300)), "tau[", "", "finite: are dq and ddq those of a robot?"),
+    "std beyond numbers": (frame(changed(1, 0, 1e120)), "tau_std[", "", "a finite number: are dq in rad/s"),
+    "beyond numbers": (frame(changed(1, 0, 1e300)), "tau[", "", "a finite number: are dq in rad/s and ddq in rad/s²?"),
 }
 
 

@@ -5,21 +5,38 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 from typing import NamedTuple
 
+from fastapi import Response
 from fastapi.routing import APIRoute
 from starlette.types import Message, Receive, Scope, Send
 
-JSON = b"application/json"
+JSON, OCTETS = b"application/json", b"application/octet-stream"
 
 
 class Reply(NamedTuple):
-    """An answer of status 200."""
+    """An answer of status 200. more: headers beside the usual ones, their names in lower case."""
 
     body: bytes
     media_type: bytes = JSON
+    more: tuple[tuple[bytes, bytes], ...] = ()
+
+    def headers(self) -> list[tuple[bytes, bytes]]:
+        """All headers of the answer."""
+        return [
+            (b"content-length", b"%d" % len(self.body)),
+            (b"content-type", self.media_type),
+            (b"x-content-type-options", b"nosniff"),
+            *self.more,
+        ]
+
+    def response(self) -> Response:
+        """Return the same answer for FastAPI to send."""
+        made = Response(self.body)
+        made.raw_headers = self.headers()
+        return made
 
 
 Answerer = Callable[[Scope, bytes], Awaitable[Reply | None]]
-"""Answers a request from its scope and body, or None where it is not as usual."""
+"""Answers a request from its scope and body, or None where it is not as usual; an error it raises is the answer."""
 
 
 def hot_route(answer: Answerer) -> type[APIRoute]:
@@ -41,17 +58,7 @@ def hot_route(answer: Answerer) -> type[APIRoute]:
             if reply is None:
                 await super().handle(scope, _again(body, receive), send)
                 return
-            await send(
-                {
-                    "type": "http.response.start",
-                    "status": 200,
-                    "headers": [
-                        (b"content-length", b"%d" % len(reply.body)),
-                        (b"content-type", reply.media_type),
-                        (b"x-content-type-options", b"nosniff"),
-                    ],
-                }
-            )
+            await send({"type": "http.response.start", "status": 200, "headers": reply.headers()})
             await send({"type": "http.response.body", "body": reply.body})
 
     return HotRoute

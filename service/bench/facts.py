@@ -1,0 +1,89 @@
+"""What a reader has to know of the machine and the model to judge the figures."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import torch
+from threadpoolctl import threadpool_limits
+
+_PACKAGES = ("lipserve", "numpy", "torch", "numba", "uvicorn", "uvloop", "websockets", "pin", "gpytorch")
+_CPU, _STAT = Path("/proc/cpuinfo"), Path("/proc/stat")
+
+
+def machine() -> dict[str, str]:
+    """Processor, cores, load at this moment and versions."""
+    versions = [f"{name} {found}" for name in _PACKAGES if (found := _version(name))]
+    return {
+        "processor": f"{_processor()}, {os.cpu_count()} cores",
+        "load before": ", ".join(f"{value:.2f}" for value in os.getloadavg()) + " (1, 5, 15 min)",
+        "Python": f"{platform.python_version()} on {platform.system()} {platform.release()}",
+        "packages": ", ".join(versions),
+    }
+
+
+def stolen() -> tuple[int, int]:
+    """Ticks of all cores that other virtual machines took, and all ticks, since the start; zeros where unknown."""
+    if not _STAT.exists():
+        return 0, 0
+    ticks = [int(value) for value in _STAT.read_text().split("\n", 1)[0].split()[1:9]]
+    return ticks[7], sum(ticks)
+
+
+def model(manifest: Mapping[str, Any], said: str) -> dict[str, str]:
+    """Size of the model, and how far it deviates from the exact posterior, in shares of a standard deviation."""
+    fit, entry = manifest["fit"], compact(manifest)
+    size = f"{entry['inducing_outputs']:.0f} inducing outputs at {entry['inducing_samples']:.0f} samples"
+    return {
+        "model": said,
+        "estimator": f"{manifest['estimator']}, {len(manifest['joint_names'])} joints",
+        "samples": f"{fit['samples_given']} given, {fit['samples_posterior']} behind the posterior",
+        "compact posterior": size,
+        "its deviation": f"mean {entry['mean_rms']:.2%} rms, {entry['mean_max']:.2%} at most, of an exact standard "
+        f"deviation; standard deviation {entry['std_max']:.2%} at most (as fitted, tolerance {entry['tolerance']:.1%})",
+    }
+
+
+def compact(manifest: Mapping[str, Any]) -> dict[str, float]:
+    """Size of a manifest's compact posterior, and how far it deviates from the exact one."""
+    names = ("inducing_outputs", "inducing_samples", "mean_rms", "mean_max", "std_max", "tolerance")
+    return {name: float(manifest["compact"][name]) for name in names}
+
+
+def deviation(manifest: Mapping[str, Any]) -> float:
+    """Largest deviation of mean or standard deviation from the exact posterior, in standard deviations."""
+    entry = compact(manifest)
+    return max(entry["mean_max"], entry["std_max"])
+
+
+@contextmanager
+def one_thread() -> Iterator[str]:
+    """Let this process's linear algebra use one thread, as a control loop would; say what was done."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1):
+            yield "1 thread"
+    finally:
+        torch.set_num_threads(before)
+
+
+def _processor() -> str:
+    if _CPU.exists():
+        for line in _CPU.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def _version(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return ""
