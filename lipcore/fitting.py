@@ -57,7 +57,7 @@ class FitOptions:
     tied: bool = True
     device: str = "auto"
     prior: str = "urdf"
-    compact_tolerance: float = 0.02
+    compact_tolerance: float = 0.01
     max_inducing_outputs: int = 1500
 
     def __post_init__(self) -> None:

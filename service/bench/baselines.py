@@ -51,13 +51,14 @@ def exact_posterior(workload: Workload) -> ExactPosterior:
     return ExactPosterior.fit(model.estimator.kernel, model.posterior.params, motion[rows], tau[rows], factor)
 
 
-def deviation(workload: Workload, exact: ExactPosterior) -> str:
-    """Say how far the model's answers to the queries lie from those of the exact posterior."""
+def deviation(workload: Workload, exact: ExactPosterior) -> tuple[float, str]:
+    """How far the model's answers to the queries lie from those of the exact posterior: at most, and in words."""
     q, dq, ddq = (np.ascontiguousarray(workload.queries[:, part]) for part in range(3))
     answer, expected = workload.model.predict(q, dq, ddq), exact.predict(Motion.from_arrays(q, dq, ddq))
     unit = expected.std.numpy()
     mean, std = (answer.tau - expected.mean.numpy()) / unit, answer.tau_std / unit - 1
-    return (
+    largest = float(max(np.abs(mean).max(), np.abs(std).max()))
+    return largest, (
         f"on the {len(q)} queries, an unseen trajectory, the model's mean deviates from the exact GP's by "
         f"{np.sqrt(np.mean(mean**2)):.2%} (rms) and at most {np.abs(mean).max():.2%} of its standard deviation, the "
         f"standard deviation by at most {np.abs(std).max():.2%}"

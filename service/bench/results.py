@@ -54,7 +54,8 @@ class Results:
     """Everything that is printed.
 
     facts: machine and packages; model: what was measured; deviation: the largest from the exact posterior, in standard
-    deviations; notes: what a reader has to know about single rows.
+    deviations, as fitted; unseen: the same at the queries, where it was compared; notes: what a reader has to know about
+    single rows.
     """
 
     facts: dict[str, str]
@@ -66,6 +67,7 @@ class Results:
     loops: dict[State, LoopPair] = field(default_factory=dict)
     motions: list[MotionRow] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    unseen: float | None = None
 
     def of(self, key: str, state: State = "idle") -> list[Timing] | None:
         """Runs of a subject in a state, None where it was not measured."""

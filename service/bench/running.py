@@ -83,7 +83,7 @@ def run(options: Options, console: Console) -> Results:
 def _subjects(bed: Bed, options: Options, results: Results, stack: ExitStack) -> list[Subject]:
     """Everything that is asked, each answer checked once; connections stay open as long as `stack`."""
     found = subjects.in_process(bed.workload) + transports.open_all(bed, options.wanted, stack)
-    compared, notes = subjects.compared(bed.workload, options.wanted)
+    compared, notes, results.unseen = subjects.compared(bed.workload, options.wanted)
     chosen = [subject for subject in [*found, *compared] if options.wanted(subject.key)]
     for subject in chosen:
         subject.check(bed.workload)

@@ -75,9 +75,12 @@ def in_process(workload: Workload) -> list[Subject]:
     ]
 
 
-def compared(workload: Workload, wanted: Callable[[str], bool]) -> tuple[list[Subject], list[str]]:
-    """The baselines that are wanted and can be had, and notes: what they are, or why one is left out."""
-    found, notes = [], []
+def compared(workload: Workload, wanted: Callable[[str], bool]) -> tuple[list[Subject], list[str], float | None]:
+    """The baselines that are wanted and can be had, and notes: what they are, or why one is left out.
+
+    Last, the model's largest deviation from the exact posterior at the queries, in standard deviations, if compared.
+    """
+    found, notes, largest = [], [], None
     robot, samples = workload.robot, workload.samples
     if wanted("rnea"):
         if robot is None:
@@ -87,12 +90,13 @@ def compared(workload: Workload, wanted: Callable[[str], bool]) -> tuple[list[Su
     if samples is None:
         if any(map(wanted, ("exact", "gpytorch", "gpytorch-fast"))):
             notes.append("exact GP and GPyTorch left out: the samples of an existing model are not at hand")
-        return found, notes
+        return found, notes, largest
     if wanted("exact"):
         posterior = baselines.exact_posterior(workload)
         ask = baselines.exact(posterior, workload.queries)
         found.append(Subject("exact", f"exact GP, {len(posterior.motion)} samples, std", ask, share=0.04))
-        notes.append(baselines.deviation(workload, posterior))
+        largest, said = baselines.deviation(workload, posterior)
+        notes.append(said)
     if wanted("gpytorch") or wanted("gpytorch-fast"):
         if baselines.gpytorch_installed():
             model = baselines.GPyTorch(samples, workload.model.noise_std)
@@ -102,4 +106,4 @@ def compared(workload: Workload, wanted: Callable[[str], bool]) -> tuple[list[Su
             notes.append(baselines.GPYTORCH_SAID)
         else:
             notes.append("GPyTorch left out: not installed (pip install 'lipserve[bench]')")
-    return found, notes
+    return found, notes, largest

@@ -41,6 +41,13 @@ def targets(results: Results) -> list[Target]:
     """Every promise about latency, in the order of the issue that made them."""
     found = [
         Target("largest deviation from the exact posterior", 100 * results.deviation, "% of std", "≤", 2),
+        Target(
+            "the same at the queries, an unseen trajectory",
+            None if results.unseen is None else 100 * results.unseen,
+            "% of std",
+            "≤",
+            2,
+        ),
         Target("in process, with std: p50", single(results.of("std"), p50), "µs", "≤", 200),
         Target("in process, mean only: p50", single(results.of("mean"), p50), "µs", "≤", 40),
         Target("in process, batch of 1000, with std: p50 a query", single(results.of("batch"), p50), "µs", "≤", 60),

@@ -19,6 +19,7 @@ from tests.service.server import free_port
 @pytest.fixture
 def lipserve(monkeypatch, capsys):
     """Run `lipserve` with arguments; return its exit code, output and error output."""
+
     def run(*arguments):
         monkeypatch.setattr("sys.argv", ["lipserve", *map(str, arguments)])
         with pytest.raises(SystemExit) as ended:
