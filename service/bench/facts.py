@@ -14,7 +14,7 @@ import torch
 from threadpoolctl import threadpool_limits
 
 _PACKAGES = ("lipserve", "numpy", "torch", "numba", "uvicorn", "uvloop", "websockets", "pin", "gpytorch")
-_CPU, _STAT = Path("/proc/cpuinfo"), Path("/proc/stat")
+_CPU = Path("/proc/cpuinfo")
 
 
 def machine() -> dict[str, str]:
@@ -26,14 +26,6 @@ def machine() -> dict[str, str]:
         "Python": f"{platform.python_version()} on {platform.system()} {platform.release()}",
         "packages": ", ".join(versions),
     }
-
-
-def stolen() -> tuple[int, int]:
-    """Ticks of all cores that other virtual machines took, and all ticks, since the start; zeros where unknown."""
-    if not _STAT.exists():
-        return 0, 0
-    ticks = [int(value) for value in _STAT.read_text().split("\n", 1)[0].split()[1:9]]
-    return ticks[7], sum(ticks)
 
 
 def model(manifest: Mapping[str, Any], said: str) -> dict[str, str]:

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
+from service.bench import processor
 from service.bench.workload import Bed, BenchError
 from service.training.schema import Job
 from service.training.states import ACTIVE, RUNNING
 
 START_SECONDS = 120.0
-_PROC = Path("/proc")
-_PARENT, _USER, _SYSTEM = 1, 11, 12
-"""Fields of /proc/PID/stat after the name."""
 
 
 class TrainingLoad:
@@ -37,10 +33,10 @@ class TrainingLoad:
         """Make sure that a job runs, and note whether the same one still runs at the end."""
         if not self._runs():
             self._start()
-        began, before = time.monotonic(), _processor_seconds(self.pid)
+        began, before = time.monotonic(), processor.seconds_below(self.pid)
         yield
         self.seconds += time.monotonic() - began
-        self.used += _processor_seconds(self.pid) - before
+        self.used += processor.seconds_below(self.pid) - before
         self.stretches += 1
         self.uncovered += not self._runs()
 
@@ -56,7 +52,7 @@ class TrainingLoad:
         """What a reader has to know of the load; nothing where there was none."""
         if not self.stretches:
             return []
-        known = _PROC.exists()
+        known = processor.KNOWN
         share = f"training had {self.used / self.seconds:.0%} of one core" if known else "a training job was there"
         if self.uncovered:
             ended = f"the job had ended at the end of {self.uncovered} of {self.stretches}, which count all the same"
@@ -78,19 +74,3 @@ class TrainingLoad:
     def _seen(self) -> Job:
         assert self.job is not None
         return self.client.job(self.job)
-
-
-def _processor_seconds(pid: int) -> float:
-    """Processor time of all children of a process and of theirs."""
-    found: dict[int, tuple[int, float]] = {}
-    for path in _PROC.glob("[0-9]*/stat"):
-        try:
-            fields = path.read_text().rpartition(")")[2].split()
-        except (FileNotFoundError, ProcessLookupError):
-            continue
-        ticks = int(fields[_USER]) + int(fields[_SYSTEM])
-        found[int(path.parent.name)] = (int(fields[_PARENT]), ticks / os.sysconf("SC_CLK_TCK"))
-    below = {pid}
-    while more := {child for child, (parent, _) in found.items() if parent in below} - below:
-        below |= more
-    return sum(found[child][1] for child in below - {pid})

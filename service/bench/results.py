@@ -29,7 +29,8 @@ class Row:
 class LoopPair:
     """The control loop on the model and on the echo, in alternating slices.
 
-    server_late: answers that the service itself counted as late, from the arrival of a query to the answer's departure.
+    server_late: answers that the service itself counted as late, from the arrival of a query to the departure of its
+    answer; the rest of the late ones waited in the network, for the processor, or in the client.
     """
 
     asked: Loop
@@ -54,8 +55,8 @@ class Results:
     """Everything that is printed.
 
     facts: machine and packages; model: what was measured; deviation: the largest from the exact posterior, in standard
-    deviations, as fitted; unseen: the same at the queries, where it was compared; notes: what a reader has to know about
-    single rows.
+    deviations, as fitted; unseen: the same at the queries, where it was compared; notes: what a reader has to
+    know about single rows.
     """
 
     facts: dict[str, str]

@@ -10,10 +10,11 @@ from pathlib import Path
 
 from rich.console import Console
 
-from service.bench import facts, motions, subjects, transports
+from service.bench import facts, motions, processor, subjects, transports
 from service.bench.load import TrainingLoad
 from service.bench.loop import DEADLINE_MS
 from service.bench.measuring import add_run, control_loop
+from service.bench.processor import Usage, watched
 from service.bench.results import Results, State
 from service.bench.subjects import Subject
 from service.bench.workload import Bed, Source, open_bed
@@ -55,7 +56,7 @@ class Options:
 
 def run(options: Options, console: Console) -> Results:
     """Measure everything that the options ask for; raise BenchError where a step fails or an answer is wrong."""
-    machine, before = facts.machine(), facts.stolen()
+    machine = facts.machine()
     with ExitStack() as stack:
         home = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lipserve-bench-")))
         bed = stack.enter_context(open_bed(home, options.source, console))
@@ -66,14 +67,11 @@ def run(options: Options, console: Console) -> Results:
         load = TrainingLoad(bed, options.source.load)
         stack.callback(load.stop)
         asked = _subjects(bed, options, results, stack)
-        _measure(asked, load, options, results, console)
+        _runs(bed, asked, load, options, results, console)
         if options.wanted(LOOP) and options.seconds > 0:
             _loop(bed, asked, load, options, results, console, stack)
         results.rows = {key: results.rows[key] for key in KEYS if key in results.rows}
         results.notes += load.said()
-        after = facts.stolen()
-        if ticks := after[1] - before[1]:
-            machine["taken by other machines"] = f"{(after[0] - before[0]) / ticks:.1%} of all processor time meanwhile"
         if options.motions:
             console.print("training on four kinds of motion")
             results.motions = motions.compare(options.source.robot, options.source.fit, options.runs, home, console)
@@ -91,14 +89,17 @@ def _subjects(bed: Bed, options: Options, results: Results, stack: ExitStack) ->
     return chosen
 
 
-def _measure(
-    asked: Sequence[Subject], load: TrainingLoad, options: Options, results: Results, console: Console
+def _runs(
+    bed: Bed, asked: Sequence[Subject], load: TrainingLoad, options: Options, results: Results, console: Console
 ) -> None:
+    usage = {state: Usage() for state in options.states}
     for number in range(1, options.runs + 1):
         for state in options.states:
             console.print(f"run {number} of {options.runs}, {state}", highlight=False)
-            add_run(results, asked, state, options.queries, load if state == "training" else None)
+            with watched(usage[state], bed.pid):
+                add_run(results, asked, state, options.queries, load if state == "training" else None)
             load.stop()
+    _note_usage(results, {f"runs, {state}": used for state, used in usage.items()})
 
 
 def _loop(
@@ -112,11 +113,20 @@ def _loop(
 ) -> None:
     stream, late = transports.open_loop(bed, DEADLINE_MS / 1e3, stack)
     echo = next(subject for subject in asked if subject.key == "echo-ws")
+    usage = {state: Usage() for state in options.states}
     for state in options.states:
         console.print(f"control loop for {options.seconds:g} s on model and echo each, {state}", highlight=False)
         under = load if state == "training" else None
-        results.loops[state] = control_loop(stream, echo, late, options.seconds, under)
+        with watched(usage[state], bed.pid):
+            results.loops[state] = control_loop(stream, echo, late, options.seconds, under)
         load.stop()
+    _note_usage(results, {f"loop, {state}": used for state, used in usage.items()})
+
+
+def _note_usage(results: Results, usage: dict[str, Usage]) -> None:
+    """Who else used the machine; figures taken beside a busy neighbour are to be seen as such."""
+    if processor.KNOWN:
+        results.facts |= {f"taken during {name}": str(used) for name, used in usage.items()}
 
 
 def _said(options: Options) -> str:

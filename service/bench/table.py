@@ -107,7 +107,8 @@ def loops(results: Results) -> Grid:
         rows += [_loop(f"model, {state}", pair.asked), _loop(f"echo, {state}", pair.floor)]
         difference = 100 * excess(pair.asked, pair.floor)
         rows.append((f"difference, {state}", "", "", f"{difference:+.3f}", "", "", "", "", ""))
-        rows.append((f"service's own count, {state}", "", str(pair.server_late), "", "", "", "", "", ""))
+        own = f"{100 * pair.server_late / pair.asked.ticks:.3f}"
+        rows.append((f"service's own count, {state}", "", str(pair.server_late), own, "", "", "", "", ""))
     return Grid(f"late: the answer came more than {DEADLINE_MS:g} ms after its tick", columns, rows)
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import socket
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,7 +19,7 @@ import pytest
 from rich.console import Console
 
 from lipcore.simulation import Stream
-from service.bench import motions, table, timing
+from service.bench import motions, processor, table, timing
 from service.bench.baselines import gpytorch_installed
 from service.bench.clients import BadAnswerError, HttpClient, post
 from service.bench.loop import Loop, excess, run_slice, summarise
@@ -139,7 +141,7 @@ def test_what_was_not_measured_is_not_claimed():
 def test_a_promise_holds_up_to_its_limit(value: float, met: bool):
     results = known()
     results.rows["std"].runs["idle"] = [timed(value)] * 3
-    assert targets(results)[1].met is met
+    assert next(each for each in targets(results) if each.name == "in process, with std: p50").met is met
 
 
 def test_tables_are_readable_and_the_same_everywhere():
@@ -233,6 +235,18 @@ def test_an_answer_that_is_not_the_models_own_stops_the_benchmark():
     bad = Subject("ws", "WebSocket", lambda number: None, answer=lambda number: (np.ones(2), np.array([1.0, 1.1])))
     with pytest.raises(BenchError, match="tau_std of query 0"):
         bad.check(workload)
+
+
+@pytest.mark.skipif(not processor.KNOWN, reason="the system does not tell")
+def test_processor_time_of_children_is_found_alive_and_ended():
+    burn = "import time\nwhile time.process_time() < 0.3: pass\nprint(flush=True)\ninput()"
+    before = processor.seconds_below(os.getpid()), processor.seconds_below(os.getpid(), itself=True)
+    child = subprocess.Popen([sys.executable, "-c", burn], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert child.stdout is not None
+    child.stdout.readline()
+    assert processor.seconds_below(os.getpid()) - before[0] >= 0.29
+    child.communicate(b"\n")
+    assert processor.seconds_below(os.getpid(), itself=True) - before[1] >= 0.29
 
 
 @pytest.fixture(scope="module")
