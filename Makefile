@@ -2,16 +2,22 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-# two processes of one thread each: the tests' matrices are small
-TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+# one thread a process: the tests' matrices are small, and two halves run side by side, each in its fixed order
+TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: demo test test-all lint install serve image clean
+.PHONY: demo test test-lipcore test-service test-all lint install serve image clean
 
 demo: install
 	$(BIN)/lipserve demo
 
 test: install
-	$(TEST) -m "not slow"
+	$(MAKE) -j2 test-lipcore test-service
+
+test-lipcore: install
+	$(TEST) -m "not slow" tests/lipcore
+
+test-service: install
+	$(TEST) -m "not slow" tests/service
 
 test-all: install
 	$(TEST)
