@@ -244,9 +244,9 @@ def test_processor_time_of_children_is_found_alive_and_ended():
     child = subprocess.Popen([sys.executable, "-c", burn], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert child.stdout is not None
     child.stdout.readline()
-    assert processor.seconds_below(os.getpid()) - before[0] >= 0.29
+    assert processor.seconds_below(os.getpid()) - before[0] >= 0.2  # ticks of 10 ms, of each process
     child.communicate(b"\n")
-    assert processor.seconds_below(os.getpid(), itself=True) - before[1] >= 0.29
+    assert processor.seconds_below(os.getpid(), itself=True) - before[1] >= 0.2
 
 
 @pytest.fixture(scope="module")
