@@ -116,6 +116,7 @@ class TorqueModel:
             posterior.weights.numpy(),
             posterior.root.numpy(),
             posterior.std_factor,
+            posterior.floor.numpy(),
         )
 
 

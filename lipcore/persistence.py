@@ -39,14 +39,21 @@ class ModelFormatError(ValueError):
 def save(model: TorqueModel, folder: Path, lineage: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Write the model as a new folder, all of it or nothing, and return its manifest.
 
-    lineage: where the model comes from, stored as given. Raise FileExistsError where the folder exists.
+    lineage: where the model comes from, stored as given. Raise FileExistsError where the folder exists, ValueError for
+    a model that has learnt online: what it has learnt is no part of the version.
     """
     if folder.exists():
         raise FileExistsError(f"{folder} exists: a saved model is never overwritten")
     basis, statistics = model.posterior.basis, model.posterior.statistics
+    if statistics is None:
+        raise ValueError("the model has learnt online since it was trained, expected one as trained")
     tensors = {f"params/{name}": value for name, value in model.posterior.params.items()}
     tensors |= {f"inducing/{name}": getattr(basis.inducing, name) for name in ("q", "dq", "ddq")}
-    tensors |= {"inducing/outputs": basis.outputs, "statistics/a": _pack(statistics.a), "statistics/b": statistics.b}
+    tensors |= {
+        "inducing/outputs": basis.outputs,
+        "statistics/a": pack_symmetric(statistics.a),
+        "statistics/b": statistics.b,
+    }
     payload = save_tensors({name: value.contiguous() for name, value in tensors.items()})
     manifest = {
         "format": FORMAT,
@@ -58,7 +65,7 @@ def save(model: TorqueModel, folder: Path, lineage: Mapping[str, Any] | None = N
         "noise_std": model.noise_std.tolist(),
         "options": model.options,
         "fit": model.fit,
-        "compact": {**model.compact, "data_samples": statistics.samples},
+        "compact": {**model.compact, "data_samples": round(statistics.samples)},
         "calibration": asdict(model.calibration),
         "parameters": report(model.posterior, model.estimator),
         "training_range": model.training_range,
@@ -132,9 +139,9 @@ def load(folder: Path) -> TorqueModel:
         for name, value in inducing.items():
             if value.dim() != 2 or value.shape != inducing["q"].shape or value.shape[1] != n:
                 raise ValueError(f"inducing/{name} has shape {tuple(value.shape)}, expected (S, {n})")
-        a, b = _unpack(tensors.pop("statistics/a")), tensors.pop("statistics/b")
+        a, b = unpack_symmetric("statistics/a", tensors.pop("statistics/a")), tensors.pop("statistics/b")
         compact = dict(manifest["compact"])
-        statistics = Statistics(a, b, int(compact.pop("data_samples")))
+        statistics = Statistics(a, b, float(compact.pop("data_samples")))
         return restore(
             manifest["estimator"],
             manifest["joint_names"],
@@ -157,17 +164,17 @@ def load(folder: Path) -> TorqueModel:
         raise ModelFormatError(f"{folder} does not hold a valid model: {error}") from error
 
 
-def _pack(symmetric: torch.Tensor) -> torch.Tensor:
+def pack_symmetric(symmetric: torch.Tensor) -> torch.Tensor:
     """Upper triangle of a symmetric matrix (M, M), row by row: (M (M + 1) / 2,)."""
     rows, columns = torch.triu_indices(*symmetric.shape)
     return symmetric[rows, columns]
 
 
-def _unpack(packed: torch.Tensor) -> torch.Tensor:
-    """Inverse of `_pack`; raise ValueError for a length that no triangle has."""
+def unpack_symmetric(name: str, packed: torch.Tensor) -> torch.Tensor:
+    """Inverse of `pack_symmetric`; raise ValueError for a length that no triangle has."""
     size = math.isqrt(2 * packed.numel())
     if packed.dim() != 1 or size * (size + 1) // 2 != len(packed):
-        raise ValueError(f"statistics/a has shape {tuple(packed.shape)}, expected M (M + 1) / 2 numbers")
+        raise ValueError(f"{name} has shape {tuple(packed.shape)}, expected M (M + 1) / 2 numbers")
     rows, columns = torch.triu_indices(size, size)
     full = torch.empty((size, size), dtype=packed.dtype)
     full[rows, columns] = full[columns, rows] = packed

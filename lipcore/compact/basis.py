@@ -73,6 +73,15 @@ class Basis:
         solved: Tensor = torch.linalg.solve_triangular(self.root, self.covariance(query), upper=False)
         return solved
 
+    def uncovered(self, query: Motion, features: Tensor) -> Tensor:
+        """Variance k(x, x) − φᵀφ that the basis leaves open at N queries, (N, n). features: φ(x), (M, N n)."""
+        if self.term is None:
+            return torch.zeros_like(query.q)
+        prior = self.term.variance(self.params, query).diagonal(dim1=1, dim2=2)
+        # the linear terms' own features leave nothing open
+        explained = features[: len(self.outputs)].square().sum(0).reshape(prior.shape)
+        return (prior - explained).clamp_min(0.0)
+
 
 def split(kernel: TorqueKernel) -> tuple[PairKernel | None, tuple[LinearKernel, ...]]:
     """The nonlinear term of a kernel, if it has one, and its linear terms; raise ValueError for any other kernel."""

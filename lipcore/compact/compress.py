@@ -10,7 +10,7 @@ from torch import Tensor
 from lipcore.compact.basis import Basis, split
 from lipcore.compact.pivots import Pivots, pivots
 from lipcore.compact.posterior import CompactPosterior
-from lipcore.compact.statistics import Statistics
+from lipcore.compact.statistics import collect
 from lipcore.kernels.base import SumKernel
 from lipcore.linalg import cholesky
 from lipcore.motion import Motion
@@ -167,7 +167,7 @@ class _Candidates:
         samples, places = torch.unique(outputs // n, return_inverse=True)
         basis = Basis.build(exact.kernel, exact.params, exact.motion[samples], places * n + outputs % n)
         residual = tau - exact.kernel.mean(exact.motion)
-        statistics = Statistics.collect(basis, self.noise, exact.motion, residual)
+        statistics = collect(basis, self.noise, exact.motion, residual)
         return CompactPosterior.build(exact.kernel, basis, statistics, self.noise)
 
 

@@ -3,38 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from lipcore.compact.basis import Basis
-from lipcore.compact.statistics import Statistics
+from lipcore.compact.statistics import Solution, Statistics, solve
 from lipcore.kernels.base import LinearKernel, TorqueKernel
-from lipcore.linalg import NotPositiveDefiniteError
 from lipcore.motion import Motion
-from lipcore.posterior import Posterior
-
-ROUNDING = 1e-8
-"""Share of the largest eigenvalue of the statistics by which the smallest may lie below zero."""
+from lipcore.posterior import Posterior, Prediction
 
 
 @dataclass(frozen=True)
 class CompactPosterior(Posterior):
     """Posterior whose anchors are the M variables of a basis (DESIGN §4).
 
-    The whitened variables have the posterior N((I + A)⁻¹ b, (I + A)⁻¹). With c = cov(u, f(x)) = B φ(x):
+    The whitened variables have the posterior N(ŵ, Σ), from statistics alone N((I + A)⁻¹ b, (I + A)⁻¹). With
+    c = cov(u, f(x)) = B φ(x):
 
-        mean       E f(x) + φᵀ (I + A)⁻¹ b                    = E f(x) + cᵀ α,     α = B⁻ᵀ (I + A)⁻¹ b
-        variance   k(x, x) − φᵀφ + φᵀ (I + A)⁻¹ φ             = k(x, x) − |Q c|²,  QᵀQ = B⁻ᵀ (I − (I + A)⁻¹) B⁻¹
+        mean       E f(x) + φᵀ ŵ                = E f(x) + cᵀ α,     α = B⁻ᵀ ŵ
+        variance   k(x, x) − φᵀφ + φᵀ Σ φ       = k(x, x) − |Q c|²,  QᵀQ = B⁻ᵀ (I − Σ) B⁻¹
 
-    where φ does not reach, the variance is the prior's. root: Q, (M, M) upper triangular; noise_variance: (n,) R.
+    where φ does not reach, the variance is the prior's. root: Q, (M, M) upper triangular; noise_variance: (n,) R;
+    floor: (n,) (N·m)², which the variance of a torque is never below, whatever the samples say; zero but for models
+    that learn online (see `online.floor`). statistics: what it was made from; None where that is more than one sum.
     """
 
     basis: Basis
-    statistics: Statistics
     noise_variance: Tensor
     root: Tensor
+    floor: Tensor
+    statistics: Statistics | None = None
 
     @classmethod
     def build(
@@ -46,18 +46,37 @@ class CompactPosterior(Posterior):
         std_factor: float = 1.0,
     ) -> CompactPosterior:
         """Posterior of statistics; raise NotPositiveDefiniteError for such as no samples have."""
-        values, vectors = torch.linalg.eigh(statistics.a)
-        if not float(values[0]) >= -ROUNDING * float(values[-1]):
-            raise NotPositiveDefiniteError(
-                f"statistics of size {len(values)} have the eigenvalue {float(values[0]):.3g}, expected none below zero"
-            )
-        values = values.clamp_min(0.0)
-        mean = vectors @ ((vectors.T @ statistics.b) / (1 + values))
-        weights = torch.linalg.solve_triangular(basis.root.T, mean[:, None], upper=True)[:, 0]
-        learnt = (values / (1 + values)).sqrt()[:, None] * vectors.T  # its square is I − (I + A)⁻¹
+        found = cls.solved(kernel, basis, solve(statistics), noise_variance, std_factor)
+        return replace(found, statistics=statistics)
+
+    @classmethod
+    def solved(
+        cls,
+        kernel: TorqueKernel,
+        basis: Basis,
+        solution: Solution,
+        noise_variance: Tensor,
+        std_factor: float = 1.0,
+        floor: Tensor | None = None,
+    ) -> CompactPosterior:
+        """Posterior of the torques, given that of the whitened variables."""
+        weights = torch.linalg.solve_triangular(basis.root.T, solution.mean[:, None], upper=True)[:, 0]
         # triangular, by QR and not from QᵀQ itself: B⁻¹ is badly conditioned
-        root = torch.linalg.qr(torch.linalg.solve_triangular(basis.root, learnt, upper=False, left=False), mode="r").R
-        return cls(kernel, basis.params, std_factor, weights, basis, statistics, noise_variance, root)
+        raw = torch.linalg.solve_triangular(basis.root, solution.learnt, upper=False, left=False)
+        root = torch.linalg.qr(raw, mode="r").R
+        floor = torch.zeros_like(noise_variance) if floor is None else floor
+        return cls(kernel, basis.params, std_factor, weights, basis, noise_variance, root, floor)
+
+    def predict(self, query: Motion, component: TorqueKernel | None = None) -> Prediction:
+        """Posterior mean and n×n covariance of the torques at each of N queries, or of one term of the kernel.
+
+        The floor is one of the whole torque: no term's share of it is known.
+        """
+        found = super().predict(query, component)
+        if component is not None:
+            return found
+        short = (self.floor - found.covariance.diagonal(dim1=1, dim2=2)).clamp_min(0.0)
+        return Prediction(found.mean, found.covariance + torch.diag_embed(short))
 
     def whiten(self, cross: Tensor) -> Tensor:
         """Q c."""

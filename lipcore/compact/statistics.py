@@ -1,30 +1,121 @@
-"""What a compact posterior needs to know of the data: sums over samples."""
+"""What a compact posterior needs to know of the data: sums over samples, and how they are added, aged and solved.
+
+All functions are pure. Sums know no order: fitting all samples at once, or in parts, or one by one, gives the same
+posterior, and what has been added can be subtracted.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from lipcore.compact.basis import Basis
+from lipcore.linalg import NotPositiveDefiniteError
 from lipcore.motion import Motion
+
+ROUNDING = 1e-8
+"""Share of the largest eigenvalue of the statistics by which the smallest may lie below zero."""
+BLOCK = 256
+"""Rows below which a product with itself is computed as a whole."""
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """A = Σ φ R⁻¹ φᵀ, (M, M), and b = Σ φ R⁻¹ (y − E y), (M,), over `samples` samples with noise variances R."""
+    """A = Σ φ R⁻¹ φᵀ, (M, M), and b = Σ φ R⁻¹ (y − E y), (M,), over samples, each with a weight of one unless aged.
+
+    R: diagonal; of each torque the noise variance and what the basis leaves open, k(x, x) − φᵀφ. So a sample beyond the
+    basis teaches the little that it can, instead of being explained by functions that do not reach it (the fully
+    independent training conditional of Snelson & Ghahramani, 2006). samples: sum of the weights.
+    """
 
     a: Tensor
     b: Tensor
-    samples: int
-
-    @classmethod
-    def collect(cls, basis: Basis, noise_variance: Tensor, motion: Motion, residual: Tensor) -> Statistics:
-        """Sum over N samples. noise_variance: (n,); residual: torque less its prior mean, (N, n)."""
-        precision = noise_variance.rsqrt().repeat(len(motion))
-        features = basis.features(motion) * precision
-        return cls(_symmetric(features @ features.T), features @ (residual.reshape(-1) * precision), len(motion))
+    samples: float
 
 
-def _symmetric(matrix: Tensor) -> Tensor:
-    return 0.5 * (matrix + matrix.T)
+@dataclass(frozen=True)
+class Solution:
+    """Posterior N(mean, Σ) of the M whitened variables. learnt: (M, M), its square learntᵀ learnt is I − Σ."""
+
+    mean: Tensor
+    learnt: Tensor
+
+
+def empty(size: int) -> Statistics:
+    """Statistics of no samples, for M = size variables."""
+    return Statistics(torch.zeros((size, size), dtype=torch.float64), torch.zeros(size, dtype=torch.float64), 0)
+
+
+def collect(
+    basis: Basis, noise_variance: Tensor, motion: Motion, residual: Tensor, weights: Tensor | None = None
+) -> Statistics:
+    """Sum over N samples. noise_variance: (n,); residual: torque less its prior mean, (N, n); weights: (N,) or one."""
+    features = basis.features(motion)
+    variance = noise_variance + basis.uncovered(motion, features)
+    precision = variance.reciprocal() if weights is None else weights[:, None] / variance
+    features *= precision.sqrt().reshape(-1)
+    b = features @ (residual * precision.sqrt()).reshape(-1)
+    return Statistics(_square(features), b, float(len(motion) if weights is None else weights.sum()))
+
+
+def update(
+    statistics: Statistics,
+    basis: Basis,
+    noise_variance: Tensor,
+    motion: Motion,
+    residual: Tensor,
+    weights: Tensor | None = None,
+) -> Statistics:
+    """Statistics with N more samples; see `collect`."""
+    return merge(statistics, collect(basis, noise_variance, motion, residual, weights))
+
+
+def merge(one: Statistics, other: Statistics) -> Statistics:
+    """Statistics of the samples of both, from parts, streams or robots that share a basis."""
+    return Statistics(one.a + other.a, one.b + other.b, one.samples + other.samples)
+
+
+def subtract(all_samples: Statistics, some: Statistics) -> Statistics:
+    """Statistics without some of their samples: what `merge` did is undone."""
+    return Statistics(all_samples.a - some.a, all_samples.b - some.b, all_samples.samples - some.samples)
+
+
+def decay(statistics: Statistics, factor: float) -> Statistics:
+    """Statistics whose samples count a `factor` from 0 to 1 as much as before; raise ValueError for another."""
+    if not 0.0 <= factor <= 1.0:
+        raise ValueError(f"factor is {factor!r}, expected a number from 0 to 1")
+    return Statistics(factor * statistics.a, factor * statistics.b, factor * statistics.samples)
+
+
+def solve(statistics: Statistics, centre: Tensor | None = None) -> Solution:
+    """Posterior of the whitened variables given the statistics, with the prior N(centre, I).
+
+    Mean (I + A)⁻¹ (centre + b), covariance (I + A)⁻¹. centre: (M,), zero where None.
+    Raise NotPositiveDefiniteError for statistics that no samples have.
+    """
+    values, vectors = torch.linalg.eigh(statistics.a)
+    if not float(values[0]) >= -ROUNDING * max(float(values[-1]), 1.0):
+        raise NotPositiveDefiniteError(
+            f"statistics of size {len(values)} have the eigenvalue {float(values[0]):.3g}, expected none below zero"
+        )
+    values = values.clamp_min(0.0)
+    said = statistics.b if centre is None else centre + statistics.b
+    mean = vectors @ ((vectors.T @ said) / (1 + values))
+    return Solution(mean, (values / (1 + values)).sqrt()[:, None] * vectors.T)
+
+
+def _square(features: Tensor) -> Tensor:
+    """F Fᵀ of (M, K), exactly symmetric: only one of each pair of off-diagonal blocks is computed."""
+    size = len(features)
+    if size <= BLOCK:
+        product = features @ features.T
+        return 0.5 * (product + product.T)
+    out = features.new_empty((size, size))
+    half = size // 2
+    upper, lower = features[:half], features[half:]
+    out[:half, :half], out[half:, half:] = _square(upper), _square(lower)
+    out[half:, :half] = lower @ upper.T
+    out[:half, half:] = out[half:, :half].T
+    return out

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
+from copy import copy
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,11 +39,12 @@ class Evaluator:
     """Posterior torques of a robot with n joints from M = m + P anchors: m inducing outputs, then all linear weights.
 
     With g(x) the covariance of the anchors with the torques at x, (M, n), the mean is E f(x) + gᵀ weights and the
-    covariance std_factor² (k(x, x) − (Q g)ᵀ (Q g)).
+    covariance std_factor² (k(x, x) − (Q g)ᵀ (Q g)), whose diagonal is raised to `floor` where it is below.
 
     term: the kernel's nonlinear term, None if it has none. params: hyperparameters of all terms. inducing: S samples,
     None without `term`. outputs: (m,), which of their torques, as sample · n + joint. linear: the linear terms in the
-    order of the anchors. weights: (M,). root: Q, (M, M) upper triangular. std_factor: see `calibration`.
+    order of the anchors. weights: (M,). root: Q, (M, M) upper triangular. std_factor: see `calibration`. floor: (n,)
+    (N·m)², none where None.
 
     Safe from several threads, which answer at the same time: compiled code runs without the GIL and every thread has
     memory of its own. Raises ValueError naming the argument that does not fit.
@@ -58,6 +60,7 @@ class Evaluator:
         weights: Array,
         root: Array,
         std_factor: float = 1.0,
+        floor: Array | None = None,
     ) -> None:
         if (term is None) != (inducing is None):
             raise ValueError("term and inducing: expected both of them or neither")
@@ -77,8 +80,27 @@ class Evaluator:
             self._regressors.append((slice(first, first + regressor.size), regressor))
             first += regressor.size
         self._std_factor = float(std_factor)
+        self._floor = np.zeros(n) if floor is None else np.array(floor, np.float64)
+        if self._floor.shape != (n,):
+            raise ValueError(f"floor has shape {self._floor.shape}, expected ({n},)")
         sizes = samples, len(self._outputs) + len(means), len(means), n
         self._one, self._many = _Scratch(1, *sizes), _Scratch(QUERIES, *sizes)
+
+    @property
+    def packed(self) -> Array:
+        """What of this evaluator depends on weights and root, laid out for compiled code: to make another `revised`."""
+        return self._fixed
+
+    def revised(self, packed: Array, floor: Array) -> Evaluator:
+        """Return an evaluator with other weights, root and floor, from `packed` of one of the same anchors.
+
+        What is compiled and the memory of threads are shared with this one: an answer uses either of them at a time.
+        """
+        if packed.shape != self._fixed.shape or floor.shape != self._floor.shape:
+            raise ValueError(f"packed has shape {packed.shape}, expected {self._fixed.shape}")
+        other = copy(self)
+        other._fixed, other._floor = packed, floor
+        return other
 
     def one(self, motion: Array, std: bool = True) -> tuple[Array, Array | None]:
         """Torque (n,) and, if asked for, its standard deviation (n,) at one query, (3, n): q, dq and ddq.
@@ -126,6 +148,7 @@ class Evaluator:
             blocks,
             features,
             self._std_factor,
+            self._floor,
             what,
             scratch.memory,
             tau,

@@ -13,7 +13,7 @@ from lipcore import FitOptions, Samples, TorqueModel, dynamics, train
 from lipcore.compact.basis import Basis
 from lipcore.compact.compress import Deviation, compress
 from lipcore.compact.posterior import CompactPosterior
-from lipcore.compact.statistics import Statistics
+from lipcore.compact.statistics import collect
 from lipcore.estimators import ESTIMATORS, ROBOT_ESTIMATORS
 from lipcore.linalg import NotPositiveDefiniteError
 from lipcore.motion import Motion
@@ -69,7 +69,7 @@ def everything(case: Case) -> CompactPosterior:
     basis = Basis.build(exact.kernel, exact.params, exact.motion, torch.arange(count))
     residual = case.samples.torque() - exact.kernel.mean(exact.motion)
     return CompactPosterior.build(
-        exact.kernel, basis, Statistics.collect(basis, noise, exact.motion, residual), noise, exact.std_factor
+        exact.kernel, basis, collect(basis, noise, exact.motion, residual), noise, exact.std_factor
     )
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from lipcore import TorqueModel, dynamics
 from lipcore.compact.basis import Basis
-from lipcore.compact.statistics import Statistics
+from lipcore.compact.statistics import collect
 from lipcore.estimators import make_estimator
 from lipcore.kernels.friction import SIGN_WIDTH
 from lipcore.model import restore, training_range
@@ -61,7 +61,7 @@ def case(request: pytest.FixtureRequest) -> Case:
     params["noise.log_std"] = torch.tensor([-1.5, -2.0], dtype=torch.float64)
     kernel, outputs = make_estimator(request.param, TYPES).kernel, torch.arange(SAMPLES * N)
     basis = Basis.build(kernel, params, motion, outputs)
-    statistics = Statistics.collect(basis, torch.exp(2 * params["noise.log_std"]), motion, tau)
+    statistics = collect(basis, torch.exp(2 * params["noise.log_std"]), motion, tau)
     parts = motion, outputs, statistics, training_range(motion), {}
     model = restore(request.param, JOINT_NAMES, TYPES, "gravity_included", {}, {}, params, *parts)
     energies = ENERGIES[request.param](TYPES, params)

@@ -21,6 +21,7 @@ def answer(
     blocks: Array,
     features: Array,
     std_factor: float,
+    floor: Array,
     what: int,
     memory: Array,
     tau: Array,
@@ -30,7 +31,8 @@ def answer(
     """Write the torques of N queries, and as much of their uncertainty as `what` says.
 
     fixed: variances of the P linear weights, the panel of the mean, then those of the root; blocks: (N, S + 1, n, n)
-    from `Cross`; features: (N, P, n), Φᵀ; tau, std: (N, n); covariance: (N, n, n), work unless asked for.
+    from `Cross`; features: (N, P, n), Φᵀ; floor: (n,), smallest variance, at least 0;
+    tau, std: (N, n); covariance: (N, n, n), work unless asked for.
     """
     queries, n = tau.shape
     chosen, linear = outputs.shape[0], features.shape[1]
@@ -59,7 +61,8 @@ def answer(
     for query in range(queries):
         _subtract(blocks[query, -1], fixed, features[query], std_factor * std_factor, full, covariance[query])
         for j in range(n):
-            std[query, j] = np.sqrt(max(covariance[query, j, j], 0.0))
+            covariance[query, j, j] = max(covariance[query, j, j], floor[j])
+            std[query, j] = np.sqrt(covariance[query, j, j])
 
 
 @compiled

@@ -1,0 +1,71 @@
+"""Rows that arrive online: samples with a time, and what became of each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lipcore.motion import Motion
+from lipcore.samples import Array
+
+CODES = ("learnt", "non_finite", "limit", "time_jump", "saturation", "stationary", "contact", "change", "edge")
+"""What may become of a row. All but the first keep it out of learning: a number that is not finite; a position,
+velocity, acceleration or torque beyond its limit; time that goes backwards or leaps; torque at its actuator's limit; a
+robot at rest, whose stiction hides its torque; a contact; a changed robot whose owner has not decided yet; the edge of
+a recording, where an acceleration cannot be derived."""
+LEARNT = 0
+
+
+@dataclass(frozen=True)
+class Rows:
+    """N rows of n joints. time: (N,) event time, s; q, dq, ddq, tau: (N, n), SI; code: (N,) uint8 places in CODES.
+
+    weight: (N,) how many independent samples each counts for (see `spacing`), one where not given.
+    """
+
+    time: Array
+    q: Array
+    dq: Array
+    ddq: Array
+    tau: Array
+    code: NDArray[np.uint8]
+    weight: Array = field(default_factory=lambda: np.empty(0))
+
+    def __post_init__(self) -> None:
+        if not len(self.weight):
+            object.__setattr__(self, "weight", np.ones(len(self.q)))
+        for name in ("dq", "ddq", "tau"):
+            if getattr(self, name).shape != self.q.shape:
+                raise ValueError(f"{name} has shape {getattr(self, name).shape}, expected {self.q.shape} as q has")
+        for name in ("time", "code", "weight"):
+            if getattr(self, name).shape != self.q.shape[:1]:
+                raise ValueError(f"{name} has shape {getattr(self, name).shape}, expected {self.q.shape[:1]}")
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def take(self, index: slice | NDArray[np.int64] | NDArray[np.bool_]) -> Rows:
+        """Return the chosen rows."""
+        return Rows(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+    @property
+    def learnt(self) -> Rows:
+        """The rows that teach."""
+        return self.take(self.code == LEARNT)
+
+    def motion(self) -> Motion:
+        """Position, velocity and acceleration as tensors; raise ValueError where one is not finite."""
+        return Motion.from_arrays(self.q, self.dq, self.ddq)
+
+    def rejected(self) -> dict[str, int]:
+        """How many rows each code other than `learnt` keeps out."""
+        counts = np.bincount(self.code, minlength=len(CODES))
+        return {code: int(count) for code, count in zip(CODES, counts, strict=True) if count and code != CODES[LEARNT]}
+
+    @staticmethod
+    def concatenate(parts: Sequence[Rows]) -> Rows:
+        """Rows of all parts in order."""
+        return Rows(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Rows)})

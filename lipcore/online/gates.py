@@ -1,0 +1,198 @@
+"""Which rows may teach: gates for broken, impossible, saturated and standing rows, for contacts and their end."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lipcore.online.batch import CODES, LEARNT
+from lipcore.samples import Array
+
+Codes = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+LARGEST_TORQUE = 1e6
+"""|tau| in N·m (N) that no robot reaches (the largest arms: some 1e4): a damaged number, not a torque. Its square would
+drown whatever was summed before. Applies where no limits are given, too."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a row may hold.
+
+    position, velocity, acceleration: largest |q|, |dq|, |ddq| of any joint, SI. torque: (n,) largest |tau| of each
+    joint, N·m or N, or None where not known. max_gap_s: longest step of time within rows that accelerations are derived
+    from, s; None: any. stationary_speed: a robot whose every |dq| lies below it stands; 0: never. saturation_share:
+    share of its limit from which on a torque is taken for cut off, below the limit since a drive's measured torque
+    wavers about it: 0.98 leaves 2 %, four standard deviations of a noise of half a per cent of the limit.
+    """
+
+    position: float
+    velocity: float
+    acceleration: float
+    torque: Array | None
+    max_gap_s: float | None
+    stationary_speed: float
+    saturation_share: float = 0.98
+
+
+def check_rows(
+    t: Array | None,
+    q: Array,
+    dq: Array,
+    ddq: Array | None,
+    tau: Array,
+    limits: Limits,
+    after: float | None = None,
+    before: float | None = None,
+    derived: bool = False,
+) -> Codes:
+    """Code of each row, (N,) places in CODES: the first that applies, or `learnt`.
+
+    t: (N,) s, or None; q, dq, ddq, tau: (N, n) with ddq None where it is yet to be derived.
+
+    - `non_finite`: a number of the row is not finite.
+    - `limit`: a magnitude is above its limit.
+    - `time_jump`: of the rows with a finite time between `after` and `before`, all but the longest run of strictly
+      increasing times, so that one wrong time, forward or backward, costs its row and no other. Where accelerations
+      are `derived` also the first row beyond a gap of more than max_gap_s; measured ones do not suffer from a gap.
+    - `saturation`: a |tau| of at least saturation_share of its limit: the robot did not do what the torque says.
+    - `stationary`: every |dq| below stationary_speed: stiction holds any torque within its band.
+
+    after, before: times that the rows must lie strictly between, such as `time_span` of the batch before and of the
+    batch after, or the time of arrival with some slack, which stops a leap into the future. Raise ValueError where
+    shapes differ.
+    """
+    _check_shapes(t, q, dq, ddq, tau, limits)
+    parts = [array for array in (q, dq, ddq, tau) if array is not None]
+    finite = np.all([np.isfinite(array).all(axis=1) for array in parts], axis=0)
+    if t is not None:
+        finite &= np.isfinite(t)
+    # the codes of rows that are not finite are set last; numbers in their place keep comparisons quiet
+    q, dq, tau = (np.nan_to_num(array) for array in (q, dq, tau))
+
+    codes = np.full(len(q), LEARNT, dtype=np.uint8)
+    codes[(np.abs(dq) < limits.stationary_speed).all(axis=1)] = CODES.index("stationary")
+    most = np.full(q.shape[1], LARGEST_TORQUE) if limits.torque is None else limits.torque
+    if limits.torque is not None:
+        saturated = np.abs(tau) >= limits.saturation_share * most
+        codes[saturated.any(axis=1)] = CODES.index("saturation")
+    if t is not None:
+        codes[_time_jumps(t, after, before, limits.max_gap_s if derived else None)] = CODES.index("time_jump")
+    beyond = (np.abs(q) > limits.position) | (np.abs(dq) > limits.velocity) | (np.abs(tau) > most)
+    if ddq is not None:
+        beyond |= np.abs(np.nan_to_num(ddq)) > limits.acceleration
+    codes[beyond.any(axis=1)] = CODES.index("limit")
+    codes[~finite] = CODES.index("non_finite")
+    return codes
+
+
+def time_span(time: Array, code: Codes) -> tuple[float, float] | None:
+    """First and last time to be believed of a batch of rows, or None: what its neighbours are to lie before and after.
+
+    Rows coded `time_jump` do not count unless no others have a time: then the clock itself was set, and the next batch
+    is to follow the new one. So a wrong time at the end of a batch costs one row, and a clock set back one batch.
+    """
+    known = np.isfinite(time)
+    believed = known & (code != CODES.index("time_jump"))
+    times = time[believed] if believed.any() else time[known]
+    return (float(times[0]), float(times[-1])) if len(times) else None
+
+
+def is_contact(tau: Array, mean: Array, std: Array, noise_std: Array, threshold: float) -> Mask:
+    """Rows (N,) where |tau − mean| > threshold · √(std² + noise_std²) at any joint: tau, mean, std (N, n)."""
+    outside = np.abs(tau - mean) > threshold * np.sqrt(std**2 + noise_std**2)
+    return np.asarray(outside.any(axis=1))
+
+
+LONGEST_SHARE = 0.1
+"""Most of the patience that one step of time uses up: a pause in a stream is not time in contact, and a stream of few
+rows a second needs at least ten of them."""
+
+
+@dataclass(frozen=True)
+class Patience:
+    """How long torques have been far off: immutable, one per stream, followed in event time.
+
+    It runs from a contact row on for as long as more than half of the rows since are contacts. Once it has run for
+    `seconds`, at a row that is a contact itself, `exhausted` is set and stays: this is no contact but a change of the
+    robot. A collision ends before; knocks that are further apart than they last start anew each time.
+    """
+
+    seconds: float
+    exhausted: bool = False
+    elapsed: float = 0.0
+    rows: int = 0
+    contacts: int = 0
+    last: float | None = None
+
+    def step(self, time: Array, contact: Mask) -> Patience:
+        """Follow rows at event times (N,) s that are contacts or not, (N,); time that goes backwards counts as 0."""
+        if self.exhausted or len(time) == 0:
+            return self
+        if not self.rows and not contact.any():
+            return replace(self, last=float(time[-1]))
+        elapsed, rows, contacts, last = self.elapsed, self.rows, self.contacts, self.last
+        longest = LONGEST_SHARE * self.seconds
+        for now, hit in zip(time.tolist(), contact.tolist(), strict=True):
+            if rows:
+                elapsed += min(max(now - last, 0.0), longest) if last is not None else 0.0
+            last = now
+            if not rows and not hit:
+                continue
+            rows, contacts = rows + 1, contacts + hit
+            if 2 * contacts <= rows:
+                elapsed, rows, contacts = 0.0, 0, 0
+            elif hit and elapsed >= self.seconds * (1 - 1e-9):
+                return replace(self, exhausted=True, elapsed=elapsed, rows=rows, contacts=contacts, last=last)
+        return replace(self, elapsed=elapsed, rows=rows, contacts=contacts, last=last)
+
+
+def _check_shapes(t: Array | None, q: Array, dq: Array, ddq: Array | None, tau: Array, limits: Limits) -> None:
+    if q.ndim != 2:
+        raise ValueError(f"q has shape {q.shape}, expected (N, n)")
+    for name, array in (("dq", dq), ("ddq", ddq), ("tau", tau)):
+        if array is not None and array.shape != q.shape:
+            raise ValueError(f"{name} has shape {array.shape}, expected {q.shape} as q has")
+    if t is not None and t.shape != q.shape[:1]:
+        raise ValueError(f"t has shape {t.shape}, expected {q.shape[:1]}")
+    if limits.torque is not None and limits.torque.shape != q.shape[1:]:
+        raise ValueError(f"limits.torque has shape {limits.torque.shape}, expected {q.shape[1:]}, one limit a joint")
+
+
+def _time_jumps(t: Array, after: float | None, before: float | None, gap: float | None) -> Mask:
+    """Rows (N,) whose time is out of bounds or out of order, or the first beyond a step of more than `gap`."""
+    inside = np.isfinite(t)
+    inside &= (t > (-np.inf if after is None else after)) & (t < (np.inf if before is None else before))
+    kept = np.flatnonzero(inside)
+    if (t[kept[1:]] <= t[kept[:-1]]).any():
+        kept = kept[_longest_increasing(t[kept].tolist())]
+    jumps = np.ones(len(t), dtype=np.bool_)
+    jumps[kept] = False
+    if gap is not None and len(kept):
+        earlier = np.append(t[kept[0]] if after is None else after, t[kept[:-1]])
+        # as a comparison of sums: a difference of damaged times may overflow
+        jumps[kept[t[kept] > earlier + gap]] = True
+    return jumps
+
+
+def _longest_increasing(values: list[float]) -> list[int]:
+    """Places of a longest strictly increasing subsequence: of equal values the first, of two ends the lower."""
+    ends: list[float] = []
+    places: list[int] = []
+    previous = [-1] * len(values)
+    for index, value in enumerate(values):
+        at = bisect_left(ends, value)
+        if at < len(ends) and ends[at] == value:
+            continue
+        previous[index] = places[at - 1] if at else -1
+        ends[at : at + 1] = [value]
+        places[at : at + 1] = [index]
+    chain, index = [], places[-1] if places else -1
+    while index >= 0:
+        chain.append(index)
+        index = previous[index]
+    return chain[::-1]

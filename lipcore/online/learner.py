@@ -1,0 +1,169 @@
+"""A model that learns: a trained version and the sums of what has come since."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lipcore.compact.posterior import CompactPosterior
+from lipcore.compact.statistics import Solution, Statistics, collect, decay, empty, merge, solve, subtract
+from lipcore.model import TorqueModel
+from lipcore.online.batch import Rows
+from lipcore.samples import Array
+
+_Combine = Callable[[Statistics, Statistics], Statistics]
+CHUNK = 500
+"""Rows whose features are computed together: they take 28 MB at a thousand variables."""
+
+
+class ForgottenError(ValueError):
+    """Rows are to be taken back from a time of which only the conclusion is kept."""
+
+
+@dataclass(frozen=True)
+class Regime:
+    """What is known of a robot between two changes: a prior N(centre, I) and the sums of what it has told.
+
+    begins: event time, s. centre: (M,) whitened variables. The trained version is in the sums of the first regime: as
+    samples that say its mean, which is the centre.
+    """
+
+    begins: float
+    centre: Tensor
+    statistics: Statistics
+
+    def solve(self) -> Solution:
+        """Posterior of the whitened variables."""
+        return solve(self.statistics, self.centre)
+
+
+@dataclass(frozen=True)
+class OnlineModel:
+    """A trained version and what it has learnt since; immutable, every method returns another one.
+
+    The posterior is a function of the rows learnt, not of their order: a row of event time t counts its own weight (see
+    `spacing`), times exp(−(reference − t) / forgetting_s) where there is forgetting. What is forgotten leaves its mean
+    behind, with the prior's uncertainty: the version as trained where that is forgotten. A change begins a new regime,
+    whose prior has the mean of what was known before and the variance that a robot never seen has.
+
+    base: the version as trained; reference: event time, s, that weights refer to, the latest seen; since: when the
+    version's own samples begin to be forgotten, the first row's time unless said; before: the regime before the last
+    change, which late rows of then still reach.
+    """
+
+    base: TorqueModel
+    forgetting_s: float | None
+    since: float | None
+    reference: float
+    before: Regime | None
+    now: Regime
+
+    @classmethod
+    def start(cls, base: TorqueModel, forgetting_s: float | None = None, since: float | None = None) -> OnlineModel:
+        """Nothing learnt yet; raise ValueError for a wrong forgetting time, or a model that has learnt already."""
+        _check(forgetting_s)
+        statistics = base.posterior.statistics
+        if statistics is None:
+            raise ValueError("the model has learnt online already, expected one as trained")
+        # (I + A) ŵ = b: samples that say ŵ have A ŵ = b − ŵ, and the prior around ŵ gives the rest
+        centre = base.posterior.basis.root.T @ base.posterior.weights
+        said = Statistics(statistics.a, statistics.b - centre, 0.0)
+        reference = -math.inf if since is None else since
+        return cls(base, forgetting_s, since, reference, None, Regime(-math.inf, centre, said))
+
+    @property
+    def samples(self) -> float:
+        """Sum of the weights of the rows learnt in this regime."""
+        return self.now.statistics.samples
+
+    def learn(self, rows: Rows) -> OnlineModel:
+        """Learn the rows of code 0, in any order; those from before the regime before this one teach nothing more."""
+        return self._add(rows.learnt, merge)
+
+    def unlearn(self, rows: Rows) -> OnlineModel:
+        """Take back rows that were learnt; raise ForgottenError for some from before the regime before this one."""
+        oldest = self.now.begins if self.before is None else self.before.begins
+        if len(rows.learnt) and float(rows.learnt.time.min()) < oldest:
+            raise ForgottenError(f"rows from before {oldest:.3f} s cannot be taken back: two changes have come since")
+        return self._add(rows.learnt, subtract)
+
+    def change(self, at: float) -> OnlineModel:
+        """Begin a new regime at an event time: the mean is kept, its uncertainty is opened.
+
+        It begins after the latest row learnt where that is later: a row belongs to one regime for good.
+        """
+        begins = max(at, math.nextafter(max(self.reference, self.now.begins), math.inf))
+        fresh = Regime(begins, self.now.solve().mean, empty(len(self.now.centre)))
+        return replace(self, before=self.now, now=fresh)
+
+    def with_forgetting(self, forgetting_s: float | None) -> OnlineModel:
+        """Forget otherwise from here on; raise ValueError for a forgetting time that is none."""
+        _check(forgetting_s)
+        return replace(self, forgetting_s=forgetting_s)
+
+    def novel(self, rows: Rows) -> NDArray[np.bool_]:
+        """Which rows the basis does not cover: it leaves more variance of a torque open than its noise has, (N,)."""
+        basis, motion = self.base.posterior.basis, rows.motion()
+        found = basis.uncovered(motion, basis.features(motion)) > self.base.posterior.noise_variance
+        novel: NDArray[np.bool_] = found.any(1).numpy()
+        return novel
+
+    def model(self, floor: Array | None = None) -> TorqueModel:
+        """Solve for the model that answers. floor: (n,) (N·m)², which its variances are never below."""
+        posterior = self.base.posterior
+        found = CompactPosterior.solved(
+            posterior.kernel,
+            posterior.basis,
+            self.now.solve(),
+            posterior.noise_variance,
+            posterior.std_factor,
+            None if floor is None else torch.from_numpy(np.array(floor, np.float64)),
+        )
+        return replace(self.base, posterior=found)
+
+    def _add(self, rows: Rows, combine: _Combine) -> OnlineModel:
+        for first in range(0, len(rows), CHUNK):
+            self = self._add_chunk(rows.take(slice(first, first + CHUNK)), combine)  # noqa: PLW0642 - immutable
+        return self
+
+    def _add_chunk(self, rows: Rows, combine: _Combine) -> OnlineModel:
+        latest = max(self.reference, float(rows.time.max()))
+        model = self._aged(latest, float(rows.time.min()) if self.since is None else self.since)
+        current = rows.time >= model.now.begins
+        now, before = model.now, model.before
+        if current.any():
+            told = model._collect(rows.take(current))
+            now = replace(now, statistics=combine(now.statistics, told))
+        if before is not None and (late := ~current & (rows.time >= before.begins)).any():
+            before = replace(before, statistics=combine(before.statistics, model._collect(rows.take(late))))
+            now = replace(now, centre=before.solve().mean)
+        return replace(model, now=now, before=before)
+
+    def _collect(self, rows: Rows) -> Statistics:
+        posterior, motion = self.base.posterior, rows.motion()
+        weights = torch.from_numpy(rows.weight)
+        if self.forgetting_s is not None:
+            weights = weights * torch.from_numpy(np.exp((rows.time - self.reference) / self.forgetting_s))
+        residual = torch.from_numpy(rows.tau) - posterior.kernel.mean(motion)
+        return collect(posterior.basis, posterior.noise_variance, motion, residual, weights)
+
+    def _aged(self, reference: float, since: float) -> OnlineModel:
+        """The same knowledge as it weighs at a later reference time."""
+        age = reference - max(self.reference, since)
+        if self.forgetting_s is None or age <= 0:
+            return replace(self, reference=reference, since=since)
+        factor = math.exp(-age / self.forgetting_s)
+        now = replace(self.now, statistics=decay(self.now.statistics, factor))
+        before = self.before and replace(self.before, statistics=decay(self.before.statistics, factor))
+        return replace(self, reference=reference, since=since, now=now, before=before)
+
+
+def _check(forgetting_s: float | None) -> None:
+    if forgetting_s is not None and not 0 < forgetting_s < math.inf:
+        raise ValueError(f"forgetting_s is {forgetting_s!r}, expected a positive number of seconds, or None")

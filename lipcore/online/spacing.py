@@ -1,0 +1,50 @@
+"""How many independent samples a row of a fast stream counts for."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lipcore.samples import Array
+
+INDEPENDENT_HZ = 10.0
+"""Rows a second that count as independent.
+
+Measured on a simulated Panda with friction that no estimator expresses exactly, learnt from 1 kHz streams of slow and
+fast motion for 30 s, 95 % intervals on an unseen trajectory covered 61 to 91 % where every row counted in full, 93 to
+95 % at 20 a second and hardly more at 10; errors were smallest between 10 and 30 a second, on slow motion at 10.
+"""
+
+
+def evenly(time: Array, rate: float = INDEPENDENT_HZ) -> Array:
+    """Weights of rows that a clock has spaced evenly, whatever a few of their times say: the same for all, (N,).
+
+    time: (N,) s; not finite where not known. Rows without a spacing count in full.
+    """
+    steps = np.diff(time[np.isfinite(time)])
+    rising = steps[steps > 0]
+    return np.full(len(time), min(1.0, rate * float(np.median(rising))) if len(rising) else 1.0)
+
+
+def weights(time: Array, before: float | None = None, rate: float = INDEPENDENT_HZ) -> Array:
+    """Weight of each row, (N,), from 0 to 1: `rate` times the seconds since the row before, 1 at most.
+
+    The noise of a sensor may be new every millisecond, but what a model cannot express, such as friction that is not as
+    it should be, is the same for as long as the motion is: a thousand rows of one second are not a thousand witnesses.
+    Counted as such they make a model certain of its own misfit. The sum over a stream is `rate` times its duration,
+    whatever its own rate and however its rows were bunched on their way.
+
+    time: (N,) event time, s, in the order of the stream; before: that of the row before the first, where known. Rows of
+    one time, as of a batch without times of its own, share the time since then evenly.
+    """
+    if not len(time):
+        return np.empty(0)
+    order = np.argsort(time, kind="stable")
+    steps = np.diff(time[order])
+    if not (steps > 0).any():
+        steps = np.full(len(time), np.inf if before is None else max(time[0] - before, 0.0) / len(time))
+    else:
+        first = np.median(steps[steps > 0]) if before is None else max(time[order[0]] - before, 0.0)
+        steps = np.concatenate([[first], steps])
+    out = np.empty(len(time))
+    out[order] = np.minimum(rate * steps, 1.0)
+    return out

@@ -1,0 +1,291 @@
+"""Change detectors: quiet on what is no change, quick on what is, and evidence that tells why."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from lipcore.online.change import Change, ChangeDetector, friction_share, suspect
+from lipcore.online.gates import is_contact
+from lipcore.online.record import Record
+from lipcore.robots import Robot, load_robot
+from lipcore.simulation import Payload, Stream, inverse_dynamics, simulate
+
+Scale = Callable[[np.ndarray], np.ndarray]
+NAMES = tuple(f"j{k + 1}" for k in range(7))
+
+
+class Alarm(NamedTuple):
+    """A change and the event time at which it was found."""
+
+    change: Change
+    found: float
+
+
+def watch(
+    t: np.ndarray,
+    tau: np.ndarray,
+    mean: np.ndarray,
+    std: np.ndarray,
+    noise: np.ndarray,
+    rows: int = 10,
+    detector: ChangeDetector | None = None,
+) -> tuple[ChangeDetector, list[Alarm]]:
+    """Feed rows (N, n) in records of `rows`."""
+    detector, alarms = detector or ChangeDetector(), []
+    for k in range(0, len(t), rows):
+        part = slice(k, k + rows)
+        detector, change = detector.step(Record.of(tau[part], mean[part], std[part], noise), float(t[part][-1]))
+        if change:
+            alarms.append(Alarm(change, float(t[part][-1])))
+    return detector, alarms
+
+
+def standard(scale: Scale, seed: int, seconds: float = 600.0, rate: float = 100.0, persist_s: float = 0.0):
+    """Innovations of the stated std 1 times `scale`, (N, 3): white, or keeping for about persist_s."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(int(seconds * rate)) / rate
+    z = rng.standard_normal((len(t), 3))
+    if persist_s:
+        keep = np.exp(-1 / (rate * persist_s))
+        z = lfilter([np.sqrt(1 - keep**2)], [1, -keep], z, axis=0)
+    z *= scale(t)[:, None]
+    return t, z, 0 * z, 0 * z, np.ones(3)
+
+
+def constant(value: float) -> Scale:
+    return lambda t: np.full_like(t, value)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("deviation", [1.0, 3.0])
+def test_ten_minutes_of_constant_innovations_raise_no_alarm(deviation: float, seed: int) -> None:
+    assert watch(*standard(constant(deviation), seed), rows=50)[1] == []
+
+
+@pytest.mark.parametrize("rate", [10.0, 1000.0])
+def test_no_false_alarm_at_other_rates(rate: float) -> None:
+    data = standard(constant(1.0), 0, seconds=600.0 if rate < 100 else 60.0, rate=rate)
+    assert watch(*data, rows=max(5, int(rate / 10)))[1] == []
+
+
+@pytest.mark.parametrize("deviation", [1.0, 3.0])
+@pytest.mark.parametrize("seed", range(2))
+def test_errors_that_persist_for_half_a_second_are_no_change(deviation: float, seed: int) -> None:
+    assert watch(*standard(constant(deviation), seed, persist_s=0.5), rows=50)[1] == []
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("size", [2.5, 4.0, 30.0])
+def test_step_is_found_within_two_seconds_and_dated_to_half_a_second(size: float, seed: int) -> None:
+    data = standard(lambda t: np.where(t >= 60.3, size, 1.0), seed, seconds=75.0)
+    [(change, found)] = watch(*data)[1]
+    assert change.kind == "sudden"
+    assert set(change.joints) == {0, 1, 2} if size > 3 else change.joints
+    assert 60.3 < found <= 62.3
+    assert abs(change.at - 60.3) <= 0.5
+
+
+def test_one_joint_is_named_alone() -> None:
+    t, z, *rest = standard(constant(1.0), 0, seconds=100.0)
+    z[t >= 50, 1] *= 5
+    [(change, _)] = watch(t, z, *rest)[1]
+    assert change.joints == (1,)
+    assert np.allclose(change.before.standardised, 1.0, atol=0.15)
+    assert change.after.standardised[1] > 10
+
+
+@pytest.mark.parametrize("deviation", [1.0, 3.0])
+def test_step_that_is_too_small_for_seconds_is_found_as_drift(deviation: float) -> None:
+    data = standard(lambda t: deviation * np.where(t >= 60, 1.8, 1.0), 1, seconds=120.0)
+    [(change, found)] = watch(*data)[1]
+    assert change.kind == "drift"
+    assert 65 < found < 85
+    assert abs(change.at - 60) < 3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_errors_that_grow_to_twice_in_five_minutes_are_a_drift(seed: int) -> None:
+    data = standard(lambda t: np.sqrt(1 + 3 * np.maximum(t - 60, 0) / 300), seed, seconds=300.0)
+    [(change, found)] = watch(*data, rows=50)[1]
+    assert change.kind == "drift"
+    # twice the old squared error is reached at 160 s and let pass
+    assert 160 < found < 260
+    assert change.before.rows >= 2000
+    assert (change.after.standardised > 1.8 * change.before.standardised).all()
+
+
+def test_errors_that_shrink_or_stay_within_what_is_stated_are_none() -> None:
+    assert watch(*standard(lambda t: np.where(t >= 60, 0.3, 3.0), 0, seconds=200.0), rows=50)[1] == []
+    assert watch(*standard(lambda t: np.where(t >= 60, 1.0, 0.1), 0, seconds=200.0), rows=50)[1] == []
+
+
+def test_what_a_model_has_learnt_to_predict_counts_as_its_reference() -> None:
+    def learning(t: np.ndarray) -> np.ndarray:
+        return np.select([t < 30, t < 300], [3.0, 1.0], 1.8)
+
+    alarms = watch(*standard(learning, 0, seconds=400.0), rows=50)[1]
+    assert [alarm.change.kind for alarm in alarms] == ["drift"]
+    assert abs(alarms[0].change.at - 300) < 3
+
+
+def test_one_alarm_until_acknowledged_then_the_new_state_is_the_reference() -> None:
+    t, z, *rest = standard(lambda t: np.select([t < 60, t < 120], [1.0, 5.0], 25.0), 0, seconds=200.0)
+    early, late = t < 90, t >= 90
+    detector, alarms = watch(t[early], z[early], *(r[early] for r in rest[:2]), rest[2])
+    assert len(alarms) == 1
+    fed = (t[late], z[late], *(r[late] for r in rest[:2]), rest[2])
+    assert watch(*fed, detector=detector)[1] == []
+    [(change, found)] = watch(*fed, detector=detector.acknowledged())[1]
+    assert 120 < found <= 122
+    assert change.before.standardised == pytest.approx([25.0] * 3, rel=0.2)
+
+
+def test_acknowledging_nothing_changes_nothing() -> None:
+    detector = watch(*standard(constant(1.0), 0, seconds=30.0))[0]
+    assert detector.acknowledged() is detector
+
+
+def test_tool_changed_in_a_pause_is_found() -> None:
+    t, z, *rest = standard(lambda t: np.where(t >= 60, 5.0, 1.0), 0, seconds=70.0)
+    t = np.where(t >= 60, t + 3600, t)
+    [(change, found)] = watch(t, z, *rest)[1]
+    assert change.kind == "sudden"
+    assert found - 3660 <= 2
+    assert change.at <= 3660
+
+
+def test_memory_is_bounded_and_the_past_does_not_change() -> None:
+    t, z, mean, std, noise = standard(constant(1.0), 0, seconds=100.0, rate=100.0)
+    detector, _ = watch(t, z, mean, std, noise)
+    size, before = len(detector.buckets), detector.buckets
+    following, _ = watch(t + 100, z, mean, std, noise, detector=detector)
+    assert len(following.buckets) == size <= 50
+    assert detector.buckets is before
+
+
+def test_records_of_other_times_and_of_no_rows_are_taken() -> None:
+    detector, _ = watch(*standard(constant(1.0), 0, seconds=30.0))
+    assert detector.step(Record.empty(3), 99.0) == (detector, None)
+    late, change = detector.step(Record.of(*(np.zeros((50, 3)),) * 3, np.ones(3)), 1.0)
+    assert change is None
+    assert late.open is not None
+    assert late.open.end >= detector.buckets[-1].end
+
+
+# a Panda judged by its own rigid-body dynamics, with a gripper of 50 g that the model does not know and owns up to
+
+RATE = 50.0
+NOISE = np.full(7, 0.05)
+PLAIN = Stream(n_samples=int(60 * RATE), rate=RATE, speed=5, noise=0.05)
+GRIPPER = Payload(0.05)
+
+
+@pytest.fixture(scope="module")
+def panda() -> Robot:
+    return load_robot("panda")
+
+
+def judged(robot: Robot, stream: Stream, seed: int = 0) -> tuple[np.ndarray, ...]:
+    """t, dq, tau, mean, std of a stream; std is the root mean square of what the unknown gripper weighs."""
+    samples = simulate(robot, stream, seed)
+    mean = inverse_dynamics(robot, samples.q, samples.dq, samples.ddq)
+    weight = inverse_dynamics(robot, samples.q, samples.dq, samples.ddq, np.ones(len(samples)), GRIPPER) - mean
+    samples.tau[:] += weight
+    std = np.broadcast_to(np.sqrt((weight**2).mean(axis=0)), mean.shape)
+    return samples.t, samples.dq, samples.tau, mean, std
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_constant_ignorance_of_a_panda_raises_no_alarm(panda: Robot, seed: int) -> None:
+    t, _, tau, mean, std = judged(panda, replace(PLAIN, n_samples=15_000), seed)
+    assert watch(t, tau, mean, std, NOISE)[1] == []
+
+
+@pytest.mark.parametrize("mass", [0.5, 2.0])
+def test_payload_is_found_within_three_seconds_and_does_not_look_like_friction(panda: Robot, mass: float) -> None:
+    t, dq, tau, mean, std = judged(panda, replace(PLAIN, payload=Payload(mass, at=40.0)))
+    [(change, found)] = watch(t, tau, mean, std, NOISE)[1]
+    assert change.kind == "sudden"
+    assert 40 < found <= 43
+    assert abs(change.at - 40) <= 1
+    assert {1, 3} <= set(change.joints)  # those that carry weight
+    after = (t >= change.at) & (t < change.at + 10)
+    share = friction_share(dq[after], (tau - mean)[after])
+    assert suspect(share, change.joints) == "payload or contact"
+
+    evidence = json.loads(json.dumps(change.evidence(panda.joint_names, share), allow_nan=False))
+    assert evidence["kind"] == "sudden"
+    assert evidence["suspect"] == "payload or contact"
+    assert "panda_joint2" in evidence["joints"]
+    second = evidence["per_joint"]["panda_joint2"]
+    assert second["standardised"]["after"] > 4 * second["standardised"]["before"]
+    assert second["rmse"]["after"] > second["rmse"]["before"]
+    assert abs(second["innovation"]["after"]) > abs(second["innovation"]["before"])
+    assert 0 <= second["friction_share"] <= 1
+
+
+def test_friction_that_grows_slowly_is_found_and_looks_like_friction(panda: Robot) -> None:
+    stream = replace(PLAIN, n_samples=12_000)
+    t, dq, tau, mean, std = judged(panda, stream)
+    worn = np.clip((t - 40) / 200, 0, None)[:, None]
+    tau = tau + worn * (0.8 * dq + 0.6 * np.sign(dq))
+    [(change, found)] = watch(t, tau, mean, std, NOISE)[1]
+    assert change.kind == "drift"
+    assert 50 < found < 160
+    after = (t >= found - 10) & (t < found)
+    share = friction_share(dq[after], (tau - mean)[after])
+    assert suspect(share, change.joints) == "friction"
+    assert change.evidence(panda.joint_names, share)["suspect"] == "friction"
+
+
+def test_collision_of_half_a_second_is_no_change_whether_gated_or_too_soft_to_be(panda: Robot) -> None:
+    t, _, tau, mean, std = judged(panda, PLAIN)
+    push = (t >= 40) & (t < 40.5)
+    for force, passing in ((0.3, 24), (5.0, 0)):
+        pushed = tau.copy()
+        pushed[push, 2] += force
+        free = ~is_contact(pushed, mean, std, NOISE, 8.0)
+        assert free[push].sum() == passing
+        assert watch(t[free], pushed[free], mean[free], std[free], NOISE)[1] == []
+
+
+def test_single_glitch_is_no_change(panda: Robot) -> None:
+    t, _, tau, mean, std = judged(panda, PLAIN)
+    tau[2000] += 1000.0
+    assert watch(t, tau, mean, std, NOISE)[1] == []
+
+
+def test_friction_share_of_pure_friction_is_whole_and_of_weight_and_noise_none() -> None:
+    rng = np.random.default_rng(0)
+    dq = rng.uniform(-1, 1, (2000, 4))
+    error = np.column_stack(
+        [0.3 * dq[:, 0] + 0.5 * np.sign(dq[:, 0]) + 2, np.full(2000, 3.0), *rng.normal(size=(2, 2000))]
+    )
+    share = friction_share(dq, error)
+    assert share[0] == pytest.approx(1.0)
+    assert share[1] == 0.0
+    assert (share[2:] < 0.01).all()
+    assert friction_share(dq[:19], error[:19]).tolist() == [0.0] * 4
+    # half of the variance is noise
+    mixed = np.sign(dq) + rng.normal(size=dq.shape)
+    assert np.allclose(friction_share(dq, mixed), 0.5, atol=0.06)
+
+
+def test_a_standing_joint_shows_no_friction() -> None:
+    error = np.random.default_rng(1).normal(size=(200, 1))
+    assert friction_share(np.zeros((200, 1)), error)[0] < 0.05
+
+
+def test_evidence_without_friction_names_no_suspect_and_unknown_figures_are_null() -> None:
+    still = Record.of(np.ones((50, 1)), np.zeros((50, 1)), np.ones((50, 1)), np.ones(1))
+    evidence = Change(5.0, (0,), still, still, "drift").evidence(("j1",))
+    assert "suspect" not in evidence
+    assert evidence["per_joint"]["j1"]["nmse"] == {"before": None, "after": None}
+    assert evidence["rows"] == {"before": 50, "after": 50}

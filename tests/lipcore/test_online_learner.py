@@ -1,0 +1,249 @@
+"""A model that learns, against dense references: late rows, forgetting, changes, and what it must refuse."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from lipcore import FitOptions, TorqueModel, save, train
+from lipcore.compact.posterior import CompactPosterior
+from lipcore.motion import Motion
+from lipcore.online import state
+from lipcore.online.batch import LEARNT, Rows
+from lipcore.online.learner import ForgottenError, OnlineModel
+from lipcore.online.revision import Revision
+from lipcore.posterior import ExactPosterior
+from lipcore.robots import load_robot
+from lipcore.samples import Samples
+from lipcore.simulation import Payload, Stream, simulate
+from tests.lipcore.online_checks import as_rows, same_answers
+
+ROBOT = "double-pendulum"
+OPTIONS = FitOptions(hyperparameter_samples=60, max_iterations=60, starts=1, device="cpu")
+STREAM = Stream(n_samples=120, speed=10, noise=0.02, viscous=0.1)
+
+
+def recorded(seed: int, **changes: object) -> Samples:
+    return simulate(load_robot(ROBOT), replace(STREAM, **changes), seed=seed)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def base() -> TorqueModel:
+    return train(recorded(1), ("revolute",) * 2, options=OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def rows() -> Rows:
+    return as_rows(recorded(2))
+
+
+def regression(
+    posterior: CompactPosterior, motion: Motion, tau: np.ndarray, weights: np.ndarray, centre: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of the whitened variables by conditioning on all torques, in the space of the torques."""
+    features = posterior.basis.features(motion).numpy()
+    prior = posterior.kernel.variance(posterior.params, motion).diagonal(dim1=1, dim2=2).numpy()
+    open_ = np.maximum(prior.reshape(-1) - np.square(features).sum(0), 0.0)
+    # the linear terms' features explain their share of the prior exactly
+    noise = np.tile(posterior.noise_variance.numpy(), len(motion)) + open_
+    gram = features.T @ features + np.diag(noise / np.repeat(weights, motion.n_joints))
+    gain = features @ np.linalg.inv(gram)
+    mean = centre + gain @ (tau.reshape(-1) - features.T @ centre)
+    return mean, np.eye(len(centre)) - gain @ features.T
+
+
+def assert_solution(online: OnlineModel, mean: np.ndarray, covariance: np.ndarray, tolerance: float = 1e-6) -> None:
+    found = online.now.solve()
+    np.testing.assert_allclose(found.mean.numpy(), mean, rtol=0, atol=tolerance * np.abs(mean).max())
+    spread = np.eye(len(mean)) - (found.learnt.T @ found.learnt).numpy()
+    np.testing.assert_allclose(spread, covariance, rtol=0, atol=tolerance)
+
+
+def test_learning_is_the_posterior_of_all_samples_old_and_new(base: TorqueModel, rows: Rows) -> None:
+    old = recorded(1)
+    motion = Samples.concatenate([old, recorded(2)]).motion()
+    tau = np.concatenate([old.tau, rows.tau])
+    zeros = np.zeros(len(base.posterior.basis))
+    expected = regression(base.posterior, motion, tau, np.ones(len(motion)), zeros)
+    assert_solution(OnlineModel.start(base).learn(rows), *expected)
+
+
+def test_where_the_basis_reaches_it_is_the_exact_gaussian_process(base: TorqueModel, rows: Rows) -> None:
+    old, posterior = recorded(1), base.posterior
+    motion = Samples.concatenate([old, recorded(2)]).motion()
+    tau = torch.from_numpy(np.concatenate([old.tau, rows.tau]))
+    exact = ExactPosterior.fit(posterior.kernel, posterior.params, motion, tau, posterior.std_factor)
+    answer, expected = OnlineModel.start(base).learn(rows).model(), exact.predict(rows.motion())
+    found = answer.predict(rows.q, rows.dq, rows.ddq)
+    off = np.abs(found.tau - expected.mean.numpy()) / expected.std.numpy()
+    assert off.max() < 0.1
+    assert (found.tau_std / expected.std.numpy()).max() < 1.1
+
+
+def test_forgetting_weighs_rows_by_their_age_and_keeps_the_mean_of_the_version(base: TorqueModel, rows: Rows) -> None:
+    began, forgetting = float(rows.time.min()), 4.0
+    online = OnlineModel.start(base, forgetting, since=began).learn(rows)
+    posterior = base.posterior
+    age = rows.time.max() - rows.time
+    # the version's own samples: pseudo-observations whose sums are those of the version, centred on its mean
+    factor = np.exp(-(rows.time.max() - began) / forgetting)
+    centre = (posterior.basis.root.T @ posterior.weights).numpy()
+    assert posterior.statistics is not None
+    old = factor * posterior.statistics.a.numpy()
+    values, vectors = np.linalg.eigh(old)
+    scale = np.sqrt(np.maximum(values, 0.0))
+    features = posterior.basis.features(rows.motion()).numpy()
+    prior = posterior.kernel.variance(posterior.params, rows.motion()).diagonal(dim1=1, dim2=2).numpy()
+    open_ = np.maximum(prior.reshape(-1) - np.square(features).sum(0), 0.0)
+    precision = np.repeat(np.exp(-age / forgetting), 2) / (np.tile(posterior.noise_variance.numpy(), len(rows)) + open_)
+    design = np.concatenate([(vectors * scale).T, features.T * np.sqrt(precision)[:, None]])
+    target = np.concatenate([(vectors * scale).T @ centre, rows.tau.reshape(-1) * np.sqrt(precision)])
+    covariance = np.linalg.inv(np.eye(len(centre)) + design.T @ design)
+    mean = covariance @ (centre + design.T @ target)
+    assert_solution(online, mean, covariance, 1e-5)
+
+
+def test_what_is_forgotten_entirely_leaves_its_mean_with_the_priors_uncertainty(base: TorqueModel, rows: Rows) -> None:
+    online = OnlineModel.start(base, 0.01, since=float(rows.time.min())).learn(rows)
+    far = base.predict(rows.q[:20], rows.dq[:20], rows.ddq[:20])
+    found = online.model().predict(rows.q[:20], rows.dq[:20], rows.ddq[:20])
+    assert (found.tau_std > 5 * far.tau_std).mean() > 0.9
+    scale = np.abs(far.tau).mean(0)
+    assert (np.abs(found.tau - far.tau).mean(0) < 0.5 * scale).all()  # zero would be off by all of it
+
+
+def test_a_changed_robot_is_learnt_anew_around_what_was_known(base: TorqueModel, rows: Rows) -> None:
+    heavier = recorded(3, payload=Payload(2.0))
+    known = OnlineModel.start(base).learn(rows)
+    changed = known.change(5000.0)
+    loaded = as_rows(heavier, 5001.0)
+    learnt = changed.learn(loaded)
+    centre = known.now.solve().mean.numpy()
+    expected = regression(base.posterior, heavier.motion(), heavier.tau, np.ones(len(loaded)), centre)
+    assert_solution(learnt, *expected)
+
+    unseen = recorded(4, payload=Payload(2.0), noise=0.0)
+    errors = {}
+    few = loaded.take(slice(0, 15))
+    for name, online in (("as before", known), ("anew", changed.learn(few)), ("on top", known.learn(few))):
+        errors[name] = np.mean((online.model().predict(unseen.q, unseen.dq, unseen.ddq).tau - unseen.tau) ** 2)
+    assert errors["anew"] < 0.2 * errors["as before"]
+    assert errors["anew"] < 0.2 * errors["on top"]
+    honest = learnt.model().predict(unseen.q, unseen.dq, unseen.ddq)
+    assert (np.abs(honest.tau - unseen.tau) < 1.96 * honest.tau_std).mean() > 0.8
+
+
+def test_rows_that_come_after_a_change_but_are_from_before_it_move_what_it_started_from(
+    base: TorqueModel, rows: Rows
+) -> None:
+    early, late = rows.take(slice(0, 60)), rows.take(slice(60, None))
+    new = as_rows(recorded(3, payload=Payload(2.0)), 5001.0)
+    in_time = OnlineModel.start(base).learn(rows).change(5000.0).learn(new)
+    too_late = OnlineModel.start(base).learn(early).change(5000.0).learn(new).learn(late)
+    same_answers(too_late.model(), in_time.model(), new, 1e-7)
+    same_answers(
+        too_late.unlearn(late).model(),
+        OnlineModel.start(base).learn(early).change(5000.0).learn(new).model(),
+        new,
+        1e-6,
+    )
+
+
+def test_a_row_belongs_to_one_regime_for_good(base: TorqueModel, rows: Rows) -> None:
+    """A change is noticed after it began: rows learnt meanwhile stay where they were, and can be taken back."""
+    online = OnlineModel.start(base).learn(rows).change(float(rows.time[30]))
+    assert online.now.begins > rows.time.max()
+    assert online.before is not None
+    assert online.unlearn(rows).before is not None
+    again = online.unlearn(rows).before
+    assert again is not None
+    assert abs(again.statistics.samples) < 1e-9
+
+
+def test_what_two_changes_have_passed_over_cannot_be_taken_back(base: TorqueModel, rows: Rows) -> None:
+    online = OnlineModel.start(base).learn(rows).change(5000.0).change(6000.0)
+    with pytest.raises(ForgottenError, match="two changes have come since"):
+        online.unlearn(rows)
+    same_answers(online.learn(rows).model(), online.model(), rows, 0.0)
+
+
+def test_novel_rows_are_told_and_stay_uncertain(base: TorqueModel) -> None:
+    seen = as_rows(recorded(1))
+    beyond = as_rows(recorded(5, motion="full"))
+    online = OnlineModel.start(base)
+    assert online.novel(seen).mean() < 0.02
+    novel = online.novel(beyond)
+    assert novel.mean() > 0.3
+    learnt = online.learn(beyond).model().predict(beyond.q, beyond.dq, beyond.ddq)
+    noise = base.noise_std
+    # the basis cannot hold what they say: however often they come, the answer there says that it does not know
+    for _ in range(20):
+        online = online.learn(beyond)
+    often = online.model().predict(beyond.q, beyond.dq, beyond.ddq)
+    assert (often.tau_std[novel] > noise).any(axis=1).all()
+    error = np.abs(learnt.tau - beyond.tau)
+    assert (error < 1.96 * np.sqrt(learnt.tau_std**2 + noise**2)).mean() > 0.9
+
+
+def test_certainty_is_never_below_the_floor(base: TorqueModel, rows: Rows) -> None:
+    floor = np.array([0.04, 1e-12])
+    plain = OnlineModel.start(base).learn(rows).model()
+    online = OnlineModel.start(base).learn(rows).model(floor)
+    one = np.array([rows.q[0], rows.dq[0], rows.ddq[0]])
+    tau, std = online.answer(one)
+    expected = plain.predict(rows.q, rows.dq, rows.ddq, covariance=True)
+    found = online.predict(rows.q, rows.dq, rows.ddq, covariance=True)
+    assert std is not None
+    assert np.array_equal(found.tau, expected.tau)
+    np.testing.assert_allclose(found.tau_std, np.maximum(expected.tau_std, np.sqrt(floor)), rtol=1e-12)
+    np.testing.assert_allclose(std, found.tau_std[0], rtol=0, atol=0)
+    assert found.covariance is not None
+    assert (np.linalg.eigvalsh(found.covariance) > 0).all()
+    dense = online.posterior.predict(rows.motion())
+    np.testing.assert_allclose(found.covariance, dense.covariance.numpy(), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(tau, dense.mean[0].numpy(), rtol=1e-7)
+
+
+@pytest.mark.parametrize("forgetting", [0.0, -1.0, float("inf"), float("nan")])
+def test_forgetting_times_that_are_none_are_refused(base: TorqueModel, forgetting: float) -> None:
+    with pytest.raises(ValueError, match="forgetting_s is"):
+        OnlineModel.start(base, forgetting)
+    with pytest.raises(ValueError, match="forgetting_s is"):
+        OnlineModel.start(base).with_forgetting(forgetting)
+
+
+def test_what_has_learnt_is_neither_a_start_nor_a_version(base: TorqueModel, rows: Rows, tmp_path: object) -> None:
+    learnt = OnlineModel.start(base).learn(rows).model()
+    with pytest.raises(ValueError, match="learnt online already"):
+        OnlineModel.start(learnt)
+    with pytest.raises(ValueError, match="expected one as trained"):
+        save(learnt, tmp_path / "never")  # type: ignore[operator]
+
+
+def test_state_of_another_version_or_damaged_is_refused(base: TorqueModel, rows: Rows) -> None:
+    payload = state.dump(OnlineModel.start(base).learn(rows))
+    other = replace(base, posterior=replace(base.posterior, weights=base.posterior.weights + 1))
+    with pytest.raises(ValueError, match="another version"):
+        state.load(other, payload)
+    for broken in (b"", payload[:-10], b"x" * 100, payload[:8] + b"[" + payload[9:]):
+        with pytest.raises(ValueError, match=r"no state|expected|another"):
+            state.load(base, broken)
+
+
+def test_revision_of_another_basis_is_refused(base: TorqueModel, rows: Rows) -> None:
+    found = Revision.of(OnlineModel.start(base).learn(rows).model())
+    with pytest.raises(ValueError, match="weights has shape"):
+        replace(found, weights=found.weights[:-1]).apply(base)
+    with pytest.raises(ValueError, match="packed has shape"):
+        replace(found, packed=found.packed[:-1]).apply(base)
+
+
+def test_rows_of_differing_shapes_are_refused(rows: Rows) -> None:
+    with pytest.raises(ValueError, match="tau has shape"):
+        replace(rows, tau=rows.tau[:-1])
+    with pytest.raises(ValueError, match="code has shape"):
+        replace(rows, code=np.zeros(3, np.uint8))
+    assert (rows.code == LEARNT).all()

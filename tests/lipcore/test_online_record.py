@@ -1,0 +1,165 @@
+"""Prequential records: figures of all rows at once, however the rows were cut up."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields
+from functools import reduce
+from itertools import pairwise
+from operator import add
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lipcore.metrics import evaluate
+from lipcore.online.record import Record
+
+Rows = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+@st.composite
+def rows(draw: st.DrawFn, most: int = 30) -> Rows:
+    """Torques far from zero beside small errors, as the weight of an arm has them."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    shape = (draw(st.integers(1, most)), 3)
+    gravity, scale = draw(st.floats(-1e4, 1e4)), draw(st.floats(1e-3, 1e3))
+    tau = gravity + scale * rng.standard_normal(shape)
+    mean = tau + rng.uniform(0, 3, 3) * rng.standard_normal(shape)
+    return tau, mean, rng.uniform(0.0, 2.0, shape), rng.uniform(0.1, 1.0, 3)
+
+
+def cut(data: Rows, bounds: list[int]) -> list[Record]:
+    tau, mean, std, noise = data
+    return [Record.of(tau[a:b], mean[a:b], std[a:b], noise) for a, b in pairwise([0, *bounds, len(tau)])]
+
+
+def assert_same(a: Record, b: Record, scale: float = 1.0) -> None:
+    assert a.rows == b.rows
+    for f in fields(Record):
+        assert np.allclose(getattr(a, f.name), getattr(b, f.name), rtol=1e-11, atol=1e-13 * scale), f.name
+
+
+@given(data=rows(), at=st.lists(st.integers(0, 30), max_size=4))
+@settings(deadline=None)
+def test_sum_of_parts_is_the_record_of_all_rows_at_once(data: Rows, at: list[int]) -> None:
+    bounds = sorted(min(each, len(data[0])) for each in at)
+    whole, summed = Record.of(*data), reduce(add, cut(data, bounds), Record.empty(3))
+    assert_same(summed, whole, scale=1 + np.abs(data[0]).max())
+
+
+@given(a=rows(), b=rows(), c=rows())
+@settings(deadline=None)
+def test_addition_is_associative_and_commutative_and_the_empty_record_adds_nothing(a: Rows, b: Rows, c: Rows) -> None:
+    x, y, z = Record.of(*a), Record.of(*b), Record.of(*c)
+    scale = 1 + max(np.abs(each[0]).max() for each in (a, b, c)) ** 2
+    assert_same((x + y) + z, x + (y + z), scale)
+    assert_same(x + y, y + x, scale)
+    assert_same(x + Record.empty(3), x)
+    assert_same(Record.empty(3) + x, x)
+
+
+@given(data=rows(most=60), at=st.integers(0, 60))
+@settings(deadline=None)
+def test_figures_are_those_of_the_metrics_of_the_same_rows(data: Rows, at: int) -> None:
+    record, expected = reduce(add, cut(data, [min(at, len(data[0]))])), evaluate(*data)
+    assert np.allclose(record.rmse, expected.rmse, rtol=1e-12, atol=0)
+    assert np.allclose(record.coverage, expected.coverage, rtol=1e-12, atol=0)
+    assert np.allclose(record.nlpd, expected.nlpd, rtol=1e-12, atol=1e-12)
+    # means of torques of 1e4 that differ by 1e-3 have themselves only so many digits
+    digits = 1e-12 + 1e-14 * np.abs(data[0]).max() / np.maximum(data[0].std(axis=0), 1e-300)
+    known = ~np.isnan(expected.nmse)
+    assert (np.abs(record.nmse[known] / expected.nmse[known] - 1) <= digits[known]).all()
+    assert (np.isnan(record.nmse) == np.isnan(expected.nmse)).all()
+
+
+def test_means_equal_hand_computed_values() -> None:
+    tau, mean = np.array([[1.0], [3.0]]), np.array([[1.5], [1.0]])
+    record = Record.of(tau, mean, np.array([[0.3], [0.0]]), np.array([0.4]))
+    assert record.error.tolist() == [0.75]
+    assert record.squared.tolist() == [2.125]
+    assert (record.mean.tolist(), record.spread.tolist()) == ([2.0], [1.0])
+    # ±1.96 · 0.5 holds −0.5; ±1.96 · 0.4 does not hold 2
+    assert record.inside.tolist() == [0.5]
+    assert record.standardised[0] == pytest.approx((0.25 / 0.25 + 4.0 / 0.16) / 2)
+    assert record.variance[0] == pytest.approx(0.045)
+    assert record.noise[0] == pytest.approx(0.16)
+
+
+def test_weight_of_an_arm_does_not_cancel() -> None:
+    rng = np.random.default_rng(0)
+    tau = 1e6 + 1e-3 * rng.standard_normal((100_000, 1))
+    flat, noise = np.full_like(tau, 1e6), np.ones(1)
+    parts = [Record.of(tau[k : k + 10], flat[k : k + 10], 0 * flat[k : k + 10], noise) for k in range(0, 100_000, 10)]
+    assert reduce(add, parts).spread[0] == pytest.approx(tau.var(), rel=1e-6)
+
+
+# the mean of seven times 0.1 is not 0.1
+def test_torque_that_does_not_vary_has_no_nmse_in_parts_either() -> None:
+    tau = np.full((12, 1), 0.1)
+    parts = [Record.of(tau[a:b], tau[a:b] + 1, 0 * tau[a:b], np.ones(1)) for a, b in ((0, 7), (7, 12))]
+    assert np.isnan((parts[0] + parts[1]).nmse[0])
+    assert (parts[0] + parts[1]).metrics()["nmse"] == [None]
+
+
+def test_json_gives_back_every_bit() -> None:
+    rng = np.random.default_rng(1)
+    record = Record.of(*rng.standard_normal((3, 40, 4)), np.ones(4))
+    back = Record.from_json(json.loads(json.dumps(record.to_json(), allow_nan=False)))
+    assert back.rows == 40
+    for f in fields(Record):
+        assert np.array_equal(getattr(back, f.name), getattr(record, f.name))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"nlpd": None}, "record has nlpd None"),
+        ({"nlpd": [1.0]}, r"record has nlpd \[1.0\], expected one finite number a joint"),
+        ({"noise": [1.0, float("nan")]}, "record has noise"),
+        ({"rows": -1}, "record has rows -1, expected an integer of at least 0"),
+        ({"rows": 1.5}, "record has rows 1.5"),
+    ],
+    ids=str,
+)
+def test_damaged_json_is_refused_by_name(change: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Record.from_json(Record.empty(2).to_json() | change)
+
+
+def test_lacking_json_is_refused_by_name() -> None:
+    values = Record.empty(2).to_json()
+    del values["spread"]
+    with pytest.raises(ValueError, match="record lacks spread"):
+        Record.from_json(values)
+
+
+def test_no_rows_make_the_empty_record_of_which_nothing_is_known() -> None:
+    nothing = np.zeros((0, 2))
+    record = Record.of(nothing, nothing, nothing, np.ones(2))
+    assert (record.rows, record.n_joints) == (0, 2)
+    assert all(values == [None, None] for values in record.metrics().values())
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        (0, np.zeros(2), r"tau has shape \(2,\), expected \(N, n\)"),
+        (1, np.zeros((3, 1)), r"mean has shape \(3, 1\), expected \(3, 2\) as tau has"),
+        (2, np.full((3, 2), np.nan), "std has values that are not finite"),
+        (3, np.ones(3), r"noise_std has shape \(3,\), expected \(2,\)"),
+        (3, np.zeros(2), "std and noise_std are both 0"),
+    ],
+    ids=str,
+)
+def test_rows_that_would_spoil_every_sum_are_refused(place: int, value: np.ndarray, message: str) -> None:
+    data = [np.zeros((3, 2)), np.zeros((3, 2)), np.zeros((3, 2)), np.ones(2)]
+    data[place] = value
+    with pytest.raises(ValueError, match=message):
+        Record.of(*data)
+
+
+def test_records_of_other_joints_do_not_add() -> None:
+    with pytest.raises(ValueError, match="records of 2 and 3 joints do not add"):
+        _ = Record.empty(2) + Record.empty(3)

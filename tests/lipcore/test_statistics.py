@@ -1,0 +1,167 @@
+"""Sums over samples: their algebra, and what is solved from them against dense references in plain NumPy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lipcore.compact.basis import Basis
+from lipcore.compact.statistics import (
+    Statistics,
+    collect,
+    decay,
+    empty,
+    merge,
+    solve,
+    subtract,
+    update,
+)
+from lipcore.kernels.base import SumKernel
+from lipcore.kernels.friction import FrictionKernel
+from lipcore.linalg import NotPositiveDefiniteError
+from lipcore.motion import Motion
+from tests.lipcore.problems import random_problem
+
+TYPES = ("revolute", "prismatic", "revolute")
+NOISE = torch.tensor([0.04, 0.01, 0.09], dtype=torch.float64)
+
+
+def problem(seed: int, samples: int = 12) -> tuple[Basis, Motion, torch.Tensor]:
+    """A basis of fewer torques than there are samples, and samples that it does not cover entirely."""
+    found = random_problem(TYPES, samples, seed, "chain")
+    kernel = SumKernel(found.kernel, FrictionKernel(len(TYPES)))
+    basis = Basis.build(kernel, found.params, found.motion[:4], torch.tensor([0, 1, 3, 5, 8, 10]))
+    generator = torch.Generator().manual_seed(seed)
+    return basis, found.motion, torch.randn((samples, len(TYPES)), generator=generator, dtype=torch.float64)
+
+
+def same(one: Statistics, other: Statistics, tolerance: float = 1e-8) -> bool:
+    scale = float(other.a.abs().max()) + 1e-30
+    return (
+        torch.allclose(one.a, other.a, rtol=0, atol=tolerance * scale)
+        and torch.allclose(one.b, other.b, rtol=0, atol=tolerance * scale)
+        and abs(one.samples - other.samples) <= tolerance * max(1.0, other.samples)
+    )
+
+
+def dense(basis: Basis, motion: Motion, residual: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Φᵀ (N n, M), noise variances and residuals as NumPy arrays, sample by sample, one query at a time."""
+    rows, variances = [], []
+    for k in range(len(motion)):
+        one = motion[k : k + 1]
+        features = basis.features(one).numpy()
+        rows.append(features.T)
+        assert basis.term is not None
+        prior = basis.term.variance(basis.params, one)[0].diagonal().numpy()
+        open_ = prior - np.square(features[: len(basis.outputs)]).sum(0)
+        variances.append(NOISE.numpy() + np.maximum(open_, 0.0))
+    return np.concatenate(rows), np.concatenate(variances), residual.numpy().reshape(-1)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000), st.permutations(range(12)), st.lists(st.integers(1, 11), unique=True, max_size=4))
+def test_all_at_once_in_parts_in_any_order_and_one_by_one_are_the_same(
+    seed: int, order: list[int], cuts: list[int]
+) -> None:
+    basis, motion, residual = problem(seed)
+    whole = collect(basis, NOISE, motion, residual)
+    parts, one_by_one = empty(len(basis)), empty(len(basis))
+    edges = [0, *sorted(cuts), 12]
+    for first, last in pairwise(edges):
+        rows = torch.tensor(order[first:last])
+        parts = merge(collect(basis, NOISE, motion[rows], residual[rows]), parts)
+    for k in order:
+        one_by_one = update(one_by_one, basis, NOISE, motion[k : k + 1], residual[k : k + 1])
+    assert same(parts, whole)
+    assert same(one_by_one, whole)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
+def test_what_is_added_can_be_taken_back_and_ages_factor(seed: int, first: float, second: float) -> None:
+    basis, motion, residual = problem(seed)
+    one = collect(basis, NOISE, motion[:7], residual[:7])
+    other = collect(basis, NOISE, motion[7:], residual[7:])
+    assert same(subtract(merge(one, other), other), one)
+    assert same(decay(merge(one, other), first), merge(decay(one, first), decay(other, first)))
+    assert same(decay(decay(one, first), second), decay(one, first * second))
+
+
+def test_weights_are_repetitions() -> None:
+    basis, motion, residual = problem(3)
+    weights = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    rows = torch.tensor([0, 1, 1, 2, 2, 2])
+    assert same(
+        collect(basis, NOISE, motion[:3], residual[:3], weights), collect(basis, NOISE, motion[rows], residual[rows])
+    )
+
+
+def test_functions_leave_their_arguments_alone() -> None:
+    basis, motion, residual = problem(4)
+    statistics = collect(basis, NOISE, motion, residual)
+    a, b, asked = statistics.a.clone(), statistics.b.clone(), residual.clone()
+    merge(statistics, statistics), subtract(statistics, statistics), decay(statistics, 0.5), solve(statistics)
+    update(statistics, basis, NOISE, motion, residual)
+    assert torch.equal(statistics.a, a)
+    assert torch.equal(statistics.b, b)
+    assert torch.equal(residual, asked)
+
+
+def test_sums_are_those_of_every_sample_by_itself() -> None:
+    basis, motion, residual = problem(5)
+    rows, variances, values = dense(basis, motion, residual)
+    found = collect(basis, NOISE, motion, residual)
+    assert np.allclose(found.a.numpy(), rows.T @ (rows / variances[:, None]), rtol=1e-10, atol=1e-10)
+    assert np.allclose(found.b.numpy(), rows.T @ (values / variances), rtol=1e-10, atol=1e-10)
+    assert found.samples == 12
+    assert torch.equal(found.a, found.a.T)
+
+
+def test_large_products_are_symmetric_and_those_of_small_ones() -> None:
+    found = random_problem(TYPES, 100, 6, "chain")
+    basis = Basis.build(found.kernel, found.params, found.motion, torch.arange(300))  # more than one block
+    residual = torch.randn((100, 3), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    whole = collect(basis, NOISE, found.motion, residual)
+    features = basis.features(found.motion) * (
+        (NOISE + basis.uncovered(found.motion, basis.features(found.motion))).rsqrt().reshape(-1)
+    )
+    assert torch.allclose(whole.a, features @ features.T, rtol=1e-12, atol=1e-9)
+    assert torch.equal(whole.a, whole.a.T)
+
+
+def test_solution_is_that_of_bayesian_linear_regression() -> None:
+    basis, motion, residual = problem(7)
+    rows, variances, values = dense(basis, motion, residual)
+    centre = torch.randn(len(basis), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    found = solve(collect(basis, NOISE, motion, residual), centre)
+    # the dual form: conditioning on the N n values themselves
+    gram = rows @ rows.T + np.diag(variances)
+    gain = rows.T @ np.linalg.inv(gram)
+    assert np.allclose(found.mean.numpy(), centre.numpy() + gain @ (values - rows @ centre.numpy()), atol=1e-9)
+    covariance = np.eye(len(basis)) - gain @ rows
+    assert np.allclose((found.learnt.T @ found.learnt).numpy(), np.eye(len(basis)) - covariance, atol=1e-9)
+
+
+def test_without_data_the_prior_is_left() -> None:
+    found = solve(empty(5), torch.arange(5.0, dtype=torch.float64))
+    assert torch.equal(found.mean, torch.arange(5.0, dtype=torch.float64))
+    assert torch.equal(found.learnt, torch.zeros((5, 5), dtype=torch.float64))
+
+
+@pytest.mark.parametrize("factor", [-0.1, 1.1, float("nan")])
+def test_ages_that_are_none_are_refused(factor: float) -> None:
+    with pytest.raises(ValueError, match="factor is"):
+        decay(empty(2), factor)
+
+
+def test_statistics_of_no_samples_are_refused() -> None:
+    basis, motion, residual = problem(10)
+    statistics = collect(basis, NOISE, motion, residual)
+    with pytest.raises(NotPositiveDefiniteError, match="none below zero"):
+        solve(replace(statistics, a=statistics.a - torch.eye(len(basis), dtype=torch.float64)))
