@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from service import __version__, errors, health
 from service.context import Service
-from service.database import Database, DatasetRow, VersionRow
+from service.database import Database, DatasetRow, SnapshotRow, VersionRow
 from service.datasets import routes as datasets
 from service.files import Files
 from service.home import hold_home
@@ -32,6 +32,12 @@ from service.settings import Settings
 from service.stream import routes as stream
 from service.training import routes as training
 from service.training.queue import JobQueue
+from service.updates import routes as observations
+from service.updates.control import routes as control
+from service.updates.quality import metrics
+from service.updates.refreshing import routes as refreshing
+from service.updates.refreshing.wiring import attach
+from service.updates.updates import Updates
 
 logger = logging.getLogger(__name__)
 
@@ -59,6 +65,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         try:
             yield
         finally:
+            await to_thread.run_sync(service.updates.close)
             service.jobs.close()
             service.database.close()
             lock.close()
@@ -72,7 +79,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         lifespan=lifespan,
         redoc_url=None,
         # tried first, and not through an included router: 50 µs less a request
-        routes=[*inference.hot.routes, *echo.hot.routes, *oip.hot.routes],
+        routes=[*inference.hot.routes, *echo.hot.routes, *oip.hot.routes, *observations.hot.routes],
     )
     errors.install(app)
     app.add_middleware(
@@ -82,11 +89,14 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         max_request_bytes=settings.max_request_bytes,
     )
     app.include_router(health.router)
+    app.include_router(metrics.router)
     app.include_router(datasets.router)
     app.include_router(robots.router)
     app.include_router(training.router)
     app.include_router(models.router)
     app.include_router(inference.router)
+    app.include_router(control.router)
+    app.include_router(refreshing.router)
     app.include_router(oip.router)
     app.include_router(stream.router())
     return app
@@ -99,13 +109,17 @@ def _open(settings: Settings) -> Service:
     with database.session() as session:
         datasets_known = set(session.scalars(select(DatasetRow.id)))
         versions_known = set(session.scalars(select(VersionRow.folder)))
-    if swept := files.sweep(datasets_known, versions_known):
+        snapshots_known = set(session.scalars(select(SnapshotRow.id)))
+    if swept := files.sweep(datasets_known, versions_known, snapshots_known):
         logger.warning("removed %d unfinished files of an earlier run", swept)
     registry.install_shipped(database, files)
     loaded = LoadedModels(database, files, settings.max_loaded_models)
     logger.info("loaded %d models", loaded.preload())
-    jobs = JobQueue(settings, database, loaded.adopt)
+    jobs = JobQueue(settings, database, lambda model, _: loaded.adopt(model))
     if recovered := jobs.recover():
         logger.warning("queued again after an interruption: %s", ", ".join(recovered))
     limiter = CapacityLimiter(settings.max_concurrent_predictions)
-    return Service(settings, database, files, loaded, jobs, limiter)
+    updates = Updates(settings, database, files, loaded)
+    service = Service(settings, database, files, loaded, jobs, limiter, updates)
+    attach(service)
+    return service

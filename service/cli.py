@@ -226,7 +226,7 @@ def reproduce(context: typer.Context) -> None:
 
 @app.command(add_help_option=False, context_settings=_PASS_ON)
 def bench(context: typer.Context) -> None:
-    """Measure how long answers take: `lipserve bench latency --help`."""
+    """Measure latency, learning while serving, and what kills cost: `lipserve bench --help`."""
     from service.bench import command  # noqa: PLC0415 - the service does without it
 
     try:

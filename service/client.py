@@ -19,6 +19,16 @@ from service.robots.schema import Robot
 from service.settings import DEFAULT_URL
 from service.training.schema import Job
 from service.training.states import ACTIVE
+from service.updates.control.learning_schema import AlarmPage, Decided, Learning
+from service.updates.control.schema import (
+    ObservationDetail,
+    ObservationPage,
+    Quality,
+    Replayed,
+    RolledBack,
+    Unlearnt,
+)
+from service.updates.schema import ObservationResponse
 
 MEDIA_TYPES = {".csv": "text/csv", ".npz": "application/x-npz"}
 POLL_SECONDS = 0.3
@@ -173,6 +183,85 @@ class Client:
         if version is not None:
             body["version"] = version
         return EvaluateResponse.model_validate(self._send("POST", f"/v1/models/{model}/evaluate", json=body))
+
+    def observe(
+        self,
+        model: str,
+        stream_id: str,
+        sequence: int,
+        q: ArrayLike,
+        dq: ArrayLike,
+        tau: ArrayLike,
+        ddq: ArrayLike | None = None,
+        t: ArrayLike | None = None,
+        joint_names: Sequence[str] | None = None,
+    ) -> ObservationResponse:
+        """Teach a model with measured rows, arrays of shape (N, n) or (n,), times (N,); repeat it until it is answered.
+
+        A number that is not finite keeps its row out of learning. Raise ApiError where the batch is refused.
+        """
+        body: dict[str, Any] = {"stream_id": stream_id, "sequence": sequence}
+        for name, values in (("t", t), ("q", q), ("dq", dq), ("ddq", ddq), ("tau", tau)):
+            if values is not None:
+                numbers = np.asarray(values, dtype=np.float64)
+                shown = numbers.astype(object)
+                shown[~np.isfinite(numbers)] = None  # JSON has no such numbers
+                body[name] = shown.tolist()
+        if joint_names is not None:
+            body["joint_names"] = list(joint_names)
+        return ObservationResponse.model_validate(self._send("POST", f"/v1/models/{model}/observations", json=body))
+
+    def quality(self, model: str) -> Quality:
+        """How well a model predicts what it has not learnt yet, over sliding windows."""
+        return Quality.model_validate(self._send("GET", f"/v1/models/{model}/quality"))
+
+    def observations(
+        self, model: str, stream_id: str | None = None, rejected: bool = False, cursor: str | None = None
+    ) -> ObservationPage:
+        """One page of the batches of a model's log, newest first; cursor: `next_cursor` of the page before."""
+        given = {"stream_id": stream_id, "cursor": cursor, "rejected": rejected or None}
+        params = {name: value for name, value in given.items() if value is not None}
+        return ObservationPage.model_validate(self._send("GET", f"/v1/models/{model}/observations", params=params))
+
+    def observation(self, model: str, stream_id: str, sequence: int, rows: bool = False) -> ObservationDetail:
+        """One batch, with its rows where asked for."""
+        path = f"/v1/models/{model}/observations/{stream_id}/{sequence}"
+        return ObservationDetail.model_validate(self._send("GET", path, params={"rows": rows}))
+
+    def unlearn(self, model: str, stream_id: str, sequence: int) -> Unlearnt:
+        """Take a batch out of what is learnt."""
+        return Unlearnt.model_validate(self._send("DELETE", f"/v1/models/{model}/observations/{stream_id}/{sequence}"))
+
+    def replay(self, model: str, stream_id: str, sequence: int, codes: Sequence[str] | None = None) -> Replayed:
+        """Learn rows of a batch after all that were kept out, by these codes or by any."""
+        path = f"/v1/models/{model}/observations/{stream_id}/{sequence}/replay"
+        body = {} if codes is None else {"codes": list(codes)}
+        return Replayed.model_validate(self._send("POST", path, json=body))
+
+    def rollback(self, model: str, revision: int | None = None, version: int | None = None) -> RolledBack:
+        """Go back to a revision of the version that serves, or to another version: name one of the two."""
+        given = {"revision": revision, "version": version}
+        body = {name: value for name, value in given.items() if value is not None}
+        return RolledBack.model_validate(self._send("POST", f"/v1/models/{model}/rollback", json=body))
+
+    def learning(self, model: str) -> Learning:
+        """How a model learns, and where that stands."""
+        return Learning.model_validate(self._send("GET", f"/v1/models/{model}/learning"))
+
+    def set_learning(self, model: str, **options: Any) -> Learning:
+        """Set how a model learns; options of `LearningOptions` by name, those left out keep their values."""
+        wanted = {**self.learning(model).options.model_dump(), **options}
+        return Learning.model_validate(self._send("PUT", f"/v1/models/{model}/learning", json=wanted))
+
+    def decide(self, model: str, decision: str, replay: bool = False) -> Decided:
+        """End a hold: `adapt` to the changed robot, or `ignore`. replay: learn the rows that were kept out since."""
+        body = {"decision": decision, "replay": replay}
+        return Decided.model_validate(self._send("POST", f"/v1/models/{model}/learning/change", json=body))
+
+    def alarms(self, model: str, cursor: str | None = None) -> AlarmPage:
+        """One page of a model's alarms, newest first."""
+        params = {} if cursor is None else {"cursor": cursor}
+        return AlarmPage.model_validate(self._send("GET", f"/v1/models/{model}/alarms", params=params))
 
     def _send(self, method: str, path: str, **request: Any) -> Any:
         try:

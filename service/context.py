@@ -13,6 +13,7 @@ from service.files import Files
 from service.inference.loaded import LoadedModels
 from service.settings import Settings
 from service.training.queue import JobQueue
+from service.updates.updates import Updates
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class Service:
     loaded: LoadedModels
     jobs: JobQueue
     predictions: CapacityLimiter
+    updates: Updates
 
 
 async def _service(request: Request) -> Service:

@@ -8,7 +8,18 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import JSON, ForeignKey, String, create_engine, event, text
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    ForeignKey,
+    Index,
+    LargeBinary,
+    String,
+    UniqueConstraint,
+    create_engine,
+    event,
+    text,
+)
 from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column, sessionmaker
 
 BUSY_TIMEOUT_MS = 30_000
@@ -97,6 +108,128 @@ class VersionRow(Base):
     created_at: Mapped[str]
     job: Mapped[str | None]
     manifest: Mapped[dict[str, Any]]
+
+
+class ServingRow(Base):
+    """Which version of a model answers where none is named: the last that was trained, promoted or rolled back to.
+
+    change: goes up by one whenever that changes. A model without such a row is answered by its newest version.
+    """
+
+    __tablename__ = "serving"
+
+    model: Mapped[str] = mapped_column(ForeignKey("models.name"), primary_key=True)
+    version: Mapped[int]
+    change: Mapped[int]
+
+
+class LearnerRow(Base):
+    """How a version learns: it contains the model's events up to number `start` by training, later ones by updates.
+
+    role: "serving" or, while a refreshed version is compared with the one that serves, "candidate"; "dismissed" where
+    that one stayed better. A version without such a row starts at 0.
+    """
+
+    __tablename__ = "learners"
+
+    model: Mapped[str] = mapped_column(ForeignKey("models.name"), primary_key=True)
+    version: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    start: Mapped[int]
+    role: Mapped[str]
+
+
+class LearningRow(Base):
+    """How a model learns, as its owner has set it, and whether it holds still after a change."""
+
+    __tablename__ = "learning"
+
+    model: Mapped[str] = mapped_column(ForeignKey("models.name"), primary_key=True)
+    options: Mapped[dict[str, Any]]
+    held: Mapped[dict[str, Any] | None]
+
+
+class StreamRow(Base):
+    """A source of observations. Event time = its own time + offset, s.
+
+    kind: "batches" or "frames"; last: highest sequence seen; missing: ranges [first, last] of sequences below it that
+    have not come; forgotten: highest sequence whose batch is no longer kept, so that it cannot be known again.
+    """
+
+    __tablename__ = "streams"
+
+    model: Mapped[str] = mapped_column(ForeignKey("models.name"), primary_key=True)
+    stream_id: Mapped[str] = mapped_column(String(64), primary_key=True)
+    kind: Mapped[str]
+    offset: Mapped[float]
+    last: Mapped[int] = mapped_column(BigInteger)
+    missing: Mapped[dict[str, Any]]
+    forgotten: Mapped[int | None] = mapped_column(BigInteger)
+    created_at: Mapped[str]
+
+
+class EventRow(Base):
+    """One entry of a model's log: what came, and what became of it. The posterior is a function of these rows.
+
+    number: 1, 2, 3 … of its model, in the order of commits; kind: "batch", "replay", "unlearn", "rollback", "change" or
+    "settings"; sequence, last_sequence: of a batch, and of its last frame; digest: sha256 of what was sent; received:
+    Unix time, s; version, revision: that predicted the rows; rows, learnt: how many came and how many teach; first,
+    last: event times, s; void: unlearnt or rolled back; report: what the acknowledgement said; record: prequential
+    sums; detail: of the other kinds; payload: the rows.
+    """
+
+    __tablename__ = "events"
+    __table_args__ = (
+        UniqueConstraint("model", "number"),
+        UniqueConstraint("model", "stream_id", "sequence"),
+        Index("events_received", "model", "received"),
+    )
+
+    seq: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
+    model: Mapped[str] = mapped_column(ForeignKey("models.name"))
+    number: Mapped[int]
+    kind: Mapped[str]
+    stream_id: Mapped[str | None] = mapped_column(String(64))
+    sequence: Mapped[int | None] = mapped_column(BigInteger)
+    last_sequence: Mapped[int | None] = mapped_column(BigInteger)
+    digest: Mapped[str | None]
+    received: Mapped[float]
+    version: Mapped[int | None]
+    revision: Mapped[int | None]
+    rows: Mapped[int] = mapped_column(default=0)
+    learnt: Mapped[int] = mapped_column(default=0)
+    first: Mapped[float | None]
+    last: Mapped[float | None]
+    void: Mapped[bool] = mapped_column(default=False)
+    report: Mapped[dict[str, Any] | None]
+    record: Mapped[dict[str, Any] | None]
+    detail: Mapped[dict[str, Any] | None]
+    payload: Mapped[bytes | None] = mapped_column(LargeBinary, deferred=True)  # read only by who needs the rows
+
+
+class SnapshotRow(Base):
+    """What a version had learnt after event `number`; its file lies in the file store under `id`."""
+
+    __tablename__ = "snapshots"
+
+    seq: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
+    id: Mapped[str] = mapped_column(String(40), unique=True)
+    model: Mapped[str]
+    version: Mapped[int]
+    number: Mapped[int]
+    created_at: Mapped[str]
+
+
+class AlarmRow(Base):
+    """Something about a learning model that its owner should know, with the evidence."""
+
+    __tablename__ = "alarms"
+
+    seq: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
+    model: Mapped[str] = mapped_column(ForeignKey("models.name"))
+    kind: Mapped[str]
+    at: Mapped[str]
+    message: Mapped[str]
+    evidence: Mapped[dict[str, Any]]
 
 
 class Database:

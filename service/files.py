@@ -1,4 +1,5 @@
-"""Files of the service below its home: samples of data sets, folders of model versions, uploads in progress.
+"""Files of the service below its home: samples of data sets, folders of model versions, snapshots of what was learnt,
+uploads in progress.
 
 A file is visible only once a database row names it, and the row is written after the file is complete.
 """
@@ -31,19 +32,14 @@ class Files:
 
     def __init__(self, home: Path) -> None:
         self.datasets, self.versions, self.uploads = home / "datasets", home / "versions", home / "uploads"
-        for folder in (self.datasets, self.versions, self.uploads):
+        self.learning = home / "learning"
+        for folder in (self.datasets, self.versions, self.uploads, self.learning):
             folder.mkdir(parents=True, exist_ok=True)
 
     def write_samples(self, dataset: str, samples: Samples) -> str:
         """Store samples durably under a new id; return their sha256."""
         payload = save_arrays({name: np.ascontiguousarray(getattr(samples, name)) for name in ARRAYS})
-        path = self.datasets / f"{dataset}.safetensors"
-        draft = path.with_suffix(".draft")
-        with draft.open("wb") as file:
-            file.write(payload)
-            file.flush()
-            os.fsync(file.fileno())
-        draft.rename(path)
+        _write(self.datasets / f"{dataset}.safetensors", payload)
         return hashlib.sha256(payload).hexdigest()
 
     def read_samples(self, dataset: str, joint_names: list[str]) -> Samples:
@@ -55,17 +51,46 @@ class Files:
         """Delete samples; nothing happens where there are none."""
         (self.datasets / f"{dataset}.safetensors").unlink(missing_ok=True)
 
+    def write_snapshot(self, snapshot: str, payload: bytes) -> None:
+        """Store what a version has learnt durably under a new id."""
+        _write(self.learning / f"{snapshot}.safetensors", payload)
+
+    def read_snapshot(self, snapshot: str) -> bytes:
+        """Read what is stored under `snapshot`."""
+        return (self.learning / f"{snapshot}.safetensors").read_bytes()
+
+    def delete_snapshot(self, snapshot: str) -> None:
+        """Delete a snapshot; nothing happens where there is none."""
+        (self.learning / f"{snapshot}.safetensors").unlink(missing_ok=True)
+
     def upload(self) -> Path:
         """Create an empty temporary file for an upload; the caller deletes it."""
         handle, name = tempfile.mkstemp(dir=self.uploads)
         os.close(handle)
         return Path(name)
 
-    def sweep(self, datasets: set[str], versions: set[str]) -> int:
+    def sweep(self, datasets: set[str], versions: set[str], snapshots: set[str]) -> int:
         """Delete what an interrupted write left: files that no row names. Return how many."""
         left = list(self.uploads.iterdir())
         left += [path for path in self.datasets.iterdir() if path.name.removesuffix(".safetensors") not in datasets]
         left += [path for path in self.versions.iterdir() if path.name not in versions]
+        stored = (path for path in self.learning.iterdir() if path.is_file())
+        left += [path for path in stored if path.name.removesuffix(".safetensors") not in snapshots]
         for path in left:
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
         return len(left)
+
+
+def _write(path: Path, payload: bytes) -> None:
+    """Write a file that outlives a power cut, whole or not at all."""
+    draft = path.with_suffix(".draft")
+    with draft.open("wb") as file:
+        file.write(payload)
+        file.flush()
+        os.fsync(file.fileno())
+    draft.rename(path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)  # the new name, before a row tells of it
+    finally:
+        os.close(folder)

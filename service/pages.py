@@ -6,14 +6,14 @@ from typing import Annotated, TypeVar
 
 from fastapi import Depends, Query, Request
 from pydantic import BaseModel
-from sqlalchemy import select
+from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session
 
-from service.database import DatasetRow, JobRow, ModelRow, RobotRow
+from service.database import AlarmRow, DatasetRow, EventRow, JobRow, ModelRow, RobotRow
 from service.errors import invalid_request
 
 USUAL = 50
-Row = TypeVar("Row", DatasetRow, JobRow, ModelRow, RobotRow)
+Row = TypeVar("Row", AlarmRow, DatasetRow, EventRow, JobRow, ModelRow, RobotRow)
 
 
 class Page(BaseModel):
@@ -23,9 +23,11 @@ class Page(BaseModel):
     limit: int
 
 
-def newest(session: Session, table: type[Row], page: Page) -> tuple[list[Row], str | None]:
-    """Return the rows of a page, newest first, and the cursor of the page after it, None on the last."""
-    query = select(table).order_by(table.seq.desc()).limit(page.limit + 1)
+def newest(
+    session: Session, table: type[Row], page: Page, *conditions: ColumnElement[bool]
+) -> tuple[list[Row], str | None]:
+    """Return the rows of a page that meet all conditions, newest first, and the cursor after it, None on the last."""
+    query = select(table).where(*conditions).order_by(table.seq.desc()).limit(page.limit + 1)
     if page.after is not None:
         query = query.where(table.seq < page.after)
     rows = list(session.scalars(query))

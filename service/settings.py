@@ -79,6 +79,38 @@ class Settings(BaseSettings):
     max_queued_jobs: Count = Field(100, description="Most jobs that may wait; more are answered 429.")
     max_loaded_models: Count = Field(4, description="Model versions kept in memory, about 100 MB each at 500 samples.")
 
+    max_observation_rows: Count = Field(5000, description="Most samples of one observation batch.")
+    max_observation_streams: Count = Field(1000, description="Most sources of observations of one model.")
+    stream_flush_rows: Count = Field(100, description="Frames of a stream that are logged together, at most.")
+    stream_flush_s: float = Field(0.1, gt=0, description="Longest wait in s of a frame to learn from for others.")
+    max_velocity: float = Field(50.0, gt=0, description="Largest |dq| in rad/s or m/s that is learnt from.")
+    max_acceleration: float = Field(2000.0, gt=0, description="Largest |ddq| in rad/s² or m/s² that is learnt from.")
+    max_time_gap_s: float = Field(1.0, gt=0, description="Step of time within a batch that is taken for a jump, s.")
+    stationary_speed: float = Field(
+        1e-3, ge=0, description="Speed of all joints, rad/s or m/s, below which a sample tells of stiction only."
+    )
+    contact_patience_s: float = Field(
+        2.0, gt=0, description="How long torques may be far off before it is no contact but a change of the robot."
+    )
+    observation_retention_bytes: Count = Field(1024 * MiB, description="Size of a model's log of observations.")
+    observation_retention_s: float = Field(30 * 86400.0, gt=0, description="Age up to which they are kept, s.")
+    snapshot_every_s: float = Field(30.0, gt=0, description="Seconds between two snapshots of a version's state.")
+    max_snapshots: int = Field(20, ge=2, description="Snapshots kept of a version: how far a rollback reaches.")
+    publish_every_s: float = Field(0.5, gt=0, description="Shortest time between two revisions of a version, s.")
+    max_learning_models: Count = Field(4, description="Versions whose statistics the learner process keeps in memory.")
+    learner_niceness: int = Field(5, ge=0, le=19, description="Niceness of the learner process.")
+    quality_windows_s: tuple[float, ...] = Field(
+        (60.0, 600.0, 3600.0), min_length=1, description="Windows of the prequential quality, s."
+    )
+    novelty_share: float = Field(
+        0.2, gt=0, le=1, description="Share of samples beyond the basis at which a version is refreshed."
+    )
+    novelty_rows: Count = Field(2000, description="Samples that share is taken over.")
+    refresh_pause_s: float = Field(600.0, ge=0, description="Shortest time between two automatic refreshes, s.")
+    max_refresh_samples: Count = Field(200_000, description="Most logged samples that a refresh learns from.")
+    promotion_rows: Count = Field(2000, description="Samples on which a refreshed version must be better.")
+    promotion_patience_s: float = Field(3600.0, gt=0, description="Time after which one that is not is dismissed, s.")
+
     training_workers: Count = Field(1, description="Training processes.")
     training_threads: Count = Field(1, description="Threads of each training process.")
     training_niceness: int = Field(10, ge=0, le=19, description="Niceness of training processes.")

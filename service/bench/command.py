@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
+from lipcore.robots import ROBOTS
 from service.bench import table
 from service.bench.clients import BadAnswerError
+from service.bench.online import durability as durable
+from service.bench.online import running as online_running
+from service.bench.online import table as online_table
+from service.bench.online.promises import targets as online_targets
+from service.bench.online.running import PARTS
+from service.bench.online.scene import Scene
 from service.bench.running import KEYS, Options, run
-from service.bench.targets import targets
+from service.bench.targets import Target, targets
 from service.bench.workload import BenchError, Source, model_folder
 from service.client import ApiError
 from service.demo import DemoError
@@ -28,11 +38,18 @@ ERRORS = (ApiError, BadAnswerError, BenchError, DemoError, ServiceError, StreamE
 QUICK_RUNS, QUICK_QUERIES, QUICK_SECONDS = 3, 1000, 5.0
 QUICK_FIT = {"hyperparameter_samples": 80, "max_iterations": 50, "starts": 1}
 """Of the model; all samples stand behind its posterior all the same."""
+QUICK_ONLINE: dict[str, Any] = {
+    "idle_s": 4.0,
+    "burst_s": 6.0,
+    "after": (0.5, 3.0, 6.0),
+    "sizes": (1_000, 4_000),
+    "refit_every": 6.0,
+}
 
 
 @app.callback()
 def _bench() -> None:
-    """Measure this machine."""  # with one command only, typer would drop its name otherwise
+    """Measure this machine."""
 
 
 @app.command()
@@ -72,14 +89,90 @@ def latency(
         only=() if only is None else tuple(name.strip() for name in only.split(",")),
     )
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # ends the service that is measured, too
-    console = Console(width=None if sys.stdout.isatty() else table.WIDTH)
+    console = _console()
     results = run(options, console)
     found = targets(results)
-    table.show(results, console)
     if json_file is not None:
         results.write(json_file, [{**asdict(each), "met": each.met} for each in found])
+    _tell(table.grids(results), results.notes, found, console, markdown, strict)
+
+
+@app.command()
+def online(
+    robot: Annotated[str, typer.Option(help=f"One of {', '.join(ROBOTS)}.")] = "panda",
+    seed: Annotated[int, typer.Option(min=0, help="Of all that is random.")] = 0,
+    speed: Annotated[float, typer.Option(help="Multiplies the frequencies of the motion.")] = 5.0,
+    payload: Annotated[float, typer.Option(min=0, help="kg, attached in the middle of the stream.")] = 1.5,
+    drift: Annotated[float, typer.Option(min=0, help="Share by which friction grows over the stream.")] = 0.3,
+    forgetting: Annotated[float, typer.Option(min=1, help="Time constant of forgetting, s.")] = 30.0,
+    inducing: Annotated[
+        int, typer.Option(min=1, help="Most inducing outputs of the model: what a sample costs to learn.")
+    ] = 500,
+    websocket: Annotated[bool, typer.Option("--websocket", help="Stream in frames, not in batches over HTTP.")] = False,
+    only: Annotated[str | None, typer.Option(help=f"Names separated by commas: {', '.join(PARTS)}.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="A first look in about two minutes.")] = False,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", dir_okay=False, help="Also write all figures here.")
+    ] = None,
+    markdown: Annotated[Path | None, typer.Option(dir_okay=False, help="Also write the tables here.")] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where something promised was missed.")] = False,
+) -> None:
+    """Teach a served model in real time while it answers: throughput, latency, cost, and quality over a change."""
+    short = QUICK_ONLINE if quick else {}
+    seconds, change = (12.0, 6.0) if quick else (60.0, 30.0)
+    options = online_running.Options(
+        scene=Scene(robot, seconds, change, speed=speed, payload=payload, drift=drift, seed=seed),
+        fit={**online_running.FIT, **(QUICK_FIT if quick else {}), "max_inducing_outputs": inducing},
+        forgetting_s=forgetting,
+        websocket=websocket,
+        only=() if only is None else tuple(name.strip() for name in only.split(",")),
+        **short,
+    )
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    console = _console()
+    results = online_running.run(options, console)
+    found = online_targets(results)
+    if json_file is not None:
+        results.write(json_file, [{**asdict(each), "met": each.met} for each in found])
+    _tell(online_table.grids(results), results.notes, found, console, markdown, strict)
+
+
+@app.command()
+def durability(
+    trials: Annotated[int, typer.Option(min=1, help="Kills: of the service and of its learner in turn.")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Of all that is random.")] = 0,
+    json_file: Annotated[Path | None, typer.Option("--json", dir_okay=False, help="Also write the tally here.")] = None,
+    markdown: Annotated[Path | None, typer.Option(dir_okay=False, help="Also write the tables here.")] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where something promised was missed.")] = False,
+) -> None:
+    """Kill the service, or its learner, while batches come; count what is lost or learnt twice. 2 to 4 s a trial."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    console = _console()
+    with TemporaryDirectory(prefix="lipserve-bench-") as folder:
+        tally = durable.run(Path(folder), trials, seed, console)
+    found = durable.targets(tally)
+    if json_file is not None:
+        said = [{**asdict(each), "met": each.met} for each in found]
+        json_file.write_text(json.dumps({**asdict(tally), "targets": said}, indent=2) + "\n")
+    _tell(durable.grids(tally), [durable.SAID], found, console, markdown, strict)
+
+
+def _console() -> Console:
+    return Console(width=None if sys.stdout.isatty() else table.WIDTH)
+
+
+def _tell(
+    grids: Sequence[table.Grid],
+    notes: Sequence[str],
+    found: Sequence[Target],
+    console: Console,
+    markdown: Path | None,
+    strict: bool,
+) -> None:
+    """Print the tables and whether all promises were kept; exit with 1 where one was missed and `strict` is set."""
+    table.show_grids(grids, notes, console)
     if markdown is not None:
-        markdown.write_text(table.markdown(results))
+        markdown.write_text(table.grids_markdown(grids, notes))
     missed = [each for each in found if each.met is False]
     said = f"{len(missed)} of {sum(each.met is not None for each in found)} promises were missed"
     console.print(said if missed else "every promise that was measured was kept", highlight=False)

@@ -140,17 +140,27 @@ def promises(found: Sequence[Target]) -> Grid:
 
 def show(results: Results, console: Console) -> None:
     """Print all tables and notes, at most WIDTH columns wide."""
+    show_grids(grids(results), results.notes, console)
+
+
+def show_grids(found: Sequence[Grid], notes: Sequence[str], console: Console) -> None:
+    """Print tables and notes, at most WIDTH columns wide."""
     width = min(WIDTH, console.width)
-    for grid in grids(results):
+    for grid in found:
         console.print(grid.rich(), width=width, soft_wrap=False)
-    for note in results.notes:
+    for note in notes:
         console.print(Text(f"- {note}"), width=width, soft_wrap=False)
 
 
 def markdown(results: Results) -> str:
     """All tables and notes as Markdown."""
-    notes = "\n".join(f"- {note}" for note in results.notes)
-    return "\n\n".join([*(grid.markdown() for grid in grids(results)), *([notes] if notes else [])]) + "\n"
+    return grids_markdown(grids(results), results.notes)
+
+
+def grids_markdown(found: Sequence[Grid], notes: Sequence[str]) -> str:
+    """Tables and notes as Markdown."""
+    listed = "\n".join(f"- {note}" for note in notes)
+    return "\n\n".join([*(grid.markdown() for grid in found), *([listed] if listed else [])]) + "\n"
 
 
 def _loop(name: str, loop: Loop) -> tuple[str, ...]:
@@ -172,6 +182,8 @@ def _time(value: float | None) -> str:
 def _figure(value: float) -> str:
     if value == 0 or not np.isfinite(value):
         return f"{value:g}"
+    if abs(value) < 1e-3:
+        return f"{value:.1e}"
     return f"{value:.3f}" if abs(value) < 1 else _time(value) if abs(value) >= 10 else f"{value:.2f}"
 
 

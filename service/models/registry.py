@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import logging
-from typing import Any
+from collections.abc import Collection
+from typing import Any, NamedTuple
 
-from sqlalchemy import func, select
+from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
 import lipcore
 from lipcore.persistence import read_manifest
-from service.database import Database, ModelRow, VersionRow, now
+from service.database import Database, EventRow, LearnerRow, ModelRow, ServingRow, VersionRow, now
 from service.errors import not_found
 from service.files import Files, new_id
 from service.models.schema import Model, ModelPage, Version, VersionSummary
@@ -22,16 +23,82 @@ logger = logging.getLogger(__name__)
 SHIPPED = "panda-sim"
 
 
-def publish(session: Session, model: str, folder: str, manifest: dict[str, Any], job: str | None) -> int:
-    """Add a version whose files are complete; it is visible once the session commits. Return its number."""
+class Serving(NamedTuple):
+    """Which version of a model answers where none is named. change: higher for what was decided later."""
+
+    version: int
+    change: int
+
+
+def publish(
+    session: Session,
+    model: str,
+    folder: str,
+    manifest: dict[str, Any],
+    job: str | None,
+    candidate: bool = False,
+    start: int | None = None,
+) -> int:
+    """Add a version whose files are complete; it is visible once the session commits. Return its number.
+
+    It answers from then on, unless it is a candidate for that of a model that has a version. start: number of the last
+    event of the model that it contains by training, the newest where None.
+    """
     if session.scalar(select(ModelRow).where(ModelRow.name == model)) is None:
         session.add(ModelRow(name=model, created_at=now()))
         session.flush()
     latest = session.scalar(select(func.max(VersionRow.version)).where(VersionRow.model == model)) or 0
-    session.add(
-        VersionRow(model=model, version=latest + 1, folder=folder, created_at=now(), job=job, manifest=manifest)
+    version = int(latest + 1)
+    session.add(VersionRow(model=model, version=version, folder=folder, created_at=now(), job=job, manifest=manifest))
+    if start is None:
+        start = session.scalar(select(func.max(EventRow.number)).where(EventRow.model == model)) or 0
+    session.add(LearnerRow(model=model, version=version, start=start, role="candidate"))
+    if candidate and latest:
+        if session.get(ServingRow, model) is None:  # of a home from before there were candidates
+            serve(session, model, latest)
+    else:
+        serve(session, model, version)
+    return version
+
+
+def serve(session: Session, model: str, version: int) -> int:
+    """Let a version answer where none is named, once the session commits, and learn; return the number of the change.
+
+    The version before neither answers nor learns any more. Raise NotFoundError where there is no such version.
+    """
+    session.flush()
+    if session.get(VersionRow, (model, version)) is None:
+        raise not_found("version", version)
+    serving = session.get(ServingRow, model)
+    if serving is None:
+        serving = ServingRow(model=model, version=version, change=1)
+        session.add(serving)
+    elif serving.version != version:
+        serving.version, serving.change = version, serving.change + 1
+    served = (LearnerRow.model == model, LearnerRow.role == "serving", LearnerRow.version != version)
+    session.execute(update(LearnerRow).where(*served).values(role="dismissed"))
+    learner = session.get(LearnerRow, (model, version))
+    if learner is None:
+        session.add(LearnerRow(model=model, version=version, start=0, role="serving"))
+    else:
+        learner.role = "serving"
+    return serving.change
+
+
+def serving(database: Database, models: Collection[str]) -> dict[str, Serving]:
+    """Which version of each of these models answers; those that have none are left out."""
+    newest = (
+        select(VersionRow.model, func.max(VersionRow.version), ServingRow.version, ServingRow.change)
+        .outerjoin(ServingRow, ServingRow.model == VersionRow.model)
+        .where(VersionRow.model.in_(models))
+        .group_by(VersionRow.model, ServingRow.version, ServingRow.change)
     )
-    return int(latest + 1)
+    with database.session() as session:
+        found = session.execute(newest).all()
+    return {
+        model: Serving(latest, 0) if chosen is None else Serving(chosen, change)
+        for model, latest, chosen, change in found
+    }
 
 
 def install_shipped(database: Database, files: Files) -> None:
@@ -57,27 +124,22 @@ def _same_tensors(one: dict[str, Any], other: dict[str, Any]) -> bool:
 
 
 def find(database: Database, model: str, version: int | None) -> VersionRow:
-    """Return a version, the latest where None; raise NotFoundError."""
-    query = select(VersionRow).where(VersionRow.model == model)
-    query = query.order_by(VersionRow.version.desc()) if version is None else query.where(VersionRow.version == version)
+    """Return a version, the one that answers where None; raise NotFoundError."""
+    if version is None:
+        chosen = serving(database, [model]).get(model)
+        version = None if chosen is None else chosen.version
     with database.session() as session:
-        row = session.scalars(query.limit(1)).first()
+        row = None if version is None else session.get(VersionRow, (model, version))
         if row is None:
             known = session.scalar(select(ModelRow).where(ModelRow.name == model))
             raise not_found("model", model) if known is None else not_found("version", version)
     return row
 
 
-def recent(database: Database, count: int) -> list[VersionRow]:
-    """Return the latest versions of the models that changed last, at most `count`."""
-    newest = select(VersionRow.model, func.max(VersionRow.version).label("version")).group_by(VersionRow.model)
-    latest = newest.subquery()
-    query = (
-        select(VersionRow)
-        .join(latest, (VersionRow.model == latest.c.model) & (VersionRow.version == latest.c.version))
-        .order_by(VersionRow.created_at.desc())
-        .limit(count)
-    )
+def recent(database: Database, count: int) -> list[str]:
+    """Return the names of the models that changed last, at most `count`."""
+    changed = func.max(VersionRow.created_at)
+    query = select(VersionRow.model).group_by(VersionRow.model).order_by(changed.desc()).limit(count)
     with database.session() as session:
         return list(session.scalars(query))
 
@@ -109,10 +171,12 @@ def _show(session: Session, row: ModelRow) -> Model:
     versions = list(
         session.scalars(select(VersionRow).where(VersionRow.model == row.name).order_by(VersionRow.version))
     )
+    chosen = session.get(ServingRow, row.name)
     return Model(
         name=row.name,
         created_at=row.created_at,
         latest_version=versions[-1].version,
+        serving_version=versions[-1].version if chosen is None else chosen.version,
         versions=[
             VersionSummary(version=v.version, created_at=v.created_at, estimator=v.manifest["estimator"])
             for v in versions

@@ -17,8 +17,7 @@ router = APIRouter(prefix="/v1/models", tags=["models"], responses=responses(Inv
 def list_models(service: ServiceDep, page: PageQuery) -> ModelPage:
     """One page of models with their versions."""
     found = registry.page(service.database, page)
-    for item in found.items:
-        service.loaded.announce(item.name, item.latest_version)
+    service.loaded.announce([item.name for item in found.items])
     return found
 
 
@@ -26,7 +25,7 @@ def list_models(service: ServiceDep, page: PageQuery) -> ModelPage:
 def show(service: ServiceDep, model: str) -> Model:
     """Which versions there are and which one answers."""
     found = registry.show(service.database, model)
-    service.loaded.announce(found.name, found.latest_version)
+    service.loaded.announce([found.name])
     return found
 
 

@@ -53,11 +53,15 @@ class VersionSummary(BaseModel):
 
 
 class Model(BaseModel):
-    """A named model. Queries are answered by its latest version unless they name another."""
+    """A named model. Queries are answered by the version that serves unless they name another."""
 
     name: str
     created_at: str
-    latest_version: int
+    latest_version: int = Field(description="The newest version")
+    serving_version: int = Field(
+        description="The version that answers where none is named: the newest, unless that is a refreshed one that has "
+        "yet to prove better, or an earlier one was chosen"
+    )
     versions: list[VersionSummary]
 
 

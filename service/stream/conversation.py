@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from abc import ABC, abstractmethod
+from collections import deque
 from contextlib import suppress
 from time import perf_counter
 
@@ -24,6 +25,7 @@ class Conversation(ABC):
         self.connection, self.receive, self.send, self.settings = connection, receive, send, settings
         self.left = perf_counter()
         self._writing = False
+        self._texts: deque[str] = deque()
         self._closing: asyncio.Task[None] | None = None
 
     @abstractmethod
@@ -52,11 +54,32 @@ class Conversation(ABC):
                 self.left = perf_counter()  # since when the answer waits, should it have to
                 await send({"type": "websocket.send", "bytes": answer})
                 self.left = perf_counter()
+                if self._texts:
+                    await self._say()
                 self._writing = False
                 # neither call above lets others run when messages wait: a client that sends many must not hold up all
                 await asyncio.sleep(0)
         finally:
             self._timer.cancel()
+
+    async def say(self, text: str) -> None:
+        """Send a text between answers: now, or after the answer that is being written. One caller at a time.
+
+        A client that does not read it is cut off as one that does not read its answers; one that is gone misses it.
+        """
+        self._texts.append(text)
+        if self._writing:
+            return
+        with suppress(OSError, RuntimeError):  # gone, or closing, which uvicorn says in its own way
+            try:
+                async with asyncio.timeout(self.settings.stream_write_s):
+                    await self._say()
+            except TimeoutError:
+                self.connection.abort()
+
+    async def _say(self) -> None:
+        while self._texts:
+            await self.send({"type": "websocket.send", "text": self._texts.popleft()})
 
     def _watch(self) -> None:
         period = min(self.settings.stream_idle_s, self.settings.stream_write_s)

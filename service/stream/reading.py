@@ -25,13 +25,17 @@ class FrameReader:
         self.motion: Array = np.zeros((3, self.n_joints))
         self._numbers, self._positions = self.motion.reshape(-1), self.motion[0]
         self._length = request_bytes(self.n_joints)
+        self._learn_length = request_bytes(self.n_joints, learn=True)
 
     def read(self, data: bytes, flags: int, n: int, budget: float) -> Array:
-        """Return q, dq, ddq of a frame, (3, n), whose header is already read; raise InvalidRequestError."""
-        if flags & ~ASK_STD:
-            raise _wrong_flags(flags)
+        """Return q, dq, ddq of a frame, (3, n), whose header is already read; raise InvalidRequestError.
+
+        Torque that it carries must be there, and is not looked at.
+        """
         if n != self.n_joints:
             raise invalid_request("n", n, f"{self.n_joints} joints: {', '.join(self.joint_names)}")
+        if flags > ASK_STD:
+            data = self._without_torque(data, flags)
         if len(data) != self._length:
             raise invalid_request("frame", f"{len(data)} bytes long", f"{self._length} bytes for {n} joints")
         if not 0.0 <= budget < inf:
@@ -43,12 +47,15 @@ class FrameReader:
         checks.positions(self._positions, self.max_position)
         return self.motion
 
+    def _without_torque(self, data: bytes, flags: int) -> bytes:
+        if flags & ~(ASK_STD | ASK_LEARN):
+            expected = f"0, {ASK_STD} to be answered tau_std, {ASK_LEARN} to be learnt from, or {ASK_STD | ASK_LEARN}"
+            raise invalid_request("flags", flags, expected)
+        if len(data) != self._learn_length:
+            expected = f"{self._learn_length} bytes for {self.n_joints} joints with tau"
+            raise invalid_request("frame", f"{len(data)} bytes long", expected)
+        return data[: self._length]
+
     def _not_finite(self) -> InvalidRequestError:
         row, joint = np.argwhere(~np.isfinite(self.motion))[0]
         return invalid_request(checks.element(FIELDS[row], joint), f"{self.motion[row, joint]:g}", "a finite number")
-
-
-def _wrong_flags(flags: int) -> InvalidRequestError:
-    if flags & ASK_LEARN:
-        return invalid_request("flags", flags, f"no {ASK_LEARN}: models do not learn from a stream yet")
-    return invalid_request("flags", flags, f"0, or {ASK_STD} to be answered tau_std")

@@ -18,6 +18,7 @@ from service.stream.conversation import Conversation, Echo
 from service.stream.protocol import CONNECTION, StreamProtocol
 from service.stream.session import Session
 
+STREAM_ID = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
 PATH, ECHO_PATH = "/v1/models/{model}/stream", "/v1/echo/stream"
 
 
@@ -80,12 +81,12 @@ class StreamRoute(EchoRoute):
 
     async def conversation(self, service: Service, scope: Scope, receive: Receive, send: Send) -> Conversation:
         """Return what talks with the client; raise InvalidRequestError, NotFoundError or UnreadableVersionError."""
-        version, std = _parameters(scope["query_string"])
+        version, std, stream_id = _parameters(scope["query_string"])
         model = scope["path_params"]["model"]
         served = service.loaded.hot(model, version)
         if served is None:
             served = await to_thread.run_sync(service.loaded.get, model, version)
-        return Session(_connection(scope), receive, send, service, served, version is not None, std)
+        return Session(_connection(scope), receive, send, service, served, version is not None, std, stream_id)
 
 
 class NoRoute:
@@ -96,9 +97,9 @@ class NoRoute:
         raise NotFoundError(f"no stream at {scope['path'][:200]}: streams are at {PATH}")
 
 
-def _parameters(query: bytes) -> tuple[int | None, bool]:
-    """Read version and std; raise InvalidRequestError."""
-    version, std = None, False
+def _parameters(query: bytes) -> tuple[int | None, bool, str | None]:
+    """Read version, std and stream_id; raise InvalidRequestError."""
+    version, std, stream_id = None, False, None
     for name, value in parse_qsl(query.decode("ascii", "backslashreplace"), keep_blank_values=True):
         if name == "version":
             if not re.fullmatch("[0-9]{1,10}", value) or not 0 < int(value) < 2**31:
@@ -108,9 +109,13 @@ def _parameters(query: bytes) -> tuple[int | None, bool]:
             if value not in ("0", "1"):
                 raise invalid_request("std", value, "0 or 1")
             std = value == "1"
+        elif name == "stream_id":
+            if not re.fullmatch(STREAM_ID, value):
+                raise invalid_request("stream_id", value, f"a name that matches {STREAM_ID}")
+            stream_id = value
         else:
-            raise invalid_request(name, value, "no parameter but version and std")
-    return version, std
+            raise invalid_request(name, value, "no parameter but version, std and stream_id")
+    return version, std, stream_id
 
 
 def _check_origin(scope: Scope) -> None:

@@ -1,4 +1,4 @@
-"""A stream of torque queries to one model."""
+"""A stream of torque queries to one model, some of which carry torque to learn from."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from service.errors import ErrorBody, ErrorResponse, ServiceError, invalid_reque
 from service.inference import checks
 from service.inference.loaded import Served
 from service.stream.conversation import Conversation
-from service.stream.frames import ANSWER, ASK_STD, ERROR, HAS_STD, LATE, LAYOUT, REQUEST, UNREAD
+from service.stream.frames import ANSWER, ASK_LEARN, ASK_STD, ERROR, HAS_STD, LATE, LAYOUT, REQUEST, UNREAD
+from service.stream.learning import Learning, Taught
 from service.stream.protocol import StreamProtocol
 from service.stream.reading import FrameReader
 
@@ -25,7 +26,8 @@ logger = logging.getLogger(__name__)
 class Session(Conversation):
     """Answers every frame from the version that is current when the frame is taken; holds that version in memory.
 
-    pinned: whether it stays with this version; std: whether every answer carries tau_std.
+    pinned: whether it stays with this version; std: whether every answer carries tau_std; stream_id: source of the
+    torques that frames carry, None where they carry none.
     """
 
     def __init__(
@@ -37,12 +39,23 @@ class Session(Conversation):
         served: Served,
         pinned: bool,
         std: bool,
+        stream_id: str | None = None,
     ) -> None:
         super().__init__(connection, receive, send, service.settings)
         self._loaded, self._name = service.loaded, served.name
         self._pin = served.version if pinned else None
         self._std, self._late, self._due = std, 0, inf
+        self._learning = None if stream_id is None else Learning(service, stream_id, self.say)
         self._take(served)
+
+    async def run(self) -> None:
+        """Talk until either side ends it; what was taught until then is logged all the same."""
+        try:
+            await super().run()
+        finally:
+            if self._learning is not None:
+                await self._learning.close()
+                self._learning = None  # which refers to this: no cycles, see StreamProtocol
 
     async def greet(self) -> None:
         """Send what holds for all answers of the version."""
@@ -78,7 +91,9 @@ class Session(Conversation):
             if current is not self._served:
                 await self._follow(current)
             motion = self._reader.read(data, asked, n, budget)
-            tau, std = self._answer(motion, self._std or asked == ASK_STD)
+            if asked > ASK_STD:
+                await self._admit(sequence, asked)
+            tau, std = self._answer(motion, self._std or asked != 0)
             checks.answer("tau", tau)
             if std is not None:
                 checks.answer("tau_std", std)
@@ -88,18 +103,32 @@ class Session(Conversation):
             logger.error("unexpected error in a stream of model %s", self._name, exc_info=error)
             said = ServiceError("an unexpected error; the service's log says more")
             return self._refuse(sequence, flags, arrived, said)
-        numbers = tau.tobytes()
+        served, numbers = self._served, tau.tobytes()
         if std is not None:
             flags = HAS_STD
             numbers += std.tobytes()
+        if asked > ASK_STD:
+            assert self._learning is not None
+            self._learning.add(Taught(served, sequence, arrived, data, numbers))
+            if asked == ASK_LEARN and not self._std:  # its standard deviation is for the record alone
+                flags, numbers = 0, tau.tobytes()
         now = perf_counter()
         if budget:
             self._due = arrived + budget
             if now > self._due:
                 self._late, self._due = self._late + 1, inf
                 flags |= LATE
-        served = self._served
         return ANSWER.pack(sequence, flags, n, served.version, self._late, served.revision, now - arrived) + numbers
+
+    async def _admit(self, sequence: int, flags: int) -> None:
+        """Wait until there is room for a frame to learn from; raise InvalidRequestError where it may not be learnt."""
+        if self._pin is not None:
+            expected = f"no {ASK_LEARN}: a stream pinned to a version only asks; leave version out of the address"
+            raise invalid_request("flags", flags, expected)
+        if self._learning is None:
+            expected = f"a name of the torque's source in the address, as in ?stream_id=arm-1, for flag {ASK_LEARN}"
+            raise invalid_request("stream_id", "missing", expected)
+        await self._learning.admit(sequence)
 
     def _refuse(self, sequence: int, flags: int, arrived: float, error: ServiceError) -> bytes:
         body = ErrorResponse(error=ErrorBody(code=error.code, message=error.message, detail=error.detail))

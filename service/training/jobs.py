@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 from sqlalchemy import func, select
+from sqlalchemy.orm import Session
 
 from lipcore.estimators import UnknownEstimatorError, make_estimator
 from lipcore.robots import ROBOTS, SimulationUnavailableError
-from service.context import Service
 from service.database import Database, DatasetRow, JobRow, RobotRow, now
 from service.datasets import store
 from service.errors import BusyError, ConflictError, InvalidRequestError, invalid_request, not_found, problem
@@ -17,6 +19,9 @@ from service.settings import Settings
 from service.training.schema import Job, JobPage, JobRequest, Options
 from service.training.states import ACTIVE, CANCELLED, QUEUED
 
+if TYPE_CHECKING:  # the service learns online too, and that queues jobs
+    from service.context import Service
+
 
 def create(service: Service, request: JobRequest) -> Job:
     """Check a request, store it as a queued job and hand it to the queue."""
@@ -26,20 +31,9 @@ def create(service: Service, request: JobRequest) -> Job:
     rows = [store.find(service.database, dataset) for dataset in request.datasets]
     joint_types = _check_joints(request, rows)
     _check_estimator(service.database, request, rows[0].joint_names, joint_types)
-    job = JobRow(
-        id=new_id("job"),
-        model=request.model,
-        state=QUEUED,
-        request={**request.model_dump(mode="json"), "joint_types": joint_types},
-        progress={"stage": "waiting"},
-        attempts=0,
-        cancel_requested=False,
-        created_at=now(),
-    )
     with service.database.transaction() as session:
-        waiting = session.scalar(select(func.count()).select_from(JobRow).where(JobRow.state == QUEUED)) or 0
-        if waiting >= service.settings.max_queued_jobs:
-            raise BusyError(f"{waiting} jobs are waiting already, the most that may: try again later")
+        wanted = {**request.model_dump(mode="json"), "joint_types": joint_types}
+        job = add(session, service.settings, request.model, wanted)
         present = set(session.scalars(select(DatasetRow.id).where(DatasetRow.id.in_(request.datasets))))
         for dataset in request.datasets:
             if dataset not in present:  # deleted since it was checked
@@ -47,9 +41,27 @@ def create(service: Service, request: JobRequest) -> Job:
         uploaded = request.robot is not None and request.robot not in ROBOTS
         if uploaded and session.scalar(select(RobotRow.id).where(RobotRow.id == request.robot)) is None:
             raise not_found("robot", request.robot)
-        session.add(job)
     service.jobs.submit(job.id)
-    return _show(job)
+    return shown(job)
+
+
+def add(session: Session, settings: Settings, model: str, request: dict[str, Any]) -> JobRow:
+    """Add a queued job, to be handed to the queue once the session has committed; raise BusyError for a full queue."""
+    waiting = session.scalar(select(func.count()).select_from(JobRow).where(JobRow.state == QUEUED)) or 0
+    if waiting >= settings.max_queued_jobs:
+        raise BusyError(f"{waiting} jobs are waiting already, the most that may: try again later")
+    job = JobRow(
+        id=new_id("job"),
+        model=model,
+        state=QUEUED,
+        request=request,
+        progress={"stage": "waiting"},
+        attempts=0,
+        cancel_requested=False,
+        created_at=now(),
+    )
+    session.add(job)
+    return job
 
 
 def show(service: Service, job: str) -> Job:
@@ -59,18 +71,16 @@ def show(service: Service, job: str) -> Job:
     if row is None:
         raise not_found("job", job)
     if row.version is not None:
-        service.loaded.announce(row.model, row.version)
-    return _show(row)
+        service.loaded.announce([row.model])
+    return shown(row)
 
 
 def page(service: Service, part: Page) -> JobPage:
     """List jobs, newest first. Who sees one succeed is answered by its version from then on."""
     with service.database.session() as session:
         rows, following = newest(session, JobRow, part)
-    for row in rows:
-        if row.version is not None:
-            service.loaded.announce(row.model, row.version)
-    return JobPage(items=[_show(row) for row in rows], next_cursor=following)
+    service.loaded.announce({row.model for row in rows if row.version is not None})
+    return JobPage(items=[shown(row) for row in rows], next_cursor=following)
 
 
 def cancel(database: Database, job: str) -> Job:
@@ -84,7 +94,7 @@ def cancel(database: Database, job: str) -> Job:
         row.cancel_requested = True
         if row.state == QUEUED:
             row.state, row.finished_at = CANCELLED, now()
-    return _show(row)
+    return shown(row)
 
 
 def _check_joints(request: JobRequest, rows: list[DatasetRow]) -> list[str]:
@@ -125,12 +135,14 @@ def _check_options(options: Options, settings: Settings) -> None:
             raise invalid_request(f"options.{name}", getattr(options, name), f"at most {most}")
 
 
-def _show(row: JobRow) -> Job:
+def shown(row: JobRow) -> Job:
+    """A job as the API shows it."""
     return Job.model_validate(
         {
             "estimator": row.request["estimator"],
             "robot": row.request.get("robot"),
             "datasets": row.request["datasets"],
+            "refresh": row.request.get("refresh"),
             **{
                 name: getattr(row, name)
                 for name in (

@@ -87,6 +87,16 @@ class JobError(BaseModel):
     message: str
 
 
+class Refresh(BaseModel):
+    """A job that trains a version anew on the data of an earlier one and what has been observed since."""
+
+    version: int = Field(description="The version that is refreshed")
+    through: int = Field(description="Last event of the model's log that it learns from")
+    trigger: Literal["novelty", "asked"] = Field(
+        description="Why: much of the motion was beyond what the version knows, or somebody asked for it"
+    )
+
+
 class Job(BaseModel):
     """A training job."""
 
@@ -96,6 +106,7 @@ class Job(BaseModel):
     estimator: str
     robot: str | None = Field(description="Profile or id of an uploaded URDF, of estimators with rigid bodies")
     datasets: list[str]
+    refresh: Refresh | None = Field(None, description="What it refreshes; null for a job with data sets alone")
     progress: JobProgress
     attempts: int = Field(description="Times it was started; more than one after an interruption")
     version: int | None = Field(description="The version it made, once succeeded")

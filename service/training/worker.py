@@ -9,17 +9,20 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import select, update
+from sqlalchemy.orm import Session
 
 import lipcore
 from lipcore.fitting import FitProgress
 from lipcore.model import TorqueModel
-from service.database import Database, DatasetRow, JobRow, now
+from lipcore.online.conditioning import condition
+from service.database import Database, JobRow, LearnerRow, now
 from service.files import Files, new_id
 from service.models import registry
-from service.robots import store as robots
 from service.settings import Settings
+from service.training.material import Material, observed, recorded
 from service.training.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED
+from service.updates.refreshing import scope
 
 logger = logging.getLogger(__name__)
 
@@ -31,13 +34,17 @@ class SupersededError(RuntimeError):
     """The job is no longer this attempt's."""
 
 
+class TakenBackError(RuntimeError):
+    """What the job was training on has been unlearnt or rolled back meanwhile."""
+
+
 def run(settings: Settings, job: str) -> None:
     """Run one queued job to its end. All outcomes are written to its row; nothing is raised for a failed fit."""
     database, files = Database(settings.home), Files(settings.home)
     try:
         claim = _claim(database, job)
         if claim is not None:
-            _train(database, files, claim)
+            _train(settings, database, files, claim)
     finally:
         database.close()
 
@@ -63,17 +70,25 @@ def _claim(database: Database, job: str) -> Claim | None:
         return Claim(job, row.attempts, row.model, row.request)
 
 
-def _train(database: Database, files: Files, claim: Claim) -> None:
+def _train(settings: Settings, database: Database, files: Files, claim: Claim) -> None:
     watch = _Watch(database, claim)
     try:
-        trained, lineage = _fit(database, files, claim, watch)
+        material = _material(settings, database, files, claim)
+        trained = _fit(claim, material, watch)
+        lineage = {
+            "job": claim.job,
+            **material.lineage,
+            "trained_at": now(),
+            "training_process": {"seconds": round(watch.elapsed, 1), "peak_memory_mb": _peak_memory_mb()},
+        }
+        watch.stage("saving")
         folder = new_id("mv")
         manifest = lipcore.save(trained, files.versions / folder, lineage)
         with database.transaction() as session:
             row = _own(session, claim)
             if row.cancel_requested:
                 raise lipcore.FitCancelledError("cancelled after the last look at the flag")
-            version = registry.publish(session, claim.model, folder, manifest, claim.job)
+            version = _publish(session, claim, material, folder, manifest)
             row.state, row.version, row.finished_at = SUCCEEDED, version, now()
             row.progress = {**row.progress, "stage": "done", "fraction": 1.0, "elapsed_s": watch.elapsed}
     except lipcore.FitCancelledError:
@@ -82,37 +97,50 @@ def _train(database: Database, files: Files, claim: Claim) -> None:
         logger.warning("job %s was taken over by another attempt", claim.job)
     except Exception as error:
         logger.exception("job %s failed", claim.job)
-        code = "not_positive_definite" if isinstance(error, lipcore.NotPositiveDefiniteError) else "training_failed"
-        _finish(database, claim, FAILED, {"code": code, "message": f"{type(error).__name__}: {error}"})
+        _finish(database, claim, FAILED, {"code": _code(error), "message": f"{type(error).__name__}: {error}"})
 
 
-def _fit(database: Database, files: Files, claim: Claim, watch: _Watch) -> tuple[TorqueModel, dict[str, Any]]:
+def _material(settings: Settings, database: Database, files: Files, claim: Claim) -> Material:
+    if claim.request.get("refresh") is None:
+        return recorded(database, files, claim.request)
+    return observed(settings, database, files, claim.model, claim.request)
+
+
+def _fit(claim: Claim, material: Material, watch: _Watch) -> TorqueModel:
     request = claim.request
-    with database.session() as session:
-        found = {
-            row.id: row for row in session.scalars(select(DatasetRow).where(DatasetRow.id.in_(request["datasets"])))
-        }
-    rows = [found[dataset] for dataset in request["datasets"]]
-    samples = lipcore.Samples.concatenate([files.read_samples(row.id, row.joint_names) for row in rows])
-    robot, names = request.get("robot"), rows[0].joint_names
     trained = lipcore.train(
-        samples,
+        material.samples,
         request["joint_types"],
         request["estimator"],
         lipcore.FitOptions(**request["options"]),
-        torque_convention=rows[0].torque_convention,  # type: ignore[arg-type]  # checked when it was stored
+        torque_convention=material.torque_convention,
         on_progress=watch.progress,
         cancelled=watch.cancelled,
-        robot=None if robot is None else robots.resolve(database, robot, names, request["joint_types"]),
+        robot=material.robot,
     )
-    lineage = {
-        "job": claim.job,
-        "datasets": [{"id": row.id, "name": row.name, "sha256": row.sha256, "rows": row.rows} for row in rows],
-        "trained_at": now(),
-        "training_process": {"seconds": round(watch.elapsed, 1), "peak_memory_mb": _peak_memory_mb()},
-    }
-    watch.stage("saving")
-    return trained, lineage
+    if request.get("refresh") is None:
+        return trained
+    # the version that serves has learnt all of these rows, not only the few that a fit chooses
+    return condition(trained, material.samples, material.weights, watch.cancelled)
+
+
+def _publish(session: Session, claim: Claim, material: Material, folder: str, manifest: dict[str, Any]) -> int:
+    """Add the version that was trained: it answers from then on; one of a refresh has to prove better first."""
+    refresh = claim.request.get("refresh")
+    if refresh is None:
+        return registry.publish(session, claim.model, folder, manifest, claim.job)
+    if scope.taken_back(session, claim.model, refresh["through"], material.seen):
+        raise TakenBackError("part of what was observed has been taken back while it was trained on: refresh again")
+    earlier = (LearnerRow.model == claim.model, LearnerRow.role == "candidate")
+    session.execute(update(LearnerRow).where(*earlier).values(role="dismissed"))  # the newer one has seen more
+    return registry.publish(session, claim.model, folder, manifest, claim.job, candidate=True, start=refresh["through"])
+
+
+def _code(error: Exception) -> str:
+    """Stable word for why a job failed."""
+    if isinstance(error, TakenBackError):
+        return "observations_taken_back"
+    return "not_positive_definite" if isinstance(error, lipcore.NotPositiveDefiniteError) else "training_failed"
 
 
 def _peak_memory_mb() -> int:

@@ -19,8 +19,10 @@ from tests.service.data import DEADLINE
 from tests.service.server import Server
 
 STD, LATE, ERROR, UNREAD = 1, 2, 4, 8
+LEARN = 2
 STREAM = "/v1/models/pendulum/stream"
 MOTION = np.array([[0.3, -0.2], [0.1, 0.4], [1.0, -0.5]])
+TAU = np.array([5.0, -2.0])
 
 
 @dataclass(frozen=True)
@@ -48,12 +50,18 @@ class Answer:
 
 
 def frame(
-    motion: Any = MOTION, sequence: int = 1, flags: int = STD, n: int | None = None, budget: float = 0.0
+    motion: Any = MOTION,
+    sequence: int = 1,
+    flags: int = STD,
+    n: int | None = None,
+    budget: float = 0.0,
+    tau: Any = None,
 ) -> bytes:
-    """A request frame; motion: q, dq, ddq."""
+    """A request frame; motion: q, dq, ddq; tau: to be learnt from, where given, and flagged so."""
     numbers = np.asarray(motion, "<f8")
     n = numbers.shape[-1] if n is None else n
-    return struct.pack("<IHHd", sequence, flags, n, budget) + numbers.tobytes()
+    torque = b"" if tau is None else np.asarray(tau, "<f8").tobytes()
+    return struct.pack("<IHHd", sequence, flags | (LEARN if torque else 0), n, budget) + numbers.tobytes() + torque
 
 
 def read(data: bytes) -> Answer:

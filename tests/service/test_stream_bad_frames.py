@@ -7,7 +7,7 @@ import pytest
 from websockets.exceptions import ConnectionClosedError
 
 from tests.service.data import DEADLINE
-from tests.service.streams import ERROR, MOTION, UNREAD, ask, dial, frame, hello, read
+from tests.service.streams import ERROR, MOTION, TAU, UNREAD, ask, dial, frame, hello, read
 
 
 def changed(row, joint, value):
@@ -28,10 +28,18 @@ BAD = {
     "wrong n": (frame(n=3), "n", "3", "2 joints: "),
     "another robot": (frame(np.zeros((3, 7))), "n", "7", "2 joints: "),
     "no joints": (frame(np.zeros((3, 0))), "n", "0", "2 joints: "),
-    "unknown flag": (frame(flags=4), "flags", "4", "0, or 1 to be answered tau_std"),
-    "all flags": (frame(flags=0xFFFC), "flags", "65532", "0, or 1 to be answered tau_std"),
-    "learn": (frame(flags=2), "flags", "2", "models do not learn from a stream yet"),
-    "learn with std": (frame(flags=3), "flags", "3", "models do not learn from a stream yet"),
+    "unknown flag": (frame(flags=4), "flags", "4", "0, 1 to be answered tau_std, 2 to be learnt from, or 3"),
+    "all flags": (frame(flags=0xFFFF), "flags", "65535", "0, 1 to be answered tau_std, 2 to be learnt from, or 3"),
+    "learn, no torque": (frame(flags=2), "frame", "64 bytes long", "80 bytes for 2 joints with tau"),
+    "torque, no flag": (frame(flags=1) + bytes(16), "frame", "80 bytes long", "64 bytes for 2 joints"),
+    "learn, one byte less": (frame(tau=TAU)[:-1], "frame", "79 bytes long", "80 bytes for 2 joints with tau"),
+    "learn, one byte more": (frame(tau=TAU) + b"x", "frame", "81 bytes long", "80 bytes for 2 joints with tau"),
+    "learn, header alone": (frame(tau=TAU)[:16], "frame", "16 bytes long", "80 bytes for 2 joints with tau"),
+    "learn, another robot": (frame(np.zeros((3, 7)), tau=np.zeros(7)), "n", "7", "2 joints: "),
+    "learn, nan in ddq": (frame(changed(2, 1, np.nan), tau=TAU), "ddq[1]", "nan", "a finite number"),
+    "learn, degrees": (frame(changed(0, 0, -90.0), tau=TAU), "q[0]", "-90", "radians (or metres) within ±12.6"),
+    "nobody's torque": (frame(tau=TAU), "stream_id", "missing", "as in ?stream_id=arm-1, for flag 2"),
+    "nobody's torque, no std": (frame(flags=0, tau=TAU), "stream_id", "missing", "as in ?stream_id=arm-1"),
     "nan deadline": (frame(budget=float("nan")), "deadline", "nan", "seconds, or 0 for none"),
     "endless deadline": (frame(budget=float("inf")), "deadline", "inf", "seconds, or 0 for none"),
     "past deadline": (frame(budget=-1e-3), "deadline", "-0.001", "seconds, or 0 for none"),

@@ -1,0 +1,37 @@
+"""Robots of one kind that learn apart and put together what they have learnt."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import reduce
+
+import torch
+
+from lipcore.compact.posterior import CompactPosterior
+from lipcore.compact.statistics import Statistics, collect, merge
+from lipcore.model import TorqueModel
+from lipcore.motion import Motion
+from lipcore.samples import Samples
+
+
+def merged_difference(model: TorqueModel, parts: Sequence[Samples], queries: Motion) -> float:
+    """How far the posterior from merged statistics lies from that of all samples at once.
+
+    The largest difference of mean torque and of its standard deviation at the queries, relative to the largest torque.
+    """
+    posterior = model.posterior
+    kernel, noise = posterior.kernel, posterior.noise_variance
+
+    def collected(samples: Samples) -> Statistics:
+        motion = samples.motion()
+        return collect(posterior.basis, noise, motion, samples.torque() - kernel.mean(motion))
+
+    def answers(statistics: Statistics) -> tuple[torch.Tensor, torch.Tensor]:
+        built = CompactPosterior.build(kernel, posterior.basis, statistics, noise, posterior.std_factor)
+        found = built.predict(queries)
+        return found.mean, found.std
+
+    apart = answers(reduce(merge, map(collected, parts)))
+    together = answers(collected(Samples.concatenate(list(parts))))
+    largest = max(float((one - other).abs().max()) for one, other in zip(apart, together, strict=True))
+    return largest / float(together[0].abs().max())

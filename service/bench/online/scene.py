@@ -1,0 +1,118 @@
+"""What is learnt from: a robot that moves at random, whose friction drifts and which takes up a payload on the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lipcore.online import spacing
+from lipcore.online.batch import LEARNT, Rows
+from lipcore.robots import Robot, load_robot
+from lipcore.samples import Array, Samples
+from lipcore.simulation import Payload, Stream, simulate
+
+SINUSOIDS, UNSEEN_SINUSOIDS = 50, 100
+"""The unseen trajectory has twice the bandwidth, as in the paper's tests."""
+UNSEEN_SAMPLES, UNSEEN_RATE = 500, 10.0
+_HISTORY, _LIVE, _UNSEEN, _NOISE, _MORE, _FLEET = range(6)
+_SEEDS = 100
+"""Seeds of a scene's parts lie between those of its own seed and of the next one."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A simulated robot at 1 kHz, moving ±0.5 rad about the middle of its joints.
+
+    seconds: length of the live stream, change_at: when the payload (kg) is attached; rate in Hz; speed: multiplies the
+    frequencies of the motion; noise: of the measured torque, N·m; viscous (N·m·s/rad) and coulomb (N·m) friction of
+    every joint at first; drift: share by which both grow, evenly, over the live stream.
+    """
+
+    robot: str = "panda"
+    seconds: float = 60.0
+    change_at: float = 30.0
+    rate: float = 1000.0
+    speed: float = 5.0
+    noise: float = 0.05
+    viscous: float = 0.5
+    coulomb: float = 0.3
+    drift: float = 0.3
+    payload: float = 1.5
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.change_at < self.seconds:
+            raise ValueError(f"change_at is {self.change_at:g} s, expected a time within {self.seconds:g} s")
+
+    @cached_property
+    def arm(self) -> Robot:
+        """The robot."""
+        return load_robot(self.robot)
+
+    def history(self, seconds: float, rate: float) -> Samples:
+        """Earlier motion without payload, before the friction drifts; its time ends where the live stream's begins."""
+        samples = self._measured(self._moving(_HISTORY, round(seconds * rate), rate), 1.0, _NOISE)
+        return replace(samples, t=samples.t - seconds)
+
+    def live(self) -> Samples:
+        """The live stream."""
+        samples = self._moving(_LIVE, round(self.seconds * self.rate), self.rate, self.change_at)
+        return self._measured(samples, self.friction(samples.t)[:, None], _NOISE + _SEEDS // 2)
+
+    def more(self, seconds: float) -> Samples:
+        """Another stream as long as wanted, in which nothing changes."""
+        return self._measured(self._moving(_MORE, round(seconds * self.rate), self.rate), 1.0, _MORE + _SEEDS // 2)
+
+    def fleet(self, robots: int, samples: int, rate: float) -> list[Samples]:
+        """Streams of several robots of the kind, as before the change."""
+        parts = [self._moving(_FLEET + number, samples, rate) for number in range(robots)]
+        return [self._measured(part, 1.0, _FLEET + _SEEDS // 2 + number) for number, part in enumerate(parts)]
+
+    def unseen(self, at: float) -> Samples:
+        """An unseen trajectory under the dynamics at time `at` of the live stream; the torque has no noise.
+
+        The payload is attached right after `change_at`.
+        """
+        loaded = 0.0 if at > self.change_at else None
+        samples = self._moving(_UNSEEN, UNSEEN_SAMPLES, UNSEEN_RATE, loaded, UNSEEN_SINUSOIDS)
+        return self._with_friction(samples, float(self.friction(np.array(at))))
+
+    def measured(self, unseen: Samples) -> Array:
+        """The torques of an unseen trajectory with noise, (N, n)."""
+        rng = np.random.default_rng(self._seed(_UNSEEN + _SEEDS // 2))
+        noisy: Array = unseen.tau + self.noise * rng.standard_normal(unseen.tau.shape)
+        return noisy
+
+    def friction(self, t: Array) -> Array:
+        """Factor of both frictions at times of the live stream."""
+        factor: Array = 1 + self.drift * t / self.seconds
+        return factor
+
+    def _moving(
+        self, part: int, count: int, rate: float, loaded: float | None = None, sinusoids: int = SINUSOIDS
+    ) -> Samples:
+        """Rigid bodies alone: no friction, no noise. loaded: time from which on they carry the payload."""
+        payload = None if loaded is None else Payload(self.payload, loaded)
+        stream = Stream(count, rate, sinusoids, speed=self.speed, noise=0.0, payload=payload)
+        return simulate(self.arm, stream, self._seed(part))
+
+    def _measured(self, samples: Samples, factor: Array | float, part: int) -> Samples:
+        samples = self._with_friction(samples, factor)
+        rng = np.random.default_rng(self._seed(part))
+        return replace(samples, tau=samples.tau + self.noise * rng.standard_normal(samples.tau.shape))
+
+    def _with_friction(self, samples: Samples, factor: Array | float) -> Samples:
+        friction = self.viscous * samples.dq + self.coulomb * np.sign(samples.dq)
+        return replace(samples, tau=samples.tau + factor * friction)
+
+    def _seed(self, part: int) -> int:
+        return _SEEDS * self.seed + part
+
+
+def rows_of(samples: Samples) -> Rows:
+    """Rows to learn from, all of them."""
+    code: NDArray[np.uint8] = np.full(len(samples), LEARNT, dtype=np.uint8)
+    return Rows(samples.t, samples.q, samples.dq, samples.ddq, samples.tau, code, spacing.evenly(samples.t))

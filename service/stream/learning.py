@@ -1,0 +1,188 @@
+"""Frames that carry measured torque: gathered while the stream goes on, and logged a block at a time."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable
+from time import perf_counter
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from anyio import to_thread
+
+from service.context import Service
+from service.errors import ErrorBody, ServiceError, invalid_request
+from service.inference.loaded import Served
+from service.stream.frames import NUMBER, REQUEST
+from service.updates.ingest.frames import Frames, FramesResult
+
+if TYPE_CHECKING:
+    from lipcore.samples import Array
+
+logger = logging.getLogger(__name__)
+
+BACKLOG = 10
+"""Blocks that may wait before the stream is read no further."""
+TICK = 1e-6
+"""Least step of time between two frames, s: those that come in one piece have one time of arrival."""
+
+
+class Taught(NamedTuple):
+    """A frame to learn from. served: what answered it; arrived: time of `time.perf_counter`.
+
+    request: the whole frame; answer: bytes of mean and standard deviation, (2, n), made before it is learnt.
+    """
+
+    served: Served
+    sequence: int
+    arrived: float
+    request: bytes
+    answer: bytes
+
+
+class Learning:
+    """What one connection teaches. One block at a time is logged, in order; what comes meanwhile waits.
+
+    stream_id: source of the torques; say: sends a text to the client. For the event loop; logging is done in a thread.
+    """
+
+    def __init__(self, service: Service, stream_id: str, say: Callable[[str], Awaitable[None]]) -> None:
+        self._service, self._stream_id, self._say = service, stream_id, say
+        self._most, self._wait = service.settings.stream_flush_rows, service.settings.stream_flush_s
+        # event time goes on evenly though the clock of the host be set while the stream is open
+        self._clock = time.time() - perf_counter()
+        self._waiting: deque[Taught] = deque()
+        self._sequence, self._time = -1, -np.inf
+        self._flushed = asyncio.Event()
+        self._task: asyncio.Task[None] | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._ended = False
+
+    async def admit(self, sequence: int) -> None:
+        """Wait until there is room for a frame; raise InvalidRequestError where its sequence does not go up."""
+        if sequence <= self._sequence:
+            expected = (
+                f"more than {self._sequence}, the last one to learn from: count up, or connect again to repeat frames"
+            )
+            raise invalid_request("sequence", sequence, expected)
+        while len(self._waiting) >= BACKLOG * self._most:
+            self._flushed.clear()
+            await self._flushed.wait()
+
+    def add(self, frame: Taught) -> None:
+        """Gather a frame that was admitted and answered."""
+        self._sequence = frame.sequence
+        self._waiting.append(frame)
+        if self._task is None and (self._timer is None or len(self._waiting) >= self._most):
+            self._go_on()
+
+    async def close(self) -> None:
+        """Log what is left, which the client is not told any more."""
+        self._ended = True
+        self._go_on()
+        while self._task is not None:
+            await asyncio.wait((self._task,))
+
+    def _go_on(self) -> None:
+        """Log a block if it is time to, else look again when it is."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if self._task is not None or not self._waiting:
+            return
+        if self._due():
+            self._task = asyncio.create_task(self._flush())
+        else:
+            left = self._waiting[0].arrived + self._wait - perf_counter()
+            self._timer = asyncio.get_running_loop().call_later(left, self._go_on)
+
+    def _due(self) -> bool:
+        waiting = self._waiting
+        if not waiting:
+            return False
+        return self._ended or len(waiting) >= self._most or perf_counter() - waiting[0].arrived >= self._wait
+
+    async def _flush(self) -> None:
+        try:
+            while self._due():
+                block = self._take()
+                said = await self._learn(block)
+                self._flushed.set()
+                if not self._ended:
+                    await self._say(json.dumps(said))
+        finally:
+            self._task = None
+            self._go_on()
+
+    def _take(self) -> list[Taught]:
+        """Take the oldest frames, as many as are logged together: at most a block, all answered by one revision."""
+        waiting, served = self._waiting, self._waiting[0].served
+        block: list[Taught] = []
+        while waiting and waiting[0].served is served and len(block) < self._most:
+            block.append(waiting.popleft())
+        return block
+
+    async def _learn(self, block: list[Taught]) -> dict[str, Any]:
+        """Log a block; return what there is to say of it."""
+        first, through = block[0].sequence, block[-1].sequence
+        try:
+            result = await to_thread.run_sync(self._hand_over, block, limiter=self._service.updates.limiter)
+        except ServiceError as error:
+            said = error
+        except Exception as error:  # the next block may be logged
+            logger.error("unexpected error while stream %r was learnt from", self._stream_id, exc_info=error)
+            said = ServiceError("an unexpected error; the service's log says more")
+        else:
+            return {
+                "learnt": {
+                    "through": result.through,
+                    "accepted": result.accepted,
+                    "duplicates": result.duplicates,
+                    "rejected": result.rejected,
+                    "revision": result.revision,
+                }
+            }
+        if self._ended:
+            logger.warning("frames %d to %d of stream %r are not learnt: %s", first, through, self._stream_id, said)
+        body = ErrorBody(code=said.code, message=said.message, detail=said.detail)
+        return {"refused": {"first": first, "through": through, "error": body.model_dump()}}
+
+    def _hand_over(self, block: list[Taught]) -> FramesResult:
+        return self._service.updates.observe_frames(self._frames(block))
+
+    def _frames(self, block: list[Taught]) -> Frames:
+        served = block[0].served
+        q, dq, ddq, tau = _columns([each.request[REQUEST.size :] for each in block], 4)
+        mean, std = _columns([each.answer for each in block], 2)
+        return Frames(
+            model=served.name,
+            stream_id=self._stream_id,
+            served=served,
+            sequences=np.array([each.sequence for each in block], np.int64),
+            time=self._times(block),
+            q=q,
+            dq=dq,
+            ddq=ddq,
+            tau=tau,
+            mean=mean,
+            std=std,
+        )
+
+    def _times(self, block: list[Taught]) -> Array:
+        """Times of arrival, Unix time in s, each later than the one before."""
+        ticks = TICK * np.arange(1, len(block) + 1)
+        arrived = np.array([each.arrived for each in block]) + self._clock
+        found: Array = np.maximum.accumulate(np.maximum(arrived - ticks, self._time)) + ticks
+        self._time = float(found[-1])
+        return found
+
+
+def _columns(rows: list[bytes], count: int) -> Array:
+    """Numbers of N rows with `count` vectors each, as one array (count, N, n) of its own."""
+    numbers = np.frombuffer(b"".join(rows), NUMBER).reshape(len(rows), count, -1)
+    found: Array = np.array(numbers.transpose(1, 0, 2), np.float64, order="C")
+    return found

@@ -1,0 +1,1 @@
+"""Learning while serving: a durable log of observations, and what follows it."""

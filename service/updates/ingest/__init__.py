@@ -1,0 +1,1 @@
+"""A batch of observations on its way into the log."""

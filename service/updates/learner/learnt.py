@@ -1,0 +1,56 @@
+"""What a version has learnt, for the process that serves: as much of it as can be told at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sqlalchemy.orm import Session
+
+from lipcore.model import TorqueModel
+from service.database import Database, LearnerRow, ServingRow
+from service.files import Files
+from service.updates.learner import recent
+from service.updates.learner.restore import restore
+from service.updates.storage import log, snapshots
+
+MOST_ROWS = 500
+"""Rows since the last snapshot that are learnt while a version is loaded, about: for more, a learner is needed."""
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """The model at a revision. behind: whether the log holds more than that."""
+
+    model: TorqueModel
+    revision: int
+    behind: bool
+
+
+def find(database: Database, files: Files, model: str, version: int, base: TorqueModel) -> Learnt | None:
+    """Return what a version has learnt, None where that is nothing. base: the version as trained.
+
+    One that neither serves nor is a candidate has learnt what its last snapshot says.
+    """
+    with database.session() as session:
+        start, newest = log.start_of(session, model, version), log.newest(session, model)
+        if newest == start:
+            return None
+        learns = _learns(session, model, version)
+        row = snapshots.latest(session, model, version, None)
+    if not learns and row is None:
+        return None
+    at_most = None if learns or row is None else row.number
+    known = restore(database, files, model, version, base, at_most, most_rows=MOST_ROWS)
+    behind = learns and known.number < newest
+    if known.number == start:
+        return Learnt(base, 0, behind)
+    floor = recent.floor(database, model, version, known.number, base.n_joints)
+    return Learnt(known.online.model(floor), known.number - start, behind)
+
+
+def _learns(session: Session, model: str, version: int) -> bool:
+    row = session.get(LearnerRow, (model, version))
+    if row is not None:
+        return row.role in ("serving", "candidate")
+    serving = session.get(ServingRow, model)
+    return serving is None or serving.version == version

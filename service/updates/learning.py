@@ -1,0 +1,94 @@
+"""How a model learns: what its owner has set, and whether it holds still after a change."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from service.database import Database, LearningRow, ModelRow
+from service.errors import invalid_request, not_found
+from service.updates.storage import log
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class LearningOptions(BaseModel):
+    """How a model learns from observations."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    enabled: bool = Field(True, description="Whether observations are taken at all")
+    forgetting_s: float | None = Field(
+        None,
+        ge=1,
+        allow_inf_nan=False,
+        description="Age in s at which a sample counts 1/e of a new one, in event time; null: nothing is forgotten",
+    )
+    on_change: Literal["hold", "adapt", "learn"] = Field(
+        "hold",
+        description="What follows a detected change of the robot. `hold`: nothing is learnt until its owner decides; "
+        "`adapt`: a new regime begins; `learn`: learning goes on as before",
+    )
+    torque_limits: list[Positive] | None = Field(
+        None, description="Largest |tau| of each joint's actuator in N·m, to tell saturated samples; null: not known"
+    )
+    contact_threshold: Positive = Field(
+        8.0, description="Predictive standard deviations, noise included, beyond which a torque is taken for a contact"
+    )
+    auto_refresh: bool = Field(True, description="Train a new version by itself where motion leaves what is known")
+    auto_promote: bool = Field(True, description="Let such a version answer by itself once it predicts better")
+
+
+def options(session: Session, model: str) -> LearningOptions:
+    """What is set for a model, the defaults where nothing is."""
+    row = session.get(LearningRow, model)
+    return LearningOptions() if row is None else LearningOptions(**row.options)
+
+
+def set_options(database: Database, model: str, wanted: LearningOptions, n_joints: int, received: float) -> None:
+    """Set how a model learns from now on; a new time constant of forgetting is an event of its log.
+
+    Raise NotFoundError for a model that does not exist, InvalidRequestError where `torque_limits` is not of its joints.
+    """
+    limits = wanted.torque_limits
+    if limits is not None and len(limits) != n_joints:
+        raise invalid_request(
+            "torque_limits", f"a list of {len(limits)}", f"{n_joints} positive numbers, one for each joint in order"
+        )
+    with database.transaction() as session:
+        row = _row(session, model)
+        row.options = wanted.model_dump()
+        if wanted.forgetting_s != log.forgetting(session, model, log.newest(session, model)):
+            log.append(session, model, "settings", {"forgetting_s": wanted.forgetting_s}, received)
+
+
+def hold(session: Session, model: str, detail: dict[str, Any]) -> None:
+    """Let a model hold still: what comes is answered and logged, but not learnt. detail: why."""
+    _row(session, model).held = detail
+
+
+def release(session: Session, model: str) -> None:
+    """Let a model learn again; nothing happens where it does."""
+    row = session.get(LearningRow, model)
+    if row is not None:
+        row.held = None
+
+
+def held(session: Session, model: str) -> dict[str, Any] | None:
+    """Why a model holds still; None where it learns."""
+    row = session.get(LearningRow, model)
+    return None if row is None else row.held
+
+
+def _row(session: Session, model: str) -> LearningRow:
+    """The row of a model, a new one with the defaults where there is none."""
+    row = session.get(LearningRow, model)
+    if row is None:
+        if session.scalar(select(ModelRow).where(ModelRow.name == model)) is None:
+            raise not_found("model", model)
+        row = LearningRow(model=model, options=LearningOptions().model_dump(), held=None)
+        session.add(row)
+    return row

@@ -1,0 +1,1 @@
+"""The log of observations, and what keeps it short."""

@@ -1,0 +1,85 @@
+"""Snapshots of what a version had learnt, which make a restart short and a rollback possible."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sqlalchemy import Select, delete, select
+from sqlalchemy.orm import Session
+
+from service.database import Database, EventRow, SnapshotRow, now
+from service.files import Files, new_id
+
+
+def save(
+    database: Database, files: Files, model: str, version: int, number: int, payload: bytes, *, seen: int, most: int
+) -> str | None:
+    """Store a version's state after event `number` durably and return its id; thin what is kept to `most`.
+
+    seen: newest event that had been read when the state was made. None, and nothing is stored, where an event since
+    then took something out that the state may contain: the state of that number is another one now.
+    """
+    snapshot = new_id("snap")
+    files.write_snapshot(snapshot, payload)
+    with database.transaction() as session:
+        outdated = _is_outdated(session, model, number, seen)
+        gone = [snapshot] if outdated else _add(session, snapshot, model, version, number, most)
+    for name in gone:  # only after the commit: until then the rows still name them
+        files.delete_snapshot(name)
+    return None if outdated else snapshot
+
+
+def latest(session: Session, model: str, version: int, at_most: int | None) -> SnapshotRow | None:
+    """The snapshot of a version with the highest number, up to `at_most` where given."""
+    query = _of(model, version) if at_most is None else _of(model, version).where(SnapshotRow.number <= at_most)
+    return session.scalar(query.limit(1))
+
+
+def read(files: Files, row: SnapshotRow) -> bytes:
+    """What was stored; raise FileNotFoundError where its file is lost."""
+    return files.read_snapshot(row.id)
+
+
+def thinned(numbers: Sequence[int], most: int) -> list[int]:
+    """Places of the snapshots to keep where they stand at these falling numbers, at most `most` >= 2.
+
+    The newest half stays and so does the oldest. Of the others those go whose neighbours are closest together, so that
+    what is left reaches back in even steps.
+    """
+    kept = list(range(len(numbers)))
+    while len(kept) > most:
+        inner = range((most + 1) // 2, len(kept) - 1)
+        kept.pop(min(inner, key=lambda place: numbers[kept[place - 1]] - numbers[kept[place + 1]]))
+    return kept
+
+
+def _of(model: str, version: int) -> Select[SnapshotRow]:
+    return (
+        select(SnapshotRow)
+        .where(SnapshotRow.model == model, SnapshotRow.version == version)
+        .order_by(SnapshotRow.number.desc())
+    )
+
+
+def _is_outdated(session: Session, model: str, number: int, seen: int) -> bool:
+    """Whether an event after `seen` took out something at or before `number`."""
+    since = select(EventRow).where(
+        EventRow.model == model, EventRow.number > seen, EventRow.kind.in_(("rollback", "unlearn"))
+    )
+    for event in session.scalars(since):
+        detail = event.detail or {}
+        if (detail["to"] < number) if event.kind == "rollback" else (detail["event"] <= number):
+            return True
+    return False
+
+
+def _add(session: Session, snapshot: str, model: str, version: int, number: int, most: int) -> list[str]:
+    """Add a snapshot's row; return the ids of those that gave way to it."""
+    rows = list(session.scalars(_of(model, version)))
+    session.add(SnapshotRow(id=snapshot, model=model, version=version, number=number, created_at=now()))
+    others = [row for row in rows if row.number != number]
+    numbers = sorted([number, *(row.number for row in others)], reverse=True)
+    kept = {numbers[place] for place in thinned(numbers, most)}
+    gone = [row.id for row in rows if row.number == number or row.number not in kept]
+    session.execute(delete(SnapshotRow).where(SnapshotRow.id.in_(gone)))
+    return gone

@@ -1,0 +1,99 @@
+"""A home with a model whose log tests write, and batches to write into it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sqlalchemy import select
+
+from lipcore.online.batch import CODES, Rows
+from service.database import Database, EventRow, ModelRow, StreamRow, VersionRow, now
+from service.updates.storage import log
+from service.updates.storage.log import NewBatch
+
+MODEL, OTHER = "arm", "other"
+
+
+def opened(home: Path) -> Database:
+    """A database with two models, each of one version."""
+    database = Database(home)
+    with database.transaction() as session:
+        session.add_all(ModelRow(name=name, created_at=now()) for name in (MODEL, OTHER))
+        session.flush()
+        for name in (MODEL, OTHER):
+            session.add(VersionRow(model=name, version=1, folder=f"mv_{name}", created_at=now(), job=None, manifest={}))
+    return database
+
+
+def rows(count: int = 4, n: int = 2, seed: int = 0, codes: tuple[str, ...] = ()) -> Rows:
+    """Rows at 1 kHz from event time 100 s + seed on; codes: of the first ones, the others are learnt."""
+    values = np.random.default_rng(seed).normal(size=(4, count, n))
+    code = np.zeros(count, np.uint8)
+    code[: len(codes)] = [CODES.index(name) for name in codes]
+    return Rows(100.0 + seed + np.arange(count) / 1000, *values, code)
+
+
+def batch(sequence: int, last: int | None = None, **fields: Any) -> NewBatch:
+    """A batch, of frames where the last one is given; its rows and digest follow from the sequence."""
+    usual = {
+        "stream_id": "robot-1",
+        "kind": "batches" if last is None else "frames",
+        "sequence": sequence,
+        "last_sequence": sequence if last is None else last,
+        "digest": f"{sequence:064x}",
+        "offset": 1.5,
+        "received": 1000.0 + sequence,
+        "version": 1,
+        "revision": 0,
+        "rows": rows(seed=sequence),
+        "report": {"accepted": 4},
+        "record": {"rows": 4},
+    }
+    return NewBatch(**{**usual, **fields})
+
+
+def everything(database: Database, model: str = MODEL) -> list[EventRow]:
+    """All events of a model by number."""
+    with database.session() as session:
+        return list(session.scalars(select(EventRow).where(EventRow.model == model).order_by(EventRow.number)))
+
+
+def live(database: Database, model: str = MODEL) -> list[int]:
+    """Numbers of the events that are not void."""
+    return [event.number for event in everything(database, model) if not event.void]
+
+
+def write(database: Database, *batches: NewBatch, model: str = MODEL) -> list[int]:
+    """Log each batch in a transaction of its own; return the numbers."""
+    numbers = []
+    for item in batches:
+        with database.transaction() as session:
+            numbers.append(log.append_batch(session, model, item).number)
+    return numbers
+
+
+def note(database: Database, kind: log.EventKind, detail: dict[str, Any], model: str = MODEL, **more: Any) -> int:
+    """Log an event of another kind; return its number."""
+    with database.transaction() as session:
+        return log.append(session, model, kind, detail, 2000.0, **more).number
+
+
+def take_back(database: Database, number: int) -> int:
+    """Unlearn the batch of this number; return the number of the event that says so."""
+    with database.transaction() as session:
+        [event] = log.events(session, MODEL, number - 1, 1, void=True)
+        return log.unlearn(session, MODEL, event, 3000.0).number
+
+
+def roll_back(database: Database, to: int) -> int:
+    """Roll back to the event of this number; return the number of the event that says so."""
+    with database.transaction() as session:
+        return log.rollback(session, MODEL, to, 3000.0).number
+
+
+def source(database: Database, stream_id: str = "robot-1", model: str = MODEL) -> StreamRow | None:
+    """What is known of a stream."""
+    with database.session() as session:
+        return log.stream(session, model, stream_id)

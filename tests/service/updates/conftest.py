@@ -1,0 +1,22 @@
+"""A service that models learn in, shared by the tests: starting one starts a process."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from service.models import registry
+from tests.service.conftest import Trained
+from tests.service.data import service_of
+from tests.service.updates.lessons import School
+from tests.service.updates.lessons import school as opened
+
+
+@pytest.fixture(scope="session")
+def school(api: object, trained: Trained, tmp_path_factory: pytest.TempPathFactory) -> Iterator[School]:
+    """A service; every test enrols models of its own."""
+    service = service_of(api)
+    folder = service.files.versions / registry.find(service.database, trained.name, 1).folder
+    with opened(tmp_path_factory.mktemp("school"), folder) as started:
+        yield started

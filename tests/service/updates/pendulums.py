@@ -1,0 +1,182 @@
+"""A home with a double pendulum whose log tests write, and what it should have learnt, by one sum over all rows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import lipcore
+from lipcore import FitOptions, Samples, TorqueModel
+from lipcore.compact.posterior import CompactPosterior
+from lipcore.compact.statistics import collect, merge
+from lipcore.online.batch import Rows
+from lipcore.online.learner import OnlineModel
+from lipcore.online.record import Record
+from service.database import Database, EventRow
+from service.files import Files
+from service.inference.loaded import LoadedModels
+from service.models import registry
+from service.settings import Settings
+from service.updates.learner import publication
+from service.updates.learner.messages import Published
+from service.updates.learner.restore import restore
+from service.updates.storage import log
+from service.updates.storage.log import NewBatch
+from tests.service.data import QUICK, stream
+
+ARM = "arm"
+ROWS = 10
+"""Rows of a batch."""
+BEGIN = 1000.0
+"""Event time of the first one, s."""
+QUERIES = np.random.default_rng(5).uniform(-1.5, 1.5, (3, 40, 2))
+CLOSE = {"rtol": 1e-8, "atol": 1e-8}
+
+
+@cache
+def trained() -> TorqueModel:
+    """A model of a double pendulum; always the same object."""
+    return lipcore.train(stream(), ["revolute", "revolute"], options=FitOptions(**QUICK))
+
+
+@cache
+def recording() -> Samples:
+    """What the robot does later on: other motions, and more friction."""
+    return stream(seed=21, samples=3000, viscous=2.0)
+
+
+def rows(number: int, size: int = ROWS) -> Rows:
+    """Rows of the batch with this sequence, at 100 Hz of event time."""
+    part = slice(number * size, (number + 1) * size)
+    time = BEGIN + np.arange(part.start, part.stop) / 100
+    values = (getattr(recording(), name)[part] for name in ("q", "dq", "ddq", "tau"))
+    return Rows(time, *values, np.zeros(size, np.uint8))
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A model in a home, and what happens to it."""
+
+    database: Database
+    files: Files
+    settings: Settings
+    model: str = ARM
+
+    @classmethod
+    def open(cls, home: Path, **settings: Any) -> Arm:
+        """A home with version 1 of the model."""
+        arm = cls(Database(home), Files(home), Settings(home=home, publish_every_s=0.02, **settings))
+        arm.publish()
+        return arm
+
+    def publish(self, model: str | None = None, **arguments: Any) -> int:
+        """Add the trained model as a version, of this model unless said."""
+        model = model or self.model
+        folder = f"mv_{model}_{len(list(self.files.versions.iterdir()))}"
+        manifest = lipcore.save(trained(), self.files.versions / folder)
+        with self.database.transaction() as session:
+            return registry.publish(session, model, folder, manifest, None, **arguments)
+
+    @property
+    def base(self) -> TorqueModel:
+        """The version as trained, as the service loads it."""
+        return lipcore.load(self.files.versions / registry.find(self.database, self.model, 1).folder)
+
+    def batch(self, number: int, size: int = ROWS, model: str | None = None, **fields: Any) -> int:
+        """Log the batch with this sequence, predicted without error unless said; return its event's number."""
+        came = fields.pop("rows", None) or rows(number, size)
+        usual: dict[str, Any] = {
+            "stream_id": "s",
+            "kind": "batches",
+            "sequence": number,
+            "last_sequence": number,
+            "digest": f"{number:064x}",
+            "offset": 0.0,
+            "received": float(came.time[-1]),
+            "version": 1,
+            "revision": 0,
+            "rows": came,
+            "report": {},
+            "record": None,
+        }
+        with self.database.transaction() as session:
+            return log.append_batch(session, model or self.model, NewBatch(**usual | fields)).number
+
+    def batches(self, *numbers: int) -> None:
+        """Log several batches."""
+        for number in numbers:
+            self.batch(number)
+
+    def event(self, kind: str, rows: Rows | None = None, **detail: Any) -> int:
+        """Log an event of another kind; return its number."""
+        with self.database.transaction() as session:
+            return log.append(session, self.model, kind, detail, 0.0, rows).number
+
+    def unlearn(self, number: int) -> int:
+        """Unlearn the batch that is the event of this number."""
+        with self.database.transaction() as session:
+            return log.unlearn(session, self.model, self.find(number), 0.0).number
+
+    def rollback(self, to: int) -> int:
+        """Roll back to the event of this number."""
+        with self.database.transaction() as session:
+            return log.rollback(session, self.model, to, 0.0).number
+
+    def find(self, number: int) -> EventRow:
+        """An event."""
+        with self.database.session() as session:
+            return log.events(session, self.model, number - 1, 1, void=True)[0]
+
+    def restored(self, **arguments: Any) -> Any:
+        """What version 1 has learnt."""
+        return restore(self.database, self.files, self.model, 1, self.base, **arguments)
+
+
+def at_once(numbers: Iterable[int] = (), parts: Iterable[Rows] = ()) -> tuple[np.ndarray, np.ndarray]:
+    """Torques and their deviations at QUERIES after the training and all of these batches, by one sum."""
+    model = trained()
+    posterior, known = model.posterior, model.posterior.statistics
+    learnt = [*(rows(number) for number in numbers), *parts]
+    if learnt:
+        every = Rows.concatenate(learnt).learnt
+        residual = torch.from_numpy(every.tau) - posterior.kernel.mean(every.motion())
+        known = merge(known, collect(posterior.basis, posterior.noise_variance, every.motion(), residual))
+    built = CompactPosterior.build(
+        posterior.kernel, posterior.basis, known, posterior.noise_variance, posterior.std_factor
+    )
+    return predicted(replace(model, posterior=built))
+
+
+def predicted(model: TorqueModel) -> tuple[np.ndarray, np.ndarray]:
+    """Torques and their deviations at QUERIES."""
+    answer = model.predict(*QUERIES)
+    return answer.tau, answer.tau_std
+
+
+def same(found: TorqueModel | OnlineModel, expected: tuple[np.ndarray, np.ndarray]) -> None:
+    """Check what a model says against torques and their deviations."""
+    model = found.model() if isinstance(found, OnlineModel) else found
+    for values, wanted in zip(predicted(model), expected, strict=True):
+        np.testing.assert_allclose(values, wanted, **CLOSE)
+
+
+def differ(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray], least: float = 1e-4) -> bool:
+    """Whether torques differ by more than `least` N·m somewhere."""
+    return bool(np.abs(one[0] - other[0]).max() > least)
+
+
+def record(error: float, count: int = 100) -> dict[str, Any]:
+    """Prequential sums of rows predicted with an error of this size and either sign, as the log has them."""
+    tau = np.where(np.arange(count)[:, None] % 2, 1.0, -1.0) * np.array([[error, 0.0]])
+    return Record.of(tau, np.zeros((count, 2)), np.full((count, 2), 1e-3), trained().noise_std).to_json()
+
+
+def adopt(loaded: LoadedModels, message: Published) -> bool:
+    """Let answers follow what the learner has published, as the service does."""
+    return loaded.revise(message.model, message.version, message.revision, publication.read(message.path))

@@ -1,0 +1,240 @@
+"""Torque over WebSockets into the log of a real server: acknowledged when it is durable, learnt once, whatever dies."""
+
+from __future__ import annotations
+
+import json
+import signal
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from sqlalchemy import select, text
+from sqlalchemy.orm import undefer
+
+from lipcore.online.batch import Rows
+from lipcore.online.learner import OnlineModel
+from service.database import Database, EventRow
+from service.stream.client import StreamClient, StreamError
+from service.updates.storage import payload
+from tests.service.data import DEADLINE, eventually, stream, train, upload
+from tests.service.server import Server
+from tests.service.streams import STREAM, TAU, dial, frame, hello, read, saved_model
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Motions (N, 3, n) and the torques (N, n) measured at them, no two alike."""
+
+    motions: np.ndarray
+    tau: np.ndarray
+
+
+def measured_on(robot: str, count: int) -> Measured:
+    """A recording of a robot that no model was trained on."""
+    samples = stream(robot, samples=count, seed=11)
+    return Measured(np.stack([samples.q, samples.dq, samples.ddq], 1), samples.tau)
+
+
+@pytest.fixture(scope="module")
+def measured() -> Measured:
+    return measured_on("double-pendulum", 500)
+
+
+@pytest.fixture(scope="module")
+def learning(tmp_path_factory):
+    """A server that logs frames soon."""
+    with Server(tmp_path_factory.mktemp("learning"), LIPSERVE_STREAM_FLUSH_S="0.05") as server:
+        train(server.client, "pendulum", upload(server.client, stream())["id"])
+        yield server
+
+
+def client_of(server: Server, stream_id: str, model: str = "pendulum", **options: Any) -> StreamClient:
+    return StreamClient(model, server.url, timeout=DEADLINE, stream_id=stream_id, **options)
+
+
+def batches(server: Server, stream_id: str) -> list[EventRow]:
+    """What is durable of a stream, in the order of the log."""
+    database = Database(server.home)
+    try:
+        with database.session() as session:
+            query = select(EventRow).where(EventRow.stream_id == stream_id, EventRow.kind == "batch")
+            return list(session.scalars(query.order_by(EventRow.number).options(undefer(EventRow.payload))))
+    finally:
+        database.close()
+
+
+def rows(server: Server, stream_id: str) -> Rows:
+    """All rows that are durable of a stream."""
+    return Rows.concatenate([payload.decode(event.payload) for event in batches(server, stream_id)])
+
+
+def sent_once(found: Rows, measured: Measured, indices: list[int]) -> None:
+    """Check that the rows are these samples, each once and in order."""
+    np.testing.assert_array_equal(np.stack([found.q, found.dq, found.ddq], 1), measured.motions[indices])
+    np.testing.assert_array_equal(found.tau, measured.tau[indices])
+
+
+def test_what_a_controller_measures_is_learnt_while_it_asks(learning, measured):
+    count, unseen = 400, measured.motions[400:]
+    with client_of(learning, "arm-1") as client:
+        answers = [client.ask(*measured.motions[k], tau=measured.tau[k]) for k in range(count)]
+        learnt = client.flush()
+        eventually(lambda: client.ask(*unseen[0]).revision >= learnt.revision)
+        after = [client.ask(*motion) for motion in unseen]
+    assert (learnt.through, learnt.duplicates, client.refusals) == (count, 0, ())
+    assert learnt.accepted + sum(learnt.rejected.values()) == count
+    assert learnt.accepted > count // 2
+    assert answers[0].revision == 0 < learnt.revision
+    found = rows(learning, "arm-1")
+    sent_once(found, measured, list(range(count)))
+    assert (np.diff(found.time) > 0).all()
+    # what is on record of a row is what was answered before it was learnt
+    revisions = [event.revision for event in batches(learning, "arm-1") for _ in range(event.rows)]
+    assert revisions == [answer.revision for answer in answers]
+    trained = saved_model(learning, "pendulum", 1)
+    model = OnlineModel.start(trained).learn(found).model()
+    assert {answer.revision for answer in after} == {learnt.revision}
+    np.testing.assert_allclose([answer.tau for answer in after], [model.answer(each)[0] for each in unseen], rtol=1e-6)
+    assert max(np.abs(after[k].tau - trained.answer(unseen[k])[0]).max() for k in range(len(unseen))) > 1e-4
+
+
+def test_nothing_is_acknowledged_before_it_is_in_the_database(learning, measured):
+    database = Database(learning.home)
+    with dial(learning, f"{STREAM}?stream_id=locked") as connection:
+        hello(connection)
+        with database.transaction() as session:  # nobody else can write
+            assert session.execute(text("SELECT count(*) FROM events WHERE stream_id = 'locked'")).scalar() == 0
+            for number in range(5):
+                connection.send(frame(measured.motions[number], number, tau=measured.tau[number]))
+            assert [read(connection.recv(DEADLINE)).sequence for _ in range(5)] == list(range(5))
+            with pytest.raises(TimeoutError):
+                connection.recv(0.5)
+        through = -1
+        while through < 4:
+            through = json.loads(connection.recv(DEADLINE))["learnt"]["through"]
+            assert batches(learning, "locked")[-1].last_sequence >= through
+    database.close()
+    sent_once(rows(learning, "locked"), measured, list(range(5)))
+
+
+def test_frames_sent_again_are_known_and_other_content_is_refused(learning, measured):
+    def send(client, numbers, scale=1.0):
+        for k in numbers:
+            client.ask(*measured.motions[k], tau=scale * measured.tau[k])
+        return client.flush()
+
+    with client_of(learning, "again", first_sequence=0) as client:
+        assert send(client, range(30)).through == 29
+    with client_of(learning, "again", first_sequence=20) as client:  # ten are known, ten are new
+        found = send(client, range(20, 40))
+    assert (found.through, found.duplicates) == (39, 10)
+    assert found.accepted + sum(found.rejected.values()) == 10
+    with client_of(learning, "again", first_sequence=35) as client:
+        send(client, range(35, 37), scale=2.0)
+        assert {refusal.code for refusal in client.refusals} == {"conflict"}
+        assert (client.refusals[0].first, client.refusals[-1].through) == (35, 36)
+    sent_once(rows(learning, "again"), measured, list(range(40)))
+
+
+def test_torques_that_cannot_be_learnt_are_counted(learning, measured):
+    with client_of(learning, "odd") as client:
+        for k in range(6):
+            tau = [np.nan, 0.0] if k in (2, 3) else measured.tau[k]
+            assert client.ask(*measured.motions[k], tau=tau).tau_std is not None
+        found = client.flush()
+    assert found.rejected["non_finite"] == 2
+    assert found.accepted + sum(found.rejected.values()) == 6
+
+
+def test_a_stream_of_batches_takes_no_frames(learning, measured):
+    q, dq, ddq = measured.motions[0].tolist()
+    body = {"stream_id": "http", "sequence": 0, "q": q, "dq": dq, "ddq": ddq, "tau": measured.tau[0].tolist()}
+    assert learning.client.post("/v1/models/pendulum/observations", json=body).status_code == 200
+    with client_of(learning, "http") as client:
+        client.ask(*measured.motions[1], tau=measured.tau[1])
+        found = client.flush()
+        (refusal,) = client.refusals
+    assert (found.through, refusal.first, refusal.through, refusal.code) == (0, 1, 1, "conflict")
+    assert "batches" in refusal.message
+
+
+def test_learning_that_is_switched_off_is_said_and_may_be_switched_on_again(learning, measured):
+    def enable(enabled):
+        answer = learning.client.put("/v1/models/pendulum/learning", json={"enabled": enabled})
+        assert answer.status_code == 200, answer.text
+
+    with client_of(learning, "switched") as client:
+        enable(False)
+        client.ask(*measured.motions[0], tau=measured.tau[0])
+        assert client.flush().through == 0
+        enable(True)
+        client.ask(*measured.motions[1], tau=measured.tau[1])
+        assert client.flush().through == 2
+        (refusal,) = client.refusals
+    assert (refusal.first, refusal.through, refusal.code) == (1, 1, "learning_disabled")
+    assert "switched off" in refusal.message
+    sent_once(rows(learning, "switched"), measured, [1])
+
+
+def test_a_pinned_stream_only_asks(learning, measured):
+    with client_of(learning, "pinned", version=1) as client:
+        with pytest.raises(StreamError, match="a stream pinned to a version only asks"):
+            client.ask(*measured.motions[0], tau=measured.tau[0])
+        assert client.ask(*measured.motions[0]).version == 1
+        assert client.flush().through == 0
+    assert batches(learning, "pinned") == []
+
+
+def test_what_was_gathered_is_logged_when_the_stream_ends(home):
+    measured = measured_on("panda", 10)
+    with Server(home, LIPSERVE_STREAM_FLUSH_S="3600", LIPSERVE_STREAM_FLUSH_ROWS="4") as server:
+        clients = {name: client_of(server, name, "panda-sim") for name in ("closed", "lost", "stopped")}
+        for client in clients.values():
+            for motion, tau in zip(measured.motions, measured.tau, strict=True):
+                client.ask(*motion, tau=tau)
+        clients["closed"].close()
+        clients["lost"]._socket.socket.close()
+        for name in ("closed", "lost"):
+            eventually(lambda name=name: sum(event.rows for event in batches(server, name)) == 10)
+        assert server.terminate() == -signal.SIGTERM  # uvicorn ends in good order, and then as it was told to
+        for name, client in clients.items():
+            sent_once(rows(server, name), measured, list(range(10)))
+            with suppress(StreamError):
+                client.flush()
+            assert client.learnt.through in (0, 4, 8)  # the last two are not told
+            client.close()
+        assert "ERROR" not in server.log.read_text()
+
+
+def test_no_acknowledged_frame_is_lost_or_learnt_twice_when_the_service_is_killed(home):
+    measured, known, count = measured_on("panda", 800), 0, 800
+    for kill_at in (90, 333, 600, None):  # None: to the end
+        with Server(home, LIPSERVE_STREAM_FLUSH_S="0.02", LIPSERVE_STREAM_FLUSH_ROWS="20") as server:
+            with client_of(server, "killed", "panda-sim", first_sequence=known + 1) as client:
+                for k in range(known, count if kill_at is None else kill_at):
+                    client.ask(*measured.motions[k], tau=measured.tau[k])
+                    if k % 80 == 79:
+                        client.flush()
+                if kill_at is None:
+                    assert client.flush().through == count
+                else:
+                    for k in range(kill_at, kill_at + 45):  # under way when it dies
+                        client.send(*measured.motions[k], tau=measured.tau[k])
+                    server.kill()
+                    with suppress(StreamError):
+                        client.flush()
+                assert client.refusals == ()
+                known = client.learnt.through
+            durable = rows(server, "killed")
+            assert len(durable) >= known > 0
+            sent_once(durable, measured, list(range(len(durable))))
+    assert known == len(durable) == count
+
+
+def test_the_flag_needs_a_stream_id_in_the_address(learning):
+    with dial(learning, STREAM) as connection:
+        hello(connection)
+        connection.send(frame(tau=TAU))
+        assert "stream_id is missing" in read(connection.recv(DEADLINE)).error["message"]
