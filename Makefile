@@ -2,22 +2,25 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-# one thread a process: the tests' matrices are small, and two halves run side by side, each in its fixed order
+# one thread a process: the tests' matrices are small, and three parts run side by side, each in its fixed order
 TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: demo test test-lipcore test-service test-all lint install serve image clean
+.PHONY: demo test test-lipcore test-service test-updates test-all lint install serve image clean
 
 demo: install
 	$(BIN)/lipserve demo
 
 test: install
-	$(MAKE) -j2 test-lipcore test-service
+	$(MAKE) -j3 test-lipcore test-service test-updates
 
 test-lipcore: install
 	$(TEST) -m "not slow" tests/lipcore
 
 test-service: install
-	$(TEST) -m "not slow" tests/service
+	$(TEST) -m "not slow" tests/service --ignore tests/service/updates
+
+test-updates: install
+	$(TEST) -m "not slow" tests/service/updates
 
 test-all: install
 	$(TEST)

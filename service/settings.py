@@ -98,7 +98,9 @@ class Settings(BaseSettings):
     max_snapshots: int = Field(20, ge=2, description="Snapshots kept of a version: how far a rollback reaches.")
     publish_every_s: float = Field(0.5, gt=0, description="Shortest time between two revisions of a version, s.")
     max_learning_models: Count = Field(4, description="Versions whose statistics the learner process keeps in memory.")
-    learner_niceness: int = Field(5, ge=0, le=19, description="Niceness of the learner process.")
+    learner_niceness: int = Field(
+        10, ge=0, le=19, description="Niceness of the learner process and of the threads that take observations."
+    )
     quality_windows_s: tuple[float, ...] = Field(
         (60.0, 600.0, 3600.0), min_length=1, description="Windows of the prequential quality, s."
     )

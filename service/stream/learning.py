@@ -12,7 +12,6 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from anyio import to_thread
 
 from service.context import Service
 from service.errors import ErrorBody, ServiceError, invalid_request
@@ -130,7 +129,7 @@ class Learning:
         """Log a block; return what there is to say of it."""
         first, through = block[0].sequence, block[-1].sequence
         try:
-            result = await to_thread.run_sync(self._hand_over, block, limiter=self._service.updates.limiter)
+            result = await self._service.updates.threads.run(self._hand_over, block)
         except ServiceError as error:
             said = error
         except Exception as error:  # the next block may be logged

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar
-
-from anyio import to_thread
 from fastapi import APIRouter
 from starlette.types import Scope
 
@@ -15,10 +11,6 @@ from service.hot import Reply, hot_route, is_json
 from service.updates.errors import ExpiredError, LearningDisabledError
 from service.updates.ingest import wire
 from service.updates.schema import ObservationRequest, ObservationResponse
-
-Result = TypeVar("Result")
-MOST_WAITING = 100
-"""Batches that wait for their turn; more are refused, as their rows fill the memory."""
 
 hot = APIRouter(
     prefix="/v1/models",
@@ -41,16 +33,8 @@ async def _answer(scope: Scope, body: bytes) -> Reply | None:
     if not is_json(scope):
         return None
     service: Service = scope["app"].state.service
-    reply = await _in_thread(service, _decoded, service, scope["path_params"]["model"], body)
+    reply = await service.updates.threads.run(_decoded, service, scope["path_params"]["model"], body)
     return None if reply is None else Reply(reply)
-
-
-async def _in_thread(service: Service, work: Callable[..., Result], *args: Any) -> Result:
-    limiter = service.updates.limiter
-    waiting = limiter.statistics().tasks_waiting
-    if waiting >= MOST_WAITING:
-        raise BusyError(f"{waiting} batches are waiting to be logged, the most that may: try again later")
-    return await to_thread.run_sync(work, *args, limiter=limiter)
 
 
 def _decoded(service: Service, model: str, body: bytes) -> bytes | None:
@@ -66,7 +50,7 @@ async def observe(service: ServiceDep, model: str, request: ObservationRequest) 
     stream; a robot whose clock was set goes on under another `stream_id`. Of joints in another order, say
     `joint_names`. Batches of about a tenth of a second to a second serve best.
     """
-    return await _in_thread(service, service.updates.observe, model, request)
+    return await service.updates.threads.run(service.updates.observe, model, request)
 
 
 hot.add_api_route(

@@ -9,23 +9,20 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from anyio import CapacityLimiter
-
 from service.database import Database
 from service.files import Files
 from service.inference.loaded import LoadedModels, Served
 from service.settings import Settings
 from service.updates.ingest.frames import Frames, FramesResult, observe_frames
 from service.updates.ingest.intake import Ingest
+from service.updates.ingest.threads import IngestThreads
 from service.updates.learner import publication
 from service.updates.learner.messages import Contested, Failed, Message, Published
-from service.updates.learner.process import LearnerProcess
+from service.updates.learner.process import LearnerProcess, learner_place
 from service.updates.quality.monitor import Monitor
 from service.updates.schema import ObservationRequest, ObservationResponse
 
 __all__ = ["Frames", "FramesResult", "Status", "Updates"]
-MOST_THREADS = 2
-"""Batches taken at the same time; those of one model take turns."""
 logger = logging.getLogger(__name__)
 
 
@@ -40,7 +37,7 @@ class Status:
 class Updates:
     """Learning of all models; safe from several threads. Close it before the database.
 
-    learner: the process that learns. limiter: of the threads that take batches. when_published, when_contested: called
+    learner: the process that learns. threads: which take batches. when_published, when_contested: called
     with each such message of the learner, in a thread of its own, after a revision answers; to be filled before the
     first batch comes.
     """
@@ -49,7 +46,7 @@ class Updates:
         self.settings, self.database, self.loaded = settings, database, loaded
         self.when_published: list[Callable[[Published], None]] = []
         self.when_contested: list[Callable[[Contested], None]] = []
-        self.limiter = CapacityLimiter(MOST_THREADS)
+        self.threads = IngestThreads(learner_place(settings))
         self._lock = threading.Lock()
         self._monitors: dict[str, Monitor] = {}
         self._said: dict[tuple[str, int], Status] = {}
@@ -58,7 +55,8 @@ class Updates:
         self._ingest = Ingest(settings, database, loaded, self._monitor, self.learner.wake)
 
     def close(self) -> None:
-        """End the learner process, which stores what it knows."""
+        """Finish the batches that have begun, and end the learner process, which stores what it knows."""
+        self.threads.close()
         self.learner.close()
 
     def observe(self, model: str, request: ObservationRequest) -> ObservationResponse:
