@@ -261,6 +261,7 @@ def measured() -> Results:
     return run(Options(source=source, runs=1, queries=20, seconds=0.05), Console(quiet=True))
 
 
+@pytest.mark.slow
 def test_a_run_measures_everything_in_both_states(measured: Results):
     absent = {LOOP} if gpytorch_installed() else {LOOP, "gpytorch", "gpytorch-fast"}
     assert list(measured.rows) == [key for key in KEYS if key not in absent]
@@ -288,6 +289,7 @@ def test_motions_are_compared_by_size_and_time(tmp_path: Path):
         assert min(row.mean, row.std, row.batch) > 0
 
 
+@pytest.mark.slow
 def test_a_run_can_be_printed_and_written(measured: Results, tmp_path: Path):
     said = table.markdown(measured)
     for text in ("inducing outputs", "training had ", "HTTP JSON, Unix socket", "Pinocchio RNEA"):

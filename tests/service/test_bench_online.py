@@ -393,6 +393,7 @@ def test_a_run_measures_everything():
     assert "nan" not in bench_table.grids_markdown(table.grids(results), results.notes)
 
 
+@pytest.mark.slow
 def test_the_live_stream_may_come_in_frames():
     results = run(tiny(websocket=True, only=("flow",)), Console(quiet=True))
     assert results.live is not None

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from anyio import CapacityLimiter
+from anyio import to_thread
 
 from service.errors import ConflictError, invalid_request
 from service.settings import Settings
@@ -43,6 +43,11 @@ class Updates:
         self.blocks, self.errors, self.open = [], list(errors), threading.Event()
         self.under_way = self.most_at_once = 0
         self.open.set()
+
+    @property
+    def threads(self):
+        """Runs what the session hands over in a thread."""
+        return SimpleNamespace(run=to_thread.run_sync)
 
     def observe_frames(self, frames):
         self.under_way += 1
@@ -78,7 +83,6 @@ class Talk:
             settings=Settings(**{**QUICK, **settings}),
             loaded=loaded,
             updates=updates,
-            predictions=CapacityLimiter(2),
         )
         self.connection = SimpleNamespace(arrived=perf_counter(), abort=self.aborted.set)
         self.session = Session(

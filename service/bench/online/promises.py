@@ -10,7 +10,7 @@ LEARNING, ADAPTING, REFIT = "learn", "adapt", "refit"
 
 
 def targets(results: Results) -> list[Target]:
-    """Every promise about learning, in the order of the issue that made them."""
+    """Every promise about learning, in the order of the table."""
     burst, last = results.burst, results.moments[-1] if results.moments else ""
     learnt = None if burst is None else burst.learnt
     return [

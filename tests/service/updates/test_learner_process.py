@@ -196,7 +196,7 @@ def test_it_gives_way_to_serving(serving):
         fields = (task / "stat").read_text().rpartition(")")[2].split()
         assert int(fields[16]) == os.nice(0) + serving.arm.settings.learner_niceness
         assert frozenset(os.sched_getaffinity(int(task.name))) == place.cpus
-    assert (place.threads, place.niceness) == (1, 5)
+    assert (place.threads, place.niceness) == (1, serving.arm.settings.learner_niceness)
 
 
 def test_it_takes_its_place_before_numerics_are_imported():

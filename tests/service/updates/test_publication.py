@@ -229,8 +229,8 @@ def test_answers_are_whole_while_revisions_come(arm, loaded):
     for thread in threads:
         thread.start()
     for number in range(1, 9):
-        known = [len(each) for each in answers]
         loaded.revise(ARM, 1, number, revisions[number - 1])
+        known = [len(each) for each in answers]  # of three more, two at least have begun since
         while any(len(each) < before + 3 for each, before in zip(answers, known, strict=True)) and not failed:
             pass
     stop.set()
