@@ -77,7 +77,7 @@ class Settings(BaseSettings):
     max_posterior_samples: Count = Field(1000, description="Most samples a posterior is conditioned on.")
     max_inducing_outputs: Count = Field(4000, description="Most inducing outputs that a training job may ask for.")
     max_queued_jobs: Count = Field(100, description="Most jobs that may wait; more are answered 429.")
-    max_loaded_models: Count = Field(4, description="Model versions kept in memory: some 45 MB each at a thousand inducing outputs.")
+    max_loaded_models: Count = Field(4, description="Model versions kept in memory.")
 
     max_observation_rows: Count = Field(5000, description="Most samples of one observation batch.")
     max_observation_streams: Count = Field(1000, description="Most sources of observations of one model.")
