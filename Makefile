@@ -5,13 +5,13 @@ BIN := $(VENV)/bin
 # one thread a process: the tests' matrices are small, and three parts run side by side, each in its fixed order
 TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: demo test test-lipcore test-service test-updates test-all lint install serve image clean
+.PHONY: demo test test-lipcore test-service test-updates test-kills test-all lint install serve image clean
 
 demo: install
 	$(BIN)/lipserve demo
 
 test: install
-	$(MAKE) -j3 test-lipcore test-service test-updates
+	$(MAKE) -j3 test-service test-updates test-lipcore test-kills
 
 test-lipcore: install
 	$(TEST) -m "not slow" tests/lipcore
@@ -20,7 +20,11 @@ test-service: install
 	$(TEST) -m "not slow" tests/service --ignore tests/service/updates
 
 test-updates: install
-	$(TEST) -m "not slow" tests/service/updates
+	$(TEST) -m "not slow" tests/service/updates --ignore tests/service/updates/test_kill_trials.py
+
+# by itself, because a minute of it is waiting for services to start: when one of the others has ended
+test-kills: install
+	$(TEST) tests/service/updates/test_kill_trials.py
 
 test-all: install
 	$(TEST)
