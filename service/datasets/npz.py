@@ -30,6 +30,7 @@ def read_npz(path: Path, settings: Settings) -> Columns:
                 name = member.filename.removesuffix(".npy")
                 with archive.open(member) as file:
                     arrays[name] = _read_array(name, file, member.file_size)
+    # zipfile says NotImplementedError of a compression that it does not know, RuntimeError of an encrypted member
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError, ValueError) as error:
         raise invalid_data("file", str(error) or type(error).__name__, "a complete NPZ archive") from None
     for name in ("q", "tau"):

@@ -12,6 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidato
 from lipcore.dynamics import COMPONENTS, ComponentName
 from lipcore.model import TorqueConvention
 from service.errors import invalid_request
+from service.matrices import to_array
 from service.models.schema import VersionNumber
 
 _NUMBERS: dict[str, Any] = {"type": "array", "items": {"type": "number"}}
@@ -19,19 +20,8 @@ _ROWS: dict[str, Any] = {"type": "array", "items": _NUMBERS}
 
 
 def _to_array(value: Any, info: ValidationInfo) -> NDArray[np.float64]:
-    """Numbers (n,) or rows of numbers (N, n) as an array; raise InvalidRequestError naming what is wrong."""
-    name = info.field_name or "value"
-    if not isinstance(value, list) or not value:
-        raise invalid_request(name, value, "a list of numbers, or a list of such lists")
-    if not isinstance(value[0], list):
-        return np.array(_row(name, value))
-    width = len(value[0])
-    rows = []
-    for index, row in enumerate(value):
-        if not isinstance(row, list) or len(row) != width:
-            raise invalid_request(f"{name}[{index}]", row, f"a list of {width} numbers, as {name}[0] has")
-        rows.append(_row(f"{name}[{index}]", row))
-    return np.array(rows).reshape(len(rows), width)
+    """JSON rows as an array; see `to_array`."""
+    return to_array(info.field_name or "value", value, _row)
 
 
 def _row(name: str, row: list[Any]) -> list[float]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema
 
 from service.errors import invalid_request
+from service.matrices import to_array
 
 MOST_SEQUENCE = 2**53 - 1
 """The largest whole number that every JSON reader takes for what it is."""
@@ -23,19 +24,8 @@ SequenceNumber = Annotated[int, Field(strict=True, ge=0, le=MOST_SEQUENCE)]
 
 
 def _to_array(value: Any, info: ValidationInfo) -> NDArray[np.float64]:
-    """Numbers (n,) or rows (N, n) as an array, null as NaN; raise InvalidRequestError naming what is wrong."""
-    name = info.field_name or "value"
-    if not isinstance(value, list) or not value:
-        raise invalid_request(name, value, "a list of numbers, or a list of such lists")
-    if not isinstance(value[0], list):
-        return np.array(_row(name, value))
-    width = len(value[0])
-    rows = []
-    for index, row in enumerate(value):
-        if not isinstance(row, list) or len(row) != width:
-            raise invalid_request(f"{name}[{index}]", row, f"a list of {width} numbers, as {name}[0] has")
-        rows.append(_row(f"{name}[{index}]", row))
-    return np.array(rows).reshape(len(rows), width)
+    """JSON rows as an array, null as NaN; see `to_array`."""
+    return to_array(info.field_name or "value", value, _row)
 
 
 def _to_times(value: Any, info: ValidationInfo) -> NDArray[np.float64]:
