@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import count
 from typing import Any
@@ -68,10 +69,7 @@ def story(tmp_path_factory):
         dataset = upload(api, slow(), name="slow")
         train(api, "arm", dataset["id"], options=OPTIONS)
         queries = {name: getattr(fast(), name)[-5:].tolist() for name in ("q", "dq", "ddq")}
-        numbers = count()
-
-        def sent() -> dict[str, Any]:
-            return pupil.post("observations", batch(next(numbers)))
+        sent = _teacher(pupil)
 
         def told(kind: str) -> list[dict[str, Any]]:
             return [each for each in pupil.get("alarms")["items"] if each["kind"] == kind]
@@ -159,10 +157,8 @@ def test_a_worse_candidate_is_not_promoted(story):
         with service.database.transaction() as session:
             registry.publish(session, pupil.model, f"mv_steady{number}", manifest, None, candidate=number == 2)
     pupil.put("learning", {"contact_threshold": 1e6, "on_change": "learn", "auto_refresh": False})
-    numbers = count()
-    [alarm] = eventually(
-        lambda: pupil.post("observations", batch(next(numbers))) and pupil.get("alarms")["items"], 2 * DEADLINE
-    )
+    sent = _teacher(pupil)
+    [alarm] = eventually(lambda: sent() and pupil.get("alarms")["items"], 2 * DEADLINE)
     assert (alarm["kind"], alarm["evidence"]["verdict"], alarm["evidence"]["promoted"]) == (
         "promotion",
         "dismiss",
@@ -171,6 +167,17 @@ def test_a_worse_candidate_is_not_promoted(story):
     assert alarm["evidence"]["gain"] < 0
     assert alarm["evidence"]["rows"] >= 2 * SETTINGS["promotion_rows"]
     assert answered(pupil.client.get("/v1/models/steady"))["serving_version"] == 1
+
+
+def _teacher(pupil: Pupil) -> Callable[[], bool]:
+    """Sends the next batch and waits until it is learnt: the motion must not end before a slow machine has seen it."""
+    numbers = count()
+
+    def sent() -> bool:
+        pupil.post("observations", batch(next(numbers)))
+        return eventually(lambda: pupil.get("learning")["status"]["lag_events"] == 0)
+
+    return sent
 
 
 def _queries() -> list[np.ndarray]:
