@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -11,11 +11,14 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
+from starlette.types import Receive, Scope, Send
 
 logger = logging.getLogger(__name__)
 
 OPEN_INFERENCE = "/v2"
 """Routes below it speak the Open Inference Protocol, whose errors have a shape of their own."""
+ERROR_CODE = "lipserve.error_code"
+"""Key of the code in the ASGI scope of a request that ended in an error: for metrics and logs."""
 
 
 class Problem(BaseModel):
@@ -46,9 +49,9 @@ class ServiceError(Exception):
     status = 500
     code = "internal_error"
 
-    def __init__(self, message: str, detail: Sequence[Problem] = ()) -> None:
+    def __init__(self, message: str, detail: Sequence[Problem] = (), headers: Mapping[str, str] | None = None) -> None:
         super().__init__(message)
-        self.message, self.detail = message, list(detail)
+        self.message, self.detail, self.headers = message, list(detail), dict(headers or {})
 
 
 class InvalidRequestError(ServiceError):
@@ -87,16 +90,58 @@ class UnsupportedMediaTypeError(ServiceError):
     status, code = 415, "unsupported_media_type"
 
 
+class UnauthorizedError(ServiceError):
+    """No API key was given where one is needed, or one that is not known, has expired or was revoked."""
+
+    status, code = 401, "unauthorized"
+
+
+class ForbiddenError(ServiceError):
+    """The API key may not do this, or a web page of another site asks."""
+
+    status, code = 403, "forbidden"
+
+
+class RequestTimeoutError(ServiceError):
+    """The body came too slowly."""
+
+    status, code = 408, "request_timeout"
+
+
 class BusyError(ServiceError):
     """A queue is full: try again later."""
 
     status, code = 429, "busy"
 
 
+class RateLimitedError(ServiceError):
+    """More requests than allowed in so short a time; the header `Retry-After` says when to go on."""
+
+    status, code = 429, "rate_limited"
+
+
 class NotReadyError(ServiceError):
     """The service cannot answer now."""
 
     status, code = 503, "not_ready"
+
+
+class StorageUnavailableError(ServiceError):
+    """The database or the disk cannot be written now: nothing was stored, try again."""
+
+    status, code = 503, "storage_unavailable"
+
+
+class StorageFullError(ServiceError):
+    """The disk or the quota of the service is full: nothing was stored. Delete data sets or versions."""
+
+    status, code = 507, "storage_full"
+
+
+class DamagedDataError(ServiceError):
+    """A stored data set does not have the checksum that it was stored with."""
+
+    status, code = 500, "damaged_data"
 
 
 class UnreadableVersionError(ServiceError):
@@ -161,8 +206,25 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(Exception, _unexpected_error)
 
 
-def _answer(request: Request, status: int, code: str, message: str, detail: Sequence[Problem] = ()) -> JSONResponse:
-    if f"{request.scope['path']}/".startswith(f"{OPEN_INFERENCE}/"):
+def answer_of(scope: Scope, error: ServiceError) -> JSONResponse:
+    """The answer to a request that ends in an error."""
+    answer = _answer(scope, error.status, error.code, error.message, error.detail)
+    answer.headers.update(error.headers)
+    return answer
+
+
+async def refuse(error: ServiceError, scope: Scope, receive: Receive, send: Send) -> None:
+    """Answer a request, or one for a WebSocket, with an error: for middleware, whose exceptions nobody handles."""
+    answer = answer_of(scope, error)
+    if scope["type"] == "websocket":
+        await receive()  # the request to connect
+    # Starlette sends what is right for either, as long as the server takes denials of WebSockets in HTTP
+    await answer(scope, receive, send)
+
+
+def _answer(scope: Scope, status: int, code: str, message: str, detail: Sequence[Problem] = ()) -> JSONResponse:
+    scope[ERROR_CODE] = code
+    if f"{scope['path']}/".startswith(f"{OPEN_INFERENCE}/"):
         return JSONResponse({"error": message}, 400 if status == 422 else status)
     body = ErrorResponse(error=ErrorBody(code=code, message=message, detail=list(detail)))
     return JSONResponse(body.model_dump(), status)
@@ -170,14 +232,14 @@ def _answer(request: Request, status: int, code: str, message: str, detail: Sequ
 
 async def _service_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, ServiceError)
-    return _answer(request, error.status, error.code, error.message, error.detail)
+    return answer_of(request.scope, error)
 
 
 async def _validation_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
     detail = [_explain(item) for item in error.errors()[:20]]
     message = sentence(detail[0]) if detail else "the request is not valid"
-    return _answer(request, 422, "invalid_request", message, detail)
+    return _answer(request.scope, 422, "invalid_request", message, detail)
 
 
 def _explain(item: dict[str, Any]) -> Problem:
@@ -201,11 +263,11 @@ async def _http_error(request: Request, error: Exception) -> JSONResponse:
     message = str(error.detail)
     if error.status_code in (404, 405):
         message = f"no route {request.method} {request.url.path[:200]}: /docs lists all"
-    answer = _answer(request, error.status_code, codes.get(error.status_code, "http_error"), message)
+    answer = _answer(request.scope, error.status_code, codes.get(error.status_code, "http_error"), message)
     answer.headers.update(error.headers or {})
     return answer
 
 
 async def _unexpected_error(request: Request, error: Exception) -> JSONResponse:
     logger.error("unexpected error at %s %s", request.method, request.url.path, exc_info=error)
-    return _answer(request, 500, "internal_error", "an unexpected error; the service's log says more")
+    return _answer(request.scope, 500, "internal_error", "an unexpected error; the service's log says more")

@@ -13,19 +13,13 @@ from starlette.datastructures import Headers
 from starlette.types import Receive, Scope, Send
 
 from service.context import Service
-from service.errors import BusyError, NotFoundError, NotReadyError, ServiceError, invalid_request
+from service.errors import BusyError, ForbiddenError, NotFoundError, NotReadyError, invalid_request
 from service.stream.conversation import Conversation, Echo
 from service.stream.protocol import CONNECTION, StreamProtocol
 from service.stream.session import Session
 
 STREAM_ID = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
 PATH, ECHO_PATH = "/v1/models/{model}/stream", "/v1/echo/stream"
-
-
-class ForeignOriginError(ServiceError):
-    """A web page of another site asks: browsers let it open sockets without asking anyone."""
-
-    status, code = 403, "forbidden"
 
 
 def router() -> APIRouter:
@@ -122,9 +116,7 @@ def _check_origin(scope: Scope) -> None:
     headers = Headers(scope=scope)
     origin = headers.get("origin")
     if origin is not None and origin.partition("://")[2] != headers.get("host"):
-        raise ForeignOriginError(
-            f"the origin {origin[:200]!r} is not this service: web pages of other sites may not ask"
-        )
+        raise ForbiddenError(f"the origin {origin[:200]!r} is not this service: web pages of other sites may not ask")
 
 
 def _connection(scope: Scope) -> StreamProtocol:

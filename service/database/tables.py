@@ -1,28 +1,12 @@
-"""The database: tables and sessions. SQLite in WAL mode."""
+"""The tables of the database."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
-from sqlalchemy import (
-    JSON,
-    BigInteger,
-    ForeignKey,
-    Index,
-    LargeBinary,
-    String,
-    UniqueConstraint,
-    create_engine,
-    event,
-    text,
-)
-from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column, sessionmaker
-
-BUSY_TIMEOUT_MS = 30_000
+from sqlalchemy import JSON, BigInteger, ForeignKey, Index, LargeBinary, String, UniqueConstraint
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 
 def now() -> str:
@@ -33,7 +17,12 @@ def now() -> str:
 class Base(DeclarativeBase):
     """Base of all tables."""
 
-    type_annotation_map = {dict[str, Any]: JSON, list[str]: JSON, list[dict[str, str]]: JSON}  # noqa: RUF012 - SQLAlchemy's own form
+    type_annotation_map = {  # noqa: RUF012 - SQLAlchemy's own form
+        dict[str, Any]: JSON,
+        list[str]: JSON,
+        list[dict[str, str]]: JSON,
+        list[dict[str, Any]]: JSON,
+    }
 
 
 class DatasetRow(Base):
@@ -67,7 +56,11 @@ class RobotRow(Base):
 
 
 class JobRow(Base):
-    """A training job: all of its state, written by the service and by the worker."""
+    """A training job: all of its state, written by the service and by the worker.
+
+    history: what happened to it, oldest first, each {at, state, message}; retry_of: id of the job that it repeats;
+    request_id: of the request that queued it.
+    """
 
     __tablename__ = "jobs"
 
@@ -85,20 +78,27 @@ class JobRow(Base):
     heartbeat_at: Mapped[str | None]
     version: Mapped[int | None]
     error: Mapped[dict[str, Any] | None]
+    history: Mapped[list[dict[str, Any]]] = mapped_column(default=list, server_default="[]")
+    retry_of: Mapped[str | None] = mapped_column(String(40))
+    request_id: Mapped[str | None] = mapped_column(String(64))
 
 
 class ModelRow(Base):
-    """A named model."""
+    """A named model. last_version: the highest number that a version of it was ever given; none is given twice."""
 
     __tablename__ = "models"
 
     seq: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
     name: Mapped[str] = mapped_column(String(64), unique=True)
     created_at: Mapped[str]
+    last_version: Mapped[int] = mapped_column(default=0, server_default="0")
 
 
 class VersionRow(Base):
-    """An immutable trained version of a model; its files lie in the file store under `folder`."""
+    """An immutable trained version of a model; its files lie in the file store under `folder`.
+
+    checksums: sha256 of each of these files by name, None of versions from before they were kept.
+    """
 
     __tablename__ = "versions"
 
@@ -108,6 +108,33 @@ class VersionRow(Base):
     created_at: Mapped[str]
     job: Mapped[str | None]
     manifest: Mapped[dict[str, Any]]
+    checksums: Mapped[dict[str, Any] | None]
+
+
+class AliasRow(Base):
+    """A name that the owner of a model has given to one of its versions, and may move to another one."""
+
+    __tablename__ = "aliases"
+
+    model: Mapped[str] = mapped_column(ForeignKey("models.name"), primary_key=True)
+    alias: Mapped[str] = mapped_column(String(64), primary_key=True)
+    version: Mapped[int]
+    changed_at: Mapped[str]
+
+
+class AliasMoveRow(Base):
+    """One move of an alias, so that it can be taken back. version: where to, None where it was removed; before: where
+    from, None where it was new."""
+
+    __tablename__ = "alias_moves"
+    __table_args__ = (Index("alias_moves_alias", "model", "alias"),)
+
+    seq: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
+    model: Mapped[str] = mapped_column(ForeignKey("models.name"))
+    alias: Mapped[str] = mapped_column(String(64))
+    version: Mapped[int | None]
+    before: Mapped[int | None]
+    at: Mapped[str]
 
 
 class ServingRow(Base):
@@ -217,6 +244,7 @@ class SnapshotRow(Base):
     version: Mapped[int]
     number: Mapped[int]
     created_at: Mapped[str]
+    sha256: Mapped[str | None]
 
 
 class AlarmRow(Base):
@@ -232,41 +260,21 @@ class AlarmRow(Base):
     evidence: Mapped[dict[str, Any]]
 
 
-class Database:
-    """Sessions on one database; safe to share between threads."""
+class ApiKeyRow(Base):
+    """An API key: what it may do and until when. The key itself is not kept.
 
-    def __init__(self, home: Path) -> None:
-        home.mkdir(parents=True, exist_ok=True)
-        self.engine = create_engine(f"sqlite:///{home / 'lipserve.sqlite3'}", connect_args={"timeout": 30})
-        event.listen(self.engine, "connect", _configure)
-        Base.metadata.create_all(self.engine)
-        self._sessions = sessionmaker(self.engine, expire_on_commit=False)
+    id: shown in lists and logs; hash: sha256 of the key; scopes: see `service.access.scopes`; expires_at, revoked_at:
+    None where it never does, or has not been; used_at: when it was seen last, to about a minute.
+    """
 
-    @contextmanager
-    def session(self) -> Iterator[Session]:
-        """Session for reading."""
-        with self._sessions() as session:
-            yield session
+    __tablename__ = "api_keys"
 
-    @contextmanager
-    def transaction(self) -> Iterator[Session]:
-        """Session whose changes are committed at the end, all or none; one writer at a time."""
-        with self._sessions() as session:
-            # taking the write lock first: what is read inside cannot change before it is written
-            session.execute(text("BEGIN IMMEDIATE"))
-            yield session
-            session.commit()
-
-    def close(self) -> None:
-        """Close all connections."""
-        self.engine.dispose()
-
-
-def _configure(connection: Any, _: object) -> None:
-    connection.isolation_level = None  # transactions are begun by `transaction`, not by the driver
-    cursor = connection.cursor()
-    cursor.execute("PRAGMA journal_mode=WAL")
-    cursor.execute("PRAGMA synchronous=FULL")
-    cursor.execute("PRAGMA foreign_keys=ON")
-    cursor.execute(f"PRAGMA busy_timeout={BUSY_TIMEOUT_MS}")
-    cursor.close()
+    seq: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
+    id: Mapped[str] = mapped_column(String(40), unique=True)
+    name: Mapped[str]
+    hash: Mapped[str] = mapped_column(String(64), unique=True)
+    scopes: Mapped[list[str]]
+    created_at: Mapped[str]
+    expires_at: Mapped[str | None]
+    revoked_at: Mapped[str | None]
+    used_at: Mapped[str | None]

@@ -1,0 +1,55 @@
+"""Brings a database to the tables of this release: Alembic's revisions, applied when the service starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sqlalchemy import Connection, Engine, inspect, text
+
+HEAD = "0002"
+"""The revision that this release needs."""
+
+
+class DatabaseVersionError(RuntimeError):
+    """The database is of a later release, which this one does not know how to read."""
+
+
+def migrate(engine: Engine) -> None:
+    """Apply what is missing, all or nothing; a database that is up to date is only looked at.
+
+    One process at a time: the others wait and then find it done. Raise DatabaseVersionError.
+    """
+    with engine.connect() as connection:
+        if revision(connection) == HEAD:
+            return
+        connection.rollback()
+        connection.execute(text("BEGIN IMMEDIATE"))
+        found = revision(connection)
+        if found != HEAD:
+            _upgrade(connection, found)
+        connection.commit()
+
+
+def revision(connection: Connection) -> str | None:
+    """The revision of a database; None of a new one and of those from before there were revisions."""
+    if not inspect(connection).has_table("alembic_version"):
+        return None
+    found: str | None = connection.scalar(text("SELECT version_num FROM alembic_version"))
+    return found
+
+
+def _upgrade(connection: Connection, found: str | None) -> None:
+    from alembic import command  # noqa: PLC0415 - needed once a release, by none of the processes that train or learn
+    from alembic.config import Config  # noqa: PLC0415
+    from alembic.script import ScriptDirectory  # noqa: PLC0415
+
+    config = Config()
+    config.set_main_option("script_location", str(Path(__file__).parent).replace("%", "%%"))
+    config.attributes["connection"] = connection
+    known = {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}
+    if found is not None and found not in known:
+        raise DatabaseVersionError(
+            f"the database has revision {found!r}, expected at most {HEAD!r}: a later release of LIPServe has used "
+            "this home; start that one, or set LIPSERVE_HOME to another folder"
+        )
+    command.upgrade(config, HEAD)

@@ -1,0 +1,115 @@
+"""Databases of earlier releases: brought up to date with all that is in them, whoever comes first."""
+
+from __future__ import annotations
+
+import sqlite3
+import threading
+from pathlib import Path
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from sqlalchemy import inspect, select, text
+
+from service.database import Base, Database, JobRow, ModelRow, SnapshotRow, VersionRow, migrations
+from service.database.migrations import HEAD, DatabaseVersionError, revision
+
+BEFORE = (Path(__file__).parent / "before_migrations.sql").read_text()
+FILE = "lipserve.sqlite3"
+
+
+@pytest.fixture
+def earlier(home):
+    """A home whose database an earlier release has made."""
+    home.mkdir()
+    connection = sqlite3.connect(home / FILE)
+    connection.executescript(BEFORE)
+    connection.close()
+    return home
+
+
+def test_the_last_revision_is_what_the_release_needs():
+    assert ScriptDirectory(migrations.__path__[0]).get_heads() == [HEAD]
+
+
+@pytest.mark.parametrize("which", ["home", "earlier"])
+def test_migrations_end_in_the_tables_of_the_release(request, which):
+    database = Database(request.getfixturevalue(which))
+    with database.engine.connect() as connection:
+        assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
+        made = set(inspect(connection).get_table_names()) - {"alembic_version"}
+    assert made == set(Base.metadata.tables)
+    database.close()
+
+
+def test_what_an_earlier_release_stored_is_kept(earlier):
+    database = Database(earlier)
+    with database.session() as session:
+        assert session.scalars(select(VersionRow.version)).all() == [1, 2, 3]
+        assert session.scalars(select(ModelRow.last_version)).all() == [3]
+        [job] = session.scalars(select(JobRow))
+        assert (job.id, job.state, job.history, job.retry_of) == ("job_1", "queued", [], None)
+        assert session.scalars(select(SnapshotRow.sha256)).all() == [None]
+    database.close()
+
+
+def test_only_tables_that_are_missing_are_made(home):
+    """A home of a release that knew fewer tables."""
+    home.mkdir()
+    connection = sqlite3.connect(home / FILE)
+    connection.executescript(BEFORE)
+    for table in ("events", "streams", "alarms"):
+        connection.execute(f"DROP TABLE {table}")
+    connection.close()
+    database = Database(home)
+    with database.engine.connect() as opened:
+        assert compare_metadata(MigrationContext.configure(opened), Base.metadata) == []
+        assert opened.scalar(text("SELECT COUNT(*) FROM versions")) == 3
+    database.close()
+
+
+def test_a_migration_that_fails_leaves_everything_as_it_was(earlier):
+    connection = sqlite3.connect(earlier / FILE)
+    connection.execute("CREATE TABLE api_keys (something TEXT)")  # in the way of a later step
+    connection.close()
+    with pytest.raises(Exception, match="api_keys"):
+        Database(earlier)
+    connection = sqlite3.connect(earlier / FILE)
+    tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    assert "alembic_version" not in tables
+    assert "aliases" not in tables
+    assert connection.execute("SELECT COUNT(*) FROM versions").fetchone() == (3,)
+    connection.close()
+
+
+def test_a_database_of_a_later_release_is_refused(home):
+    database = Database(home)
+    with database.transaction() as session:
+        session.execute(text("UPDATE alembic_version SET version_num = '9999'"))
+    database.close()
+    with pytest.raises(DatabaseVersionError, match=r"'9999'.*a later release"):
+        Database(home)
+
+
+def test_processes_that_start_together_migrate_once(earlier):
+    failures, opened = [], []
+    barrier = threading.Barrier(4)
+
+    def start() -> None:
+        barrier.wait()
+        try:
+            opened.append(Database(earlier))
+        except Exception as error:
+            failures.append(error)
+
+    threads = [threading.Thread(target=start) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert failures == []
+    with opened[0].engine.connect() as connection:
+        assert revision(connection) == HEAD
+    for database in opened:
+        database.close()
