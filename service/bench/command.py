@@ -24,6 +24,8 @@ from service.bench.online.promises import targets as online_targets
 from service.bench.online.running import PARTS
 from service.bench.online.scene import Scene
 from service.bench.running import KEYS, Options, run
+from service.bench.soak import running as soak_running
+from service.bench.soak import table as soak_table
 from service.bench.targets import Target, targets
 from service.bench.workload import BenchError, Source, model_folder
 from service.client import ApiError
@@ -155,6 +157,30 @@ def durability(
         said = [{**asdict(each), "met": each.met} for each in found]
         json_file.write_text(json.dumps({**asdict(tally), "targets": said}, indent=2) + "\n")
     _tell(durable.grids(tally), [durable.SAID], found, console, markdown, strict)
+
+
+@app.command()
+def load(
+    connections: Annotated[int, typer.Option(min=4, help="At the same time.")] = 64,
+    seconds: Annotated[float, typer.Option(min=1, help="How long.")] = 120.0,
+    pause: Annotated[float, typer.Option(min=0, help="s between an answer and the next question.")] = 0.02,
+    robot: Annotated[str, typer.Option(help=f"One of {', '.join(ROBOTS)}.")] = "panda",
+    seed: Annotated[int, typer.Option(min=0, help="Of all that is random.")] = 0,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", dir_okay=False, help="Also write all figures here.")
+    ] = None,
+    markdown: Annotated[Path | None, typer.Option(dir_okay=False, help="Also write the tables here.")] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where something promised was missed.")] = False,
+) -> None:
+    """Predict, stream, teach and upload at once; then count errors, memory, and whether every write is there."""
+    options = soak_running.Options(connections, seconds, pause, robot, seed)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    console = _console()
+    results = soak_running.run(options, console)
+    found = soak_table.targets(results)
+    if json_file is not None:
+        results.write(json_file, [{**asdict(each), "met": each.met} for each in found])
+    _tell(soak_table.grids(results), [], found, console, markdown, strict)
 
 
 def _console() -> Console:

@@ -1,0 +1,1 @@
+"""Many clients at once for minutes: errors, memory, and whether every accepted write is there afterwards."""
