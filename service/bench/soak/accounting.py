@@ -29,8 +29,8 @@ class Account:
 
     batches, rows: acknowledged; datasets, deleted: acknowledged uploads and deletions; unsure: writes without an
     answer, which may have been stored or not; lost: of all that was acknowledged, what is not there; changed: there,
-    but not as acknowledged; surplus: there, but neither acknowledged nor unsure; twice: batches that were learnt again when sent
-    again; difference: of served torques from those of a model that learnt the same rows at once, relative.
+    but not as acknowledged; surplus: there, but neither acknowledged nor unsure; twice: batches that were learnt again
+    when sent again; difference: of served torques from those of a model that learnt the same rows at once, relative.
     """
 
     batches: int = 0
