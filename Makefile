@@ -5,13 +5,21 @@ BIN := $(VENV)/bin
 # one thread a process: the tests' matrices are small, and three parts run side by side, each in its fixed order
 TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: demo test test-lipcore test-service test-updates test-kills test-all lint install serve image clean
+.PHONY: demo test warm-lip warm-chain test-lipcore test-service test-updates test-kills test-all lint install serve image clean
 
 demo: install
 	$(BIN)/lipserve demo
 
 test: install
+	$(MAKE) -j2 warm-lip warm-chain
 	$(MAKE) -j3 test-service test-updates test-lipcore test-kills
+
+# compiles what the parts below would else compile once each, side by side: a minute of one core
+warm-lip: install
+	$(BIN)/python -m lipcore.warm_up lip baselines
+
+warm-chain: install
+	$(BIN)/python -m lipcore.warm_up lip-chain
 
 test-lipcore: install
 	$(TEST) -m "not slow" tests/lipcore

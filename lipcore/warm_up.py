@@ -1,10 +1,13 @@
-"""Compile every kernel ahead of its first use, for images and installations: `python -m lipcore.warm_up`.
+"""Compile every kernel ahead of its first use, for images and installations: `python -m lipcore.warm_up [KERNEL …]`.
 
 Numba keeps the machine code on disk (`NUMBA_CACHE_DIR`, else beside the source, else below the home); without this the
 first fit on a machine waits some twenty seconds for it.
 """
 
 from __future__ import annotations
+
+import sys
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -19,22 +22,39 @@ from lipcore.kernels.se import SquaredExponentialKernel
 from lipcore.motion import Motion
 
 
-def warm_up() -> None:
-    """Run every compiled function once, on a robot of two joints."""
+def warm_up(*names: str) -> None:
+    """Run every compiled function of these kernels once, on a robot of two joints; of all kernels where none is named.
+
+    Raise ValueError for a name that is none.
+    """
+    if unknown := [name for name in names if name not in _KERNELS]:
+        raise ValueError(f"{unknown[0]!r} is no compiled kernel, expected names out of {', '.join(_KERNELS)}")
     ones = torch.ones((2, 2), dtype=torch.float64)
-    motion = Motion(ones, ones, ones)
-    for kernel in (LipKernel(("revolute", "revolute")), ChainKernel(("revolute", "revolute"))):
-        params = kernel.initial(motion, ones)
-        kernel.gram(params, motion, motion)
-        kernel.gradient(params, motion, kernel.symmetric_gram(params, motion))
-        friction = FrictionKernel(2)
-        both = {**params, **friction.initial(motion, ones)}
-        Evaluator(kernel, both, motion, np.arange(4), [friction], np.ones(10), np.eye(10)).warm_up()
-    types = ("revolute", "revolute")
-    for baseline in (SquaredExponentialKernel(2), GeometricallyInspiredKernel(types), LagrangianSEKernel(types)):
-        cross = baseline.cross(baseline.initial(motion, ones), motion)
+    for name in names or _KERNELS:
+        _KERNELS[name](Motion(ones, ones, ones), ones)
+
+
+def _energy(kernel: LipKernel | ChainKernel, motion: Motion, tau: torch.Tensor) -> None:
+    params = kernel.initial(motion, tau)
+    kernel.gram(params, motion, motion)
+    kernel.gradient(params, motion, kernel.symmetric_gram(params, motion))
+    friction = FrictionKernel(2)
+    both = {**params, **friction.initial(motion, tau)}
+    Evaluator(kernel, both, motion, np.arange(4), [friction], np.ones(10), np.eye(10)).warm_up()
+
+
+def _baselines(motion: Motion, tau: torch.Tensor) -> None:
+    for kernel in (SquaredExponentialKernel(2), GeometricallyInspiredKernel(_TYPES), LagrangianSEKernel(_TYPES)):
+        cross = kernel.cross(kernel.initial(motion, tau), motion)
         cross.fill(np.zeros((3, 2)), np.empty((3, 2, 2)))
 
 
+_TYPES = ("revolute", "revolute")
+_KERNELS: dict[str, Callable[[Motion, torch.Tensor], None]] = {
+    "lip": lambda motion, tau: _energy(LipKernel(_TYPES), motion, tau),
+    "lip-chain": lambda motion, tau: _energy(ChainKernel(_TYPES), motion, tau),
+    "baselines": _baselines,
+}
+
 if __name__ == "__main__":
-    warm_up()
+    warm_up(*sys.argv[1:])

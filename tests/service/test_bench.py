@@ -279,6 +279,7 @@ def test_a_run_measures_everything_in_both_states(measured: Results):
     assert all(each.value is not None for each in targets(measured) if "GPyTorch" not in each.name)
 
 
+@pytest.mark.slow
 def test_motions_are_compared_by_size_and_time(tmp_path: Path):
     found = motions.compare("double-pendulum", QUICK, 1, tmp_path, Console(quiet=True), queries=20)
     assert [row.motion for row in found] == list(motions.MOTIONS)

@@ -372,6 +372,7 @@ def tiny(websocket: bool = False, only: tuple[str, ...] = ()) -> Options:
     )
 
 
+@pytest.mark.slow
 def test_a_run_measures_everything():
     results = run(tiny(), Console(quiet=True))
     assert list(results.methods) == ["none", "learn", "adapt", "refit", "fourier"]
