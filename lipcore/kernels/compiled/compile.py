@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import atexit
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, MutableMapping
 from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from numba import njit
+from numba import config, njit
 from numba.core.compiler import Compiler
 
 _F = TypeVar("_F", bound=Callable[..., object])
@@ -20,6 +24,32 @@ _FASTMATH = {"contract", "reassoc", "nsz"}
 # calls. Here it is taken while every file of this package is. (Should a later Numba not know `_source_stamp`: after
 # editing a function that is called from another file, run `make clean` or delete __pycache__.)
 _SOURCES = sha256(b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))).hexdigest()
+
+
+def use_cache(environment: MutableMapping[str, str]) -> Path | None:
+    """Let Numba read a cache that cannot be written, as in a container whose file system is read-only.
+
+    Numba takes no machine code from a folder that it cannot write. So `NUMBA_CACHE_DIR` is copied to a new private
+    folder, which this process and its children use and which goes when it ends. Return that folder, None where nothing
+    was to be done or no temporary folder can be made.
+    """
+    given = environment.get("NUMBA_CACHE_DIR")
+    if not given or not Path(given).is_dir() or os.access(given, os.W_OK):
+        return None
+    try:
+        folder = Path(tempfile.mkdtemp(prefix="lipserve-numba-"))
+        shutil.copytree(given, folder, dirs_exist_ok=True)
+        for each in (folder, *folder.rglob("*")):
+            if each.is_dir():
+                each.chmod(0o700)  # copying gave it the mode of its source
+    except OSError:
+        return None
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    environment["NUMBA_CACHE_DIR"] = config.CACHE_DIR = str(folder)
+    return folder
+
+
+use_cache(os.environ)
 
 
 class _NoAlias(Compiler):
@@ -34,8 +64,8 @@ class _NoAlias(Compiler):
 def compiled(function: _F) -> _F:
     """Compile `function` with Numba at its first call, without the GIL; division by zero gives what NumPy gives.
 
-    The machine code is kept on disk: beside the source, or else below the home directory or `NUMBA_CACHE_DIR`. Where
-    none of them is writable, as in a read-only container, every process compiles anew.
+    The machine code is kept on disk: in `NUMBA_CACHE_DIR`, beside the source, or else below the home directory. Where
+    nothing can be written at all, not even a temporary folder, every process compiles anew.
     """
     return _compile(function)
 
