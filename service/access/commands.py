@@ -1,0 +1,104 @@
+"""`lipserve keys`: make, list and revoke API keys, also while the service runs."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Column, Table
+
+from service.access import keys
+from service.access.scopes import SCOPES
+from service.database import ApiKeyRow, Database
+from service.settings import Settings
+
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, help="API keys of the home LIPSERVE_HOME.")
+LONGEST_DAYS = 36_500.0
+PIPE_WIDTH = 160
+"""Columns of a table that no terminal shows."""
+
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+@app.command()
+def create(
+    name: Annotated[str, typer.Option(help="What the key is for, as lists show it.")],
+    scope: Annotated[
+        list[str], typer.Option(help=f"What it may do: {', '.join(SCOPES)}; several separated by commas or repeated.")
+    ],
+    days: Annotated[float | None, typer.Option(help="Days after which it expires, never by default.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Make a key and print it: the only time that it can be seen. What else is to be said goes to standard error."""
+    if days is not None and not 0 < days <= LONGEST_DAYS:
+        raise ValueError(f"days is {days:g}, expected more than 0 and at most {LONGEST_DAYS:g}")
+    expires = None if days is None else datetime.now(UTC) + timedelta(days=days)
+    with _database() as (database, settings):
+        scopes = [part.strip() for given in scope for part in given.split(",")]
+        row, secret = keys.create(database, name, scopes, expires)
+    if as_json:
+        typer.echo(json.dumps({**_shown(row), "key": secret}))
+        return
+    typer.echo(secret)
+    until = f"until {row.expires_at}" if row.expires_at else "until it is revoked"
+    note = (
+        f"{row.id} may {', '.join(row.scopes)} {until}; a running service knows it after {settings.keys_refresh_s:g} s"
+    )
+    typer.echo(note, err=True)
+
+
+@app.command("list")
+def list_(as_json: Json = False) -> None:
+    """List all keys, without the keys themselves."""
+    with _database() as (database, _):
+        rows = keys.stored(database)
+    if as_json:
+        typer.echo(json.dumps([_shown(row) for row in rows]))
+        return
+    table = Table(Column("id", no_wrap=True), "name", "scopes", "state", "made", "expires", "last used")
+    for row in rows:
+        shown = _shown(row)
+        times = (_minute(shown[field]) for field in ("created_at", "expires_at", "used_at"))
+        table.add_row(row.id, escape(row.name), ", ".join(row.scopes), shown["state"], *times)
+    Console(width=None if sys.stdout.isatty() else PIPE_WIDTH).print(table)
+
+
+@app.command()
+def revoke(
+    key: Annotated[str, typer.Argument(help="Id of the key, as `lipserve keys list` shows it: key_…")],
+    as_json: Json = False,
+) -> None:
+    """End a key for good. A running service refuses it, and closes its streams, within a second or so."""
+    with _database() as (database, settings):
+        row = keys.revoke(database, key)
+    if as_json:
+        typer.echo(json.dumps(_shown(row)))
+        return
+    typer.echo(f"{row.id} is revoked; a running service refuses it after {settings.keys_refresh_s:g} s", err=True)
+
+
+@contextmanager
+def _database() -> Iterator[tuple[Database, Settings]]:
+    settings = Settings()
+    database = Database(settings.home)
+    try:
+        yield database, settings
+    finally:
+        database.close()
+
+
+def _shown(row: ApiKeyRow) -> dict[str, Any]:
+    fields = ("id", "name", "scopes", "created_at", "expires_at", "revoked_at", "used_at")
+    return {**{field: getattr(row, field) for field in fields}, "state": keys.state_of(row, time.time())}
+
+
+def _minute(at: str | None) -> str:
+    return "-" if at is None else at[:16].replace("T", " ")

@@ -1,0 +1,56 @@
+"""A service that asks for keys, in this process."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import pytest
+from fastapi.testclient import TestClient
+
+from service.access import keys
+from service.access.scopes import SCOPES
+from service.app import create_app
+from service.database import Database
+from service.settings import Settings
+
+REFRESH_S = 0.05
+
+
+@dataclass(frozen=True)
+class Guarded:
+    """A service that asks for keys, one key of each scope, and a connection to its database like the CLI's."""
+
+    api: TestClient
+    secrets: dict[str, str]
+    database: Database
+
+    def make(self, *scopes: str) -> tuple[str, str]:
+        """Make a key; return its id and the key."""
+        row, secret = keys.create(self.database, "test", scopes, None)
+        return row.id, secret
+
+
+def bearer(secret: str) -> dict[str, str]:
+    """The header with a key."""
+    return {"Authorization": f"Bearer {secret}"}
+
+
+@pytest.fixture(scope="package")
+def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
+    """A service that asks for keys."""
+    home = tmp_path_factory.mktemp("guarded")
+    database = Database(home)
+    secrets = {scope: keys.create(database, f"only {scope}", [scope], None)[1] for scope in SCOPES}
+    settings = Settings(home=home, keys="on", keys_refresh_s=REFRESH_S)
+    with TestClient(create_app(settings), "http://robot.example") as api:
+        yield Guarded(api, secrets, database)
+    database.close()
+
+
+@pytest.fixture
+def keys_database(home) -> Iterator[Database]:
+    """An empty database."""
+    opened = Database(home)
+    yield opened
+    opened.close()

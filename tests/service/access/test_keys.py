@@ -1,0 +1,256 @@
+"""Keys: how they are stored, found and ended."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from datetime import UTC, datetime, timedelta
+
+import pytest
+from sqlalchemy import delete, update
+
+from service.access import keyring as keyring_module
+from service.access import keys
+from service.access.keyring import Keyring
+from service.access.scopes import ADMIN, SCOPES
+from service.database import ApiKeyRow
+from service.errors import UnauthorizedError
+from tests.service.access.conftest import REFRESH_S, bearer
+from tests.service.data import error, eventually
+
+
+def test_a_key_is_long_random_and_not_stored(keys_database, home):
+    made = [keys.create(keys_database, "arm", ["predict"], None) for _ in range(20)]
+    secrets = [secret for _, secret in made]
+    assert len(set(secrets)) == 20
+    assert all(secret.startswith("lip_") and len(secret) == 4 + 43 for secret in secrets)
+    keys_database.close()
+    stored = b"".join(path.read_bytes() for path in home.glob("lipserve.sqlite3*"))
+    for row, secret in made:
+        assert row.id.encode() in stored
+        assert secret.encode() not in stored
+        assert secret.removeprefix("lip_").encode() not in stored
+
+
+@pytest.mark.parametrize(
+    ("name", "scopes", "said"),
+    [
+        ("", ["read"], "name is"),
+        ("   ", ["read"], "name is"),
+        ("x" * 201, ["read"], "name is"),
+        ("arm\n", ["read"], "name is"),
+        ("arm\u202e", ["read"], "name is"),
+        ("arm\u200b", ["read"], "name is"),
+        ("arm", [], "scopes are missing"),
+        ("arm", ["read", "write"], "scope is 'write', expected one of read, predict, update, train, admin"),
+        ("arm", [""], "scope is ''"),
+    ],
+)
+def test_wrong_keys_are_not_made(keys_database, name, scopes, said):
+    with pytest.raises(ValueError, match=said):
+        keys.create(keys_database, name, scopes, None)
+    assert keys.stored(keys_database) == []
+
+
+def test_only_admin_implies_other_scopes():
+    for held in SCOPES:
+        key = keys.Key("key_1", b"", frozenset({held}), float("inf"), False)
+        assert {scope for scope in SCOPES if key.allows(scope)} == (set(SCOPES) if held == ADMIN else {held})
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {},
+        {"Authorization": ""},
+        {"Authorization": "Bearer"},
+        {"Authorization": "Basic bGlwOnNlcnZl"},
+        {"Authorization": "{}"},
+        {"X-Api-Key": "{}"},
+        {"Cookie": "key={}"},
+        {"Sec-WebSocket-Protocol": "lipserve.key.{}"},
+    ],
+)
+def test_a_key_comes_as_a_bearer_token(guarded, headers):
+    given = {name: value.format(guarded.secrets[ADMIN]) for name, value in headers.items()}
+    answer = guarded.api.get("/v1/models", headers=given)
+    assert "no API key was given" in error(answer, 401, "unauthorized")["message"]
+    assert answer.headers["www-authenticate"] == 'Bearer realm="lipserve"'
+    assert guarded.api.get("/v1/models?key=" + guarded.secrets[ADMIN]).status_code == 401
+
+
+def test_the_name_of_the_scheme_may_be_written_in_any_way(guarded):
+    for scheme in ("Bearer", "bearer", "BEARER"):
+        headers = {"Authorization": f"{scheme} {guarded.secrets['read']}"}
+        assert guarded.api.get("/v1/models", headers=headers).status_code == 200
+
+
+def test_what_is_not_a_key_is_not_repeated(guarded, caplog):
+    secret = guarded.secrets["read"]
+    for wrong in (secret[:-1], secret + "x", secret.upper(), secret[4:], "lip_", "x" * 5000, secret[::-1]):
+        answer = guarded.api.get("/v1/models", headers=bearer(wrong))
+        assert "is not one of this service" in error(answer, 401, "unauthorized")["message"]
+        assert 'error="invalid_token"' in answer.headers["www-authenticate"]
+        assert wrong[:40] == "lip_" or wrong[:40] not in answer.text + caplog.text
+    assert guarded.api.get("/v1/models", headers={"Authorization": b"Bearer \xff\xfe"}).status_code == 401
+
+
+def test_errors_below_v2_have_its_shape(guarded):
+    answer = guarded.api.get("/v2")
+    assert (answer.status_code, list(answer.json())) == (401, ["error"])
+    assert isinstance(answer.json()["error"], str)
+    answer = guarded.api.get("/v2", headers=bearer(guarded.secrets["train"]))
+    assert (answer.status_code, type(answer.json()["error"])) == (403, str)
+
+
+def test_keys_are_known_and_revoked_while_the_service_runs(guarded):
+    key, secret = guarded.make("read")
+
+    def status():
+        return guarded.api.get("/v1/models", headers=bearer(secret)).status_code
+
+    eventually(lambda: status() == 200)
+    keys.revoke(guarded.database, key)
+    eventually(lambda: status() == 401)
+    answer = guarded.api.get("/v1/models", headers=bearer(secret))
+    assert f"the API key {key} was revoked" in error(answer, 401, "unauthorized")["message"]
+
+
+def test_when_a_key_was_used_is_stored(guarded):
+    key, secret = guarded.make("read")
+    eventually(lambda: guarded.api.get("/v1/models", headers=bearer(secret)).status_code == 200)
+
+    def row():
+        return next(row for row in keys.stored(guarded.database) if row.id == key)
+
+    used = datetime.fromisoformat(eventually(lambda: row().used_at)).timestamp()
+    assert abs(time.time() - used) < 60
+
+
+def watched(database, steps):
+    """Run `steps` with a keyring that watches a database."""
+
+    async def run():
+        keyring = Keyring(REFRESH_S)
+        async with keyring.watching(database):
+            return await steps(keyring)
+
+    return asyncio.run(run())
+
+
+async def until(look):
+    """Wait in the event loop until something is true."""
+    async with asyncio.timeout(30):
+        while not look():
+            await asyncio.sleep(REFRESH_S / 4)
+
+
+def admits(keyring, secret):
+    try:
+        keyring.use(keyring.find(secret.encode()))
+    except UnauthorizedError:
+        return False
+    return True
+
+
+def test_a_key_ends_when_it_expires(keys_database, monkeypatch):
+    row, secret = keys.create(keys_database, "guest", ["read"], datetime.now(UTC) + timedelta(days=1))
+
+    async def steps(keyring):
+        ended = []
+        with keyring.lasting(keyring.find(secret.encode()), lambda: ended.append(1)):
+            assert admits(keyring, secret)
+            monkeypatch.setattr(keyring_module, "time", lambda: time.time() + 86_390)
+            assert admits(keyring, secret)
+            assert not ended
+            monkeypatch.setattr(keyring_module, "time", lambda: time.time() + 86_410)
+            with pytest.raises(UnauthorizedError, match=f"the API key {row.id} has expired"):
+                keyring.use(keyring.find(secret.encode()))
+            await until(lambda: ended)
+
+    watched(keys_database, steps)
+
+
+@pytest.mark.parametrize("how", [update(ApiKeyRow).values(revoked_at="2026-01-01"), delete(ApiKeyRow)])
+def test_what_lasts_ends_with_its_key_and_only_then(keys_database, how):
+    row, secret = keys.create(keys_database, "arm", ["predict"], None)
+    _, other = keys.create(keys_database, "other", ["predict"], None)
+
+    async def steps(keyring):
+        ended, others = [], []
+        key = keyring.find(secret.encode())
+        with (
+            keyring.lasting(key, lambda: ended.append(1)),
+            keyring.lasting(key, lambda: ended.append(2)),
+            keyring.lasting(keyring.find(other.encode()), lambda: others.append(1)),
+        ):
+            with keyring.lasting(key, lambda: ended.append(3)):
+                pass  # over before its key is
+            with keys_database.transaction() as session:
+                session.execute(how.where(ApiKeyRow.id == row.id))
+            await until(lambda: len(ended) >= 2)
+            assert set(ended) == {1, 2}
+            assert not others
+            assert not admits(keyring, secret)
+            assert admits(keyring, other)
+
+    watched(keys_database, steps)
+
+
+def test_one_stream_that_cannot_be_ended_does_not_keep_others_open(keys_database, caplog):
+    row, secret = keys.create(keys_database, "arm", ["predict"], None)
+
+    def fail():
+        raise OSError("cannot")
+
+    async def steps(keyring):
+        ended = []
+        key = keyring.find(secret.encode())
+        with keyring.lasting(key, fail), keyring.lasting(key, lambda: ended.append(1)):
+            keys.revoke(keys_database, row.id)
+            await until(lambda: len(ended) > 1)
+
+    watched(keys_database, steps)
+    assert "cannot be ended" in caplog.text
+
+
+def test_scopes_that_are_changed_hold_for_the_same_key(keys_database):
+    row, secret = keys.create(keys_database, "arm", ["predict"], None)
+
+    async def steps(keyring):
+        key = keyring.find(secret.encode())
+        with keys_database.transaction() as session:
+            session.execute(update(ApiKeyRow).where(ApiKeyRow.id == row.id).values(scopes=["read"]))
+        await until(lambda: key.allows("read"))
+        assert not key.allows("predict")
+        assert keyring.find(secret.encode()) is key
+
+    watched(keys_database, steps)
+
+
+def test_known_keys_stay_while_the_database_cannot_be_read(keys_database, monkeypatch, caplog):
+    row, secret = keys.create(keys_database, "arm", ["predict"], None)
+    failures = []
+
+    def fail():
+        failures.append(1)
+        raise OSError("the disk is gone")
+
+    async def steps(keyring):
+        monkeypatch.setattr(keys_database, "session", fail)
+        await until(lambda: len(failures) > 3)
+        assert admits(keyring, secret)
+        assert caplog.text.count("the keys cannot be read") == 1
+        keys.revoke(keys_database, row.id)
+        monkeypatch.undo()
+        await until(lambda: not admits(keyring, secret))
+
+    watched(keys_database, steps)
+
+
+def test_a_service_without_a_valid_key_says_how_to_make_one(keys_database, caplog):
+    async def steps(keyring):
+        return None
+
+    watched(keys_database, steps)
+    assert "make one with `lipserve keys create`" in caplog.text
