@@ -7,14 +7,18 @@ import errno
 import functools
 import logging
 import os
+import signal
 import socket
 import stat
 import sys
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import uvicorn
 from uvicorn.config import STARTUP_FAILURE
+
+from service.limits.stopping import Stopping
 
 logger = logging.getLogger(__name__)
 
@@ -59,15 +63,21 @@ class UnixSocket:
 
 
 class Server(uvicorn.Server):
-    """uvicorn's server with a second listener: of itself it takes a port or a socket, not both."""
+    """uvicorn's server with a second listener, which of itself takes a port or a socket, not both.
 
-    def __init__(self, config: uvicorn.Config, unix: UnixSocket) -> None:
+    Told to stop, it first says so for `notice_s`, then takes no more connections and finishes what it has begun. Told a
+    second time, it ends at once.
+    """
+
+    def __init__(self, config: uvicorn.Config, unix: UnixSocket | None, stopping: Stopping, notice_s: float) -> None:
         super().__init__(config)
-        self.unix = unix
+        self.unix, self.stopping, self.notice_s = unix, stopping, notice_s
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Listen on the port as usual, and on the socket."""
         await super().startup(sockets)
+        if self.unix is None:
+            return
         made: Any = self.config.http_protocol_class  # uvicorn's type of it says nothing of its arguments
         protocol = functools.partial(
             made,
@@ -81,18 +91,34 @@ class Server(uvicorn.Server):
         logger.info("listening on the Unix-domain socket %s", self.unix.path)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Remove the socket, and stop as usual: the signal that stops uvicorn ends the process right after."""
-        self.unix.remove()
+        """Give notice, remove the socket, and stop as usual: the signal that stops uvicorn ends the process after."""
+        self.stopping.begun = True
+        if self.notice_s:
+            logger.info("stopping in %g s: no longer ready, but still answering", self.notice_s)
+            await asyncio.sleep(self.notice_s)
+        self.stopping.closing.set()
+        if self.unix is not None:
+            self.unix.remove()
         await super().shutdown(sockets)
 
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Stop at the first signal, end at the second: what is durable is so already."""
+        if self.should_exit:
+            if self.unix is not None:
+                self.unix.remove()
+            signal.signal(sig, signal.SIG_DFL)
+            signal.raise_signal(sig)
+        super().handle_exit(sig, frame)
 
-def serve(config: uvicorn.Config, uds: Path | None, mode: int) -> None:
+
+def serve(config: uvicorn.Config, uds: Path | None, mode: int, stopping: Stopping, notice_s: float = 0.0) -> None:
     """Serve until a signal comes, on the port of the config and on a socket at the path `uds`.
 
-    Raise SocketError before anything starts; end the process where the start fails.
+    notice_s: how long it still answers after the signal, while `stopping` says that it was told. Raise SocketError
+    before anything starts; end the process where the start fails.
     """
     unix = None if uds is None else UnixSocket(uds, mode)
-    server = uvicorn.Server(config) if unix is None else Server(config, unix)
+    server = Server(config, unix, stopping, notice_s)
     try:
         server.run()
     except KeyboardInterrupt:

@@ -1,0 +1,191 @@
+"""Connections: too many, silent, slow, unread, endless."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from websockets.sync.client import connect
+
+from service.limits.connections import REFUSED, GuardedProtocol
+from tests.service.data import DEADLINE, eventually
+from tests.service.limits.serving import Raw, Serving, refusal
+
+MiB = 1024 * 1024
+SOON = {"header_s": 1.0, "answer_s": 1.0, "keep_alive_s": 1}
+"""Limits that are soon reached."""
+GET = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
+LARGE = GET.replace(b"/ ", b"/large ", 1)
+POST = b"POST /body HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n"
+
+
+@pytest.fixture(scope="module")
+def soon():
+    """A server whose limits are soon reached."""
+    with Serving(**SOON) as serving:
+        yield serving
+
+
+@pytest.fixture(scope="module")
+def few():
+    """A server for two connections that keeps them."""
+    with Serving(max_connections=2, max_header_bytes=4096) as serving:
+        yield serving
+
+
+@pytest.fixture
+def none_open(few):
+    """The same, once nobody is connected any more."""
+    eventually(lambda: few.connections == 0)
+    return few
+
+
+def test_requests_one_after_the_other_are_answered(few, none_open):
+    with Raw(few.port) as client:
+        for _ in range(3):
+            client.send(GET)
+            assert client.answer() == (200, b"hello")
+        client.send(GET * 3)
+        assert [client.answer() for _ in range(3)] == [(200, b"hello")] * 3
+
+
+def test_clients_that_do_not_ask_are_let_go(soon):
+    """All at the same time: each would take a second."""
+    with Raw(soon.port) as silent, Raw(soon.port) as half, Raw(soon.port) as second, Raw(soon.port) as idle:
+        half.send(GET[:-2])
+        second.send(GET)
+        idle.send(GET)
+        assert second.answer() == idle.answer() == (200, b"hello")
+        second.send(GET[:-2])
+        status, code, message = refusal(half.rest())
+        assert (status, code) == (408, "request_timeout")
+        assert "within 1 s" in message
+        assert silent.rest() == second.rest() == idle.rest() == b""
+
+
+def test_streams_outlast_what_requests_may_take(soon):
+    end = time.monotonic() + 2 * SOON["header_s"]
+    with connect(f"ws://127.0.0.1:{soon.port}/") as stream:
+        while time.monotonic() < end:
+            stream.send(b"still there?")
+            assert stream.recv(DEADLINE) == b"still there?"
+
+
+def test_headers_that_trickle_end_as_those_that_stop(soon):
+    before = soon.app.begun
+    with Raw(soon.port) as client:
+        client.send(b"GET / HTTP/1.1\r\n")
+        client.socket.settimeout(0.02)
+        answer = b""
+        while not answer:
+            try:
+                client.send(b"X-A: b\r\n")
+                answer = client.socket.recv(1 << 16)
+            except TimeoutError:
+                continue
+            except ConnectionError:
+                break
+    assert answer == b"" or b"408" in answer
+    assert soon.app.begun == before
+
+
+def test_clients_that_read_nothing_are_cut_off(soon):
+    """One request, one after another that was answered, and several at once."""
+    with Raw(soon.port) as one, Raw(soon.port) as after, Raw(soon.port) as many:
+        begun = soon.app.begun
+        one.send(LARGE)
+        after.send(GET + LARGE)
+        many.send(LARGE * 3)
+        eventually(lambda: soon.app.begun >= begun + 4)
+        eventually(lambda: soon.connections == 0)
+
+
+def test_a_client_that_reads_slowly_gets_all(soon, monkeypatch):
+    looks = []
+
+    def look(protocol):
+        looked(protocol)
+        looks.append(protocol)
+
+    looked = GuardedProtocol._look_reading
+    monkeypatch.setattr(GuardedProtocol, "_look_reading", look)
+    with Raw(soon.port) as client:
+        client.send(LARGE)
+        read = 0
+        for _ in range(2):
+            read += len(client.exactly(8 * MiB))
+            known = len(looks)
+            eventually(lambda known=known: len(looks) > known)
+        rest = client.rest()
+    assert read + len(rest) > 64 * MiB
+
+
+def test_what_is_no_http_is_answered_as_any_error(few, none_open):
+    with Raw(few.port) as client:
+        client.send(b"\x16\x03\x01 what is this\r\n\r\n")
+        assert refusal(client.rest())[:2] == (400, "invalid_request")
+
+
+def test_headers_without_end_are_answered_431(few, none_open):
+    with Raw(few.port) as client:
+        client.send(GET[:-2] + b"X-Long: " + b"a" * 4096)
+        status, code, message = refusal(client.rest())
+        assert (status, code) == (431, "too_large")
+        assert "4096 bytes" in message
+
+
+def test_headers_after_a_body_have_an_end_too(few, none_open):
+    with Raw(few.port) as client:
+        client.send(POST + b"3\r\nabc\r\n0\r\n" + b"X-Long: ")
+        eventually(lambda: few.connections == 1)
+        with pytest.raises(ConnectionError):
+            client.send(b"a" * MiB * 64)
+
+
+def test_bodies_in_small_pieces_are_taken(few, none_open):
+    with Raw(few.port) as client:
+        begun = few.app.begun
+        client.send(POST)
+        eventually(lambda: few.app.begun > begun)
+        client.send(b"5\r\nabcde\r\n" * 2000 + b"0\r\n\r\n")
+        assert client.answer() == (200, b"10000")
+
+
+def test_headers_of_many_requests_are_not_those_of_one(few, none_open):
+    with Raw(few.port) as client:
+        for _ in range(2 * 4096 // len(GET)):
+            client.send(GET)
+            assert client.answer() == (200, b"hello")
+
+
+def test_more_connections_than_allowed_are_told_so_until_one_ends(few, none_open):
+    with Raw(few.port) as first, Raw(few.port) as second:
+        for client in (first, second):
+            client.send(GET)
+            assert client.answer() == (200, b"hello")
+        with Raw(few.port) as third:
+            third.send(GET)
+            status, code, message = refusal(third.rest())
+            assert (status, code) == (429, "busy")
+            assert "2 connections are open" in message
+        with Raw(few.port) as third:
+            third.send(GET[:-2] + b"Connection: Upgrade\r\nUpgrade: websocket\r\n\r\n")
+            assert refusal(third.rest())[:2] == (429, "busy")
+        with Raw(few.port) as third:
+            third.send(GET.replace(b"/", b"/health/live", 1))
+            assert third.answer() == (200, b"hello")
+    eventually(lambda: few.connections == 0)
+    with Raw(few.port) as another:
+        another.send(GET)
+        assert another.answer() == (200, b"hello")
+
+
+def test_connections_far_beyond_the_most_are_not_even_told(few, none_open):
+    clients = [Raw(few.port) for _ in range(2 + REFUSED)]
+    try:
+        eventually(lambda: few.connections == 2 + REFUSED)
+        with Raw(few.port) as one_more:
+            assert one_more.rest() == b""
+    finally:
+        for client in clients:
+            client.socket.close()

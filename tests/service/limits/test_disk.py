@@ -1,0 +1,182 @@
+"""The quota of the home and the space that stays free on its disk."""
+
+from __future__ import annotations
+
+import os
+import time
+from types import SimpleNamespace
+
+import pytest
+
+import lipcore
+from service.errors import StorageFullError
+from service.files import new_id
+from service.limits import disk as measuring
+from service.limits.disk import Disk, measure
+from service.limits.upload import WRITE_BYTES
+from service.models import registry
+from service.settings import Settings, shipped_models
+from tests.service.data import QUICK, arrays, error, npz, post, service_of, stream, upload
+
+KiB = 1024
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Time that stands still until it is told to go on."""
+    clock = SimpleNamespace(now=0.0)
+    monkeypatch.setattr(time, "monotonic", lambda: clock.now)
+    return clock
+
+
+@pytest.fixture
+def full(api, monkeypatch):
+    """The session's service, with a home that has no room for more."""
+    monkeypatch.setattr(service_of(api).disk, "quota", 1)
+    return api
+
+
+def home_of(tmp_path, size):
+    (tmp_path / "file").write_bytes(bytes(size))
+    return tmp_path
+
+
+def test_a_home_is_measured_with_all_below_it_but_not_what_links_lead_to(tmp_path):
+    (tmp_path / "home" / "a" / "b").mkdir(parents=True)
+    (tmp_path / "home" / "one").write_bytes(bytes(1000))
+    (tmp_path / "home" / "a" / "b" / "two").write_bytes(bytes(200))
+    (tmp_path / "outside").write_bytes(bytes(10_000))
+    for link, target in (("file", "outside"), ("folder", ""), ("nothing", "nowhere")):
+        (tmp_path / "home" / link).symlink_to(tmp_path / target)
+    links = sum((tmp_path / "home" / link).lstat().st_size for link in ("file", "folder", "nothing"))
+    assert measure(tmp_path / "home") == 1200 + links
+    assert measure(tmp_path / "nowhere") == 0
+
+
+def test_a_quota_is_kept_between_measurements(tmp_path, clock):
+    disk = Disk(Settings(home=home_of(tmp_path, 500), max_home_bytes=1000, min_free_bytes=0))
+    disk.take(300)
+    disk.take(200)
+    disk.require()
+    with pytest.raises(StorageFullError, match=r"1000 bytes of 1000 bytes \(LIPSERVE_MAX_HOME_BYTES\)"):
+        disk.take(1)
+    clock.now = 2.0  # what was announced was not written, as a measurement shows
+    disk.take(500)
+    with pytest.raises(StorageFullError):
+        disk.require(1)
+
+
+def test_what_others_write_is_seen_after_a_while_and_what_they_delete_soon(tmp_path, clock):
+    disk = Disk(Settings(home=home_of(tmp_path, 500), max_home_bytes=1000, min_free_bytes=0))
+    disk.require(500)
+    (tmp_path / "other").write_bytes(bytes(400))
+    disk.require(500)
+    clock.now = 2 * measuring.MEASURE_S
+    with pytest.raises(StorageFullError):
+        disk.require(500)
+    (tmp_path / "other").unlink()
+    with pytest.raises(StorageFullError):
+        disk.require(500)
+    clock.now += 2 * measuring.AGAIN_S
+    disk.require(500)
+
+
+def test_space_stays_free(tmp_path):
+    free = os.statvfs(tmp_path).f_bavail * os.statvfs(tmp_path).f_frsize
+    Disk(Settings(home=tmp_path, min_free_bytes=0)).require()
+    disk = Disk(Settings(home=tmp_path, min_free_bytes=free * 2))
+    with pytest.raises(StorageFullError, match="LIPSERVE_MIN_FREE_BYTES"):
+        disk.require()
+    assert disk.usage().shortage() is not None
+
+
+def nothing_comes(api):
+    """Look that nothing of what follows in the block stays."""
+    files = service_of(api).files
+    return sorted(files.datasets.iterdir()), sorted(files.uploads.iterdir())
+
+
+@pytest.mark.parametrize("form", [False, True], ids=["body", "form"])
+def test_uploads_are_refused_before_they_are_read_while_queries_go_on(full, form):
+    before = nothing_comes(full)
+    if form:
+        answer = full.post("/v1/datasets", files={"file": ("full.npz", npz(**arrays(stream())))})
+    else:
+        answer = post(full, npz(**arrays(stream())))
+    assert "LIPSERVE_MAX_HOME_BYTES" in error(answer, 507, "storage_full")["message"]
+    assert nothing_comes(full) == before
+    query = {"q": [0.0] * 7, "dq": [0.0] * 7, "ddq": [0.0] * 7}
+    assert full.post("/v1/models/panda-sim/predict", json=query).status_code == 200
+    assert full.get("/v1/datasets").status_code == 200
+
+
+def test_an_upload_of_unknown_length_is_ended_where_the_room_ends(api, monkeypatch):
+    before, disk = nothing_comes(api), service_of(api).disk
+    sent = 0
+
+    def body():
+        nonlocal sent
+        for _ in range(64):
+            sent += 64 * KiB
+            yield bytes(64 * KiB)
+
+    monkeypatch.setattr(disk, "quota", disk.usage(0).used + WRITE_BYTES + 1)
+    error(post(api, body(), "text/csv"), 507, "storage_full")
+    assert sent <= 64 * 64 * KiB
+    assert nothing_comes(api) == before
+
+
+def test_data_that_is_larger_once_unpacked_is_refused(api, monkeypatch):
+    before, disk = nothing_comes(api), service_of(api).disk
+    packed = npz(**arrays(stream()))
+    monkeypatch.setattr(disk, "quota", disk.usage(0).used + len(packed) + 100)
+    error(post(api, packed), 507, "storage_full")
+    assert nothing_comes(api) == before
+
+
+def test_robots_and_jobs_are_refused(api, pendulum, monkeypatch):
+    monkeypatch.setattr(service_of(api).disk, "quota", 1)
+    body = {"model": "limits-full", "datasets": [pendulum["id"]], "options": QUICK}
+    error(api.post("/v1/jobs", json=body), 507, "storage_full")
+    answer = api.post("/v1/robots", content=b"<robot/>", headers={"content-type": "application/xml"})
+    error(answer, 507, "storage_full")
+
+
+def test_observations_are_refused_and_repeated_ones_are_still_known(api, monkeypatch):
+    service, folder = service_of(api), new_id("mv")
+    manifest = lipcore.copy_model(shipped_models() / "panda-sim", service.files.versions / folder)
+    with service.database.transaction() as session:
+        registry.publish(session, "limits-taught", folder, manifest, None)
+    rows = {"dq": [[0.0] * 7] * 2, "ddq": [[0.0] * 7] * 2, "tau": [[0.0] * 7] * 2}
+    body = {"stream_id": "limits-full", "sequence": 0, "t": [0.0, 0.01], "q": [[0.1] * 7] * 2, **rows}
+    address = "/v1/models/limits-taught/observations"
+    assert api.post(address, json=body).status_code == 200
+    monkeypatch.setattr(service_of(api).disk, "quota", 1)
+    assert api.post(address, json=body).json()["duplicate"] is True
+    error(api.post(address, json=body | {"sequence": 1, "t": [0.02, 0.03]}), 507, "storage_full")
+
+
+def test_a_deleted_data_set_makes_room(api, monkeypatch):
+    disk, samples = service_of(api).disk, stream()
+    large = upload(api, stream(samples=2000), name="limits-large")["id"]
+    monkeypatch.setattr(measuring, "AGAIN_S", 0.0)
+    monkeypatch.setattr(disk, "quota", disk.usage(0).used + 1)
+    error(post(api, npz(**arrays(samples))), 507, "storage_full")
+    assert api.delete(f"/v1/datasets/{large}").status_code == 204
+    small = upload(api, samples, name="limits-small")["id"]
+    assert api.delete(f"/v1/datasets/{small}").status_code == 204
+
+
+def test_a_state_without_room_is_not_stored_and_learning_goes_on(monkeypatch, caplog, tmp_path):
+    from service.updates.learner.follower import Follower
+
+    monkeypatch.setattr("service.updates.learner.follower.state.dump", lambda _: bytes(1000))
+    follower = Follower.__new__(Follower)
+    follower.model, follower.version, follower._stored = "limits", 1, 0
+    follower.known = SimpleNamespace(number=5, settled=True, online=None, seen=5)
+    follower.settings = Settings(home=tmp_path, max_home_bytes=1, snapshot_every_s=60)
+    follower.disk = Disk(follower.settings)
+    follower.store()
+    assert "has learnt is not stored" in caplog.text
+    assert follower._stored == 0
+    assert time.monotonic() < follower.snapshot_due <= time.monotonic() + 60
