@@ -1,0 +1,127 @@
+"""The form of log lines: for people and as JSON, with ids, without what could forge a line or tell a key."""
+
+from __future__ import annotations
+
+import json
+import logging
+import multiprocessing
+import subprocess
+import sys
+from concurrent.futures import ProcessPoolExecutor
+
+import pytest
+
+from service.observability import logs
+from service.observability.context import job_id, request_id
+from service.observability.logs import LogOptions
+from service.training.process import Place, start_process
+
+
+def record(message="said %s", *args, **more):
+    return logging.getLogger("service.x").makeRecord(
+        "service.x", logging.WARNING, __file__, 1, message, args, more.pop("failure", None), extra=more
+    )
+
+
+def as_json(entry):
+    text = logs._formatter("json").format(entry)
+    assert "\n" not in text
+    return json.loads(text)
+
+
+@pytest.fixture
+def ids():
+    tokens = request_id.set("req-1"), job_id.set("job_1")
+    yield
+    request_id.reset(tokens[0])
+    job_id.reset(tokens[1])
+
+
+def test_a_line_of_json_is_an_object(ids):
+    line = as_json(record("said %s", "so", fields={"status": 200}))
+    assert line.pop("timestamp").endswith("Z")
+    assert line == {
+        "event": "said so",
+        "level": "warning",
+        "logger": "service.x",
+        "status": 200,
+        "request_id": "req-1",
+        "job": "job_1",
+    }
+
+
+def test_outside_of_requests_no_id_is_named():
+    assert not {"request_id", "job", "trace_id"} & set(as_json(record("alone")))
+
+
+def test_a_line_for_people_names_the_same(ids):
+    line = logs._formatter("console").format(record("said %s", "so", fields={"status": 200}))
+    for part in ("warning", "said so", "service.x", "status=200", "request_id=req-1", "job=job_1"):
+        assert part in line
+    assert "\n" not in line
+    assert "\x1b" not in line
+
+
+@pytest.mark.parametrize("form", ["json", "console"])
+@pytest.mark.parametrize(
+    "text", ["a\nlevel=error forged", "a\r\nb", "a\x1b[2Jb", "a\u202eb", "a\u2028b", "a\x9bb", "a\0b"]
+)
+def test_no_text_of_a_client_leaves_its_line(form, text):
+    line = logs._formatter(form).format(record("%s", text, fields={"path": text}))
+    assert line.isprintable()
+
+
+@pytest.mark.parametrize("form", ["json", "console"])
+def test_a_traceback_is_whole_and_harmless(form):
+    try:
+        raise ValueError("sent: \x1b[2J")
+    except ValueError:
+        failure = sys.exc_info()
+    line = logs._formatter(form).format(record("failed", failure=failure))
+    assert "test_a_traceback_is_whole" in line
+    assert "ValueError" in line
+    assert "\x1b" not in line
+
+
+def test_readable_texts_stay_as_they_are():
+    assert as_json(record("Größe %s", "αβ ☃"))["event"] == "Größe αβ ☃"
+
+
+CONFIGURED = """
+import json, logging, warnings
+from service.observability import logs
+logs.configure(logs.LogOptions("debug", "json"))
+logs.configure(logs.LogOptions("debug", "json"))
+logging.getLogger("service.a").debug("ours")
+logging.getLogger("uvicorn.error").info("theirs")
+for name in ("uvicorn.error", "websockets.server", "httpx", "sqlalchemy.engine", "alembic.runtime.plugins"):
+    logging.getLogger(name).debug("Authorization: Bearer lip_secret")
+try:
+    raise ValueError
+except ValueError:
+    logging.getLogger("uvicorn.error").error("Exception in ASGI application\\n", exc_info=True)
+theirs = logging.getLogger("uvicorn.error")
+theirs.info('%s - "WebSocket %s" [accepted]', "127.0.0.1:1", "/v1/models/m/stream?stream_id=private")
+theirs.info("connection open")
+warnings.warn("careful")
+assert logging.getLogger("uvicorn.error").level > 5, "uvicorn would trace"
+"""
+
+
+def test_a_process_logs_everything_once_and_no_headers():
+    done = subprocess.run([sys.executable, "-c", CONFIGURED], capture_output=True, text=True, check=True)
+    lines = [json.loads(line) for line in done.stderr.splitlines()]
+    assert [line["logger"] for line in lines] == ["service.a", "uvicorn.error", "py.warnings"]
+    assert [line["event"] for line in lines[:2]] == ["ours", "theirs"]
+    assert done.stdout == ""
+
+
+def _options():
+    return logs.current(), logging.getLogger("service").level
+
+
+def test_processes_that_are_started_log_as_their_parent_does():
+    options = LogOptions("error", "json")
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, context, start_process, (Place(threads=1, log=options),)) as pool:
+        assert pool.submit(_options).result() == (options, logging.ERROR)

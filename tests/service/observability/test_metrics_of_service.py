@@ -1,0 +1,179 @@
+"""/metrics beyond learning: it says what was asked, and what is documented is what is there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from prometheus_client.openmetrics.parser import text_string_to_metric_families as parse_open
+from prometheus_client.parser import text_string_to_metric_families as parse
+from sqlalchemy import delete
+
+from service.database import JobRow
+from service.observability import table
+from service.observability.work import DURATION, FINISHED, JOBS, Work
+from tests.service.data import QUICK, service_of, stream, upload
+from tests.service.observability.test_request_ids import QUERY
+
+DOCUMENT = Path(__file__).parents[3] / "docs/monitoring.md"
+FEW = {**QUICK, "posterior_samples": 40}
+"""Options of a fit as small as the strict service wants it."""
+PREDICT = "/v1/models/{model}/predict"
+
+
+def scraped(api):
+    """All samples, {(name, labels): value}."""
+    families = list(parse(api.get("/metrics").text))
+    return {(s.name, frozenset(s.labels.items())): s.value for family in families for s in family.samples}
+
+
+def value(samples, name, **labels):
+    return samples.get((name, frozenset(labels.items())), 0)
+
+
+def grown(api, ask):
+    """How much each sample grows while something is asked."""
+    before = scraped(api)
+    ask()
+    after = scraped(api)
+    return {key: now - before.get(key, 0) for key, now in after.items() if now != before.get(key, 0)}
+
+
+def test_the_documentation_has_the_table():
+    assert "\n".join(table.lines()) in DOCUMENT.read_text()
+
+
+def test_the_table_has_what_is_shown(api):
+    documented = {kind.name.removesuffix("_total"): kind for kind in table.KINDS}
+    shown = {family.name: family for family in parse(api.get("/metrics").text)}
+    assert {name for name in shown if name.startswith("lipserve_")} == set(documented)
+    for name, kind in documented.items():
+        family = shown[name]
+        assert (family.type, family.documentation) == (kind.kind, kind.said)
+        for sample in family.samples:
+            assert set(sample.labels) - {"le"} == set(kind.labels)
+
+
+def test_openmetrics_can_be_read(api):
+    answer = api.get("/metrics", headers={"accept": "application/openmetrics-text; version=1.0.0"})
+    assert {kind.name.removesuffix("_total") for kind in table.KINDS} <= {each.name for each in parse_open(answer.text)}
+
+
+def test_requests_are_counted_and_timed_by_route_and_model(api):
+    def ask():
+        for _ in range(3):
+            assert api.post("/v1/models/panda-sim/predict", json=QUERY).status_code == 200
+
+    more = grown(api, ask)
+    asked = {"method": "POST", "route": PREDICT}
+    assert value(more, "lipserve_requests_total", **asked, status="200") == 3
+    timed = "lipserve_request_duration_seconds"
+    assert value(more, f"{timed}_count", **asked, model="panda-sim") == 3
+    assert value(more, f"{timed}_bucket", **asked, model="panda-sim", le="+Inf") == 3
+    assert 0 < value(more, f"{timed}_sum", **asked, model="panda-sim") < 60
+
+
+def test_errors_are_counted_by_code(api):
+    def ask():
+        assert api.post("/v1/models/panda-sim/predict", json={}).status_code == 422
+        assert api.get("/v1/jobs/nobody").status_code == 404
+
+    more = grown(api, ask)
+    assert value(more, "lipserve_errors_total", route=PREDICT, code="invalid_request") == 1
+    assert value(more, "lipserve_errors_total", route="/v1/jobs/{job}", code="not_found") == 1
+    assert value(more, "lipserve_requests_total", method="POST", route=PREDICT, status="422") == 1
+    # of a model that exists, though it was refused
+    assert value(more, "lipserve_request_duration_seconds_count", method="POST", route=PREDICT, model="panda-sim") == 1
+
+
+def test_names_that_clients_make_up_are_no_labels(api):
+    def ask():
+        for number in range(3):
+            assert api.post(f"/v1/models/made-up-{number}/predict", json=QUERY).status_code == 404
+            assert api.get(f"/made-up-{number}").status_code == 404
+            assert api.request(f"MADEUP{number}", "/v1/models").status_code == 405
+
+    more = grown(api, ask)
+    assert "made-up" not in str(more).lower()
+    assert value(more, "lipserve_request_duration_seconds_count", method="POST", route=PREDICT, model="") == 3
+    assert value(more, "lipserve_requests_total", method="GET", route="", status="404") == 3
+    assert value(more, "lipserve_requests_total", method="other", route="/v1/models", status="405") == 3
+
+
+def test_a_request_that_asks_is_in_flight(api):
+    assert value(scraped(api), "lipserve_requests_in_flight") == 1
+    assert service_of(api).meters.requests.in_flight == 0
+
+
+def test_the_service_tells_of_itself(api):
+    samples = scraped(api)
+    assert value(samples, "lipserve_models_loaded") == len(service_of(api).loaded.versions())
+    assert value(samples, "lipserve_disk_used_bytes", what="versions") > 1000
+    assert value(samples, "lipserve_disk_free_bytes") > 0
+    assert value(samples, "process_resident_memory_bytes") > 1e7
+    assert value(samples, "lipserve_ready", part="database") == 1
+
+
+@pytest.fixture
+def jobs(api):
+    """Jobs that ended after known times, in the database alone."""
+    database = service_of(api).database
+    made = [
+        ("succeeded", "2026-01-01T00:00:00.000+00:00", "2026-01-01T00:00:20.000+00:00"),
+        ("succeeded", "2026-01-01T00:00:00.000+00:00", "2026-01-01T02:00:00.000+00:00"),
+        ("failed", "2026-01-01T00:00:00.000+00:00", "2026-01-01T00:00:00.500+00:00"),
+        ("failed", "2026-01-01T00:00:01.000+00:00", "2026-01-01T00:00:00.000+00:00"),  # the clock was set back
+        ("cancelled", None, "2026-01-01T00:00:00.000+00:00"),
+    ]
+    before = families(database)
+    with database.transaction() as session:
+        for number, (state, started, finished) in enumerate(made):
+            session.add(
+                JobRow(
+                    id=f"job_metrics_{number}",
+                    model="m",
+                    state=state,
+                    request={},
+                    progress={},
+                    created_at="2026-01-01T00:00:00.000+00:00",
+                    started_at=started,
+                    finished_at=finished,
+                )
+            )
+    yield before, families(database)
+    with database.transaction() as session:
+        session.execute(delete(JobRow).where(JobRow.id.startswith("job_metrics_")))
+
+
+def families(database):
+    return {
+        (sample.name, *sample.labels.values()): sample.value
+        for family in Work(database).collect()
+        for sample in family.samples
+    }
+
+
+def test_jobs_are_counted_and_timed_by_outcome(jobs):
+    before, after = jobs
+    more = {key: now - before[key] for key, now in after.items()}
+    name = DURATION.name
+    assert more[FINISHED.name, "succeeded"] == 2
+    assert more[FINISHED.name, "failed"] == 2
+    assert more[FINISHED.name, "cancelled"] == 1
+    assert [more[f"{name}_bucket", "succeeded", le] for le in ("10.0", "30.0", "3600.0", "10800.0", "+Inf")] == [
+        *(0, 1, 1, 2, 2)
+    ]
+    assert more[f"{name}_sum", "succeeded"] == pytest.approx(7220.0, abs=1e-3)
+    assert more[f"{name}_bucket", "failed", "1.0"] == 2
+    assert more[f"{name}_sum", "failed"] == pytest.approx(0.5, abs=1e-3)
+    assert more[f"{name}_count", "cancelled"] == 0  # it never started
+
+
+def test_jobs_that_wait_are_counted(no_worker):
+    before = families(service_of(no_worker).database)[JOBS.name, "queued"]
+    dataset = upload(no_worker, stream())["id"]
+    answer = no_worker.post("/v1/jobs", json={"model": "waits-for-metrics", "datasets": [dataset], "options": FEW})
+    assert answer.status_code == 202, answer.text
+    assert families(service_of(no_worker).database)[JOBS.name, "queued"] == before + 1
+    assert no_worker.post(f"/v1/jobs/{answer.json()['id']}/cancel").json()["state"] == "cancelled"
+    assert families(service_of(no_worker).database)[JOBS.name, "queued"] == before

@@ -1,0 +1,158 @@
+"""Readiness: each part that does not work is named, looked at anew, and no more often than need be."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+
+import pytest
+
+from service.observability import readiness
+from service.observability.readiness import KEPT_S, RESTART_S, START_S, Readiness
+from service.updates.learner.process import LearnerProcess
+from tests.service.data import QUICK, error, service_of, stream, upload
+
+FEW = {**QUICK, "posterior_samples": 40}
+"""Options of a fit as small as the strict service wants it."""
+PARTS = ["database", "home", "models", "learner", "training"]
+
+
+class Clock:
+    """Time that passes when told to."""
+
+    def __init__(self):
+        self.now = 1000.0
+
+    def __call__(self):
+        return self.now
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+@pytest.fixture
+def look(clock):
+    """A look at a service, as if nobody had looked within the last second: states by part."""
+    seen = Readiness(clock)
+
+    def look(service):
+        seen.forget()
+        return {check.name: (check.state, check.message) for check in seen.report(service).checks}
+
+    return look
+
+
+def test_all_parts_are_named(api, fresh_looks):
+    answer = api.get("/health/ready")
+    assert answer.status_code == 200, answer.text
+    assert [part["name"] for part in answer.json()["checks"]] == PARTS
+
+
+def test_what_does_not_work_is_named(api, fresh_looks, monkeypatch):
+    monkeypatch.setattr(service_of(api).disk, "floor", 2**62)
+    said = error(api.get("/health/ready"), 503, "not_ready")
+    assert [item["field"] for item in said["detail"]] == ["home"]
+    assert "LIPSERVE_MIN_FREE_BYTES" in said["message"]
+
+
+def test_a_locked_database_is_found(api, look, monkeypatch):
+    monkeypatch.setattr(readiness, "WRITE_S", 0.05)
+    service = service_of(api)
+    with closing(sqlite3.connect(service.database.engine.url.database, isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        assert look(service)["database"] == ("failed", "OperationalError: database is locked")
+        other.execute("ROLLBACK")
+    assert look(service)["database"][0] == "ok"
+
+
+def test_a_home_that_cannot_be_written_is_found_and_not_named(api, look, monkeypatch, tmp_path):
+    service = service_of(api)
+    monkeypatch.setattr(service.files, "uploads", tmp_path / "gone")
+    state, said = look(service)["home"]
+    assert state == "failed"
+    assert "gone" not in said  # whoever asks needs no key
+
+
+def test_nothing_is_left_behind(api, look):
+    service = service_of(api)
+    before = list(service.files.uploads.iterdir())
+    look(service)
+    assert list(service.files.uploads.iterdir()) == before
+
+
+def test_versions_that_cannot_be_read_are_a_warning_while_others_can(api, trained, look, monkeypatch):
+    service = service_of(api)
+    monkeypatch.setattr(service.loaded, "versions", set)
+    monkeypatch.setattr(service.loaded, "unreadable", lambda: {(trained.name, 1): "damaged"})
+    state, said = look(service)["models"]
+    assert state == "warning"
+    assert said.startswith("1 of ")
+    assert trained.name not in said
+
+
+def test_without_a_version_that_can_be_read_the_service_is_not_ready(api, look, monkeypatch, tmp_path):
+    service = service_of(api)
+    monkeypatch.setattr(service.loaded, "versions", set)
+    monkeypatch.setattr(service.files, "versions", tmp_path)
+    assert look(service)["models"][0] == "failed"
+
+
+def test_a_version_in_memory_answers_whatever_its_files_are(api, trained, look, monkeypatch):
+    service = service_of(api)
+    found = service.loaded.get(trained.name, 1)
+    before = look(service)["models"]
+    monkeypatch.setattr(service.loaded, "unreadable", lambda: {(found.name, found.version): "damaged since"})
+    assert look(service)["models"] == before
+
+
+def test_a_learner_that_is_gone_for_long_is_found(api, look, clock, monkeypatch):
+    service = service_of(api)
+    monkeypatch.setattr(LearnerProcess, "wanted", True)
+    monkeypatch.setattr(LearnerProcess, "pid", None)
+    assert look(service)["learner"][0] == "warning"
+    clock.now += RESTART_S
+    assert look(service)["learner"][0] == "warning"
+    clock.now += 1.0
+    assert look(service)["learner"][0] == "failed"
+    monkeypatch.setattr(LearnerProcess, "pid", 1)
+    assert look(service)["learner"] == ("ok", "runs")
+    monkeypatch.setattr(LearnerProcess, "pid", None)
+    assert look(service)["learner"][0] == "warning"  # gone anew
+
+
+def test_jobs_that_nobody_starts_are_found(no_worker, look, clock):
+    service = service_of(no_worker)
+    dataset = upload(no_worker, stream())["id"]
+    body = {"model": "waits-for-health", "datasets": [dataset], "options": FEW}
+    queued = no_worker.post("/v1/jobs", json=body).json()["id"]
+    assert look(service)["training"] == ("ok", "1 jobs wait, 0 run")
+    clock.now += START_S + 1.0
+    assert look(service)["training"][0] == "failed"
+    assert no_worker.post(f"/v1/jobs/{queued}/cancel").json()["state"] == "cancelled"
+    assert look(service)["training"][0] == "ok"
+
+
+def test_a_service_that_stops_is_not_ready_though_all_parts_work(api, monkeypatch):
+    monkeypatch.setattr(service_of(api).stopping, "begun", True)
+    said = error(api.get("/health/ready"), 503, "not_ready")
+    assert [item["field"] for item in said["detail"]] == ["stopping"]
+
+
+def test_a_report_is_kept_for_a_moment(api, clock, monkeypatch):
+    seen, looks = Readiness(clock), []
+    monkeypatch.setattr(readiness, "_home", lambda service: looks.append(1) or ("ok", ""))
+    for _ in range(5):
+        seen.report(service_of(api))
+    assert len(looks) == 1
+    clock.now += KEPT_S
+    seen.report(service_of(api))
+    assert len(looks) == 2
+
+
+def test_asking_does_not_count_as_using_a_version(api, look):
+    service = service_of(api)
+    used = dict(service.loaded._used)
+    look(service)
+    assert service.loaded._used == used
