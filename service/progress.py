@@ -30,6 +30,8 @@ def follow(client: Client, job: Job, console: Console) -> Job:
             at = seen.progress
             objective = "" if at.objective is None else f" objective {at.objective:.1f}"
             text = f"{at.stage} {at.iteration}/{at.max_iterations}{objective}" if at.iteration else at.stage
+            if at.remaining_s:
+                text += f", at most about {at.remaining_s:.0f} s left"
             bar.update(task, description=text, completed=at.fraction)
             if not console.is_terminal and (at.elapsed_s - printed >= PLAIN_EVERY or seen.state not in ACTIVE):
                 printed = at.elapsed_s

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import func, select
@@ -13,27 +14,33 @@ from service.database import Database, DatasetRow, JobRow, RobotRow, now
 from service.datasets import store
 from service.errors import BusyError, ConflictError, InvalidRequestError, invalid_request, not_found, problem
 from service.files import new_id
+from service.observability.context import request_id
 from service.pages import Page, newest
 from service.robots import store as robots
 from service.settings import Settings
+from service.training import history
 from service.training.schema import Job, JobPage, JobRequest, Options
-from service.training.states import ACTIVE, CANCELLED, QUEUED
+from service.training.states import ACTIVE, CANCELLED, QUEUED, RUNNING
 
 if TYPE_CHECKING:  # the service learns online too, and that queues jobs
     from service.context import Service
 
+USUAL_WAIT_S, LONGEST_WAIT_S = 30, 3600
+"""Seconds after which who finds the queue full may try again: where nothing is known of the jobs that run, and most."""
 
-def create(service: Service, request: JobRequest) -> Job:
-    """Check a request, store it as a queued job and hand it to the queue."""
+
+def create(service: Service, request: JobRequest, retry_of: str | None = None) -> Job:
+    """Check a request, store it as a queued job and hand it to the queue. retry_of: the job that it repeats."""
     _check_options(request.options, service.settings)
     if len(request.datasets) > service.settings.max_job_datasets:
         raise invalid_request("datasets", len(request.datasets), f"at most {service.settings.max_job_datasets}")
     rows = [store.find(service.database, dataset) for dataset in request.datasets]
     joint_types = _check_joints(request, rows)
+    service.disk.require()  # for the version that will be made
     _check_estimator(service.database, request, rows[0].joint_names, joint_types)
     with service.database.transaction() as session:
         wanted = {**request.model_dump(mode="json"), "joint_types": joint_types}
-        job = add(session, service.settings, request.model, wanted)
+        job = add(session, service.settings, request.model, wanted, retry_of)
         present = set(session.scalars(select(DatasetRow.id).where(DatasetRow.id.in_(request.datasets))))
         for dataset in request.datasets:
             if dataset not in present:  # deleted since it was checked
@@ -45,31 +52,43 @@ def create(service: Service, request: JobRequest) -> Job:
     return shown(job)
 
 
-def add(session: Session, settings: Settings, model: str, request: dict[str, Any]) -> JobRow:
+def add(
+    session: Session, settings: Settings, model: str, request: dict[str, Any], retry_of: str | None = None
+) -> JobRow:
     """Add a queued job, to be handed to the queue once the session has committed; raise BusyError for a full queue."""
     waiting = session.scalar(select(func.count()).select_from(JobRow).where(JobRow.state == QUEUED)) or 0
     if waiting >= settings.max_queued_jobs:
-        raise BusyError(f"{waiting} jobs are waiting already, the most that may: try again later")
+        raise BusyError(
+            f"{waiting} jobs are waiting already, the most that may: try again later",
+            headers={"Retry-After": str(_seconds_to_wait(session))},
+        )
     job = JobRow(
         id=new_id("job"),
         model=model,
-        state=QUEUED,
         request=request,
-        progress={"stage": "waiting"},
+        progress={},
         attempts=0,
         cancel_requested=False,
         created_at=now(),
+        history=[],
+        retry_of=retry_of,
+        request_id=request_id.get(),
     )
+    history.enter(job, QUEUED, "queued" if retry_of is None else f"queued to repeat job {retry_of}")
     session.add(job)
     return job
 
 
+def _seconds_to_wait(session: Session) -> int:
+    """When the first of the jobs that run may end and another one leave the queue, s: a guess where none can tell."""
+    left = [row.get("remaining_s") for row in session.scalars(select(JobRow.progress).where(JobRow.state == RUNNING))]
+    known = [seconds for seconds in left if seconds is not None]
+    return math.ceil(min(max(min(known), 1.0), LONGEST_WAIT_S)) if known else USUAL_WAIT_S
+
+
 def show(service: Service, job: str) -> Job:
     """Return one job; raise NotFoundError. Who sees it succeed is answered by its version from then on."""
-    with service.database.session() as session:
-        row = session.scalar(select(JobRow).where(JobRow.id == job))
-    if row is None:
-        raise not_found("job", job)
+    row = find(service.database, job)
     if row.version is not None:
         service.loaded.announce([row.model])
     return shown(row)
@@ -83,17 +102,32 @@ def page(service: Service, part: Page) -> JobPage:
     return JobPage(items=[shown(row) for row in rows], next_cursor=following)
 
 
-def cancel(database: Database, job: str) -> Job:
-    """Cancel a job: at once while it waits, at its next look at the database while it runs."""
-    with database.transaction() as session:
+def find(database: Database, job: str) -> JobRow:
+    """Return a job's row; raise NotFoundError."""
+    with database.session() as session:
+        row = session.scalar(select(JobRow).where(JobRow.id == job))
+    if row is None:
+        raise not_found("job", job)
+    return row
+
+
+def cancel(service: Service, job: str) -> Job:
+    """Cancel a job: at once while it waits; while it runs within `job_cancel_grace_s`, with or without its consent.
+
+    Raise NotFoundError, ConflictError where it has ended.
+    """
+    service.jobs.stop(job)  # before anything is written, for which its process may hold the lock
+    with service.database.transaction() as session:
         row = session.scalar(select(JobRow).where(JobRow.id == job))
         if row is None:
             raise not_found("job", job)
         if row.state not in ACTIVE:
             raise ConflictError(f"job {job!r} has {row.state} already")
-        row.cancel_requested = True
         if row.state == QUEUED:
-            row.state, row.finished_at = CANCELLED, now()
+            history.enter(row, CANCELLED, "cancelled while it waited")
+        elif not row.cancel_requested:
+            history.enter(row, RUNNING, "asked to end")
+        row.cancel_requested = True
     return shown(row)
 
 
@@ -157,6 +191,9 @@ def shown(row: JobRow) -> Job:
                     "started_at",
                     "heartbeat_at",
                     "finished_at",
+                    "history",
+                    "retry_of",
+                    "request_id",
                 )
             },
         }

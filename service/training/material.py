@@ -44,7 +44,7 @@ class Material:
 def recorded(database: Database, files: Files, request: dict[str, Any]) -> Material:
     """Samples of the data sets that a job names."""
     rows = _datasets(database, request["datasets"])
-    samples = Samples.concatenate([files.read_samples(row.id, row.joint_names) for row in rows])
+    samples = Samples.concatenate([files.read_samples(row.id, row.joint_names, row.sha256) for row in rows])
     names, robot = rows[0].joint_names, request.get("robot")
     return Material(
         samples,
@@ -67,13 +67,13 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
         within = scope.find(session, model, refresh["through"])
         rows, left_out = scope.split(session, within, version.manifest["lineage"])
     rows = [row for row in rows if row.id in request["datasets"]]  # what may be deleted meanwhile was not promised
-    base = lipcore.load(files.versions / version.folder)
+    base = lipcore.load(files.versions / version.folder, version.checksums)
     logged = material.read(
         database, model, base.joint_names, within, settings.max_refresh_samples, settings.max_time_gap_s
     )
     if not rows and logged.found < settings.min_samples:
         raise NothingToLearnError(f"the log has {logged.found} rows to train on, expected {settings.min_samples}")
-    parts = [files.read_samples(row.id, row.joint_names) for row in rows]
+    parts = [files.read_samples(row.id, row.joint_names, row.sha256) for row in rows]
     times = [np.full(len(part), _uploaded(row)) for row, part in zip(rows, parts, strict=True)]
     log_lineage: dict[str, Any] = {"through": within.through, "rows": 0, "found": logged.found}
     if logged.samples is not None:

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from typing import Literal
 
+from service.observability import logs
+from service.observability.logs import LogOptions
 from service.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -31,7 +33,8 @@ THREAD_VARIABLES = (
 
 @dataclass(frozen=True)
 class Place:
-    """What a process may take of the machine: threads of each numerical library, priority, CPUs (None: all).
+    """What a process may take of the machine: threads of each numerical library, priority, CPUs (None: all); log: how
+    it says what happens, None: as Python does of itself.
 
     policy: of scheduling, Linux only; "idle" runs where nothing else wants to, "other" is the usual one. On two CPUs
     neither it nor more niceness kept training out of serving's way as well as leaving one CPU to serving did.
@@ -41,6 +44,7 @@ class Place:
     niceness: int = 0
     policy: Literal["other", "idle"] = "other"
     cpus: frozenset[int] | None = None
+    log: LogOptions | None = None
 
 
 def training_place(settings: Settings) -> Place:
@@ -48,7 +52,7 @@ def training_place(settings: Settings) -> Place:
     cpus = None
     if hasattr(os, "sched_getaffinity"):  # Linux
         cpus = training_cpus(os.sched_getaffinity(0), settings.training_cpus)
-    return Place(settings.training_threads, settings.training_niceness, settings.training_policy, cpus)
+    return Place(settings.training_threads, settings.training_niceness, settings.training_policy, cpus, logs.current())
 
 
 def training_cpus(available: set[int], most: int | None) -> frozenset[int]:
@@ -62,6 +66,7 @@ def start_process(place: Place) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends its processes
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(place.threads)))
     os.nice(place.niceness)
+    logs.configure(place.log)
     try:
         if place.policy == "idle" and hasattr(os, "sched_setscheduler"):
             os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))

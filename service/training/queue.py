@@ -1,118 +1,247 @@
-"""The queue of training jobs: rows in the database, worked off by a pool of other processes."""
+"""The queue of training jobs: rows in the database, worked off by other processes, each watched by one thread here.
+
+Three threads share the work. The watcher alone knows which process has which job; it only reads the database, so that
+no lock there keeps it from ending a process. The clerk writes what becomes of jobs whose process ended, again and again
+until it is written. A version that was made is loaded in a thread of its own.
+"""
 
 from __future__ import annotations
 
 import logging
-import multiprocessing
+import queue
 import threading
+import time
 from collections.abc import Callable
-from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from datetime import UTC, datetime
+from functools import partial
 
 from sqlalchemy import select
 
-from service.database import Database, JobRow, now
+from service.database import Database, JobRow
+from service.files import Files
 from service.settings import Settings
-from service.training import worker
-from service.training.process import start_process, training_place
-from service.training.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED
+from service.training import history, worker
+from service.training.feed import Feed
+from service.training.process import training_place
+from service.training.settling import Settled, Settler, queue_again
+from service.training.slots import Slot
+from service.training.states import ACTIVE, CANCELLED, QUEUED, RUNNING
+from service.training.watch import Ended, Facts, Hand
 
 logger = logging.getLogger(__name__)
 
+WATCH_S = 0.2
+"""Seconds between two looks at the jobs that run."""
+RECONCILE_S = 30.0
+"""Seconds between two searches for jobs that nobody has: there are none, unless something went very wrong."""
+AGAIN_S = 1.0
+"""Seconds after which the clerk tries again to write what the database did not take."""
+
 
 class JobQueue:
-    """Hands queued jobs to training processes and takes back what an interruption left.
+    """Hands queued jobs to training processes, watches these, and takes back what an interruption left.
 
     trained: called with the model and the version that a job has made, in a thread of its own.
     """
 
     def __init__(self, settings: Settings, database: Database, trained: Callable[[str, int], None]) -> None:
         self.settings, self.database, self.trained = settings, database, trained
-        self._lock = threading.Lock()
-        self._closing = False
-        self._pool = self._new_pool()
+        self.feed = Feed(database)
+        self.problem: str | None = None
+        """Why training processes cannot be started, None while they can as far as is known."""
+        self._settler = Settler(settings, database, Files(settings.home))
+        self._slots = [Slot(training_place(settings)) for _ in range(settings.training_workers)]
+        self._hands: list[Hand] = []
+        self._waiting: dict[str, float] = {}  # when each may be handed out, monotonic, in the order of coming
+        self._settling: set[str] = set()
+        self._watched = self._reconciled = time.monotonic()
+        self._closing = threading.Event()
+        self._inbox: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._desk: queue.SimpleQueue[Ended | None] = queue.SimpleQueue()
+        self._watcher = threading.Thread(target=self._watch, daemon=True, name="job-watcher")
+        self._clerk = threading.Thread(target=self._settle, daemon=True, name="job-clerk")
+        self._watcher.start()
+        self._clerk.start()
 
     def submit(self, job: str) -> None:
         """Hand a queued job to the next free training process."""
-        with self._lock:
-            if self._closing:
-                return  # the row stays queued and is taken up at the next start
-            try:
-                future = self._pool.submit(worker.run, self.settings, job)
-            except BrokenProcessPool:
-                self._pool = self._new_pool()
-                future = self._pool.submit(worker.run, self.settings, job)
-        future.add_done_callback(lambda done: self._ended(job, done))
+        self._inbox.put(partial(self._wait, job))
+
+    def stop(self, job: str) -> None:
+        """End the process that runs a job, if one does, unless it ends within `job_cancel_grace_s`: it is cancelled."""
+        self._inbox.put(partial(self._stop, job))
 
     def recover(self) -> list[str]:
         """Queue again every job that an earlier run of the service left unfinished; return their ids."""
         with self.database.transaction() as session:
             rows = list(session.scalars(select(JobRow).where(JobRow.state.in_(ACTIVE)).order_by(JobRow.seq)))
-            ready = [row.id for row in rows if self._requeue(row)]
+            ready = [row.id for row in rows if self._is_ready(row)]
         for job in ready:
             self.submit(job)
         return ready
 
     def close(self) -> None:
         """Stop the training processes at once; their jobs stay in the database and go on at the next start."""
-        with self._lock:
-            self._closing = True
-            pool = self._pool
-        pool.kill_workers() if hasattr(pool, "kill_workers") else self._kill(pool)
-        pool.shutdown(wait=True, cancel_futures=True)
+        self._closing.set()
+        self._inbox.put(lambda: None)
+        self._desk.put(None)
+        self._watcher.join()
+        for slot in self._slots:
+            slot.close()
+        self._clerk.join()
+        try:
+            self._hand_back()
+        except Exception:  # as after a kill: the next start finds them
+            logger.exception("running jobs could not be handed back")
+
+    def _hand_back(self) -> None:
         with self.database.transaction() as session:
             for row in session.scalars(select(JobRow).where(JobRow.state == RUNNING)):
-                # handed back in order: such a start is no failed attempt
-                row.state, row.attempts, row.progress = QUEUED, row.attempts - 1, {"stage": "waiting"}
+                if row.cancel_requested:
+                    history.enter(row, CANCELLED, "cancelled: the service was stopped while it ran")
+                    continue
+                row.attempts -= 1  # handed back in order: such a start is no failed attempt
+                history.enter(row, QUEUED, "the service was stopped while it ran: queued again")
 
-    def _new_pool(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(
-            self.settings.training_workers,
-            mp_context=multiprocessing.get_context("spawn"),
-            initializer=start_process,
-            initargs=(training_place(self.settings),),
-        )
-
-    @staticmethod
-    def _kill(pool: ProcessPoolExecutor) -> None:
-        # Python < 3.14 has no public way to end a pool's processes
-        for process in list((pool._processes or {}).values()):
-            process.kill()
-
-    def _requeue(self, row: JobRow) -> bool:
-        """Make an interrupted job wait again, or end it where it was cancelled or tried too often."""
-        if row.cancel_requested:
-            row.state, row.finished_at = CANCELLED, now()
-        elif row.attempts >= self.settings.max_job_attempts:
-            row.state, row.finished_at = FAILED, now()
-            message = f"the training process ended before its job, {row.attempts} times"
-            row.error = {"code": "interrupted", "message": message}
-        else:
-            row.state, row.progress = QUEUED, {"stage": "waiting"}
+    def _is_ready(self, row: JobRow) -> bool:
+        if row.state == QUEUED and not row.cancel_requested:
             return True
-        return False
+        return queue_again(row, "the service was killed while it ran", self.settings.max_job_attempts)
 
-    def _ended(self, job: str, future: Future[None]) -> None:
-        if self._closing or future.cancelled():
-            return
-        error = future.exception()
-        if error is None:
-            threading.Thread(target=self._succeeded, args=(job,), daemon=True).start()
-            return
-        # the process died or could not reach the database: the job's row still says queued or running
-        logger.error("the training process of job %s ended early: %r", job, error)
-        # a broken pool calls back while it holds a lock that submitting needs: from another thread then
-        threading.Thread(target=self._retry, args=(job,)).start()
+    # the watcher: all below until the clerk runs in its thread alone
 
-    def _succeeded(self, job: str) -> None:
+    def _watch(self) -> None:
+        while not self._closing.is_set():
+            try:
+                self._inbox.get(timeout=WATCH_S if self._hands or self._waiting else RECONCILE_S)()
+            except queue.Empty:
+                pass
+            except Exception:
+                logger.exception("the queue of jobs goes on after an error")
+            for step in (self._look, self._reconcile, self._hand_out):
+                try:
+                    step()
+                except Exception:  # of the database: the next look may find it well again
+                    logger.exception("the queue of jobs goes on after an error")
+
+    def _wait(self, job: str, ready: float = 0.0) -> None:
+        self._waiting.setdefault(job, ready)
+
+    def _stop(self, job: str) -> None:
+        for hand in self._hands:
+            if hand.job == job:
+                hand.stop(time.monotonic())
+
+    def _hand_out(self) -> None:
+        busy = {hand.slot for hand in self._hands}
+        running = {hand.job for hand in self._hands} | self._settling
+        clock = time.monotonic()
+        free = [slot for slot in self._slots if slot not in busy]
+        ready = [job for job, at in self._waiting.items() if at <= clock and job not in running]
+        for slot, job in zip(free, ready, strict=False):
+            if self._closing.is_set():
+                return
+            del self._waiting[job]
+            try:
+                future = slot.start(worker.run, self.settings, job)
+            except Exception as error:  # no memory, too many processes
+                self._pass_on(Ended(job, "ended", f"a training process could not be started: {error}"))
+                continue
+            hand = Hand(job, slot, future, clock)
+            self._hands.append(hand)
+            # called by a thread of the pool, which may hold its lock
+            future.add_done_callback(lambda _, hand=hand: self._inbox.put(partial(self._ended, hand)))  # type: ignore[misc]
+
+    def _look(self) -> None:
+        """See how the jobs that run are doing, and end the processes that have to be."""
+        clock = time.monotonic()
+        if not self._hands or clock - self._watched < WATCH_S:
+            return
+        self._watched = clock
+        try:
+            self._read(clock)
+        finally:
+            for hand in list(self._hands):
+                if ended := hand.judge(self.settings, clock):
+                    self._hands.remove(hand)
+                    hand.slot.kill()
+                    self._pass_on(ended)
+
+    def _read(self, clock: float) -> None:
+        columns = JobRow.id, JobRow.state, JobRow.heartbeat_at, JobRow.cancel_requested
         with self.database.session() as session:
-            row = session.scalar(select(JobRow).where(JobRow.id == job, JobRow.state == SUCCEEDED))
-        if row is not None and row.version is not None:
-            self.trained(row.model, row.version)
+            rows = session.execute(select(*columns).where(JobRow.id.in_([hand.job for hand in self._hands])))
+            found = {job: Facts(state, heard, cancel) for job, state, heard, cancel in rows}
+        for hand in self._hands:
+            if hand.job in found:
+                hand.see(found[hand.job], clock)
+            if hand.ran is not None:
+                self.problem = None
 
-    def _retry(self, job: str) -> None:
-        with self.database.transaction() as session:
-            row = session.scalar(select(JobRow).where(JobRow.id == job, JobRow.state.in_(ACTIVE)))
-            again = row is not None and self._requeue(row)
-        if again:
+    def _ended(self, hand: Hand) -> None:
+        if hand not in self._hands:
+            return  # it was ended, and its job passed on
+        self._hands.remove(hand)
+        error = hand.future.exception()
+        if error is None:
+            self._pass_on(Ended(hand.job, "returned", "the training process gave it back"))
+        elif isinstance(error, BrokenProcessPool):
+            self._pass_on(Ended(hand.job, "ended", f"the training process {hand.slot.ending()}"))
+        else:
+            self._pass_on(Ended(hand.job, "ended", f"the training process could not go on: {error}"))
+
+    def _pass_on(self, ended: Ended) -> None:
+        self._settling.add(ended.job)
+        self._desk.put(ended)
+
+    def _reconcile(self) -> None:
+        clock = time.monotonic()
+        if clock - self._reconciled < RECONCILE_S:
+            return
+        self._reconciled = clock
+        known = {hand.job for hand in self._hands} | self._settling | self._waiting.keys()
+        with self.database.session() as session:
+            rows = list(session.scalars(select(JobRow).where(JobRow.state.in_(ACTIVE)).order_by(JobRow.seq)))
+        for row in rows:
+            if row.id in known:
+                continue
+            if row.state == QUEUED:
+                self.submit(row.id)
+            elif _age(row.heartbeat_at) > self.settings.job_heartbeat_s:
+                self._pass_on(Ended(row.id, "ended", "no process runs it"))
+
+    def _settled(self, job: str, settled: Settled) -> None:
+        self._settling.discard(job)
+        if settled.problem is not None:
+            self.problem = settled.problem
+        if settled.again and settled.pause_s:
+            self._wait(job, time.monotonic() + settled.pause_s)
+        elif settled.again:
             self.submit(job)
+        else:
+            self._waiting.pop(job, None)  # where it was handed in twice
+
+    # the clerk
+
+    def _settle(self) -> None:
+        while (ended := self._desk.get()) is not None:
+            settled = None
+            while settled is None and not self._closing.is_set():
+                try:
+                    settled = self._settler.settle(ended)
+                except Exception:
+                    logger.exception("what becomes of job %s could not be written: tried again", ended.job)
+                    self._closing.wait(AGAIN_S)
+            if settled is None:
+                return
+            if settled.made is not None:
+                threading.Thread(target=self.trained, args=settled.made, daemon=True).start()
+            self._inbox.put(partial(self._settled, ended.job, settled))
+
+
+def _age(moment: str | None) -> float:
+    """Seconds since a moment of the wall clock, infinite where there was none."""
+    if moment is None:
+        return float("inf")
+    return (datetime.now(UTC) - datetime.fromisoformat(moment)).total_seconds()

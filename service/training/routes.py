@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterable
+
 from fastapi import APIRouter, Response, status
+from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from service.context import ServiceDep
 from service.errors import BusyError, ConflictError, InvalidRequestError, NotFoundError, TooLargeError, responses
 from service.pages import PageQuery
-from service.training import jobs
+from service.route import Route
+from service.training import events, jobs, retrying
 from service.training.schema import Job, JobPage, JobRequest
 
-router = APIRouter(prefix="/v1/jobs", tags=["training jobs"], responses=responses(InvalidRequestError))
+router = APIRouter(
+    prefix="/v1/jobs", tags=["training jobs"], responses=responses(InvalidRequestError), route_class=Route
+)
 
 
 @router.post(
@@ -38,7 +44,34 @@ def show(service: ServiceDep, job: str) -> Job:
     return jobs.show(service, job)
 
 
+@router.get(
+    "/{job}/events",
+    summary="Follow a job",
+    response_class=EventSourceResponse,
+    responses=responses(NotFoundError, BusyError),
+)
+async def follow(service: ServiceDep, row: events.FollowedDep) -> AsyncIterable[ServerSentEvent]:
+    """Server-sent events, each with the whole job as its data: `state` at the start, at every entry of its history and
+    at its end; `progress` in between, about twice a second. The answer ends with the job, or when the service stops:
+    ask again then, the first event says how it stands."""
+    async for event in events.events(service, row):
+        yield event
+
+
 @router.post("/{job}/cancel", summary="Cancel a job", responses=responses(NotFoundError, ConflictError))
 def cancel(service: ServiceDep, job: str) -> Job:
-    """Cancel a waiting job at once, a running one within about a second."""
-    return jobs.cancel(service.database, job)
+    """Cancel a waiting job at once, a running one within two seconds: a process that does not obey is killed."""
+    return jobs.cancel(service, job)
+
+
+@router.post(
+    "/{job}/retry",
+    status_code=status.HTTP_202_ACCEPTED,
+    summary="Repeat a job that failed or was cancelled",
+    responses=responses(NotFoundError, ConflictError, BusyError),
+)
+def retry(service: ServiceDep, job: str, response: Response) -> Job:
+    """Queue a new job with the same request; `retry_of` names the old one. What it needs must still be there."""
+    again = retrying.retry(service, job)
+    response.headers["Location"] = f"/v1/jobs/{again.id}"
+    return again

@@ -18,7 +18,7 @@ _DEFAULTS = FitOptions()
 class Options(BaseModel):
     """How to fit; the defaults suit most recordings."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
 
     hyperparameter_samples: int = Field(
         _DEFAULTS.hyperparameter_samples, ge=10, description="Samples that hyperparameters are fitted on"
@@ -54,6 +54,7 @@ class JobRequest(BaseModel):
 
     model_config = ConfigDict(
         extra="forbid",
+        strict=True,
         json_schema_extra={"examples": [{"model": "my-panda", "datasets": ["ds_0123456789abcdef"]}]},
     )
 
@@ -78,6 +79,19 @@ class JobProgress(BaseModel):
     objective: float | None = Field(None, description="Penalised negative log evidence, nats: falls during the fit")
     fraction: float = Field(0.0, ge=0, le=1)
     elapsed_s: float = 0.0
+    remaining_s: float | None = Field(
+        None,
+        description="Roughly the seconds that are left; null until that can be told. Taken to need all iterations, "
+        "though a fit often converges earlier",
+    )
+
+
+class JobChange(BaseModel):
+    """One thing that happened to a job."""
+
+    at: str
+    state: JobState = Field(description="From then on")
+    message: str
 
 
 class JobError(BaseModel):
@@ -115,6 +129,9 @@ class Job(BaseModel):
     started_at: str | None
     heartbeat_at: str | None = Field(description="When the training process last said that it lives")
     finished_at: str | None
+    history: list[JobChange] = Field(description="What happened to it, oldest first")
+    retry_of: str | None = Field(description="The job that it repeats")
+    request_id: str | None = Field(description="Id of the request that queued it, as the service's log names it")
 
 
 class JobPage(BaseModel):

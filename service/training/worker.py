@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import resource
 import sys
-import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,25 +12,29 @@ from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
 import lipcore
-from lipcore.fitting import FitProgress
 from lipcore.model import TorqueModel
 from lipcore.online.conditioning import condition
+from service import storage_errors
 from service.database import Database, JobRow, LearnerRow, now
-from service.files import Files, new_id
+from service.errors import ServiceError, StorageFullError, StorageUnavailableError
+from service.files import Files
+from service.limits.disk import Disk
 from service.models import registry
+from service.models.lineage import software, training_metrics
+from service.observability.context import job_id
 from service.settings import Settings
+from service.training import history, leftovers
 from service.training.material import Material, observed, recorded
-from service.training.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED
+from service.training.pulse import Pulse, SupersededError
+from service.training.remaining import Remaining
+from service.training.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, JobState
 from service.updates.refreshing import scope
 
 logger = logging.getLogger(__name__)
 
-REPORT_EVERY = 0.5
-"""Seconds between two looks at the database: progress out, cancel flag in."""
 
-
-class SupersededError(RuntimeError):
-    """The job is no longer this attempt's."""
+class StorageError(RuntimeError):
+    """The database or the disk could not be used: the job has not failed, it is to be started again."""
 
 
 class TakenBackError(RuntimeError):
@@ -39,14 +42,19 @@ class TakenBackError(RuntimeError):
 
 
 def run(settings: Settings, job: str) -> None:
-    """Run one queued job to its end. All outcomes are written to its row; nothing is raised for a failed fit."""
+    """Run one queued job to its end. All outcomes are written to its row; nothing is raised for a failed fit.
+
+    Raise StorageError where the outcome could not be written, or what is needed not be read.
+    """
+    token = job_id.set(job)
     database, files = Database(settings.home), Files(settings.home)
     try:
-        claim = _claim(database, job)
+        claim = _claim(settings, database, job)
         if claim is not None:
             _train(settings, database, files, claim)
     finally:
         database.close()
+        job_id.reset(token)
 
 
 @dataclass(frozen=True)
@@ -59,45 +67,51 @@ class Claim:
     request: dict[str, Any]
 
 
-def _claim(database: Database, job: str) -> Claim | None:
+def _claim(settings: Settings, database: Database, job: str) -> Claim | None:
     with database.transaction() as session:
         row = session.scalar(select(JobRow).where(JobRow.id == job))
         if row is None or row.state != QUEUED:
             return None
-        row.state, row.attempts = RUNNING, row.attempts + 1
+        row.attempts += 1
+        history.enter(row, RUNNING, f"started: attempt {row.attempts} of at most {settings.max_job_attempts}")
         row.started_at = row.heartbeat_at = now()
         row.progress = {"stage": "loading"}
         return Claim(job, row.attempts, row.model, row.request)
 
 
 def _train(settings: Settings, database: Database, files: Files, claim: Claim) -> None:
-    watch = _Watch(database, claim)
     try:
-        material = _material(settings, database, files, claim)
-        trained = _fit(claim, material, watch)
-        lineage = {
-            "job": claim.job,
-            **material.lineage,
-            "trained_at": now(),
-            "training_process": {"seconds": round(watch.elapsed, 1), "peak_memory_mb": _peak_memory_mb()},
-        }
-        watch.stage("saving")
-        folder = new_id("mv")
-        manifest = lipcore.save(trained, files.versions / folder, lineage)
+        with Pulse(database, lambda session: _own(session, claim)) as pulse:
+            material = _material(settings, database, files, claim)
+            trained = _fit(claim, material, pulse)
+            lineage = {
+                "job": claim.job,
+                **material.lineage,
+                "trained_at": now(),
+                "training_process": {"seconds": round(pulse.elapsed, 1), "peak_memory_mb": _peak_memory_mb()},
+                "software": software(),
+                "training_metrics": training_metrics(trained, material.samples),
+            }
+            pulse.stage("saving")
+            folder = leftovers.new_folder(claim.job)
+            Disk(settings).require()
+            manifest = lipcore.save(trained, files.versions / folder, lineage)
         with database.transaction() as session:
             row = _own(session, claim)
             if row.cancel_requested:
                 raise lipcore.FitCancelledError("cancelled after the last look at the flag")
-            version = _publish(session, claim, material, folder, manifest)
-            row.state, row.version, row.finished_at = SUCCEEDED, version, now()
-            row.progress = {**row.progress, "stage": "done", "fraction": 1.0, "elapsed_s": watch.elapsed}
+            row.version = _publish(session, claim, material, folder, manifest)
+            row.progress = {**pulse.shown(), "stage": "done", "fraction": 1.0, "remaining_s": 0.0}
+            history.enter(row, SUCCEEDED, f"version {row.version} is trained")
     except lipcore.FitCancelledError:
-        _finish(database, claim, CANCELLED, None)
+        _finish(database, files, claim, CANCELLED, "cancelled while it ran")
     except SupersededError:
         logger.warning("job %s was taken over by another attempt", claim.job)
     except Exception as error:
         logger.exception("job %s failed", claim.job)
-        _finish(database, claim, FAILED, {"code": _code(error), "message": f"{type(error).__name__}: {error}"})
+        if isinstance(storage_errors.translated(error), StorageUnavailableError):
+            raise StorageError(str(error)) from None  # another time it may work
+        _finish(database, files, claim, FAILED, f"{type(error).__name__}: {error}", _code(error))
 
 
 def _material(settings: Settings, database: Database, files: Files, claim: Claim) -> Material:
@@ -106,22 +120,25 @@ def _material(settings: Settings, database: Database, files: Files, claim: Claim
     return observed(settings, database, files, claim.model, claim.request)
 
 
-def _fit(claim: Claim, material: Material, watch: _Watch) -> TorqueModel:
-    request = claim.request
+def _fit(claim: Claim, material: Material, pulse: Pulse) -> TorqueModel:
+    request, count = claim.request, len(material.samples)
+    options = lipcore.FitOptions(**request["options"])
+    pulse.remaining = Remaining(min(options.hyperparameter_samples, count), min(options.posterior_samples, count))
+    pulse.stage("hyperparameters")
     trained = lipcore.train(
         material.samples,
         request["joint_types"],
         request["estimator"],
-        lipcore.FitOptions(**request["options"]),
+        options,
         torque_convention=material.torque_convention,
-        on_progress=watch.progress,
-        cancelled=watch.cancelled,
+        on_progress=pulse.progress,
+        cancelled=pulse.cancelled,
         robot=material.robot,
     )
     if request.get("refresh") is None:
         return trained
     # the version that serves has learnt all of these rows, not only the few that a fit chooses
-    return condition(trained, material.samples, material.weights, watch.cancelled)
+    return condition(trained, material.samples, material.weights, pulse.cancelled)
 
 
 def _publish(session: Session, claim: Claim, material: Material, folder: str, manifest: dict[str, Any]) -> int:
@@ -140,6 +157,10 @@ def _code(error: Exception) -> str:
     """Stable word for why a job failed."""
     if isinstance(error, TakenBackError):
         return "observations_taken_back"
+    if isinstance(storage_errors.translated(error), StorageFullError):
+        return StorageFullError.code
+    if isinstance(error, ServiceError):  # as of a data set that is damaged
+        return error.code
     return "not_positive_definite" if isinstance(error, lipcore.NotPositiveDefiniteError) else "training_failed"
 
 
@@ -147,47 +168,6 @@ def _peak_memory_mb() -> int:
     """Largest resident memory of this process so far; earlier jobs of the same process count too."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return int(peak / (1024 * 1024 if sys.platform == "darwin" else 1024))
-
-
-class _Watch:
-    """Writes progress to the job's row and reads its cancel flag, at most every REPORT_EVERY seconds."""
-
-    def __init__(self, database: Database, claim: Claim) -> None:
-        self.database, self.claim = database, claim
-        self.began, self.looked = time.monotonic(), 0.0
-        self.latest: dict[str, Any] = {"stage": "hyperparameters"}
-        self.stop = False
-
-    @property
-    def elapsed(self) -> float:
-        return time.monotonic() - self.began
-
-    def progress(self, at: FitProgress) -> None:
-        self.latest = {
-            "stage": at.stage,
-            "iteration": at.iteration,
-            "max_iterations": at.max_iterations,
-            "objective": at.objective,
-            "fraction": at.fraction,
-        }
-        self._exchange(force=at.stage != "hyperparameters")
-
-    def stage(self, name: str) -> None:
-        self.latest = {**self.latest, "stage": name}
-        self._exchange(force=True)
-
-    def cancelled(self) -> bool:
-        self._exchange()
-        return self.stop
-
-    def _exchange(self, force: bool = False) -> None:
-        if not force and time.monotonic() - self.looked < REPORT_EVERY:
-            return
-        self.looked = time.monotonic()
-        with self.database.transaction() as session:
-            row = _own(session, self.claim)
-            row.progress, row.heartbeat_at = {**self.latest, "elapsed_s": self.elapsed}, now()
-            self.stop = row.cancel_requested
 
 
 def _own(session: Any, claim: Claim) -> JobRow:
@@ -198,7 +178,11 @@ def _own(session: Any, claim: Claim) -> JobRow:
     return row
 
 
-def _finish(database: Database, claim: Claim, state: str, error: dict[str, str] | None) -> None:
+def _finish(
+    database: Database, files: Files, claim: Claim, state: JobState, message: str, code: str | None = None
+) -> None:
     with database.transaction() as session:
         row = _own(session, claim)
-        row.state, row.error, row.finished_at = state, error, now()
+        history.enter(row, state, message)
+        row.error = None if code is None else {"code": code, "message": message}
+    leftovers.remove(database, files, claim.job)

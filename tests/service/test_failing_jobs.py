@@ -20,7 +20,7 @@ def test_lost_samples_fail_the_job_with_its_reason(api, monkeypatch):
     service.jobs.submit(name)
     seen = ended(api, name)
     assert (seen["state"], seen["version"], seen["attempts"]) == ("failed", None, 1)
-    assert seen["error"]["code"] == "training_failed"
+    assert seen["error"]["code"] == "damaged_data"
     assert dataset in seen["error"]["message"]
     assert seen["finished_at"]
     error(api.get("/v1/models/lost"), 404, "not_found")

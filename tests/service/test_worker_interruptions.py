@@ -5,11 +5,9 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import threading
-from concurrent.futures import Future
-from concurrent.futures.process import BrokenProcessPool
 
-from tests.service import data
+import pytest
+
 from tests.service.data import ENDLESS, ended, eventually, job, queue, running, service_of, stream, train, upload
 from tests.service.server import command
 
@@ -40,22 +38,6 @@ def test_a_process_killed_while_it_has_nothing_to_do_is_replaced(api, pendulum):
     assert api.get("/v1/models/idle").json()["latest_version"] == 2
 
 
-def test_a_pool_that_holds_its_lock_may_report_a_broken_process(api, pendulum, monkeypatch):
-    """As pools do since Python 3.12.1: waiting for that lock in the report would wait for ever."""
-    jobs = service_of(api).jobs
-    with monkeypatch.context() as patch:
-        patch.setattr(jobs, "submit", lambda job: None)
-        name = queue(api, "locked", pendulum["id"])["id"]
-    broken = Future()
-    broken.set_exception(BrokenProcessPool())
-    report = threading.Thread(target=jobs._ended, args=(name, broken), daemon=True)
-    with jobs._pool._shutdown_lock:
-        report.start()
-        report.join(data.DEADLINE / 4)
-        assert not report.is_alive()
-    assert ended(api, name)["state"] == "succeeded"
-
-
 def test_an_interrupt_from_the_keyboard_does_not_reach_a_job(api):
     """Ctrl-C goes to the whole process group: the service decides what becomes of its processes."""
     name = queue(api, "interrupted", upload(api, stream("panda", 100))["id"], options=LONG)["id"]
@@ -66,6 +48,7 @@ def test_an_interrupt_from_the_keyboard_does_not_reach_a_job(api):
     assert (seen["state"], seen["attempts"]) == ("succeeded", 1)
 
 
+@pytest.mark.slow
 def test_a_job_whose_process_dies_every_time_fails_in_the_end(api):
     most = service_of(api).settings.max_job_attempts
     name = queue(api, "poison", upload(api, stream("panda", 200))["id"], options=ENDLESS)["id"]

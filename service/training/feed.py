@@ -1,0 +1,96 @@
+"""Jobs as they change, for any number of readers: the database is read once for all of them."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager, suppress
+from contextvars import Context
+
+from anyio import to_thread
+from sqlalchemy import select
+
+from service.database import Database, JobRow
+from service.errors import BusyError
+
+logger = logging.getLogger(__name__)
+
+LOOK_S = 0.4
+"""Seconds between two looks at the jobs that somebody follows."""
+
+
+class Feed:
+    """Followers of jobs. It belongs to the event loop."""
+
+    def __init__(self, database: Database) -> None:
+        self.database, self.open = database, 0
+        self._rows: dict[str, JobRow] = {}
+        self._followers: dict[str, list[asyncio.Event]] = {}
+        self._reader: asyncio.Task[None] | None = None
+
+    @contextmanager
+    def one_more(self, most: int) -> Iterator[None]:
+        """Count a reader while it lasts; raise BusyError beyond `most`."""
+        if self.open >= most:
+            raise BusyError(
+                f"events of jobs are followed {self.open} times, the most there may be: close one, or try again later",
+                headers={"Retry-After": "5"},
+            )
+        self.open += 1
+        try:
+            yield
+        finally:
+            self.open -= 1
+
+    async def follow(self, row: JobRow, closing: asyncio.Event) -> AsyncIterator[JobRow]:
+        """The row as it is, and again whenever it has changed, until the service closes; the caller knows its end."""
+        changed = asyncio.Event()
+        if row.id in self._rows:  # it may have changed since `row` was read
+            changed.set()
+        self._followers.setdefault(row.id, []).append(changed)
+        if self._reader is None or self._reader.done():
+            # in a context of its own, not that of the request that happens to be the first
+            self._reader = asyncio.get_running_loop().create_task(self._read(closing), context=Context())
+        try:
+            yield row
+            while not closing.is_set():
+                await changed.wait()
+                changed.clear()
+                if (found := self._rows.get(row.id)) is not None:
+                    yield found
+        finally:
+            self._followers[row.id].remove(changed)
+            if not self._followers[row.id]:
+                del self._followers[row.id]
+                self._rows.pop(row.id, None)
+
+    async def _read(self, closing: asyncio.Event) -> None:
+        while self._followers and not closing.is_set():
+            try:
+                found = await to_thread.run_sync(self._look, list(self._followers))
+            except Exception:  # of the database: the next look may find it well again
+                logger.exception("jobs that are followed could not be read")
+                found = []
+            for row in found:
+                known = self._rows.get(row.id)
+                if row.id in self._followers and (known is None or _mark(known) != _mark(row)):
+                    self._rows[row.id] = row
+                    self._wake(row.id)
+            with suppress(TimeoutError):
+                await asyncio.wait_for(closing.wait(), LOOK_S)
+        for job in list(self._followers):
+            self._wake(job)
+
+    def _wake(self, job: str) -> None:
+        for changed in self._followers[job]:
+            changed.set()
+
+    def _look(self, jobs: list[str]) -> list[JobRow]:
+        with self.database.session() as session:
+            return list(session.scalars(select(JobRow).where(JobRow.id.in_(jobs))))
+
+
+def _mark(row: JobRow) -> tuple[object, ...]:
+    """What differs after a change."""
+    return row.state, row.heartbeat_at, row.finished_at, row.progress, row.history

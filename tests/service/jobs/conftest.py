@@ -1,0 +1,82 @@
+"""A queue of jobs on its own, whose training processes do what a test wants."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from sqlalchemy import select
+
+from service.database import Database, JobRow, now
+from service.settings import Settings
+from service.training import queue
+from service.training.queue import JobQueue
+from service.training.states import ACTIVE, QUEUED
+from tests.service.data import eventually
+
+DATABASE_TIMEOUT_S = 0.2
+
+
+class Bench:
+    """A queue with a database of its own."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.database = Database(settings.home, DATABASE_TIMEOUT_S)
+        self.made: list[tuple[str, int]] = []
+        self.queue = JobQueue(settings, self.database, lambda *made: self.made.append(made))
+
+    def add(self, name: str, **values: Any) -> str:
+        """A queued job of that name that nobody has been told of."""
+        with self.database.transaction() as session:
+            session.add(new_row(name, **values))
+        return f"job_{name}"
+
+    def submit(self, name: str) -> str:
+        """A job of that name, handed to the queue."""
+        job = self.add(name)
+        self.queue.submit(job)
+        return job
+
+    def row(self, job: str) -> JobRow:
+        with self.database.session() as session:
+            return session.scalar(select(JobRow).where(JobRow.id == job))
+
+    def running(self, job: str, attempt: int = 1) -> JobRow:
+        """Wait until an attempt at a job has begun."""
+        return eventually(lambda: (row := self.row(job)).attempts == attempt and row.state == "running" and row)
+
+    def ended(self, job: str) -> JobRow:
+        """Wait for the end of a job."""
+        return eventually(lambda: (row := self.row(job)).state not in ACTIVE and row)
+
+    def cancel(self, job: str) -> None:
+        """Wish a running job to end, as the service does."""
+        with self.database.transaction() as session:
+            session.scalar(select(JobRow).where(JobRow.id == job)).cancel_requested = True
+
+
+def new_row(name: str, **values: Any) -> JobRow:
+    """A job as it is queued."""
+    usual = {"state": QUEUED, "model": name, "request": {}, "progress": {"stage": "waiting"}, "created_at": now()}
+    return JobRow(id=f"job_{name}", **{**usual, "attempts": 0, "cancel_requested": False, "history": [], **values})
+
+
+@pytest.fixture
+def bench(home, monkeypatch) -> Iterator[Callable[..., Bench]]:
+    """Starts a queue with a function for its processes, and settings."""
+    monkeypatch.setattr(queue, "WATCH_S", 0.05)
+    with ExitStack() as stack:
+
+        def start(run: Callable[[Settings, str], None], **settings: Any) -> Bench:
+            monkeypatch.setattr(queue, "worker", SimpleNamespace(run=run))
+            # some are shorter than a user may choose
+            made = Bench(Settings(home=home, training_niceness=0).model_copy(update=settings))
+            stack.callback(made.database.close)
+            stack.callback(made.queue.close)
+            return made
+
+        yield start

@@ -1,0 +1,206 @@
+"""A job's changes as server-sent events: from its present state to its end, for any number of readers."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from itertools import pairwise
+
+import pytest
+from sqlalchemy import select
+
+from service.database import Database, JobRow
+from service.errors import BusyError
+from service.training import feed
+from service.training.feed import Feed
+from tests.service.data import ENDLESS, error, eventually, queue, service_of, stream, upload
+from tests.service.jobs.conftest import new_row
+from tests.service.server import Server
+
+
+def read(text):
+    """Events of a stream: (kind, data)."""
+    found = []
+    for block in text.strip().split("\n\n"):
+        fields = dict(line.split(": ", 1) for line in block.splitlines() if not line.startswith(":"))
+        if fields:
+            found.append((fields["event"], json.loads(fields["data"])))
+    return found
+
+
+def test_a_job_is_followed_from_its_start_to_its_end(api, pendulum):
+    name = queue(api, "followed", pendulum["id"])["id"]
+    answer = api.get(f"/v1/jobs/{name}/events")
+    assert answer.status_code == 200
+    assert answer.headers["content-type"].startswith("text/event-stream")
+    assert answer.headers["cache-control"] == "no-cache"
+    events = read(answer.text)
+    assert events[0][0] == events[-1][0] == "state"
+    assert {data["id"] for _, data in events} == {name}
+    assert {kind for kind, _ in events} <= {"state", "progress"}
+    last = events[-1][1]
+    assert (last["state"], last["version"], last["progress"]["fraction"]) == ("succeeded", 1, 1.0)
+    assert [entry["state"] for entry in last["history"]] == ["queued", "running", "succeeded"]
+    assert last == api.get(f"/v1/jobs/{name}").json()
+    for (_, before), (kind, after) in pairwise(events):
+        assert (kind == "state") == (before["history"] != after["history"])
+        assert kind == "state" or before["progress"] != after["progress"]
+
+    assert read(api.get(f"/v1/jobs/{name}/events").text) == [("state", last)]  # of one that has ended
+    assert service_of(api).jobs.feed.open == 0
+
+
+def test_an_unknown_job_is_not_followed(api):
+    error(api.get("/v1/jobs/job_nowhere/events"), 404, "not_found")
+    assert service_of(api).jobs.feed.open == 0
+
+
+def test_no_more_readers_than_may_be(no_worker, monkeypatch):
+    name = queue(no_worker, "many", upload(no_worker, stream())["id"], options={**FEW})["id"]
+    many = service_of(no_worker).jobs.feed
+    monkeypatch.setattr(many, "open", service_of(no_worker).settings.max_job_followers)
+    answer = no_worker.get(f"/v1/jobs/{name}/events")
+    error(answer, 429, "busy")
+    assert int(answer.headers["retry-after"]) > 0
+    no_worker.post(f"/v1/jobs/{name}/cancel")
+
+
+FEW = {"hyperparameter_samples": 20, "posterior_samples": 30, "max_iterations": 2}
+
+
+def test_a_reader_that_leaves_is_forgotten(no_worker):
+    """The application itself, whose client hangs up after the first event."""
+    name = queue(no_worker, "left", upload(no_worker, stream())["id"], options=FEW)["id"]
+    sent = []
+
+    async def talk():
+        first = asyncio.Event()
+
+        async def receive():
+            await first.wait()
+            return {"type": "http.disconnect"}
+
+        async def send(message):
+            sent.append(message)
+            if message.get("body"):
+                first.set()
+
+        scope = {
+            "type": "http",
+            "method": "GET",
+            "path": f"/v1/jobs/{name}/events",
+            "raw_path": b"",
+            "query_string": b"",
+            "headers": [(b"host", b"127.0.0.1")],
+            "client": ("127.0.0.1", 1),
+            "server": ("127.0.0.1", 80),
+            "scheme": "http",
+            "root_path": "",
+            "http_version": "1.1",
+            "asgi": {"version": "3.0", "spec_version": "2.3"},  # in which the server says that the client has left
+            "app": no_worker.app,
+            "state": {},
+        }
+        await no_worker.app(scope, receive, send)
+
+    no_worker.portal.call(talk)
+    assert sent[0]["status"] == 200
+    assert b'"state":"queued"' in sent[1]["body"]
+    assert service_of(no_worker).jobs.feed.open == 0
+    assert not service_of(no_worker).jobs.feed._followers
+    no_worker.post(f"/v1/jobs/{name}/cancel")
+
+
+@pytest.fixture
+def job_row(home, monkeypatch):
+    """A job in a database of its own, which a feed looks at often."""
+    monkeypatch.setattr(feed, "LOOK_S", 0.01)
+    database = Database(home)
+    with database.transaction() as session:
+        session.add(new_row("x"))
+    yield database
+    database.close()
+
+
+def change(database, **values):
+    with database.transaction() as session:
+        row = session.scalar(select(JobRow).where(JobRow.id == "job_x"))
+        for name, value in values.items():
+            setattr(row, name, value)
+
+
+def row_of(database):
+    with database.session() as session:
+        return session.scalar(select(JobRow).where(JobRow.id == "job_x"))
+
+
+def test_many_readers_cost_one_look(job_row, monkeypatch):
+    """Each sees every change that lasts, also one who came late or whose first look is stale."""
+    following, looks = Feed(job_row), []
+    look = following._look
+    monkeypatch.setattr(following, "_look", lambda jobs: (looks.append(jobs), look(jobs))[1])
+
+    async def until(state, row):
+        async for seen in following.follow(row, closing):
+            if seen.state == state:
+                return seen.id
+
+    async def story():
+        stale = row_of(job_row)
+        early = [asyncio.create_task(until("running", stale)) for _ in range(20)]
+        while not looks:
+            await asyncio.sleep(0)
+        change(job_row, state="running")
+        assert await asyncio.gather(*early) == ["job_x"] * 20
+
+        stay = asyncio.create_task(until("succeeded", stale))
+        while "job_x" not in following._rows:
+            await asyncio.sleep(0.001)
+        assert await until("running", stale) == "job_x"  # nothing changes any more, but the row was read before
+        change(job_row, state="succeeded")
+        assert await stay == "job_x"
+
+    closing = asyncio.Event()
+    asyncio.run(story())
+    assert not following._followers
+    assert not following._rows
+    assert all(jobs == ["job_x"] for jobs in looks)
+
+
+def test_readers_end_when_the_service_closes(job_row):
+    async def story():
+        closing = asyncio.Event()
+        following = Feed(job_row)
+
+        async def everything():
+            return [seen.state async for seen in following.follow(row_of(job_row), closing)]
+
+        tasks = [asyncio.create_task(everything()) for _ in range(3)]
+        while "job_x" not in following._rows:
+            await asyncio.sleep(0.001)
+        closing.set()
+        assert all(states[0] == "queued" for states in await asyncio.gather(*tasks))
+
+    asyncio.run(story())
+
+
+def test_a_feed_counts_its_readers():
+    following = Feed(None)
+    with following.one_more(1):
+        with pytest.raises(BusyError, match="1 times"), following.one_more(1):
+            pass
+        assert following.open == 1
+    assert following.open == 0
+
+
+@pytest.mark.slow
+def test_a_service_that_is_told_to_stop_ends_the_events(home):
+    with Server(home) as server:
+        name = queue(server.client, "long", upload(server.client, stream("panda", 200))["id"], options=ENDLESS)["id"]
+        with server.client.stream("GET", f"/v1/jobs/{name}/events") as answer:
+            lines = answer.iter_lines()
+            assert next(lines) == "event: state"
+            server.process.terminate()
+            rest = list(lines)
+        assert rest
+        eventually(lambda: server.process.poll() is not None)

@@ -1,0 +1,111 @@
+"""A training process's talk with the database: it goes on whatever the fit does."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+
+import pytest
+from sqlalchemy import select
+from sqlalchemy.exc import OperationalError
+
+from lipcore.fitting import FitProgress
+from service.database import Database, JobRow
+from service.training import pulse
+from service.training.pulse import Pulse, SupersededError
+from tests.service.data import eventually
+from tests.service.jobs.conftest import new_row
+
+
+@pytest.fixture
+def beating(home, monkeypatch):
+    """A database with a running job, and a pulse of it that beats quickly."""
+    monkeypatch.setattr(pulse, "BEAT_S", 0.01)
+    database = Database(home)
+    with database.transaction() as session:
+        session.add(new_row("x", state="running", attempts=1))
+    with Pulse(database, own) as talk:
+        yield database, talk
+    database.close()
+
+
+def own(session):
+    found = session.scalar(select(JobRow).where(JobRow.id == "job_x"))
+    if found.attempts != 1:
+        raise SupersededError
+    return found
+
+
+def row(database):
+    with database.session() as session:
+        return own(session)
+
+
+def change(database, **values):
+    with database.transaction() as session:
+        found = session.scalar(select(JobRow).where(JobRow.id == "job_x"))
+        for name, value in values.items():
+            setattr(found, name, value)
+
+
+def test_signs_of_life_come_while_the_fit_is_busy_with_one_step(beating):
+    database, _ = beating
+    first = eventually(lambda: row(database).heartbeat_at)
+    eventually(lambda: row(database).heartbeat_at != first)
+
+
+def test_progress_is_written_without_the_fit_waiting_for_it(beating):
+    database, talk = beating
+    with database.transaction():  # nobody else can write: the fit does not notice
+        talk.progress(FitProgress("hyperparameters", 7, 50, -12.5, 0.133, 3.0))
+        assert not talk.cancelled()
+    seen = eventually(lambda: (found := row(database).progress).get("iteration") and found)
+    assert {name: seen[name] for name in ("stage", "max_iterations", "objective", "fraction", "remaining_s")} == {
+        "stage": "hyperparameters",
+        "max_iterations": 50,
+        "objective": -12.5,
+        "fraction": 0.133,
+        "remaining_s": None,
+    }
+
+
+def test_the_wish_to_cancel_arrives(beating):
+    database, talk = beating
+    eventually(lambda: row(database).heartbeat_at)
+    assert not talk.cancelled()
+    change(database, cancel_requested=True)
+    eventually(talk.cancelled)
+
+
+def test_an_attempt_that_was_superseded_stops(beating):
+    database, talk = beating
+    change(database, attempts=2)
+    with pytest.raises(SupersededError):
+        eventually(talk.cancelled)
+
+
+def test_a_database_that_fails_for_a_while_stops_nothing(beating, monkeypatch, caplog):
+    database, talk = beating
+    transaction, failures = database.transaction, iter([OperationalError("BEGIN", {}, Exception("locked"))] * 2)
+
+    @contextmanager
+    def sometimes():
+        for failure in failures:
+            raise failure
+        with transaction() as session:
+            yield session
+
+    monkeypatch.setattr(database, "transaction", sometimes)
+    eventually(lambda: len(caplog.records) == 2)
+    before = row(database).heartbeat_at
+    eventually(lambda: row(database).heartbeat_at != before)
+    assert not talk.cancelled()
+
+
+def test_nothing_is_written_after_the_end(beating):
+    database, talk = beating
+    eventually(lambda: row(database).heartbeat_at)
+    talk.end()
+    change(database, progress={"stage": "done"})
+    talk.stage("saving")
+    assert not talk._thread.is_alive()
+    assert row(database).progress == {"stage": "done"}

@@ -1,0 +1,76 @@
+"""Repeating jobs, and what jobs tell of themselves."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.service.data import error, job, queue, stream, upload
+
+MODEL = "repeated"
+
+
+@pytest.fixture
+def cancelled(no_worker):
+    """A cancelled job and its data set."""
+    dataset = upload(no_worker, stream())["id"]
+    options = {"hyperparameter_samples": 20, "posterior_samples": 30, "max_iterations": 2}
+    name = queue(no_worker, MODEL, dataset, options=options)["id"]
+    no_worker.post(f"/v1/jobs/{name}/cancel")
+    return name, dataset
+
+
+def retry(api, name):
+    return api.post(f"/v1/jobs/{name}/retry")
+
+
+def test_a_repeated_job_is_a_new_one_with_the_same_request(no_worker, cancelled):
+    name, dataset = cancelled
+    answer = retry(no_worker, name)
+    assert answer.status_code == 202
+    again, before = answer.json(), job(no_worker, name)
+    assert answer.headers["location"] == f"/v1/jobs/{again['id']}"
+    assert again["id"] != name
+    assert (again["retry_of"], again["state"], again["attempts"]) == (name, "queued", 0)
+    assert [entry["message"] for entry in again["history"]] == [f"queued to repeat job {name}"]
+    for field in ("model", "datasets", "estimator", "robot", "refresh"):
+        assert again[field] == before[field]
+    assert (before["state"], before["retry_of"]) == ("cancelled", None)
+
+    assert "is queued" in error(retry(no_worker, again["id"]), 409, "conflict")["message"]
+    no_worker.post(f"/v1/jobs/{again['id']}/cancel")
+    no_worker.delete(f"/v1/datasets/{dataset}")
+    said = error(retry(no_worker, again["id"]), 409, "conflict")["message"]
+    assert dataset in said
+    assert again["id"] in said
+
+
+def test_a_job_that_succeeded_is_not_repeated(api, trained):
+    made = api.get(f"/v1/models/{trained.name}/versions/1").json()["job"]
+    assert "is succeeded" in error(retry(api, made), 409, "conflict")["message"]
+
+
+def test_an_unknown_job_is_not_found(no_worker):
+    assert "job_nowhere" in error(retry(no_worker, "job_nowhere"), 404, "not_found")["message"]
+
+
+def test_a_full_queue_says_when_to_come_again(no_worker, cancelled):
+    name, _ = cancelled
+    waiting = [retry(no_worker, name).json()["id"] for _ in range(2)]
+    answer = retry(no_worker, name)
+    error(answer, 429, "busy")
+    assert int(answer.headers["retry-after"]) > 0
+    for each in waiting:
+        no_worker.post(f"/v1/jobs/{each}/cancel")
+
+
+def test_a_job_knows_the_request_that_queued_it_and_what_happened(no_worker, cancelled):
+    name, _ = cancelled
+    answer = no_worker.post(f"/v1/jobs/{name}/retry", headers={"X-Request-ID": "who-asked-7"}).json()
+    assert answer["request_id"] == "who-asked-7"
+    after = no_worker.post(f"/v1/jobs/{answer['id']}/cancel").json()
+    assert [entry["state"] for entry in after["history"]] == ["queued", "cancelled"]
+    assert after["history"][-1] == {
+        "at": after["finished_at"],
+        "state": "cancelled",
+        "message": "cancelled while it waited",
+    }
