@@ -2,8 +2,9 @@
 
 from lipcore.fitting import FitCancelledError, FitOptions, FitProgress
 from lipcore.linalg import NotPositiveDefiniteError
+from lipcore.manifest import ModelFormatError
 from lipcore.model import TorqueModel, TorquePrediction, train
-from lipcore.persistence import ModelFormatError, copy_model, load, save
+from lipcore.persistence import copy_model, load, save
 from lipcore.samples import Samples
 
 __all__ = [

@@ -1,13 +1,12 @@
 """A model on disk: `manifest.json`, which a person can read, `model.safetensors`, and `robot.urdf` where there is one.
 
-None of them can hold code.
+None of them can hold code, and whatever they hold is checked: what is loaded may come from a stranger.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import math
 import os
 import shutil
 import tempfile
@@ -16,44 +15,54 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import torch
-from safetensors.torch import load as load_tensors
+import numpy as np
 from safetensors.torch import save as save_tensors
+from torch import Tensor
 
 from lipcore.calibration import Calibration
 from lipcore.compact.statistics import Statistics
-from lipcore.model import TORQUE_CONVENTIONS, TorqueModel, restore
+from lipcore.manifest import (
+    DEFAULT_LIMITS,
+    FORMAT,
+    FORMAT_VERSION,
+    MANIFEST,
+    ROBOT,
+    TENSORS,
+    Limits,
+    ModelFormatError,
+    read_manifest_bytes,
+)
+from lipcore.model import TorqueModel, restore
 from lipcore.motion import Motion
 from lipcore.parameters import report
+from lipcore.tensors import FLOOR, INDUCING, OUTPUTS, PARAMS, A, B, pack_symmetric, read_tensors, unpack_symmetric
 from lipcore.urdf import RigidBody
 
-FORMAT = "lipserve-model"
-FORMAT_VERSION = 3
-MANIFEST, TENSORS, ROBOT = "manifest.json", "model.safetensors", "robot.urdf"
-
-
-class ModelFormatError(ValueError):
-    """A folder does not hold a valid model; the message names what is wrong."""
+SAME = 1e-6
+"""Relative difference of the noise in the manifest and in the tensors that another processor may make."""
 
 
 def save(model: TorqueModel, folder: Path, lineage: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Write the model as a new folder, all of it or nothing, and return its manifest.
 
     lineage: where the model comes from, stored as given. Raise FileExistsError where the folder exists, ValueError for
-    a model that has learnt online: what it has learnt is no part of the version.
+    a model that has learnt online: see `lipcore.online.consolidation`.
     """
-    if folder.exists():
-        raise FileExistsError(f"{folder} exists: a saved model is never overwritten")
+    manifest, files = encode(model, lineage)
+    write(folder, files)
+    return manifest
+
+
+def encode(model: TorqueModel, lineage: Mapping[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """The manifest of a model and its files by name; raise ValueError as `save` does."""
     basis, statistics = model.posterior.basis, model.posterior.statistics
     if statistics is None:
         raise ValueError("the model has learnt online since it was trained, expected one as trained")
-    tensors = {f"params/{name}": value for name, value in model.posterior.params.items()}
-    tensors |= {f"inducing/{name}": getattr(basis.inducing, name) for name in ("q", "dq", "ddq")}
-    tensors |= {
-        "inducing/outputs": basis.outputs,
-        "statistics/a": pack_symmetric(statistics.a),
-        "statistics/b": statistics.b,
-    }
+    tensors = {f"{PARAMS}{name}": value for name, value in model.posterior.params.items()}
+    tensors |= {name: getattr(basis.inducing, name.rpartition("/")[2]) for name in INDUCING}
+    tensors |= {OUTPUTS: basis.outputs, A: pack_symmetric(statistics.a), B: statistics.b}
+    if bool((model.posterior.floor > 0).any()):
+        tensors[FLOOR] = model.posterior.floor
     payload = save_tensors({name: value.contiguous() for name, value in tensors.items()})
     manifest = {
         "format": FORMAT,
@@ -68,153 +77,119 @@ def save(model: TorqueModel, folder: Path, lineage: Mapping[str, Any] | None = N
         "compact": {**model.compact, "data_samples": round(statistics.samples)},
         "calibration": asdict(model.calibration),
         "parameters": report(model.posterior, model.estimator),
+        "hyperparameters": {name: value.tolist() for name, value in model.posterior.params.items()},
         "training_range": model.training_range,
         "lineage": dict(lineage or {}),
-        "tensors": {"file": TENSORS, "bytes": len(payload), "sha256": hashlib.sha256(payload).hexdigest()},
+        "tensors": {"file": TENSORS, "bytes": len(payload), "sha256": sha256(payload)},
     }
     files = {TENSORS: payload}
     if model.robot is not None:
-        urdf = model.robot.urdf.encode()
-        files[ROBOT] = urdf
+        files[ROBOT] = model.robot.urdf.encode()
         manifest["robot"] = {
             "name": model.robot.name,
             "joints": list(model.robot.urdf_joints),
             "matched": model.robot.matched,
             "prior": model.options["prior"],
             "file": ROBOT,
-            "bytes": len(urdf),
-            "sha256": model.robot.sha256,
+            "bytes": len(files[ROBOT]),
+            "sha256": sha256(files[ROBOT]),
         }
-    _write_folder(folder, {**files, MANIFEST: json.dumps(manifest, indent=2, allow_nan=False).encode() + b"\n"})
-    return manifest
+    files[MANIFEST] = manifest_bytes(manifest)
+    read_manifest_bytes(files[MANIFEST])  # nothing is written that would be refused when it is read
+    return manifest, files
+
+
+def decode(files: Mapping[str, bytes], limits: Limits = DEFAULT_LIMITS) -> TorqueModel:
+    """The model that these files hold; raise ModelFormatError for anything that `encode` does not make.
+
+    What it costs in time and memory is bounded by the limits, which are checked before anything is computed.
+    """
+    manifest = _manifest(files, limits)
+    n = len(manifest["joint_names"])
+    tensors = read_tensors(_verified(files, TENSORS, manifest["tensors"]), n, limits)
+    robot = _robot(files, manifest, limits)
+    try:
+        return _restore(manifest, tensors, robot)
+    except ModelFormatError:
+        raise
+    except Exception as error:  # whatever numerics make of numbers that no training has made
+        raise ModelFormatError(f"the tensors do not make a valid model: {_said(error)}", TENSORS) from error
+
+
+def load(folder: Path, checksums: Mapping[str, str] | None = None, limits: Limits = DEFAULT_LIMITS) -> TorqueModel:
+    """Load a model that `save` wrote; raise ModelFormatError for anything else.
+
+    checksums: sha256 of each file by name, as kept elsewhere, which the files then have to match.
+    """
+    files = read_files(folder, limits)
+    if checksums is not None:
+        check(files, checksums)
+    try:
+        return decode(files, limits)
+    except ModelFormatError as error:
+        raise ModelFormatError(f"{folder} does not hold a valid model: {error}", error.file) from error
 
 
 def copy_model(source: Path, folder: Path) -> dict[str, Any]:
     """Copy a saved model to a new folder, all of it or nothing, and return its manifest; raise ModelFormatError."""
-    manifest = read_manifest(source)
-    files = {TENSORS: _read_tensors(source, manifest)}
+    files = read_files(source)
+    manifest = _manifest(files, DEFAULT_LIMITS)
+    _verified(files, TENSORS, manifest["tensors"])
     if "robot" in manifest:
-        files[ROBOT] = _read_urdf(source, manifest)
-    _write_folder(folder, {**files, MANIFEST: (source / MANIFEST).read_bytes()})
+        _verified(files, ROBOT, manifest["robot"])
+    write(folder, {**files, MANIFEST: manifest_bytes(manifest)})
     return manifest
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
     """Read and check a model's manifest; raise ModelFormatError."""
-    try:
-        manifest = json.loads((folder / MANIFEST).read_bytes())
-    except (OSError, ValueError) as error:
-        raise ModelFormatError(f"{folder / MANIFEST} cannot be read: {error}") from error
-    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise ModelFormatError(f"{folder / MANIFEST} is not a manifest of format {FORMAT!r}")
-    if manifest.get("format_version") != FORMAT_VERSION:
-        found = manifest.get("format_version")
-        raise ModelFormatError(f"format_version is {found!r}, expected {FORMAT_VERSION}: train the model again")
-    kinds: dict[str, type] = {"estimator": str, "joint_names": list, "joint_types": list}
-    kinds |= dict.fromkeys(("options", "fit", "compact", "calibration", "training_range", "tensors"), dict)
-    for name, kind in kinds.items():
-        if not isinstance(manifest.get(name), kind):
-            raise ModelFormatError(f"{name} is {manifest.get(name)!r}, expected a {kind.__name__}")
-    if manifest.get("torque_convention") not in TORQUE_CONVENTIONS:
-        raise ModelFormatError(f"torque_convention is {manifest.get('torque_convention')!r}")
-    if not isinstance(manifest.get("robot", {}), dict):
-        raise ModelFormatError(f"robot is {manifest['robot']!r}, expected a dict")
-    return manifest
+    return read_manifest_bytes(_read(folder / MANIFEST, DEFAULT_LIMITS.manifest_bytes))
 
 
-def load(folder: Path) -> TorqueModel:
-    """Load a model that `save` wrote; raise ModelFormatError for anything else."""
-    manifest = read_manifest(folder)
-    payload = _read_tensors(folder, manifest)
-    try:
-        tensors = load_tensors(payload)
-        outputs = tensors.pop("inducing/outputs")
-        if outputs.dtype != torch.int64:
-            raise ValueError(f"tensor 'inducing/outputs' is of {outputs.dtype}, expected int64")
-        for name, value in tensors.items():
-            if value.dtype != torch.float64 or not torch.isfinite(value).all():
-                raise ValueError(f"tensor {name!r} is not made of finite float64 numbers")
-        inducing = {name: tensors.pop(f"inducing/{name}") for name in ("q", "dq", "ddq")}
-        n = len(manifest["joint_names"])
-        for name, value in inducing.items():
-            if value.dim() != 2 or value.shape != inducing["q"].shape or value.shape[1] != n:
-                raise ValueError(f"inducing/{name} has shape {tuple(value.shape)}, expected (S, {n})")
-        a, b = unpack_symmetric("statistics/a", tensors.pop("statistics/a")), tensors.pop("statistics/b")
-        compact = dict(manifest["compact"])
-        statistics = Statistics(a, b, float(compact.pop("data_samples")))
-        return restore(
-            manifest["estimator"],
-            manifest["joint_names"],
-            manifest["joint_types"],
-            manifest["torque_convention"],
-            manifest["options"],
-            manifest["fit"],
-            {name.removeprefix("params/"): value for name, value in tensors.items()},
-            Motion(**inducing),
-            outputs,
-            statistics,
-            manifest["training_range"],
-            compact,
-            _read_robot(folder, manifest),
-            Calibration(**manifest["calibration"]),
-        )
-    except ModelFormatError:
-        raise
-    except Exception as error:
-        raise ModelFormatError(f"{folder} does not hold a valid model: {error}") from error
+def read_files(folder: Path, limits: Limits = DEFAULT_LIMITS) -> dict[str, bytes]:
+    """The files of a saved model by name, as they are; raise ModelFormatError where one is missing."""
+    files = {MANIFEST: _read(folder / MANIFEST, limits.manifest_bytes)}
+    files[TENSORS] = _read(folder / TENSORS)
+    if "robot" in _manifest(files, limits):
+        files[ROBOT] = _read(folder / ROBOT, limits.robot_bytes)
+    return files
 
 
-def pack_symmetric(symmetric: torch.Tensor) -> torch.Tensor:
-    """Upper triangle of a symmetric matrix (M, M), row by row: (M (M + 1) / 2,)."""
-    rows, columns = torch.triu_indices(*symmetric.shape)
-    return symmetric[rows, columns]
+def check(files: Mapping[str, bytes], checksums: Mapping[str, str]) -> None:
+    """Compare files with the sha256 that is known of each; raise ModelFormatError naming the file."""
+    for name in sorted(files.keys() | checksums.keys()):
+        if name not in files or name not in checksums:
+            raise ModelFormatError(f"{name} is {'missing' if name in checksums else 'one file too many'}", name)
+        if sha256(files[name]) != checksums[name]:
+            raise ModelFormatError(f"{name} does not have the sha256 that was kept of it: it is damaged", name)
 
 
-def unpack_symmetric(name: str, packed: torch.Tensor) -> torch.Tensor:
-    """Inverse of `pack_symmetric`; raise ValueError for a length that no triangle has."""
-    size = math.isqrt(2 * packed.numel())
-    if packed.dim() != 1 or size * (size + 1) // 2 != len(packed):
-        raise ValueError(f"{name} has shape {tuple(packed.shape)}, expected M (M + 1) / 2 numbers")
-    rows, columns = torch.triu_indices(size, size)
-    full = torch.empty((size, size), dtype=packed.dtype)
-    full[rows, columns] = full[columns, rows] = packed
-    return full
+def checksums(manifest: Mapping[str, Any]) -> dict[str, str]:
+    """sha256 of each file of the model with this manifest, by name."""
+    found = {MANIFEST: sha256(manifest_bytes(manifest)), TENSORS: str(manifest["tensors"]["sha256"])}
+    return {**found, ROBOT: str(manifest["robot"]["sha256"])} if "robot" in manifest else found
 
 
-def _read_tensors(folder: Path, manifest: Mapping[str, Any]) -> bytes:
-    try:
-        payload = (folder / TENSORS).read_bytes()
-    except OSError as error:
-        raise ModelFormatError(f"{folder / TENSORS} cannot be read: {error}") from error
-    if hashlib.sha256(payload).hexdigest() != manifest["tensors"].get("sha256"):
-        raise ModelFormatError(f"{folder / TENSORS} does not match the sha256 of its manifest")
-    return payload
+def manifest_bytes(manifest: Mapping[str, Any]) -> bytes:
+    """The file of a manifest: equal manifests give equal bytes."""
+    return json.dumps(manifest, indent=2, allow_nan=False).encode() + b"\n"
 
 
-def _read_urdf(folder: Path, manifest: Mapping[str, Any]) -> bytes:
-    try:
-        urdf = (folder / ROBOT).read_bytes()
-    except OSError as error:
-        raise ModelFormatError(f"{folder / ROBOT} cannot be read: {error}") from error
-    if hashlib.sha256(urdf).hexdigest() != manifest["robot"].get("sha256"):
-        raise ModelFormatError(f"{folder / ROBOT} does not match the sha256 of its manifest")
-    return urdf
+def sha256(content: bytes) -> str:
+    """Hash of a file, in hexadecimal digits."""
+    return hashlib.sha256(content).hexdigest()
 
 
-def _read_robot(folder: Path, manifest: Mapping[str, Any]) -> RigidBody | None:
-    if "robot" not in manifest:
-        return None
-    entry, urdf = manifest["robot"], _read_urdf(folder, manifest).decode()
-    robot = RigidBody.from_urdf(
-        urdf, manifest["joint_names"], manifest["joint_types"], list(entry["joints"]), str(entry["name"])
-    )
-    return replace(robot, matched=entry["matched"])
+def write(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write files as a new folder that outlives a power cut, all of it or nothing.
 
-
-def _write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write all files to a draft beside `folder`, then rename it: readers see all or nothing."""
+    Raise FileExistsError where the folder exists.
+    """
+    if folder.exists():
+        raise FileExistsError(f"{folder} exists: a saved model is never overwritten")
     folder.parent.mkdir(parents=True, exist_ok=True)
-    draft = Path(tempfile.mkdtemp(prefix=".draft-", dir=folder.parent))
+    # its name tells whose draft it is, where nobody comes to remove it
+    draft = Path(tempfile.mkdtemp(prefix=f".draft-{folder.name}-", dir=folder.parent))
     try:
         for name, content in files.items():
             _write(draft / name, content)
@@ -225,6 +200,84 @@ def _write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
     except BaseException:
         shutil.rmtree(draft, ignore_errors=True)
         raise
+
+
+def _manifest(files: Mapping[str, bytes], limits: Limits) -> dict[str, Any]:
+    if MANIFEST not in files:
+        raise ModelFormatError(f"{MANIFEST} is missing")
+    return read_manifest_bytes(files[MANIFEST], limits)
+
+
+def _verified(files: Mapping[str, bytes], name: str, entry: Mapping[str, Any]) -> bytes:
+    """A file that is as its manifest says."""
+    if name not in files:
+        raise ModelFormatError(f"{name} is missing", name)
+    content = files[name]
+    if len(content) != entry["bytes"] or sha256(content) != entry["sha256"]:
+        raise ModelFormatError(f"{name} does not match the sha256 and the size of its manifest", name)
+    return content
+
+
+def _robot(files: Mapping[str, bytes], manifest: Mapping[str, Any], limits: Limits) -> RigidBody | None:
+    if "robot" not in manifest:
+        return None
+    entry = manifest["robot"]
+    content = _verified(files, ROBOT, entry)
+    if len(content) > limits.robot_bytes:
+        raise ModelFormatError(f"{ROBOT} has {len(content)} bytes, expected at most {limits.robot_bytes}", ROBOT)
+    try:
+        robot = RigidBody.from_urdf(
+            content.decode(), manifest["joint_names"], manifest["joint_types"], entry["joints"], entry["name"]
+        )
+    except Exception as error:  # Pinocchio raises what its parser does
+        raise ModelFormatError(f"{ROBOT} is not the robot of this model: {_said(error)}", ROBOT) from error
+    return replace(robot, matched=entry["matched"])
+
+
+def _restore(manifest: Mapping[str, Any], tensors: dict[str, Tensor], robot: RigidBody | None) -> TorqueModel:
+    params = {name.removeprefix(PARAMS): value for name, value in tensors.items() if name.startswith(PARAMS)}
+    compact = dict(manifest["compact"])
+    statistics = Statistics(unpack_symmetric(A, tensors[A]), tensors[B], float(compact.pop("data_samples")))
+    model = restore(
+        manifest["estimator"],
+        manifest["joint_names"],
+        manifest["joint_types"],
+        manifest["torque_convention"],
+        manifest["options"],
+        manifest["fit"],
+        params,
+        Motion(*(tensors[name] for name in INDUCING)),
+        tensors[OUTPUTS],
+        statistics,
+        manifest["training_range"],
+        compact,
+        robot,
+        Calibration(**manifest["calibration"]),
+    )
+    stated = manifest.get("hyperparameters")
+    if stated is not None and stated != {name: value.tolist() for name, value in params.items()}:
+        raise ModelFormatError("hyperparameters are not those of the tensors")
+    if not np.allclose(model.noise_std, manifest["noise_std"], rtol=SAME, atol=0):
+        raise ModelFormatError(f"noise_std is not that of the tensors, {model.noise_std.tolist()}")
+    if FLOOR in tensors:
+        model = replace(model, posterior=replace(model.posterior, floor=tensors[FLOOR]))
+    return model
+
+
+def _said(error: Exception) -> str:
+    return (str(error).strip() or type(error).__name__)[:300]
+
+
+def _read(path: Path, most: int | None = None) -> bytes:
+    """A file of a saved model, whole; raise ModelFormatError, also for more than `most` bytes."""
+    try:
+        with path.open("rb") as file:
+            content = file.read(-1 if most is None else most + 1)
+    except OSError as error:
+        raise ModelFormatError(f"{path} cannot be read: {error}", path.name) from error
+    if most is not None and len(content) > most:
+        raise ModelFormatError(f"{path} has more than {most} bytes", path.name)
+    return content
 
 
 def _write(path: Path, content: bytes) -> None:

@@ -18,8 +18,13 @@ from safetensors.numpy import load as load_arrays
 from safetensors.numpy import save as save_arrays
 
 from lipcore.samples import Samples
+from service.errors import DamagedDataError
 
 ARRAYS = ("t", "episode", "q", "dq", "ddq", "tau")
+
+
+class DamagedFileError(ValueError):
+    """A file does not have the sha256 that was kept of it, or is not there."""
 
 
 def new_id(prefix: str) -> str:
@@ -42,22 +47,26 @@ class Files:
         _write(self.datasets / f"{dataset}.safetensors", payload)
         return hashlib.sha256(payload).hexdigest()
 
-    def read_samples(self, dataset: str, joint_names: list[str]) -> Samples:
-        """Read samples stored under `dataset`."""
-        arrays = load_arrays((self.datasets / f"{dataset}.safetensors").read_bytes())
-        return Samples(joint_names=tuple(joint_names), **arrays)
+    def read_samples(self, dataset: str, joint_names: list[str], sha256: str) -> Samples:
+        """Read samples stored under `dataset`; raise DamagedDataError unless they are those that were stored."""
+        try:
+            payload = _read(self.datasets / f"{dataset}.safetensors", sha256)
+        except DamagedFileError as error:
+            raise DamagedDataError(f"data set {dataset!r} is damaged: {error}. Upload it again") from error
+        return Samples(joint_names=tuple(joint_names), **load_arrays(payload))
 
     def delete_samples(self, dataset: str) -> None:
         """Delete samples; nothing happens where there are none."""
         (self.datasets / f"{dataset}.safetensors").unlink(missing_ok=True)
 
-    def write_snapshot(self, snapshot: str, payload: bytes) -> None:
-        """Store what a version has learnt durably under a new id."""
+    def write_snapshot(self, snapshot: str, payload: bytes) -> str:
+        """Store what a version has learnt durably under a new id; return its sha256."""
         _write(self.learning / f"{snapshot}.safetensors", payload)
+        return hashlib.sha256(payload).hexdigest()
 
-    def read_snapshot(self, snapshot: str) -> bytes:
-        """Read what is stored under `snapshot`."""
-        return (self.learning / f"{snapshot}.safetensors").read_bytes()
+    def read_snapshot(self, snapshot: str, sha256: str | None = None) -> bytes:
+        """Read what is stored under `snapshot`; raise DamagedFileError unless it has the sha256, where known."""
+        return _read(self.learning / f"{snapshot}.safetensors", sha256)
 
     def delete_snapshot(self, snapshot: str) -> None:
         """Delete a snapshot; nothing happens where there is none."""
@@ -81,14 +90,29 @@ class Files:
         return len(left)
 
 
+def _read(path: Path, sha256: str | None) -> bytes:
+    """A stored file; raise DamagedFileError where it is another one than was stored, or none."""
+    try:
+        payload = path.read_bytes()
+    except FileNotFoundError:
+        raise DamagedFileError(f"{path} is missing") from None
+    if sha256 is not None and hashlib.sha256(payload).hexdigest() != sha256:
+        raise DamagedFileError(f"{path} does not have the sha256 that was kept of it")
+    return payload
+
+
 def _write(path: Path, payload: bytes) -> None:
     """Write a file that outlives a power cut, whole or not at all."""
     draft = path.with_suffix(".draft")
-    with draft.open("wb") as file:
-        file.write(payload)
-        file.flush()
-        os.fsync(file.fileno())
-    draft.rename(path)
+    try:
+        with draft.open("wb") as file:
+            file.write(payload)
+            file.flush()
+            os.fsync(file.fileno())
+        draft.rename(path)
+    except OSError:
+        draft.unlink(missing_ok=True)  # on a full disk, room for what comes next
+        raise
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)  # the new name, before a row tells of it

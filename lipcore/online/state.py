@@ -11,7 +11,7 @@ from torch import Tensor
 from lipcore.compact.statistics import Statistics
 from lipcore.model import TorqueModel
 from lipcore.online.learner import OnlineModel, Regime
-from lipcore.persistence import pack_symmetric, unpack_symmetric
+from lipcore.tensors import pack_symmetric, unpack_symmetric
 
 REGIMES = ("now", "before")
 ABSENT = float("nan")

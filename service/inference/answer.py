@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import isfinite
 from typing import Any
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from lipcore.metrics import LEVELS, RELIABILITY_LEVELS
 from lipcore.metrics import evaluate as compare
+from lipcore.samples import Samples
 from service.context import Service
 from service.datasets import store
 from service.errors import invalid_request
@@ -35,7 +37,7 @@ def at_once(served: Served, motion: Array, max_position: float) -> Prediction | 
 
 def predict(service: Service, model: str, request: PredictRequest) -> Prediction:
     """Torque with uncertainty at the queries; raise InvalidRequestError or NotFoundError. Not for the event loop."""
-    served = service.loaded.get(model, request.version)
+    served = service.loaded.get(model, request.version, request.alias)
     loaded = served.model
     single = request.q.ndim == 1
     components.check(loaded, request, service.settings.max_component_batch)
@@ -83,30 +85,53 @@ def _prediction(served: Served, tau: list[Any], tau_std: list[Any], covariance: 
     )
 
 
-def evaluate(service: Service, model: str, request: EvaluateRequest) -> EvaluateResponse:
-    """Compare a model with a data set; raise InvalidRequestError or NotFoundError."""
-    served = service.loaded.get(model, request.version)
-    loaded = served.model
-    dataset = store.find(service.database, request.dataset)
-    if tuple(dataset.joint_names) != loaded.joint_names:
-        expected = f"the joints of the model, {list(loaded.joint_names)}"
-        raise invalid_request("dataset", f"a data set with the joints {dataset.joint_names}", expected)
-    if dataset.torque_convention != loaded.torque_convention:
-        expected = f"that of the model, {loaded.torque_convention}"
-        raise invalid_request("dataset", f"a data set whose torque is {dataset.torque_convention}", expected)
-    samples = store.samples(service.files, dataset)
+@dataclass(frozen=True)
+class Measured:
+    """A data set to compare models with. samples: how many it has; used: those that are compared, evenly thinned."""
+
+    id: str
+    sha256: str
+    samples: int
+    used: Samples
+
+    def in_training_of(self, served: Served) -> bool:
+        """Whether a version was trained on it, or on the same samples uploaded another time."""
+        return not served.datasets.isdisjoint((self.id, self.sha256))
+
+
+def measured(service: Service, dataset: str, *versions: Served) -> Measured:
+    """Read a data set for these versions; raise NotFoundError, or InvalidRequestError where it is of other joints."""
+    row = store.find(service.database, dataset)
+    for served in versions:
+        loaded = served.model
+        if tuple(row.joint_names) != loaded.joint_names:
+            expected = f"the joints of the model, {list(loaded.joint_names)}"
+            raise invalid_request("dataset", f"a data set with the joints {row.joint_names}", expected)
+        if row.torque_convention != loaded.torque_convention:
+            expected = f"that of the model, {loaded.torque_convention}"
+            raise invalid_request("dataset", f"a data set whose torque is {row.torque_convention}", expected)
+    samples = store.samples(service.files, row)
     count = min(len(samples), service.settings.max_evaluation_samples)
     used = samples.rows(np.linspace(0, len(samples) - 1, count).round().astype(np.int64))
+    return Measured(row.id, row.sha256, len(samples), used)
+
+
+def evaluate(service: Service, model: str, request: EvaluateRequest) -> EvaluateResponse:
+    """Compare a model with a data set; raise InvalidRequestError or NotFoundError."""
+    served = service.loaded.get(model, request.version, request.alias)
+    loaded = served.model
+    recorded = measured(service, request.dataset, served)
+    used = recorded.used
     answer = loaded.predict(used.q, used.dq, used.ddq)
     metrics = compare(used.tau, answer.tau, answer.tau_std, answer.noise_std)
     return EvaluateResponse(
         model=served.name,
         version=served.version,
         revision=served.revision,
-        dataset=dataset.id,
+        dataset=recorded.id,
         joint_names=list(loaded.joint_names),
-        samples=len(samples),
-        samples_used=count,
+        samples=recorded.samples,
+        samples_used=len(used),
         level=metrics.level,
         nmse=[None if np.isnan(value) else float(value) for value in metrics.nmse],
         rmse=metrics.rmse.tolist(),
@@ -118,5 +143,5 @@ def evaluate(service: Service, model: str, request: EvaluateRequest) -> Evaluate
             for each, coverage, width in zip(LEVELS, metrics.coverages, metrics.widths, strict=True)
         ],
         reliability=Reliability(nominal=list(RELIABILITY_LEVELS), observed=metrics.reliability.T.tolist()),
-        in_training=dataset.id in served.datasets,
+        in_training=recorded.in_training_of(served),
     )

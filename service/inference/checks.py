@@ -17,6 +17,12 @@ def element(name: str, *place: int | np.intp) -> str:
     return name + "".join(f"[{index}]" for index in place)
 
 
+def one_choice(version: int | None, alias: str | None) -> None:
+    """Raise InvalidRequestError where a version is named by its number and by an alias."""
+    if version is not None and alias is not None:
+        raise invalid_request("alias", alias, f"no alias beside the version, {version}: name one of the two")
+
+
 def positions(q: Array, limit: float) -> None:
     """Raise InvalidRequestError where a position is beyond ±limit. q: (n,) or (N, n) rad or m, finite."""
     size = np.abs(q)

@@ -6,9 +6,8 @@ import gc
 import itertools
 import logging
 import threading
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Callable, Collection
+from dataclasses import replace
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -17,52 +16,25 @@ import lipcore
 from lipcore.model import TorqueModel
 from lipcore.online.revision import Revision
 from service.database import Database, VersionRow
-from service.errors import UnreadableVersionError
+from service.errors import NotFoundError, UnreadableVersionError, not_found
 from service.files import Files
-from service.models import registry
+from service.inference.served import Key, Served, Snapshot
+from service.models import moves, registry
 from service.models.registry import Serving
 from service.updates.learner import learnt as learning
 
 logger = logging.getLogger(__name__)
 
-Key = tuple[str, int]
-
-
-@dataclass(frozen=True)
-class Served:
-    """One version in memory, immutable: whoever holds it answers from it whatever is learnt or dropped meanwhile.
-
-    model: what answers; base: the version as trained; datasets: ids of the data sets it was trained on; revision:
-    online updates applied to it.
-    """
-
-    name: str
-    version: int
-    model: TorqueModel
-    base: TorqueModel
-    datasets: frozenset[str]
-    revision: int = 0
-
-    @cached_property
-    def noise_std(self) -> list[float]:
-        """Standard deviation of the measured torque around the function, (n,) N·m, as answers carry it."""
-        found: list[float] = self.model.noise_std.tolist()
-        return found
-
-
-@dataclass(frozen=True)
-class _Snapshot:
-    """What is in memory, and which version of each model answers; replaced as a whole, never changed."""
-
-    served: Mapping[Key, Served] = field(default_factory=dict)
-    serving: Mapping[str, Serving] = field(default_factory=dict)
+__all__ = ["LoadedModels", "Served"]
 
 
 class LoadedModels:
     """Cache of loaded versions; safe to share between threads. The least recently used are dropped beyond `capacity`.
 
     A version becomes the one that answers once it is in memory and warm, by one assignment: queries in flight keep
-    theirs, and none waits. So does a revision of it.
+    theirs, and none waits. So does a revision of it. An alias moves in the same way.
+
+    moving: held while an alias is moved or a version deleted, in the database and then here, one at a time.
     """
 
     def __init__(self, database: Database, files: Files, capacity: int) -> None:
@@ -72,42 +44,91 @@ class LoadedModels:
         self._revisions: dict[Key, tuple[int, Revision]] = {}
         self._held: WeakValueDictionary[Key, Served] = WeakValueDictionary()  # by streams too, after they are dropped
         self._revising = threading.Lock()
-        self._snapshot = _Snapshot()
+        self._snapshot = Snapshot(aliases=moves.pointers(database))
+        self._deleted: set[Key] = set()
         self._lock = threading.Lock()
+        self.moving = threading.Lock()
         self._loading: dict[Key, threading.Lock] = {}
         self._clock = itertools.count()
         self._used: dict[Key, int] = {}
+        self._unreadable: dict[Key, str] = {}
 
-    def hot(self, model: str, version: int | None) -> Served | None:
-        """Return a version, the one that serves where None, if it is in memory; never waits."""
+    def hot(self, model: str, version: int | None, alias: str | None = None) -> Served | None:
+        """Return a version, or the one that an alias points to, if it is in memory; never waits.
+
+        With neither, as with the alias `serving`, it is the one that serves.
+        """
         snapshot = self._snapshot
         if version is None:
-            serving = snapshot.serving.get(model)
-            if serving is None:
+            version = snapshot.pointed(model, alias)
+            if version is None:
                 return None
-            version = serving.version
         key = (model, version)
         found = snapshot.served.get(key)
         if found is not None:
             self._used[key] = next(self._clock)
         return found
 
-    def newest(self, model: str) -> int | None:
-        """Return the version that answers where none is named, in memory or dropped since; never waits."""
-        serving = self._snapshot.serving.get(model)
-        return None if serving is None else serving.version
+    def newest(self, model: str, alias: str | None = None) -> int | None:
+        """Return the version that answers where an alias is named, or none, in memory or dropped since; never waits."""
+        return self._snapshot.pointed(model, alias)
 
-    def get(self, model: str, version: int | None) -> Served:
-        """Return a version, the one that serves where None, loaded if need be. Not for the event loop.
+    def is_deleted(self, model: str, version: int) -> bool:
+        """Whether a version has been deleted since the service started; never waits."""
+        return (model, version) in self._deleted
 
-        Raise NotFoundError or UnreadableVersionError.
+    def get(self, model: str, version: int | None, alias: str | None = None) -> Served:
+        """Return a version, or the one that an alias points to, loaded if need be. Not for the event loop.
+
+        With neither it is the one that serves. Raise NotFoundError or UnreadableVersionError.
         """
-        found = self.hot(model, version)
-        if found is not None:
-            return found
-        if version is None and model in (serving := registry.serving(self.database, [model])):
-            return self._load(registry.find(self.database, model, serving[model].version), serving[model])
-        return self._load(registry.find(self.database, model, version))
+        found = self.hot(model, version, alias)
+        while found is None:
+            number, serving = self._find(model, version, alias)
+            try:
+                found = self._load(registry.find(self.database, model, number), serving)
+            except NotFoundError:
+                if self._find(model, version, alias)[0] == number:
+                    raise  # else the alias has moved on, and the version before was deleted
+        return found
+
+    def _find(self, model: str, version: int | None, alias: str | None) -> tuple[int | None, Serving | None]:
+        """The number of the version that is meant, and what serves where that is it; raise NotFoundError."""
+        if version is not None:
+            return version, None
+        if alias is None or alias == moves.SERVING:
+            serving = registry.serving(self.database, [model]).get(model)
+            return (None, None) if serving is None else (serving.version, serving)
+        number = self.newest(model, alias)
+        if number is None:
+            registry.find(self.database, model, None)  # that there is no such model is said first
+            raise not_found("alias", alias)
+        return number, None
+
+    def point(self, model: str, alias: str, version: int | None) -> None:
+        """Let an alias point to a version from now on, or to none; `moving` is held, and the database says so."""
+        with self._lock:
+            aliases = {**self._snapshot.aliases}
+            aliases.pop((model, alias), None)
+            if version is not None:
+                aliases[model, alias] = version
+            self._snapshot = replace(self._snapshot, aliases=aliases)
+
+    def forget(self, model: str, versions: Collection[int], whole: bool = False) -> None:
+        """Answer no more with these versions, which have been deleted; `moving` is held.
+
+        whole: the model has been deleted with them. Queries in flight keep theirs. To be called before their files go:
+        who finds them gone has to know why.
+        """
+        gone = {(model, version) for version in versions}
+        with self._revising, self._lock:
+            self._deleted |= gone
+            self._snapshot = self._snapshot.without(gone, model if whole else None)
+            for key in gone:
+                self._revisions.pop(key, None)
+                self._held.pop(key, None)
+                self._used.pop(key, None)
+                self._unreadable.pop(key, None)
 
     def announce(self, models: Collection[str]) -> None:
         """Answer for these models with the versions that now serve. Not for the event loop."""
@@ -123,6 +144,16 @@ class LoadedModels:
                 self._load(registry.find(self.database, model, serving.version), serving)
             except UnreadableVersionError as error:  # who asks for it is told; the version before goes on answering
                 logger.error("%s", error)
+            except NotFoundError:  # another one serves by now, and this one has been deleted: who did that adopts it
+                logger.info("version %d of model %s was deleted before it answered", serving.version, model)
+
+    def versions(self) -> Collection[Key]:
+        """Versions that are in memory; asking does not count as using them."""
+        return self._snapshot.served.keys()
+
+    def unreadable(self) -> dict[Key, str]:
+        """Versions that could not be read when they were last asked for, and why."""
+        return dict(self._unreadable)
 
     def learn_from(self, wake: Callable[[str], None]) -> None:
         """Have a learner woken, by the name of the model, whenever a version is loaded without all that its log holds.
@@ -140,6 +171,8 @@ class LoadedModels:
         """
         key = (name, version)
         with self._revising:  # one at a time, so that the highest is the last
+            if key in self._deleted:
+                return False
             known = self._revisions.pop(key, None)
             if known is not None and known[0] >= revision:
                 revision, learnt = known
@@ -171,7 +204,12 @@ class LoadedModels:
         with loading:  # a second request for the same version waits for the first, others do not
             served = self._snapshot.served.get(key)
             if served is None:
-                served = self._make(row)
+                try:
+                    served = self._make(row)
+                except UnreadableVersionError as error:
+                    self._unreadable[key] = str(error)
+                    raise
+                self._unreadable.pop(key, None)
             served = self._publish(served, serving)
             if (learnt := self._revisions.get(key)) is not None:  # published while this was loaded
                 self.revise(*key, *learnt)
@@ -188,7 +226,8 @@ class LoadedModels:
     def _make(self, row: VersionRow) -> Served:
         base = self._read(row)
         base.warm_up()
-        datasets = frozenset(item["id"] for item in row.manifest["lineage"].get("datasets", []))
+        named = row.manifest["lineage"].get("datasets", [])
+        datasets = frozenset(item[field] for item in named for field in ("id", "sha256") if field in item)
         served = Served(row.model, row.version, base, base, datasets)
         if (published := self._revisions.get((row.model, row.version))) is not None:
             revision, learnt = published
@@ -206,8 +245,10 @@ class LoadedModels:
 
     def _read(self, row: VersionRow) -> TorqueModel:
         try:
-            return lipcore.load(self.files.versions / row.folder)
+            return lipcore.load(self.files.versions / row.folder, row.checksums)
         except lipcore.ModelFormatError as error:
+            if self.is_deleted(row.model, row.version):
+                raise not_found("version", row.version) from error
             message = f"version {row.version} of model {row.model!r} cannot be loaded: {error}"
             raise UnreadableVersionError(message) from error
 
@@ -215,6 +256,8 @@ class LoadedModels:
         """Answer with a version from now on, and with this one of its model where told; return what answers."""
         key = (served.name, served.version)
         with self._lock:
+            if key in self._deleted:  # while it was loaded: who asked before is answered, nobody after
+                return served
             self._used.setdefault(key, next(self._clock))
             entries, pointers = dict(self._snapshot.served), dict(self._snapshot.serving)
             current = entries.get(key)

@@ -10,15 +10,16 @@ from starlette.types import Scope
 
 from service.context import Service, ServiceDep
 from service.errors import InvalidRequestError, NotFoundError, TooLargeError, responses
-from service.hot import Reply, hot_route, is_json
+from service.hot import Reply, hot_route
 from service.inference import answer
 from service.inference.schema import EvaluateRequest, EvaluateResponse, PredictRequest, PredictResponse
 from service.inference.wire import decode, encode
+from service.route import Route, is_json
 
 _ERRORS = responses(InvalidRequestError, NotFoundError, TooLargeError)
 
 _TAGS: list[str | Enum] = ["inference"]
-router = APIRouter(prefix="/v1/models", tags=_TAGS, responses=_ERRORS)
+router = APIRouter(prefix="/v1/models", tags=_TAGS, responses=_ERRORS, route_class=Route)
 hot = APIRouter(prefix="/v1/models", tags=_TAGS, responses=_ERRORS)
 """The route of a control loop, which the application tries first."""
 
@@ -30,7 +31,7 @@ async def _answer(scope: Scope, body: bytes) -> Reply | None:
         return None
     service: Service = scope["app"].state.service
     model: str = scope["path_params"]["model"]
-    served, motion = service.loaded.hot(model, query.version), query.single()
+    served, motion = service.loaded.hot(model, query.version, query.alias), query.single()
     if served is not None and motion is not None:
         at_once = answer.at_once(served, motion, service.settings.max_position)
         if at_once is not None:

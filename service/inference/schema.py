@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 from math import isfinite
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    ValidationInfo,
+    WithJsonSchema,
+    model_validator,
+)
 
 from lipcore.dynamics import COMPONENTS, ComponentName
 from lipcore.model import TorqueConvention
 from service.errors import invalid_request
+from service.inference import checks
 from service.matrices import to_array
-from service.models.schema import VersionNumber
+from service.models.schema import AliasName, VersionNumber
 
 _NUMBERS: dict[str, Any] = {"type": "array", "items": {"type": "number"}}
 _ROWS: dict[str, Any] = {"type": "array", "items": _NUMBERS}
@@ -56,11 +66,24 @@ ComponentNames = Annotated[
 Nested = float | list[float] | list[list[float]] | list[list[list[float]]]
 
 
-class PredictRequest(BaseModel):
+class VersionChoice(BaseModel):
+    """Which version is meant: a number, an alias, or the one that serves."""
+
+    version: VersionNumber | None = Field(None, description="A version of the model; the one that serves by default")
+    alias: AliasName | None = Field(None, description="A version by a name that it was given, instead of its number")
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        checks.one_choice(self.version, self.alias)
+        return self
+
+
+class PredictRequest(VersionChoice):
     """One query, or a batch of them, in SI units."""
 
     model_config = ConfigDict(
         extra="forbid",
+        strict=True,
         arbitrary_types_allowed=True,
         json_schema_extra={
             "examples": [
@@ -77,7 +100,6 @@ class PredictRequest(BaseModel):
     q: Vectors = Field(description="Positions, rad (prismatic: m): (n) or (N, n)")
     dq: Vectors = Field(description="Velocities, rad/s (m/s)")
     ddq: Vectors = Field(description="Accelerations, rad/s² (m/s²)")
-    version: VersionNumber | None = Field(None, description="A version of the model; the latest by default")
     covariance: bool = Field(False, description="Also answer the covariance of the function between joints")
     components: ComponentNames = Field(
         default=[],
@@ -116,15 +138,14 @@ class PredictResponse(BaseModel):
     )
 
 
-class EvaluateRequest(BaseModel):
+class EvaluateRequest(VersionChoice):
     """Which data set to compare a model with."""
 
     model_config = ConfigDict(
-        extra="forbid", json_schema_extra={"examples": [{"dataset": "ds_0123456789abcdef", "version": 1}]}
+        extra="forbid", strict=True, json_schema_extra={"examples": [{"dataset": "ds_0123456789abcdef", "version": 1}]}
     )
 
     dataset: str = Field(max_length=40)
-    version: VersionNumber | None = Field(None, description="A version of the model; the latest by default")
 
 
 class Interval(BaseModel):

@@ -12,8 +12,11 @@ from numpy.typing import NDArray
 from lipcore.dynamics import ComponentName
 from lipcore.model import TorqueConvention
 from service.inference.schema import PredictRequest
+from service.models.schema import ALIAS
+from service.route import each_once
 
 Array = NDArray[np.float64]
+_ALIAS = ALIAS.replace("$", r"\Z")  # Python's own expressions let a line end follow
 Numbers = list[float | list[float]]
 """One query or a batch; that it is one of the two, and not some of each, is left to be checked."""
 
@@ -25,6 +28,7 @@ class Query(Struct, forbid_unknown_fields=True):
     dq: Numbers
     ddq: Numbers
     version: Annotated[int, Meta(ge=1, lt=2**31)] | None = None
+    alias: Annotated[str, Meta(pattern=_ALIAS)] | None = None
     covariance: bool = False
     components: list[ComponentName] = []
     tau: Numbers | None = None
@@ -48,7 +52,14 @@ class Query(Struct, forbid_unknown_fields=True):
         if len(set(self.components)) < len(self.components):
             return None
         return PredictRequest.model_construct(
-            q=q, dq=dq, ddq=ddq, tau=tau, version=self.version, covariance=self.covariance, components=self.components
+            q=q,
+            dq=dq,
+            ddq=ddq,
+            tau=tau,
+            version=self.version,
+            alias=self.alias,
+            covariance=self.covariance,
+            components=self.components,
         )
 
 
@@ -68,15 +79,20 @@ class Prediction(Struct, omit_defaults=True):
 
 
 _decoder = msgspec.json.Decoder(Query)
+_FIELDS = tuple(name.encode() for name in Query.__struct_fields__)
 _encoder = msgspec.json.Encoder()
 
 
 def decode(body: bytes) -> Query | None:
     """Decode a query, or return None where anything in it is not as it should be."""
     try:
-        return _decoder.decode(body)
+        query = _decoder.decode(body)
     except msgspec.MsgspecError:
         return None
+    if query.alias is not None and query.version is not None:
+        return None
+    # the usual query has the quotes of q, dq and ddq, which are all there, and no others
+    return query if body.count(b'"') == 6 or each_once(body, *_FIELDS) else None
 
 
 def encode(answer: Prediction) -> bytes:

@@ -10,10 +10,21 @@ from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
 import lipcore
-from lipcore.persistence import read_manifest
-from service.database import Database, EventRow, LearnerRow, ModelRow, ServingRow, VersionRow, now
+from lipcore.persistence import checksums, read_manifest
+from service.database import (
+    AliasRow,
+    Database,
+    DeletedModelRow,
+    EventRow,
+    LearnerRow,
+    ModelRow,
+    ServingRow,
+    VersionRow,
+    now,
+)
 from service.errors import not_found
 from service.files import Files, new_id
+from service.models import moves
 from service.models.schema import Model, ModelPage, Version, VersionSummary
 from service.pages import Page, newest
 from service.settings import shipped_models
@@ -44,36 +55,73 @@ def publish(
     It answers from then on, unless it is a candidate for that of a model that has a version. start: number of the last
     event of the model that it contains by training, the newest where None.
     """
-    if session.scalar(select(ModelRow).where(ModelRow.name == model)) is None:
-        session.add(ModelRow(name=model, created_at=now()))
-        session.flush()
-    latest = session.scalar(select(func.max(VersionRow.version)).where(VersionRow.model == model)) or 0
-    version = int(latest + 1)
-    session.add(VersionRow(model=model, version=version, folder=folder, created_at=now(), job=job, manifest=manifest))
+    row, latest = _row(session, model), _newest(session, model)
+    if latest and session.get(ServingRow, model) is None:  # of a home from before there were candidates
+        serve(session, model, latest)
+    row.last_version = version = max(row.last_version, latest) + 1
+    session.add(
+        VersionRow(
+            model=model,
+            version=version,
+            folder=folder,
+            created_at=now(),
+            job=job,
+            manifest=manifest,
+            checksums=checksums(manifest),
+        )
+    )
     if start is None:
         start = session.scalar(select(func.max(EventRow.number)).where(EventRow.model == model)) or 0
     session.add(LearnerRow(model=model, version=version, start=start, role="candidate"))
-    if candidate and latest:
-        if session.get(ServingRow, model) is None:  # of a home from before there were candidates
-            serve(session, model, latest)
-    else:
+    if not candidate or not latest:
         serve(session, model, version)
     return version
 
 
-def serve(session: Session, model: str, version: int) -> int:
+def _row(session: Session, model: str) -> ModelRow:
+    """The row of a model, a new one where there is none: no number of one that was deleted is given again."""
+    row = session.scalar(select(ModelRow).where(ModelRow.name == model))
+    if row is None:
+        deleted = session.get(DeletedModelRow, model)
+        row = ModelRow(name=model, created_at=now(), last_version=0 if deleted is None else deleted.last_version)
+        session.add(row)
+        session.flush()
+    return row
+
+
+def _newest(session: Session, model: str) -> int:
+    """The highest number among the versions that there are, 0 where there are none."""
+    return session.scalar(select(func.max(VersionRow.version)).where(VersionRow.model == model)) or 0
+
+
+def answering(session: Session, model: str) -> int:
+    """The version that answers where none is named, 0 where there is none."""
+    chosen = session.get(ServingRow, model)
+    return _newest(session, model) if chosen is None else chosen.version
+
+
+def exists(session: Session, model: str, version: int) -> bool:
+    """Whether there is such a version."""
+    query = select(VersionRow.version).where(VersionRow.model == model, VersionRow.version == version)
+    return session.scalar(query) is not None
+
+
+def serve(session: Session, model: str, version: int, takes_back: int | None = None) -> int:
     """Let a version answer where none is named, once the session commits, and learn; return the number of the change.
 
-    The version before neither answers nor learns any more. Raise NotFoundError where there is no such version.
+    The version before neither answers nor learns any more. takes_back: see `moves.point`. Raise NotFoundError where
+    there is no such version.
     """
     session.flush()
-    if session.get(VersionRow, (model, version)) is None:
+    if not exists(session, model, version):
         raise not_found("version", version)
     serving = session.get(ServingRow, model)
     if serving is None:
         serving = ServingRow(model=model, version=version, change=1)
         session.add(serving)
+        moves.note(session, model, moves.SERVING, None, version)
     elif serving.version != version:
+        moves.note(session, model, moves.SERVING, serving.version, version, takes_back)
         serving.version, serving.change = version, serving.change + 1
     served = (LearnerRow.model == model, LearnerRow.role == "serving", LearnerRow.version != version)
     session.execute(update(LearnerRow).where(*served).values(role="dismissed"))
@@ -104,14 +152,21 @@ def serving(database: Database, models: Collection[str]) -> dict[str, Serving]:
 def install_shipped(database: Database, files: Files) -> None:
     """Register the model that comes with LIPServe; where an upgrade brings another one, as a new version.
 
-    Not if the user has trained a version of that name since, which goes on answering.
+    Not if the user has made a version of that name since, which goes on answering, or has deleted the model or its
+    newest version.
     """
     source = shipped_models() / SHIPPED
-    query = select(VersionRow).where(VersionRow.model == SHIPPED).order_by(VersionRow.version.desc()).limit(1)
+    query = select(VersionRow).where(VersionRow.model == SHIPPED).order_by(VersionRow.version.desc())
     with database.session() as session:
-        newest = session.scalars(query).first()
-    if newest is not None and (newest.job is not None or _same_tensors(newest.manifest, read_manifest(source))):
-        return
+        known = list(session.scalars(query))
+        row = session.scalar(select(ModelRow).where(ModelRow.name == SHIPPED))
+        if row is None and session.get(DeletedModelRow, SHIPPED) is not None:
+            return
+    if known and row is not None:
+        shipped = read_manifest(source)
+        made_by_user = known[0].job is not None or "imported" in known[0].manifest["lineage"]
+        if made_by_user or row.last_version > known[0].version or any(_same(each, shipped) for each in known):
+            return
     folder = new_id("mv")
     manifest = lipcore.copy_model(source, files.versions / folder)
     with database.transaction() as session:
@@ -119,8 +174,8 @@ def install_shipped(database: Database, files: Files) -> None:
     logger.info("registered the shipped model %s as version %d", SHIPPED, version)
 
 
-def _same_tensors(one: dict[str, Any], other: dict[str, Any]) -> bool:
-    return bool(one["tensors"]["sha256"] == other["tensors"]["sha256"])
+def _same(version: VersionRow, manifest: dict[str, Any]) -> bool:
+    return bool(version.manifest["tensors"]["sha256"] == manifest["tensors"]["sha256"])
 
 
 def find(database: Database, model: str, version: int | None) -> VersionRow:
@@ -171,12 +226,13 @@ def _show(session: Session, row: ModelRow) -> Model:
     versions = list(
         session.scalars(select(VersionRow).where(VersionRow.model == row.name).order_by(VersionRow.version))
     )
-    chosen = session.get(ServingRow, row.name)
+    aliases = session.scalars(select(AliasRow).where(AliasRow.model == row.name).order_by(AliasRow.alias))
     return Model(
         name=row.name,
         created_at=row.created_at,
         latest_version=versions[-1].version,
-        serving_version=versions[-1].version if chosen is None else chosen.version,
+        serving_version=answering(session, row.name),
+        aliases={each.alias: each.version for each in aliases},
         versions=[
             VersionSummary(version=v.version, created_at=v.created_at, estimator=v.manifest["estimator"])
             for v in versions

@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter
+from typing import Annotated
+
+from anyio import to_thread
+from fastapi import APIRouter, Path, status
 
 from service.context import ServiceDep
-from service.errors import InvalidRequestError, NotFoundError, responses
-from service.models import registry
-from service.models.schema import Model, ModelPage, Version, VersionNumber
+from service.errors import (
+    ConflictError,
+    DamagedDataError,
+    InvalidRequestError,
+    NotFoundError,
+    UnreadableVersionError,
+    responses,
+)
+from service.models import aliases, comparison, deletion, registry
+from service.models.alias_schema import Alias, AliasList, AliasRequest
+from service.models.comparison_schema import CompareRequest, CompareResponse
+from service.models.schema import AliasName, Model, ModelPage, Version, VersionNumber
 from service.pages import PageQuery
+from service.route import Route
 
-router = APIRouter(prefix="/v1/models", tags=["models"], responses=responses(InvalidRequestError))
+router = APIRouter(prefix="/v1/models", tags=["models"], responses=responses(InvalidRequestError), route_class=Route)
+AliasPath = Annotated[AliasName, Path(description="`serving`, or a name of your own")]
 
 
 @router.get("", summary="List models, newest first")
@@ -33,3 +47,73 @@ def show(service: ServiceDep, model: str) -> Model:
 def show_version(service: ServiceDep, model: str, version: VersionNumber) -> Version:
     """Joints, noise, training range, options, what the fit reported, and the data it came from."""
     return registry.show_version(service.database, model, version)
+
+
+@router.delete(
+    "/{model}/versions/{version}",
+    status_code=status.HTTP_204_NO_CONTENT,
+    summary="Delete a version",
+    responses=responses(NotFoundError, ConflictError),
+)
+def delete_version(service: ServiceDep, model: str, version: VersionNumber) -> None:
+    """Delete a version that nothing needs: no alias, not the service, no contest and no job. Its number is not given
+    again."""
+    deletion.delete_version(service, model, version)
+
+
+@router.delete(
+    "/{model}",
+    status_code=status.HTTP_204_NO_CONTENT,
+    summary="Delete a model",
+    responses=responses(NotFoundError, ConflictError),
+)
+def delete_model(service: ServiceDep, model: str) -> None:
+    """Delete a model with its versions, aliases and all that it has observed and learnt. Jobs and data sets stay."""
+    deletion.delete_model(service, model)
+
+
+@router.get("/{model}/aliases", summary="List the aliases of a model", responses=responses(NotFoundError))
+def list_aliases(service: ServiceDep, model: str) -> AliasList:
+    """Where each points, since when, and where it pointed before. `serving` is the version that answers by default."""
+    return aliases.page(service, model)
+
+
+@router.put(
+    "/{model}/aliases/{alias}",
+    summary="Point an alias to a version",
+    responses=responses(NotFoundError, ConflictError, UnreadableVersionError),
+)
+def put_alias(service: ServiceDep, model: str, alias: AliasPath, request: AliasRequest) -> Alias:
+    """Make or move an alias. The version is loaded first: queries follow in one step, and none fails or waits."""
+    return aliases.put(service, model, alias, request)
+
+
+@router.delete(
+    "/{model}/aliases/{alias}",
+    status_code=status.HTTP_204_NO_CONTENT,
+    summary="Remove an alias",
+    responses=responses(NotFoundError, ConflictError),
+)
+def remove_alias(service: ServiceDep, model: str, alias: AliasPath) -> None:
+    """Remove an alias; the version stays, and a rollback brings the alias back. `serving` cannot be removed."""
+    aliases.remove(service, model, alias)
+
+
+@router.post(
+    "/{model}/aliases/{alias}/rollback",
+    summary="Point an alias to where it pointed before",
+    responses=responses(NotFoundError, ConflictError, UnreadableVersionError),
+)
+def rollback_alias(service: ServiceDep, model: str, alias: AliasPath) -> Alias:
+    """Take back the last move, the next time the one before it, and so on."""
+    return aliases.rollback(service, model, alias)
+
+
+@router.post(
+    "/{model}/compare",
+    summary="Compare two versions on a data set",
+    responses=responses(NotFoundError, UnreadableVersionError, DamagedDataError),
+)
+async def compare(service: ServiceDep, model: str, request: CompareRequest) -> CompareResponse:
+    """Which of two versions predicts a data set better, joint by joint and over all, and whether that may be chance."""
+    return await to_thread.run_sync(comparison.compare, service, model, request, limiter=service.predictions)

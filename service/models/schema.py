@@ -12,6 +12,9 @@ from lipcore.motion import JointType
 ModelName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")]
 """Lower-case letters, digits, dots, underscores and hyphens: safe in URLs and never a path."""
 VersionNumber = Annotated[int, Field(ge=1, lt=2**31)]
+ALIAS = r"^[a-z][a-z0-9._-]{0,63}$"
+AliasName = Annotated[str, StringConstraints(pattern=ALIAS)]
+"""Lower-case letters, digits, dots, underscores and hyphens after a letter: never taken for a version's number."""
 
 
 class Version(BaseModel):
@@ -20,7 +23,7 @@ class Version(BaseModel):
     model: str
     version: int
     created_at: str
-    job: str | None = Field(description="The job that made it; null for the model that comes with LIPServe")
+    job: str | None = Field(description="The job that made it; null for one that was imported or came with LIPServe")
     estimator: str
     joint_names: list[str]
     joint_types: list[JointType]
@@ -37,7 +40,13 @@ class Version(BaseModel):
     calibration: dict[str, Any] = Field(
         description="`function_std_factor`: what `tau_std` was multiplied by so that intervals hold on unseen motion"
     )
-    lineage: dict[str, Any] = Field(description="Data sets with their hashes, and when it was trained")
+    hyperparameters: dict[str, Any] | None = Field(
+        None, description="Hyperparameters by name, mostly logarithms; null for versions of earlier releases"
+    )
+    lineage: dict[str, Any] = Field(
+        description="Data sets with their hashes, when and with which `software` it was trained, and how well it fits "
+        "them (`training_metrics`); of an imported version also where it comes from (`imported`)"
+    )
     robot: dict[str, Any] | None = Field(None, description="The URDF of an estimator with rigid bodies, and its prior")
     parameters: dict[str, Any] | None = Field(
         None, description="Friction coefficients and, of rigid bodies, inertial parameters, with standard deviations"
@@ -62,6 +71,7 @@ class Model(BaseModel):
         description="The version that answers where none is named: the newest, unless that is a refreshed one that has "
         "yet to prove better, or an earlier one was chosen"
     )
+    aliases: dict[str, int] = Field(description="Names that were given to versions, `serving` aside")
     versions: list[VersionSummary]
 
 

@@ -10,7 +10,13 @@ from service.oip.schema import Failure, InferRequest, InferResponse
 from service.oip.wire import HEADER
 
 MODEL = {"name": "model", "in": "path", "required": True, "schema": {"type": "string"}}
-VERSION = {"name": "version", "in": "path", "required": True, "schema": {"type": "string"}}
+VERSION = {
+    "name": "version",
+    "in": "path",
+    "required": True,
+    "schema": {"type": "string"},
+    "description": "A version's number, or an alias",
+}
 _POSTURE = [0.0, -0.5, 0.0, -2.0, 0.0, 1.5, 0.7]
 REQUEST: dict[str, Any] = {
     "id": "42",

@@ -14,6 +14,7 @@ from service.hot import Reply, hot_route
 from service.oip import answer, versions, wire
 from service.oip.openapi import MODEL, VERSION, failures, infer_answer, infer_body
 from service.oip.schema import BINARY, ModelMetadata, ModelReady, ServerLive, ServerMetadata, ServerReady
+from service.route import Route
 
 SMALL = 16 * 1024
 """Bytes of a body that is decoded on the event loop: one query of the largest robot fits many times."""
@@ -21,7 +22,7 @@ SMALL = 16 * 1024
 _ONE, _VERSIONED = {"parameters": [MODEL]}, {"parameters": [MODEL, VERSION]}
 _TAGS: list[str | Enum] = ["open inference protocol"]
 
-router = APIRouter(prefix="/v2", tags=_TAGS)
+router = APIRouter(prefix="/v2", tags=_TAGS, route_class=Route)
 hot = APIRouter(prefix="/v2", tags=_TAGS)
 """The routes of inference, to be tried before all others: FastAPI tries one route after the other, 2 µs each."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from anyio import to_thread
 
 from lipcore.model import TorqueModel
@@ -9,6 +11,7 @@ from service.context import Service
 from service.errors import NotFoundError, NotReadyError, UnreadableVersionError, problem, sentence
 from service.inference.loaded import Served
 from service.models import registry
+from service.models.schema import ALIAS
 from service.oip.outputs import FORWARD, shapes
 from service.oip.schema import INPUTS, TORQUE, ModelMetadata, TensorMetadata
 
@@ -16,12 +19,15 @@ _LISTED = 20
 
 
 async def find(service: Service, name: str, version: str | None) -> Served:
-    """Return a version, the latest where None, loaded if need be; raise NotFoundError naming those there are."""
-    number = None if version is None else _number(version)
-    found = service.loaded.hot(name, number)
+    """Return a version by its number or an alias, the one that serves where None, loaded if need be.
+
+    Raise NotFoundError naming those there are.
+    """
+    number, alias = (None, None) if version is None else _meant(version)
+    found = service.loaded.hot(name, number, alias)
     if found is not None:
         return found
-    return await to_thread.run_sync(_load, service, name, version, number, limiter=service.predictions)
+    return await to_thread.run_sync(_load, service, name, version, number, alias, limiter=service.predictions)
 
 
 async def ready(service: Service, name: str, version: str | None) -> Served:
@@ -58,20 +64,27 @@ def _parameters(served: Served, model: TorqueModel) -> dict[str, str | int]:
     }
 
 
-def _number(version: str) -> int:
-    """A version's number; 0, which no version has, for what is none."""
+def _meant(version: str) -> tuple[int | None, str | None]:
+    """A version's number or an alias; the number 0, which no version has, for what is neither."""
+    if re.fullmatch(ALIAS, version):
+        return None, version
     number = int(version) if version.isascii() and version.isdigit() and len(version) < 10 else 0
-    return number if str(number) == version else 0
+    return number if str(number) == version else 0, None
 
 
-def _load(service: Service, name: str, version: str | None, number: int | None) -> Served:
+def _load(service: Service, name: str, version: str | None, number: int | None, alias: str | None) -> Served:
     try:
-        return service.loaded.get(name, number)
+        return service.loaded.get(name, number, alias)
     except NotFoundError as error:
         if error.detail[0].field == "model":
             raise NotFoundError(f"no model {name[:200]!r}: GET /v1/models lists all", error.detail) from error
-        item = problem("version", version, f"one of {', '.join(_known(service, name)[-_LISTED:])}")
+        item = problem("version", version, f"one of {', '.join(_names(service, name)[-_LISTED:])}")
         raise NotFoundError(f"{sentence(item)}, of model {name!r}", [item]) from error
+
+
+def _names(service: Service, name: str) -> list[str]:
+    """Aliases and numbers."""
+    return [*registry.show(service.database, name).aliases, *_known(service, name)]
 
 
 def _known(service: Service, name: str) -> list[str]:

@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 import msgspec
 
 from service.errors import InvalidRequestError, UnsupportedMediaTypeError, invalid_request, problem, sentence
-from service.hot import OCTETS, Reply
+from service.hot import Reply
 from service.oip.schema import InferRequest, InferResponse
+from service.route import OCTETS
 
 HEADER = "Inference-Header-Content-Length"
 _HEADER, _ENCODING = HEADER.lower().encode(), b"content-encoding"
@@ -89,7 +90,7 @@ def _explain(error: Exception, text: bytes, alone: bool) -> InvalidRequestError:
         return _explain_value(said["what"], said["path"] or "", loose)
     for path, value in _leaves(loose):
         if isinstance(value, float) and not isfinite(value):  # Python and others write NaN, which JSON does not know
-            return invalid_request(path, value, "a finite number")
+            return invalid_request(path or "the body", value, "a finite number" if path else "an object")
     reason = f"not JSON: {str(error).removeprefix('JSON is malformed: ')}"
     where, expected = "the body", "an inference request as JSON"
     if alone:

@@ -250,9 +250,7 @@ def test_warm_up_answers_nothing_and_changes_nothing() -> None:
 
 
 def test_warming_up_names_kernels_that_there_are() -> None:
-    with pytest.raises(
-        ValueError, match="expected names out of lip, lip-chain, baselines"
-    ):
+    with pytest.raises(ValueError, match="expected names out of lip, lip-chain, baselines"):
         warm_up("lip", "gpu")
 
 

@@ -45,7 +45,8 @@ def use_cache(environment: MutableMapping[str, str]) -> Path | None:
     except OSError:
         return None
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    environment["NUMBA_CACHE_DIR"] = config.CACHE_DIR = str(folder)
+    environment["NUMBA_CACHE_DIR"] = str(folder)
+    config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]  # read when Numba was imported
     return folder
 
 

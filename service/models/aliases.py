@@ -1,0 +1,136 @@
+"""Aliases of versions: listed, moved and taken back, so that no query fails or waits for it."""
+
+from __future__ import annotations
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from service.context import Service
+from service.database import AliasMoveRow, AliasRow, ModelRow, VersionRow
+from service.errors import ConflictError, invalid_request, not_found
+from service.models import moves, registry
+from service.models.alias_schema import Alias, AliasList, AliasMove, AliasRequest
+from service.models.moves import SERVING
+
+
+def page(service: Service, model: str) -> AliasList:
+    """Every alias of a model, `serving` first; raise NotFoundError."""
+    with service.loaded.moving, service.database.session() as session:  # all of it as of one moment
+        _check_model(session, model)
+        names = list(session.scalars(select(AliasRow.alias).where(AliasRow.model == model).order_by(AliasRow.alias)))
+        return AliasList(items=[_show(service, session, model, name) for name in (SERVING, *names)])
+
+
+def put(service: Service, model: str, alias: str, request: AliasRequest) -> Alias:
+    """Point an alias, a new one too, to a version.
+
+    The version is in memory and warm before the alias moves: queries follow by one assignment, those in flight keep
+    what answered them. Raise InvalidRequestError where not exactly one of version and alias is named, NotFoundError,
+    ConflictError beyond `max_aliases`, UnreadableVersionError. Not for the event loop.
+    """
+    if (request.version is None) == (request.alias is None):
+        found = "neither" if request.version is None else "both"
+        raise invalid_request("version or alias", found, "exactly one of the two")
+    return _move(service, model, alias, service.loaded.get(model, request.version, request.alias).version)
+
+
+def rollback(service: Service, model: str, alias: str) -> Alias:
+    """Take the last move of an alias back, its removal too, and the next time the one before it.
+
+    Raise NotFoundError where there never was such an alias, ConflictError where it has pointed to nothing before, or to
+    a version that has been deleted; UnreadableVersionError. Not for the event loop.
+    """
+    with service.database.session() as session:
+        move = _last(session, model, alias)
+        version = _before(session, move)
+    service.loaded.get(model, version)
+    return _move(service, model, alias, version, move)
+
+
+def remove(service: Service, model: str, alias: str) -> None:
+    """Remove an alias; raise NotFoundError, or ConflictError for `serving`. A rollback brings it back."""
+    with service.loaded.moving:
+        with service.database.transaction() as session:
+            _check_model(session, model)
+            if alias == SERVING:
+                raise ConflictError("the alias 'serving' is built in: it can be moved, and not be removed")
+            if session.get(AliasRow, (model, alias)) is None:
+                raise not_found("alias", alias)
+            moves.point(session, model, alias, None)
+        service.loaded.point(model, alias, None)
+
+
+def _move(service: Service, model: str, alias: str, version: int, taken_back: AliasMoveRow | None = None) -> Alias:
+    """Move an alias to a version that is in memory; taken_back: the move that has to be the last one still."""
+    number = None if taken_back is None else taken_back.seq
+    with service.loaded.moving:
+        with service.database.transaction() as session:
+            _check_model(session, model)
+            if not registry.exists(session, model, version):  # deleted since it was found
+                raise not_found("version", version)
+            if taken_back is not None and _last(session, model, alias).seq != number:
+                raise ConflictError(f"the alias {alias!r} of model {model!r} was moved meanwhile: look, and try again")
+            if alias == SERVING:
+                registry.serve(session, model, version, number)
+            else:
+                _check_room(service, session, model, alias)
+                moves.point(session, model, alias, version, number)
+            shown = _show(service, session, model, alias)
+        if alias != SERVING:
+            service.loaded.point(model, alias, version)
+    if alias == SERVING:
+        service.loaded.adopt(model)
+        service.updates.learner.wake(model)
+    return shown
+
+
+def _last(session: Session, model: str, alias: str) -> AliasMoveRow:
+    _check_model(session, model)
+    move = moves.standing(session, model, alias)
+    if move is None and (alias == SERVING or moves.history(session, model, alias, 1)):
+        raise ConflictError(f"the alias {alias!r} of model {model!r} has no move left that could be taken back")
+    if move is None:
+        raise not_found("alias", alias)
+    return move
+
+
+def _before(session: Session, move: AliasMoveRow) -> int:
+    """The version that an alias pointed to before a move."""
+    name = f"the alias {move.alias!r} of model {move.model!r}"
+    if move.before is None:
+        raise ConflictError(f"{name} has pointed to nothing before version {move.version}: it can be moved or removed")
+    if not registry.exists(session, move.model, move.before):
+        raise ConflictError(f"{name} pointed to version {move.before} before, which has been deleted: name another one")
+    return move.before
+
+
+def _check_model(session: Session, model: str) -> None:
+    if session.scalar(select(ModelRow.name).where(ModelRow.name == model)) is None:
+        raise not_found("model", model)
+
+
+def _check_room(service: Service, session: Session, model: str, alias: str) -> None:
+    most = service.settings.max_aliases
+    if session.get(AliasRow, (model, alias)) is None and moves.count(session, model) >= most:
+        raise ConflictError(f"model {model!r} has {most} aliases, the most it may have: remove one first")
+
+
+def _show(service: Service, session: Session, model: str, alias: str) -> Alias:
+    found = moves.history(session, model, alias, service.settings.max_alias_moves)
+    if alias == SERVING:
+        version = registry.answering(session, model)
+        changed_at = found[0].at if found else session.get_one(VersionRow, (model, version)).created_at
+    else:
+        row = session.get_one(AliasRow, (model, alias))
+        version, changed_at = row.version, row.changed_at
+    move = moves.standing(session, model, alias)
+    return Alias(
+        alias=alias,
+        version=version,
+        changed_at=changed_at,
+        previous=None if move is None else move.before,
+        history=[
+            AliasMove(version=each.version, before=each.before, at=each.at, rollback=each.takes_back is not None)
+            for each in found
+        ],
+    )

@@ -1,0 +1,225 @@
+"""A version from an archive, which may come from a stranger: everything is checked before anything is kept of it."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from lipcore import persistence, strict_json
+from lipcore.manifest import MANIFEST, ROBOT, TENSORS, Limits, ModelFormatError, read_manifest_bytes
+from lipcore.parameters import report
+from lipcore.probing import probe
+from service.context import Service
+from service.database import LearnerRow, ServingRow, now
+from service.errors import InvalidDataError, invalid_data, problem
+from service.files import new_id
+from service.models import archive, registry
+from service.models.archive import CHECKSUMS, EXPORT, ArchiveError
+from service.models.schema import ModelName, Version
+from service.settings import Settings
+
+logger = logging.getLogger(__name__)
+
+SMALL = 64 * 1024
+"""Most bytes of the members that only describe the others."""
+MANIFEST_BYTES = 1024 * 1024
+OPTION_LIMITS = {
+    "hyperparameter_samples": "max_hyperparameter_samples",
+    "posterior_samples": "max_posterior_samples",
+    "max_inducing_outputs": "max_inducing_outputs",
+}
+"""Options of a fit, and the settings that limit them: a refresh trains with those of the version."""
+
+
+class About(BaseModel):
+    """What `export.json` says: where an archive comes from."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    format: str = Field(pattern=f"^{archive.FORMAT}$")
+    format_version: int = Field(ge=archive.FORMAT_VERSION, le=archive.FORMAT_VERSION)
+    model: ModelName
+    version: int = Field(ge=1, lt=2**31)
+    revision: int = Field(ge=0, lt=2**63)
+    learnt: bool
+    created_at: str = Field(max_length=40)
+    exported_at: str = Field(max_length=40)
+    software: dict[str, str | int] = Field(max_length=20)
+
+
+class LineageDataset(BaseModel):
+    """A data set as a lineage names it."""
+
+    model_config = ConfigDict(strict=True)
+
+    id: str = Field(max_length=40)
+    name: str = Field("", max_length=1000)
+    sha256: str = Field("", max_length=64)
+    rows: int = Field(0, ge=0, lt=2**63)
+
+
+class Lineage(BaseModel):
+    """What the service reads of a lineage; whatever else there is goes with it unread."""
+
+    model_config = ConfigDict(strict=True)
+
+    datasets: list[LineageDataset] = Field([], max_length=10_000)
+    imported: list[dict[str, Any]] = Field([], max_length=1000)
+    learnt: dict[str, Any] | None = None
+
+
+def add(service: Service, upload: Path, name: str | None) -> Version:
+    """Make a new version of what an archive holds; return it. Not for the event loop.
+
+    name: of the model, that of the archive by default. The version answers only where it is the model's first one: any
+    other has to be chosen. Raise InvalidDataError naming the member that is wrong and what is wrong with it.
+    """
+    settings = service.settings
+    files = _read(upload, settings)
+    about = _about(files.pop(EXPORT))
+    manifest = _checked(files, settings)
+    model = name or about.model
+    manifest["lineage"] = {
+        **manifest["lineage"],
+        "imported": [*manifest["lineage"].get("imported", []), {**about.model_dump(), "imported_at": now()}],
+    }
+    files[MANIFEST] = persistence.manifest_bytes(manifest)
+    service.disk.require(sum(map(len, files.values())))
+    folder = new_id("mv")
+    target = service.files.versions / folder
+    persistence.write(target, files)
+    try:
+        version, serves = _publish(service, model, folder, manifest)
+    except BaseException:
+        shutil.rmtree(target, ignore_errors=True)
+        raise
+    if serves:
+        service.loaded.adopt(model)
+    came_from = f"version {about.version} of {about.model}"
+    logger.info("imported version %d of model %s, which was %s", version, model, came_from)
+    return registry.show_version(service.database, model, version)
+
+
+def _publish(service: Service, model: str, folder: str, manifest: dict[str, Any]) -> tuple[int, bool]:
+    """Add the version; return its number, and whether it answers where none is named."""
+    with service.database.transaction() as session:
+        version = registry.publish(session, model, folder, manifest, None, candidate=True)
+        serving = session.get(ServingRow, model)
+        serves = serving is not None and serving.version == version
+        if not serves:  # it is nobody's rival: who imports it says what becomes of it
+            session.get_one(LearnerRow, (model, version)).role = "dismissed"
+    return version, serves
+
+
+def _read(upload: Path, settings: Settings) -> dict[str, bytes]:
+    """The members of an archive, all but the checksums, which they have."""
+    limits = {
+        EXPORT: SMALL,
+        CHECKSUMS: SMALL,
+        MANIFEST: MANIFEST_BYTES,
+        TENSORS: settings.max_archive_bytes,
+        ROBOT: settings.max_urdf_bytes,
+    }
+    try:
+        found = archive.members(upload, limits)
+    except ArchiveError as error:
+        raise invalid_data(error.member, error.found, error.expected) from None
+    for name in archive.MEMBERS:
+        if name not in found and name != ROBOT:
+            raise invalid_data(name, "missing", "a file of that name in the archive")
+    sums = _json(CHECKSUMS, archive.read(upload, found.pop(CHECKSUMS)))
+    files = {name: archive.read(upload, member) for name, member in found.items()}
+    _check_sums(files, sums)
+    return files
+
+
+def _check_sums(files: Mapping[str, bytes], sums: Any) -> None:
+    if not isinstance(sums, dict) or sums.keys() != files.keys():
+        found = f"of {', '.join(map(strict_json.quote, sums))}" if isinstance(sums, dict) else strict_json.quote(sums)
+        raise invalid_data(CHECKSUMS, found, f"the sha256 of each of {', '.join(files)}")
+    for name, content in files.items():
+        if persistence.sha256(content) != sums[name]:
+            raise invalid_data(name, "not what its sha256 in checksums.json says", "an undamaged file")
+
+
+def _about(content: bytes) -> About:
+    try:
+        return About.model_validate(_json(EXPORT, content))
+    except ValidationError as error:
+        raise _invalid(EXPORT, error) from None
+
+
+def _checked(files: Mapping[str, bytes], settings: Settings) -> dict[str, Any]:
+    """The manifest of files that make a model which answers; what can be computed of it is computed anew."""
+    limits = Limits(
+        joints=settings.max_joints,
+        inducing_samples=settings.max_posterior_samples,
+        inducing_torques=settings.max_archive_torques,
+        inducing_outputs=settings.max_inducing_outputs,
+        manifest_bytes=MANIFEST_BYTES,
+        robot_bytes=settings.max_urdf_bytes,
+    )
+    try:
+        manifest = read_manifest_bytes(files[MANIFEST], limits)
+        _check_members(files, manifest)
+        _check_texts(manifest)
+        _check_options(manifest["options"], settings)
+        Lineage.model_validate(manifest["lineage"])
+        model = persistence.decode(files, limits)
+        probe(model)
+        manifest["parameters"] = report(model.posterior, model.estimator)
+        manifest["hyperparameters"] = {name: value.tolist() for name, value in model.posterior.params.items()}
+        read_manifest_bytes(persistence.manifest_bytes(manifest), limits)
+    except ModelFormatError as error:
+        raise InvalidDataError(f"{error.file}: {error}", [problem(error.file, str(error), "a valid model")]) from None
+    except ValidationError as error:
+        raise _invalid(f"{MANIFEST}: lineage", error) from None
+    except (ValueError, ArithmeticError) as error:  # parameters that no fit has
+        raise invalid_data(TENSORS, str(error), "parameters that are finite numbers") from None
+    return manifest
+
+
+def _check_members(files: Mapping[str, bytes], manifest: Mapping[str, Any]) -> None:
+    if ROBOT in files and "robot" not in manifest:
+        raise ModelFormatError(f"{ROBOT} is there, but the manifest names no robot", ROBOT)
+
+
+def _check_texts(value: Any) -> None:
+    """Raise ModelFormatError for a text that a terminal or a log would not show as it is. The depth is limited."""
+    if isinstance(value, str):
+        if not all(each.isprintable() or each == "\N{NO-BREAK SPACE}" for each in value):
+            raise ModelFormatError(f"{strict_json.quote(value)} has a character that cannot be printed")
+    elif isinstance(value, dict):
+        for name, each in value.items():
+            _check_texts(name)
+            _check_texts(each)
+    elif isinstance(value, list):
+        for each in value:
+            _check_texts(each)
+
+
+def _check_options(options: Mapping[str, Any], settings: Settings) -> None:
+    for name, setting in OPTION_LIMITS.items():
+        most = getattr(settings, setting)
+        if options.get(name, 0) > most:
+            raise ModelFormatError(f"options.{name} is {options[name]}, expected at most {most}")
+
+
+def _json(member: str, content: bytes) -> Any:
+    try:
+        value = strict_json.read(content, SMALL)
+        _check_texts(value)
+    except (strict_json.StrictJsonError, ModelFormatError) as error:
+        raise invalid_data(member, str(error), "JSON as an export writes it") from None
+    return value
+
+
+def _invalid(member: str, error: ValidationError) -> InvalidDataError:
+    first = error.errors()[0]
+    where = ".".join([member, *map(str, first["loc"])])
+    return invalid_data(where, first.get("input"), first["msg"].removeprefix("Input should be "))

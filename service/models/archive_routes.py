@@ -1,0 +1,93 @@
+"""Routes that take a version to another service: export and import."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from anyio import to_thread
+from fastapi import APIRouter, Query, Request, Response, status
+from fastapi.responses import StreamingResponse
+
+from service.context import ServiceDep
+from service.errors import (
+    InvalidDataError,
+    InvalidRequestError,
+    NotFoundError,
+    TooLargeError,
+    UnreadableVersionError,
+    UnsupportedMediaTypeError,
+    responses,
+)
+from service.limits.upload import Kinds, receive_to
+from service.models import archive_import
+from service.models.archive import MEDIA_TYPE
+from service.models.export import export
+from service.models.schema import AliasName, ModelName, Version, VersionNumber
+from service.route import Route
+
+KINDS = Kinds({MEDIA_TYPE: "tar"}, {".tar": "tar"})
+_BINARY = {"schema": {"type": "string", "format": "binary"}}
+_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "description": "An archive as an export writes it.",
+        "content": {
+            MEDIA_TYPE: _BINARY,
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "required": ["file"],
+                    "properties": {"file": {"type": "string", "format": "binary", "description": "A .tar file"}},
+                }
+            },
+        },
+    }
+}
+
+router = APIRouter(prefix="/v1/models", tags=["models"], responses=responses(InvalidRequestError), route_class=Route)
+
+
+@router.post(
+    "/import",
+    status_code=status.HTTP_201_CREATED,
+    summary="Import a version",
+    responses=responses(InvalidDataError, InvalidRequestError, TooLargeError, UnsupportedMediaTypeError),
+    openapi_extra=_BODY,
+)
+async def import_version(
+    request: Request,
+    response: Response,
+    service: ServiceDep,
+    name: Annotated[ModelName | None, Query(description="Name of the model; that of the archive by default")] = None,
+) -> Version:
+    """Check an archive and make a new version of it, which answers where the model had none."""
+    path = service.files.upload()
+    try:
+        await receive_to(request, path, KINDS, service.disk)
+        version = await to_thread.run_sync(archive_import.add, service, path, name, limiter=service.archives)
+    finally:
+        path.unlink(missing_ok=True)
+    response.headers["Location"] = f"/v1/models/{version.model}/versions/{version.version}"
+    return version
+
+
+@router.get(
+    "/{model}/export",
+    summary="Export a version",
+    response_class=StreamingResponse,
+    responses={
+        **responses(NotFoundError, UnreadableVersionError),
+        200: {"description": "A tar file", "content": {MEDIA_TYPE: _BINARY}},
+    },
+)
+async def export_version(
+    service: ServiceDep,
+    model: str,
+    version: Annotated[VersionNumber | None, Query(description="The version that serves by default")] = None,
+    alias: Annotated[AliasName | None, Query(description="An alias, instead of a version's number")] = None,
+    learnt: Annotated[bool, Query(description="With what it has learnt online; false: as it was trained")] = True,
+) -> StreamingResponse:
+    """One archive with all that another service needs to answer alike; `export.json` in it says what it holds."""
+    found = await to_thread.run_sync(export, service, model, version, alias, learnt, limiter=service.archives)
+    headers = {"Content-Length": str(found.size), "Content-Disposition": f'attachment; filename="{found.name}"'}
+    return StreamingResponse(found.pieces, media_type=MEDIA_TYPE, headers=headers)

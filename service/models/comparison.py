@@ -1,0 +1,150 @@
+"""Comparing two versions of a model on one data set: no transport here."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from math import isfinite
+
+from lipcore import paired
+from lipcore.metrics import evaluate
+from lipcore.paired import Answer, Comparison, Difference
+from lipcore.samples import Array, Samples
+from service.context import Service
+from service.errors import invalid_request
+from service.inference.answer import measured
+from service.inference.loaded import Served
+from service.models.comparison_schema import (
+    CompareRequest,
+    CompareResponse,
+    Differences,
+    JointDifferences,
+    Outcome,
+    TotalDifference,
+    VersionFigures,
+)
+
+
+def compare(service: Service, model: str, request: CompareRequest) -> CompareResponse:
+    """Compare two versions; raise InvalidRequestError, NotFoundError, DamagedDataError or UnreadableVersionError.
+
+    Not for the event loop.
+    """
+    first, second = versions = _versions(service, model, request)
+    found = measured(service, request.dataset, *versions)
+    answers = [_answer(each, found.used) for each in versions]
+    compared = paired.compare(found.used, *answers)
+    outcome, verdict = _verdict(first.version, second.version, compared)
+    in_training = [found.in_training_of(each) for each in versions]
+    return CompareResponse(
+        model=model,
+        dataset=found.id,
+        joint_names=list(first.model.joint_names),
+        samples=found.samples,
+        samples_used=len(found.used),
+        blocks=compared.blocks,
+        versions=[
+            _figures(each, answer, found.used, trained)
+            for each, answer, trained in zip(versions, answers, in_training, strict=True)
+        ],
+        differences=JointDifferences(
+            **{name: Differences(**_shown(getattr(compared, name))) for name in JointDifferences.model_fields}
+        ),
+        nlpd=_total(compared.total, 0),
+        nmse=_total(compared.total, 1),
+        outcome=outcome,
+        better={"first_better": first.version, "second_better": second.version}.get(outcome),
+        verdict=verdict,
+        warnings=_warnings(versions, in_training),
+    )
+
+
+def _versions(service: Service, model: str, request: CompareRequest) -> tuple[Served, Served]:
+    first, second = (
+        service.loaded.get(model, named, None) if isinstance(named, int) else service.loaded.get(model, None, named)
+        for named in request.versions
+    )
+    if first.version == second.version:
+        raise invalid_request("versions[1]", request.versions[1], f"another version than versions[0], {first.version}")
+    return first, second
+
+
+def _answer(served: Served, samples: Samples) -> Answer:
+    answer = served.model.predict(samples.q, samples.dq, samples.ddq)
+    return Answer(answer.tau, answer.tau_std, answer.noise_std)
+
+
+def _figures(served: Served, answer: Answer, samples: Samples, in_training: bool) -> VersionFigures:
+    metrics = evaluate(samples.tau, *answer)
+    return VersionFigures(
+        version=served.version,
+        revision=served.revision,
+        nmse=_finite(metrics.nmse),
+        rmse=metrics.rmse.tolist(),
+        coverage=metrics.coverage.tolist(),
+        nlpd=metrics.nlpd.tolist(),
+        interval_width=metrics.width.tolist(),
+        in_training=in_training,
+    )
+
+
+def _verdict(first: int, second: int, compared: Comparison) -> tuple[Outcome, str]:
+    """What the difference says, for programs and in words."""
+    if compared.blocks < paired.MIN_BLOCKS:
+        return "cannot_tell", (
+            f"These data cannot tell: they make {compared.blocks} stretches of {paired.BLOCK_S:g} s, or episodes, and "
+            f"a verdict needs {paired.MIN_BLOCKS}. Record longer, or more episodes."
+        )
+    total = compared.total
+    (density, nmse), (clear, larger_or_smaller) = total.mean.tolist(), total.significant.tolist()
+    better, worse = (first, second) if density > 0 else (second, first)
+    if clear:
+        outcome: Outcome = "first_better" if better == first else "second_better"
+        text = (
+            f"Version {better} predicts better than version {worse}: its negative log predictive density is lower by "
+        )
+    else:
+        outcome, better = "no_difference", second
+        text = f"These data show no difference between versions {first} and {second}: their negative log predictive "
+        text += "densities differ by "
+    text += f"{_amount(total, 0)} nats a sample (95 % interval)."
+    if not isfinite(nmse):
+        return outcome, text
+    if not larger_or_smaller:
+        return outcome, f"{text} Their mean nMSE differs by {_amount(total, 1)}, which shows no difference."
+    smaller = (nmse < 0) == (better == second)
+    text += f" The errors of version {better} are {'smaller' if smaller else 'larger'}: its mean nMSE is "
+    text += f"{'lower' if smaller else 'higher'} by {_amount(total, 1)}."
+    if clear and not smaller:
+        text += " What is better is how true its stated uncertainty is."
+    return outcome, text
+
+
+def _amount(difference: Difference, place: int) -> str:
+    return f"{abs(difference.mean[place]):.3g} ± {difference.half_width[place]:.2g}"
+
+
+def _warnings(versions: Collection[Served], in_training: Collection[bool]) -> list[str]:
+    """What makes figures flatter one of the versions."""
+    found = []
+    for served, trained in zip(versions, in_training, strict=True):
+        if trained:
+            found.append(f"version {served.version} was trained on this data set: its figures flatter it")
+        if served.revision:
+            found.append(
+                f"version {served.version} has learnt online since, up to revision {served.revision}: where that was "
+                "from the motion of this data set, its figures flatter it"
+            )
+    return found
+
+
+def _shown(difference: Difference) -> dict[str, list[float | None]]:
+    names = {"difference": difference.mean, "standard_error": difference.standard_error}
+    return {name: _finite(values) for name, values in {**names, "half_width": difference.half_width}.items()}
+
+
+def _finite(values: Array) -> list[float | None]:
+    return [value if isfinite(value) else None for value in values.tolist()]
+
+
+def _total(difference: Difference, place: int) -> TotalDifference:
+    return TotalDifference(**{name: values[place] for name, values in _shown(difference).items()})

@@ -1,0 +1,136 @@
+"""Deleting versions and models: rows first, files after, and nobody goes on answering from either."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+
+from sqlalchemy import delete, select
+from sqlalchemy.orm import Session
+
+from service.context import Service
+from service.database import (
+    AlarmRow,
+    AliasMoveRow,
+    AliasRow,
+    DeletedModelRow,
+    EventRow,
+    JobRow,
+    LearnerRow,
+    LearningRow,
+    ModelRow,
+    ServingRow,
+    SnapshotRow,
+    StreamRow,
+    VersionRow,
+    now,
+)
+from service.errors import ConflictError, not_found
+from service.files import Files
+from service.models import moves, registry
+from service.training.states import ACTIVE
+
+logger = logging.getLogger(__name__)
+
+OF_MODEL = (AliasMoveRow, AliasRow, ServingRow, LearnerRow, LearningRow, StreamRow, EventRow, AlarmRow, SnapshotRow)
+"""Tables of what belongs to a model, beside its versions. Jobs and data sets keep their history."""
+
+
+def delete_version(service: Service, model: str, version: int) -> None:
+    """Delete a version for good; its number is not given again. Not for the event loop.
+
+    Raise NotFoundError; ConflictError, naming the reason, while an alias points to it, it serves, it is compared with
+    the one that serves, or a job trains it anew.
+    """
+    with service.loaded.moving:
+        with service.database.transaction() as session:
+            row = session.get(VersionRow, (model, version))
+            if row is None:
+                known = session.scalar(select(ModelRow.name).where(ModelRow.name == model))
+                raise not_found("model", model) if known is None else not_found("version", version)
+            _check_unused(session, model, version)
+            of_version = (SnapshotRow.model == model, SnapshotRow.version == version)
+            snapshots = list(session.scalars(select(SnapshotRow.id).where(*of_version)))
+            session.execute(delete(SnapshotRow).where(*of_version))
+            session.execute(delete(LearnerRow).where(LearnerRow.model == model, LearnerRow.version == version))
+            session.delete(row)
+        service.loaded.forget(model, [version])
+    _remove_files(service.files, [row.folder], snapshots)
+    service.updates.learner.wake(model)
+    logger.info("deleted version %d of model %s", version, model)
+
+
+def delete_model(service: Service, model: str) -> None:
+    """Delete a model with its versions, aliases, log, streams, snapshots and alarms. Not for the event loop.
+
+    A model that is trained later under the same name goes on with the numbers of versions. Raise NotFoundError, or
+    ConflictError while a job of the model waits or runs.
+    """
+    with service.loaded.moving:
+        with service.database.transaction() as session:
+            row = session.scalar(select(ModelRow).where(ModelRow.name == model))
+            if row is None:
+                raise not_found("model", model)
+            for job in _active_jobs(session, model):
+                raise ConflictError(f"job {job.id!r} of model {model!r} is {job.state}: cancel it or wait for its end")
+            versions = list(session.scalars(select(VersionRow).where(VersionRow.model == model)))
+            snapshots = list(session.scalars(select(SnapshotRow.id).where(SnapshotRow.model == model)))
+            _note_deletion(session, row, [each.version for each in versions])
+            for table in OF_MODEL:
+                session.execute(delete(table).where(table.model == model))
+            session.execute(delete(VersionRow).where(VersionRow.model == model))
+            session.execute(delete(ModelRow).where(ModelRow.name == model))
+        service.loaded.forget(model, [each.version for each in versions], whole=True)
+    service.updates.forget(model)
+    _remove_files(service.files, [each.folder for each in versions], snapshots)
+    service.updates.learner.wake(model)
+    logger.info("deleted model %s with %d versions", model, len(versions))
+
+
+def _check_unused(session: Session, model: str, version: int) -> None:
+    """Raise ConflictError, naming the reason, where a version is needed."""
+    name = f"version {version} of model {model!r}"
+    pointing = [alias for alias in moves.pointing(session, model, version) if alias != moves.SERVING]
+    if pointing:
+        raise ConflictError(f"{name} has the alias {', '.join(map(repr, pointing))}: move or remove it first")
+    if registry.answering(session, model) == version:
+        raise ConflictError(f"{name} serves: let another version serve first, or delete the model")
+    learner = session.get(LearnerRow, (model, version))
+    if learner is not None and learner.role == "candidate":
+        raise ConflictError(f"{name} is compared with the version that serves: wait until that is decided")
+    for job in _active_jobs(session, model):
+        if (job.request.get("refresh") or {}).get("version") == version:
+            raise ConflictError(f"job {job.id!r} trains {name} anew: cancel it or wait for its end")
+
+
+def _active_jobs(session: Session, model: str) -> list[JobRow]:
+    return list(session.scalars(select(JobRow).where(JobRow.model == model, JobRow.state.in_(ACTIVE))))
+
+
+def _note_deletion(session: Session, row: ModelRow, versions: Collection[int]) -> None:
+    """Remember which numbers were given."""
+    deleted = session.get(DeletedModelRow, row.name)
+    if deleted is None:
+        deleted = DeletedModelRow(name=row.name)
+        session.add(deleted)
+    deleted.last_version, deleted.deleted_at = max(row.last_version, *versions, 0), now()
+
+
+def _remove_files(files: Files, folders: Collection[str], snapshots: Collection[str]) -> None:
+    """Remove files that no row names any more; what cannot be removed now is at the next start."""
+    for folder in folders:
+        with _forgiven():
+            shutil.rmtree(files.versions / folder)
+    for snapshot in snapshots:
+        with _forgiven():
+            files.delete_snapshot(snapshot)
+
+
+@contextmanager
+def _forgiven() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        logger.warning("a file of a deleted version is left until the next start: %s", error)

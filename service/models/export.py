@@ -1,0 +1,116 @@
+"""A version as an archive: its files, with their checksums and what made them."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from lipcore import persistence
+from lipcore.manifest import MANIFEST, TENSORS, ModelFormatError
+from service.context import Service
+from service.database import VersionRow, now
+from service.errors import UnreadableVersionError, invalid_request, not_found
+from service.models import archive, registry
+from service.models.archive import CHECKSUMS, EXPORT, Part
+from service.models.lineage import software
+from service.models.moves import SERVING
+from service.updates.learner import learnt as learning
+
+
+@dataclass(frozen=True)
+class Exported:
+    """An archive that is ready to be sent. size: bytes; name: of the file."""
+
+    name: str
+    size: int
+    pieces: Iterator[bytes]
+
+
+def export(service: Service, model: str, version: int | None, alias: str | None, learnt: bool) -> Exported:
+    """Archive a version, the one that serves where none is named. Not for the event loop.
+
+    learnt: with what it has learnt online, else as trained. Nothing is sent before all of it has been checked. Raise
+    NotFoundError, InvalidRequestError for both a version and an alias, UnreadableVersionError for damaged files,
+    StorageFullError.
+    """
+    if version is not None and alias is not None:
+        raise invalid_request("version or alias", "both", "one of the two at most")
+    row = _find(service, model, version, alias)
+    try:
+        files, revision = _files(service, row, learnt)
+    except ModelFormatError as error:
+        registry.find(service.database, row.model, row.version)  # it may have been deleted meanwhile
+        message = f"version {row.version} of model {row.model!r} cannot be exported: {error}"
+        raise UnreadableVersionError(message) from error
+    about = {
+        "format": archive.FORMAT,
+        "format_version": archive.FORMAT_VERSION,
+        "model": row.model,
+        "version": row.version,
+        "revision": revision,
+        "learnt": revision > 0,
+        "created_at": row.created_at,
+        "exported_at": now(),
+        "software": software(),
+    }
+    files = {EXPORT: _json(about), **files}
+    sums = {name: persistence.sha256(content) for name, content in files.items()}
+    parts = [Part(name, len(content), content) for name, content in {CHECKSUMS: _json(sums), **files}.items()]
+    size = archive.size(parts)
+    kept = [_on_disk(service, each) if each.name == TENSORS else each for each in parts]
+    suffix = f"-r{revision}" if revision else ""
+    return Exported(f"{row.model}-v{row.version}{suffix}.tar", size, archive.stream(kept))
+
+
+def _find(service: Service, model: str, version: int | None, alias: str | None) -> VersionRow:
+    if alias is not None:
+        version = service.loaded.newest(model, alias)
+        if version is None and alias != SERVING:
+            registry.find(service.database, model, None)  # that there is no such model is said first
+            raise not_found("alias", alias)
+    return registry.find(service.database, model, version)
+
+
+def _files(service: Service, row: VersionRow, learnt: bool) -> tuple[dict[str, bytes], int]:
+    """The files of a version by name, checked, and the revision that they are of: 0 as trained."""
+    files = persistence.read_files(service.files.versions / row.folder)
+    if row.checksums is not None:
+        persistence.check(files, row.checksums)
+    if not learnt:
+        return files, 0
+    served = service.loaded.hot(row.model, row.version)
+    base = persistence.decode(files) if served is None else served.base
+    known = learning.consolidated(service.database, service.files, row.model, row.version, base)
+    if known is None:
+        return files, 0
+    lineage = {**row.manifest["lineage"], "learnt": _learnt(row, known.revision)}
+    _, files = persistence.encode(known.model, lineage)
+    return {MANIFEST: files.pop(MANIFEST), **files}, known.revision
+
+
+def _learnt(row: VersionRow, revision: int) -> dict[str, Any]:
+    """What the lineage says of online updates: of an earlier life too, where the version was imported with some."""
+    found: dict[str, Any] = {"model": row.model, "version": row.version, "revision": revision}
+    earlier = row.manifest["lineage"].get("learnt")
+    return found if earlier is None else {**found, "before": earlier}
+
+
+def _on_disk(service: Service, part: Part) -> Part:
+    """A part whose content waits on disk, in a file without a name, for a client that may be slow."""
+    assert isinstance(part.content, bytes)
+    service.disk.require(part.size)
+    file = tempfile.TemporaryFile(dir=service.files.uploads)  # noqa: SIM115 - closed by who reads it
+    try:
+        file.write(part.content)
+        file.flush()
+    except BaseException:
+        file.close()
+        raise
+    return Part(part.name, part.size, file)
+
+
+def _json(value: Any) -> bytes:
+    return json.dumps(value, indent=2, allow_nan=False).encode() + b"\n"

@@ -1,0 +1,72 @@
+"""What made a version: the software, so that it can be made again, and how well it fits what it was made from."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lipcore import metrics
+from lipcore.manifest import FORMAT_VERSION
+from lipcore.model import TorqueModel
+from lipcore.samples import Samples
+from service import __version__
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+MOST_SAMPLES = 500
+"""Samples that training metrics are computed on."""
+GIT_SECONDS = 5.0
+"""Longest wait for git, s: a checkout on a slow disk loses its commit, not its training."""
+
+
+def software() -> dict[str, str | int]:
+    """Versions of what computes here, for a version's lineage: cheap after the first call of a process.
+
+    model_format: of the files that this release writes; git_commit: only in a checkout, with the suffix `-dirty` where
+    it was changed since.
+    """
+    found: dict[str, str | int] = {
+        "lipserve": __version__,
+        "model_format": FORMAT_VERSION,
+        "python": platform.python_version(),
+        "torch": str(torch.__version__),
+        "numpy": np.__version__,
+    }
+    commit = git_commit(CHECKOUT)
+    return found if commit is None else {**found, "git_commit": commit}
+
+
+def training_metrics(model: TorqueModel, samples: Samples) -> dict[str, Any]:
+    """How well a model answers for the samples it was trained on, thinned evenly to MOST_SAMPLES of them.
+
+    Per joint: nmse (None where the torque did not vary), rmse in N·m, coverage of the 95 % interval, nlpd in nats. It
+    says how well the fit went; of motion that the model has not seen only other data can tell.
+    """
+    count = min(len(samples), MOST_SAMPLES)
+    used = samples.rows(np.linspace(0, len(samples) - 1, count).astype(np.int64))
+    # not by the compiled form of the model: a process that trains and never serves would wait for it
+    answer = model.posterior.predict(used.motion())
+    found = metrics.evaluate(used.tau, answer.mean.numpy(), answer.std.numpy(), model.noise_std)
+    figures = {name: getattr(found, name) for name in ("nmse", "rmse", "coverage", "nlpd")}
+    shown = {name: [float(each) if np.isfinite(each) else None for each in values] for name, values in figures.items()}
+    return {"samples": len(used), "of": len(samples), **shown}
+
+
+@cache
+def git_commit(checkout: Path) -> str | None:
+    """The commit that a folder is a checkout of; None where it is none, or git cannot tell."""
+    if not (checkout / ".git").exists():  # an installed package may lie within somebody else's checkout
+        return None
+    command = ["git", "--no-optional-locks", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    try:
+        answer = subprocess.run(  # noqa: S603 - a fixed command
+            command, cwd=checkout, capture_output=True, text=True, timeout=GIT_SECONDS, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return answer.stdout.strip() or None

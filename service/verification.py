@@ -1,0 +1,194 @@
+"""Reading everything that a home stores, to find what is damaged before it is needed."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import torch
+from sqlalchemy import select, text
+from sqlalchemy.orm import Session, undefer
+
+import lipcore
+from lipcore import persistence
+from lipcore.online import state
+from lipcore.probing import probe
+from service.database import Database, DatasetRow, EventRow, RobotRow, SnapshotRow, VersionRow
+from service.database.engine import FILE
+from service.errors import DamagedDataError
+from service.files import Files
+from service.settings import Settings
+from service.updates.storage.payload import decode
+
+ERRORS_OF_SQLITE = 20
+"""Faults of the database that are told, at most."""
+EVENTS = 200
+"""Batches that are read together."""
+
+
+class Damage(NamedTuple):
+    """Something stored that cannot be used. kind, name: of what; reason: why."""
+
+    kind: str
+    name: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.kind} {self.name}: {self.reason}"
+
+
+@dataclass
+class Verified:
+    """What was read, how many of each kind, and what of it is damaged."""
+
+    read: dict[str, int] = field(default_factory=dict)
+    damages: list[Damage] = field(default_factory=list)
+
+    def shown(self) -> dict[str, Any]:
+        """The findings for JSON."""
+        return {"read": self.read, "damaged": [each._asdict() for each in self.damages]}
+
+
+def verify(settings: Settings) -> Verified:
+    """Read a home whole: the database, data sets, robots, versions, what they have learnt and the log of observations.
+
+    It may run beside the service: what that deletes meanwhile is not damaged. Nothing is changed but a database of an
+    earlier release, which is brought up to date. Raise FileNotFoundError where the home has no database.
+    """
+    if not (settings.home / FILE).is_file():
+        raise FileNotFoundError(f"home is {str(settings.home)!r}, expected a folder with the database of a service")
+    torch.set_num_threads(settings.serving_threads)
+    database, files = Database(settings.home, settings.database_timeout_s), Files(settings.home)
+    try:
+        return _verify(database, files)
+    finally:
+        database.close()
+
+
+def _verify(database: Database, files: Files) -> Verified:
+    found = Verified()
+    with database.session() as session:
+        faults = [str(each) for each in session.scalars(text(f"PRAGMA integrity_check({ERRORS_OF_SQLITE})"))]
+        faults += [f"a row of {row[0]} refers to no row of {row[2]}" for row in session.execute(_FOREIGN)]
+    found.damages += [Damage("database", FILE, each) for each in faults if each != "ok"]
+    for kind, check in _CHECKS.items():
+        found.read[kind] = 0
+        for name, gone, reason in check(database, files):
+            found.read[kind] += 1
+            if reason is None:
+                continue
+            with database.session() as session:
+                if not gone(session):
+                    found.damages.append(Damage(kind.removesuffix("s"), name, reason))
+    return found
+
+
+_FOREIGN = text("PRAGMA foreign_key_check")
+_Finding = tuple[str, Callable[[Session], bool], str | None]
+"""Name of what was read, how to tell whether it has been deleted since, and why it is damaged, None where it is not."""
+
+
+def _datasets(database: Database, files: Files) -> Iterator[_Finding]:
+    with database.session() as session:
+        rows = list(session.scalars(select(DatasetRow)))
+    for row in rows:
+        yield row.id, _gone(DatasetRow, row.seq), _reason(_read_dataset, files, row)
+
+
+def _read_dataset(files: Files, row: DatasetRow) -> None:
+    samples = files.read_samples(row.id, row.joint_names, row.sha256)
+    if len(samples) != row.rows:
+        raise ValueError(f"it has {len(samples)} rows, expected {row.rows}")
+
+
+def _robots(database: Database, files: Files) -> Iterator[_Finding]:
+    with database.session() as session:
+        rows = list(session.scalars(select(RobotRow).options(undefer(RobotRow.urdf))))
+    for row in rows:
+        same = hashlib.sha256(row.urdf.encode()).hexdigest() == row.sha256
+        yield row.id, _gone(RobotRow, row.seq), None if same else "its URDF has another sha256 than was kept"
+
+
+def _versions(database: Database, files: Files) -> Iterator[_Finding]:
+    with database.session() as session:
+        rows = list(session.scalars(select(VersionRow)))
+    for row in rows:
+        reason = _reason(_read_version, files, row)
+        yield f"{row.version} of model {row.model!r}", _gone(VersionRow, (row.model, row.version)), reason
+
+
+def _read_version(files: Files, row: VersionRow) -> None:
+    folder = files.versions / row.folder
+    probe(lipcore.load(folder, row.checksums))
+    if persistence.read_manifest(folder) != row.manifest:
+        raise ValueError("manifest.json is not the manifest that the database has")
+
+
+def _snapshots(database: Database, files: Files) -> Iterator[_Finding]:
+    with database.session() as session:
+        rows = list(session.scalars(select(SnapshotRow).order_by(SnapshotRow.model, SnapshotRow.version)))
+        versions = {(row.model, row.version): row for row in session.scalars(select(VersionRow))}
+    base: tuple[tuple[str, int], lipcore.TorqueModel | None] | None = None
+    for row in rows:
+        key = (row.model, row.version)
+        if base is None or base[0] != key:  # one model in memory at a time
+            base = key, _base(files, versions.get(key))
+        reason = _reason(_read_snapshot, files, row, base[1])
+        yield f"{row.id} of version {row.version} of model {row.model!r}", _gone(SnapshotRow, row.seq), reason
+
+
+def _base(files: Files, row: VersionRow | None) -> lipcore.TorqueModel | None:
+    """The version as trained, None where it cannot be read, which is said of the version."""
+    try:
+        return None if row is None else lipcore.load(files.versions / row.folder, row.checksums)
+    except lipcore.ModelFormatError:
+        return None
+
+
+def _read_snapshot(files: Files, row: SnapshotRow, base: lipcore.TorqueModel | None) -> None:
+    payload = files.read_snapshot(row.id, row.sha256)
+    if base is not None:
+        state.load(base, payload)
+
+
+def _observations(database: Database, files: Files) -> Iterator[_Finding]:
+    last = 0
+    while True:
+        query = select(EventRow).where(EventRow.seq > last, EventRow.payload.is_not(None)).order_by(EventRow.seq)
+        with database.session() as session:
+            rows = list(session.scalars(query.limit(EVENTS).options(undefer(EventRow.payload))))
+        if not rows:
+            return
+        for row in rows:
+            yield f"{row.number} of model {row.model!r}", _gone(EventRow, row.seq), _reason(_read_event, row)
+        last = rows[-1].seq
+
+
+def _read_event(row: EventRow) -> None:
+    rows = decode(row.payload or b"")
+    if len(rows) != row.rows:
+        raise ValueError(f"it has {len(rows)} rows, expected {row.rows}")
+
+
+def _reason(read: Callable[..., None], *arguments: Any) -> str | None:
+    """Why something cannot be read, None where it can."""
+    try:
+        read(*arguments)
+    except (ValueError, OSError, DamagedDataError) as error:
+        return str(error)
+    return None
+
+
+def _gone(table: type[Any], key: object) -> Callable[[Session], bool]:
+    return lambda session: session.get(table, key) is None
+
+
+_CHECKS: dict[str, Callable[[Database, Files], Iterator[_Finding]]] = {
+    "datasets": _datasets,
+    "robots": _robots,
+    "versions": _versions,
+    "snapshots": _snapshots,
+    "observations": _observations,
+}

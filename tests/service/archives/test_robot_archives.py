@@ -1,0 +1,98 @@
+"""Archives of models with rigid bodies, whose URDF may come from a stranger too."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+
+import numpy as np
+import pytest
+
+import lipcore
+from lipcore import persistence
+from lipcore.urdf import RigidBody
+from tests.service.archives.packing import MANIFEST, exported, pack, refused, send, unpack, vouched, with_json
+from tests.service.data import QUICK, stream
+
+ROBOT = "robot.urdf"
+TYPES = ["revolute", "revolute"]
+
+
+@pytest.fixture(scope="module")
+def model():
+    samples = stream()
+    robot = RigidBody.from_profile("double-pendulum", samples.joint_names, TYPES)
+    return lipcore.train(samples, TYPES, "rigid-body", lipcore.FitOptions(**QUICK), robot=robot)
+
+
+@pytest.fixture(scope="module")
+def files(api, trained, model):
+    about = unpack(exported(api, trained.name))["export.json"]
+    return vouched({"export.json": about, **persistence.encode(model, {"made": "by a test"})[1]})
+
+
+def with_urdf(files, urdf):
+    """The members with another URDF, which checksums and manifest vouch for."""
+    entry = {"bytes": len(urdf), "sha256": hashlib.sha256(urdf).hexdigest()}
+    return with_json({**files, ROBOT: urdf}, MANIFEST, lambda manifest: manifest["robot"].update(entry))
+
+
+def test_model_with_its_robot_goes_in_and_out(api, files, model):
+    assert send(api, pack(files), name="with-robot").status_code == 201
+    out = unpack(exported(api, "with-robot"))
+    assert out[ROBOT] == files[ROBOT]
+    samples = stream(seed=12, samples=10)
+    body = {name: getattr(samples, name).tolist() for name in ("q", "dq", "ddq")}
+    answer = api.post("/v1/models/with-robot/predict", json=body).json()
+    assert np.array_equal(answer["tau"], model.predict(samples.q, samples.dq, samples.ddq).tau)
+
+
+def test_parameters_are_computed_anew(api, files):
+    def lie(manifest):
+        manifest["parameters"]["inertia"]["bodies"][0]["mean"]["mass"] = 1000.0
+
+    version = send(api, pack(with_json(files, MANIFEST, lie)), name="lied").json()
+    told = json.loads(files[MANIFEST])["parameters"]["inertia"]["bodies"][0]["mean"]["mass"]
+    found = version["parameters"]["inertia"]["bodies"][0]["mean"]["mass"]
+    assert found == pytest.approx(told, rel=1e-6)
+
+
+BOMB = b'<?xml version="1.0"?><!DOCTYPE r [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><robot name="r">&b;</robot>'
+URDFS = {
+    "entities": (BOMB, "document type"),
+    "external entity": (b'<!DOCTYPE r SYSTEM "file:///etc/passwd"><robot name="r"/>', "document type"),
+    "not XML": (b"{}", "not well-formed"),
+    "not UTF-8": (b"\xff\xfe<robot/>", ""),
+    "another robot": (b'<robot name="r"><link name="a"/></robot>', "movable joints none"),
+    "deep": (b"<robot>" + b"<a>" * 1000 + b"</a>" * 1000 + b"</robot>", "deep"),
+}
+
+
+@pytest.mark.parametrize("attack", URDFS.values(), ids=URDFS)
+def test_wrong_urdf(api, files, attack):
+    urdf, said = attack
+    refused(api, pack(with_urdf(files, urdf)), ROBOT, said)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"file": "/etc/passwd"}, "robot.file"),
+        ({"joints": ["one"]}, "robot.joints"),
+        ({"joints": ["no", "such"]}, "robot"),
+        ({"joints": [1, 2]}, "robot.joints[0]"),
+        ({"matched": "magic"}, "robot.matched"),
+        ({"prior": "none"}, "robot.prior"),
+        ({"name": "n" * 300}, "robot.name"),
+        ({"mesh": "file:///etc/passwd"}, "mesh"),
+    ],
+    ids=str,
+)
+def test_wrong_entry_of_the_robot(api, files, change, said):
+    packed = pack(with_json(files, MANIFEST, lambda manifest: manifest["robot"].update(change)))
+    refused(api, packed, ROBOT if "such" in str(change) else MANIFEST, said)
+
+
+def test_robot_that_is_missing(api, files):
+    rest = {name: content for name, content in files.items() if name != ROBOT}
+    refused(api, pack(vouched(rest)), ROBOT, "missing")

@@ -1,0 +1,170 @@
+"""A version taken out and in again: the same answers, and it says where it comes from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import subprocess
+import tarfile
+
+import numpy as np
+import pytest
+
+from service.client import ApiError, Client
+from service.models import lineage
+from tests.service.archives.packing import exported, pack, send, unpack, vouched
+from tests.service.data import error, service_of, stream
+
+
+@pytest.fixture(scope="module")
+def archive(api, trained):
+    return exported(api, trained.name)
+
+
+def ask(api, model, **more):
+    samples = stream(seed=12, samples=15)
+    body = {name: getattr(samples, name).tolist() for name in ("q", "dq", "ddq")} | {"covariance": True, **more}
+    answer = api.post(f"/v1/models/{model}/predict", json=body)
+    assert answer.status_code == 200, answer.text
+    return answer.json()
+
+
+def test_archive_tells_what_it_holds_and_vouches_for_it(api, trained, archive):
+    files = unpack(archive)
+    assert set(files) == {"checksums.json", "export.json", "manifest.json", "model.safetensors"}
+    sums = json.loads(files.pop("checksums.json"))
+    assert sums == {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    about = json.loads(files["export.json"])
+    assert (about["model"], about["version"], about["revision"], about["learnt"]) == (trained.name, 1, 0, False)
+    assert about["software"] == lineage.software()
+    folder = service_of(api).files.versions
+    stored = [path.read_bytes() for path in folder.glob("*/model.safetensors")]
+    assert files["model.safetensors"] in stored
+
+
+def test_imported_version_answers_alike_to_the_last_bit(api, trained, archive):
+    answer = send(api, archive, name="taken-in")
+    assert answer.status_code == 201, answer.text
+    assert answer.headers["location"] == "/v1/models/taken-in/versions/1"
+    before, after = ask(api, trained.name, version=1), ask(api, "taken-in")
+    for name in ("tau", "tau_std", "noise_std", "covariance"):
+        assert before[name] == after[name]
+
+
+def test_imported_version_tells_where_it_comes_from(api, trained, archive):
+    version = send(api, archive, name="told").json()
+    original = api.get(f"/v1/models/{trained.name}/versions/1").json()
+    came = version["lineage"].pop("imported")
+    assert version["lineage"] == original["lineage"]
+    assert [(each["model"], each["version"], each["revision"]) for each in came] == [(trained.name, 1, 0)]
+    assert version["job"] is None
+    for name in ("joint_names", "noise_std", "options", "fit", "compact", "calibration", "training_range"):
+        assert version[name] == original[name]
+    again = send(api, exported(api, "told"), name="told").json()
+    assert [each["model"] for each in again["lineage"]["imported"]] == [trained.name, "told"]
+    assert again["version"] == 2
+
+
+def test_import_into_a_model_that_answers_does_not_take_its_place(api, archive):
+    for version in (1, 2):
+        assert send(api, archive, name="careful").json()["version"] == version
+    assert api.get("/v1/models/careful").json()["serving_version"] == 1
+    assert ask(api, "careful")["version"] == 1
+    assert ask(api, "careful", version=2)["version"] == 2
+
+
+def test_archive_says_the_name_of_its_model(api, archive):
+    files = unpack(archive)
+    about = json.loads(files["export.json"]) | {"model": "named-inside"}
+    answer = send(api, pack(vouched({**files, "export.json": json.dumps(about).encode()})))
+    assert answer.json()["model"] == "named-inside"
+
+
+@pytest.mark.parametrize("form", [tarfile.USTAR_FORMAT, tarfile.GNU_FORMAT], ids=["ustar", "gnu"])
+def test_archive_packed_by_python_is_taken(api, archive, form):
+    assert send(api, pack(unpack(archive), form), name=f"repacked-{form}").status_code == 201
+
+
+@pytest.mark.skipif(shutil.which("tar") is None, reason="needs tar")
+def test_archive_packed_by_tar_is_taken(api, archive, tmp_path):
+    files = unpack(archive)
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    packed = subprocess.run(["tar", "-C", tmp_path, "-cf", "-", *files], capture_output=True, check=True).stdout
+    assert send(api, packed, name="by-tar").status_code == 201
+
+
+def test_version_knows_its_software_hyperparameters_and_metrics(api, trained):
+    version = api.get(f"/v1/models/{trained.name}/versions/1").json()
+    params = trained.model.posterior.params
+    assert version["hyperparameters"] == {name: value.tolist() for name, value in params.items()}
+    assert version["lineage"]["software"].keys() >= {"lipserve", "model_format", "python", "torch", "numpy"}
+    assert version["calibration"] == {"function_std_factor": trained.model.calibration.function_std_factor}
+    metrics = version["lineage"]["training_metrics"]
+    answer = trained.model.predict(trained.samples.q, trained.samples.dq, trained.samples.ddq)
+    rmse = np.sqrt(np.mean((answer.tau - trained.samples.tau) ** 2, axis=0))
+    assert np.allclose(metrics["rmse"], rmse, rtol=1e-6)
+    assert metrics["samples"] == metrics["of"] == len(trained.samples)
+    assert all(0 <= each <= 1 for each in metrics["coverage"])
+
+
+def test_commit_is_known_in_a_checkout_only(tmp_path):
+    assert lineage.git_commit(tmp_path) is None
+    (tmp_path / ".git").mkdir()  # no repository for git
+    assert lineage.git_commit(tmp_path / ".") is None
+
+
+@pytest.mark.parametrize(
+    ("params", "status", "code", "field"),
+    [
+        ({"version": 9}, 404, "not_found", "version"),
+        ({"version": 0}, 422, "invalid_request", "version"),
+        ({"alias": "nowhere"}, 404, "not_found", "alias"),
+        ({"alias": "Serving"}, 422, "invalid_request", "alias"),
+        ({"alias": "serving", "version": 1}, 422, "invalid_request", "version or alias"),
+        ({"learnt": "perhaps"}, 422, "invalid_request", "learnt"),
+    ],
+    ids=str,
+)
+def test_wrong_export_is_refused(api, trained, params, status, code, field):
+    body = error(api.get(f"/v1/models/{trained.name}/export", params=params), status, code)
+    assert body["detail"][0]["field"] == field
+
+
+def test_unknown_model_cannot_be_exported(api):
+    error(api.get("/v1/models/nobody/export"), 404, "not_found")
+
+
+def test_alias_is_exported(api, trained, archive):
+    named = unpack(exported(api, trained.name, alias="serving"))
+    assert named["model.safetensors"] == unpack(archive)["model.safetensors"]
+
+
+@pytest.mark.parametrize("name", ["Upper", "", "a/b", "../up", "x" * 65])
+def test_name_of_the_model_is_checked(api, archive, name):
+    error(send(api, archive, name=name), 422, "invalid_request")
+
+
+def test_form_is_taken_by_the_ending_of_its_file(api, archive):
+    def post(name):
+        return api.post("/v1/models/import", files={"file": (name, archive)}, params={"name": "by-form"})
+
+    assert post("model.tar").status_code == 201
+    error(post("model.zip"), 415, "unsupported_media_type")
+    answer = api.post("/v1/models/import", content=archive, headers={"content-type": "application/zip"})
+    error(answer, 415, "unsupported_media_type")
+
+
+def test_client_writes_a_whole_file_or_none(streaming, tmp_path):
+    with Client(streaming.server.url) as client:
+        path = client.export_model("pendulum", tmp_path / "arm.tar")
+        version = client.import_model(path, name="by-client")
+        assert (version.model, version.version) == ("by-client", 1)
+        with pytest.raises(ApiError, match="nobody") as refused:
+            client.export_model("nobody", tmp_path / "nobody.tar")
+        assert refused.value.status == 404
+        path.write_bytes(path.read_bytes()[:-5000])
+        with pytest.raises(ApiError, match=r"model\.safetensors"):
+            client.import_model(path)
+    assert [each.name for each in tmp_path.iterdir()] == ["arm.tar"]

@@ -1,0 +1,191 @@
+"""Files that have changed behind the service's back are found when they are read, and only what they hold is lost."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from sqlalchemy import select
+from typer.testing import CliRunner
+
+from lipcore import ModelFormatError
+from lipcore.online import state
+from service import cli
+from service.database import DatasetRow, EventRow, RobotRow, SnapshotRow, VersionRow
+from service.errors import DamagedDataError
+from service.files import DamagedFileError, Files
+from service.models import registry
+from service.settings import Settings
+from service.training.material import recorded
+from service.updates.learner.restore import restore
+from service.updates.storage import snapshots
+from service.verification import verify
+from tests.service.data import error, service_of, stream, upload
+from tests.service.updates.pendulums import ARM, Arm
+
+
+def flip(path):
+    """Change one bit in the middle of a file."""
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("spoil", [flip, lambda path: path.unlink(), lambda path: path.write_bytes(b"")])
+def test_damaged_data_set_is_not_evaluated_and_not_trained_on(api, trained, spoil):
+    dataset = upload(api, stream(samples=40, seed=31))
+    service = service_of(api)
+    spoil(service.files.datasets / f"{dataset['id']}.safetensors")
+    answer = api.post(f"/v1/models/{trained.name}/evaluate", json={"dataset": dataset["id"]})
+    assert dataset["id"] in error(answer, 500, "damaged_data")["message"]
+    with pytest.raises(DamagedDataError, match="Upload it again"):
+        recorded(service.database, service.files, {"datasets": [dataset["id"]]})
+    assert api.get(f"/v1/datasets/{dataset['id']}").status_code == 200
+    assert api.delete(f"/v1/datasets/{dataset['id']}").status_code == 204
+
+
+@pytest.fixture
+def arm(home):
+    arm = Arm.open(home)
+    yield arm
+    arm.database.close()
+
+
+def row_of(arm):
+    return registry.find(arm.database, ARM, 1)
+
+
+def test_checksums_of_every_file_are_kept(arm):
+    assert set(row_of(arm).checksums) == {"manifest.json", "model.safetensors"}
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "model.safetensors"])
+def test_version_that_is_whole_but_another_one_is_not_loaded(arm, name):
+    """The manifest itself may be exchanged, and vouch for other tensors."""
+    import lipcore
+
+    row = row_of(arm)
+    folder = arm.files.versions / row.folder
+    if name == "manifest.json":
+        manifest = json.loads((folder / name).read_text())
+        manifest["calibration"]["function_std_factor"] = 50.0
+        (folder / name).write_text(json.dumps(manifest))
+        assert lipcore.load(folder).calibration.function_std_factor == 50.0
+    else:
+        flip(folder / name)
+    with pytest.raises(ModelFormatError, match=f"{name} does not have the sha256"):
+        lipcore.load(folder, row.checksums)
+
+
+def snapshot(arm, number):
+    known = restore(arm.database, arm.files, ARM, 1, arm.base, number)
+    return snapshots.save(arm.database, arm.files, ARM, 1, number, state.dump(known.online), seen=known.seen, most=20)
+
+
+def test_damaged_snapshot_gives_way_to_the_one_before(arm, caplog):
+    for number in range(4):
+        arm.batch(number)
+    snapshot(arm, 2)
+    newest = snapshot(arm, 4)
+    expected = restore(arm.database, arm.files, ARM, 1, arm.base).online.model()
+    path = arm.files.learning / f"{newest}.safetensors"
+    flip(path)
+    with arm.database.session() as session:
+        row = session.scalar(select(SnapshotRow).where(SnapshotRow.id == newest))
+    with pytest.raises(DamagedFileError, match="sha256"):
+        snapshots.read(arm.files, row)
+    found = restore(arm.database, arm.files, ARM, 1, arm.base)
+    assert (found.number, newest in caplog.text) == (4, True)
+    query = stream(seed=3, samples=10)
+    one, other = (model.predict(query.q, query.dq, query.ddq) for model in (expected, found.online.model()))
+    assert abs(one.tau - other.tau).max() < 1e-8
+
+
+def test_snapshot_of_an_earlier_release_has_no_checksum_and_is_read(arm):
+    arm.batch(0)
+    name = snapshot(arm, 1)
+    with arm.database.transaction() as session:
+        session.scalar(select(SnapshotRow).where(SnapshotRow.id == name)).sha256 = None
+    assert verify(arm.settings).damages == []
+
+
+@pytest.fixture
+def store(arm):
+    """A home with one of everything."""
+    arm.batch(0)
+    snapshot(arm, 1)
+    samples = stream(samples=40, seed=32)
+    digest = arm.files.write_samples("ds_one", samples)
+    with arm.database.transaction() as session:
+        dataset = {"torque_convention": "gravity_included", "joint_names": list(samples.joint_names), "report": {}}
+        session.add(DatasetRow(id="ds_one", name="one", created_at="", sha256=digest, rows=len(samples), **dataset))
+        robot = {"sha256": "b05c5ddf5ae7e0a0ba28a2e3bb5c7c9c8b2ae6d0f5b8e4e0f1b7d4c0a9d8e7f6", "joints": []}
+        session.add(RobotRow(id="rb_one", name="one", created_at="", urdf="<robot/>", **robot))
+        session.flush()
+        import hashlib
+
+        session.scalar(select(RobotRow)).sha256 = hashlib.sha256(b"<robot/>").hexdigest()
+    return arm
+
+
+def test_whole_store_is_said_to_be_whole(store):
+    found = verify(store.settings)
+    assert found.damages == []
+    assert found.read == {"datasets": 1, "robots": 1, "versions": 1, "snapshots": 1, "observations": 1}
+
+
+def spoil_row(table, **values):
+    def spoil(store):
+        with store.database.transaction() as session:
+            row = session.scalar(select(table))
+            for name, value in values.items():
+                setattr(row, name, value)
+
+    return spoil
+
+
+DAMAGES = {
+    "dataset": lambda store: flip(store.files.datasets / "ds_one.safetensors"),
+    "dataset rows": spoil_row(DatasetRow, rows=7),
+    "robot": spoil_row(RobotRow, urdf="<robot name='other'/>"),
+    "version": lambda store: flip(next(store.files.versions.glob("*/model.safetensors"))),
+    "version's manifest": spoil_row(VersionRow, manifest={}),
+    "version's file": lambda store: next(store.files.versions.glob("*/manifest.json")).unlink(),
+    "snapshot": lambda store: flip(next(store.files.learning.glob("snap_*"))),
+    "snapshot lost": lambda store: next(store.files.learning.glob("snap_*")).unlink(),
+    "observation": spoil_row(EventRow, payload=b"torn"),
+    "observation rows": spoil_row(EventRow, rows=3),
+}
+
+
+@pytest.mark.parametrize("what", DAMAGES)
+def test_each_damage_is_found_and_nothing_else(store, what):
+    DAMAGES[what](store)
+    (damage,) = verify(store.settings).damages
+    assert damage.kind == what.split("'")[0].split()[0]
+    assert damage.reason
+
+
+def test_command_says_what_is_damaged_and_ends_with_1(store, monkeypatch):
+    monkeypatch.setenv("LIPSERVE_HOME", str(store.settings.home))
+    whole = CliRunner().invoke(cli.app, ["verify", "--json"])
+    assert (whole.exit_code, json.loads(whole.stdout)["damaged"]) == (0, [])
+    DAMAGES["dataset"](store)
+    found = CliRunner().invoke(cli.app, ["verify", "--json"])
+    assert (found.exit_code, json.loads(found.stdout)["damaged"][0]["name"]) == (1, "ds_one")
+
+
+def test_home_without_a_database_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match="expected a folder with the database"):
+        verify(Settings(home=tmp_path / "none"))
+    assert not (tmp_path / "none").exists()
+
+
+def test_what_is_deleted_meanwhile_is_not_damaged(store, monkeypatch):
+    def read(self, dataset, *_):
+        with store.database.transaction() as session:
+            session.delete(session.scalar(select(DatasetRow)))
+        raise DamagedDataError("its file is gone")
+
+    monkeypatch.setattr(Files, "read_samples", read)
+    assert verify(store.settings).damages == []

@@ -1,0 +1,132 @@
+"""Wherever a version can be named, an alias can: answers follow it in one step and always name the version."""
+
+from __future__ import annotations
+
+import threading
+from itertools import pairwise
+
+import pytest
+
+from service.inference.wire import decode
+from tests.service.data import error, service_of, stream, upload
+from tests.service.models.versions import QUERY, predict, publish, worse
+
+BINARY = {
+    "inputs": [{"name": name, "shape": [2], "datatype": "FP64", "data": QUERY[name]} for name in ("q", "dq", "ddq")]
+}
+
+
+@pytest.fixture(scope="module")
+def arm(api):
+    """A model whose version 1, `production`, says something else than version 2, which serves."""
+    assert [publish(api, "alias-answers"), publish(api, "alias-answers", worse())] == [1, 2]
+    assert api.put("/v1/models/alias-answers/aliases/production", json={"version": 1}).status_code == 200
+    return "alias-answers"
+
+
+def test_queries_are_answered_by_where_an_alias_points(api, arm):
+    by_number, by_alias = predict(api, arm, version=1).json(), predict(api, arm, alias="production").json()
+    assert by_alias == by_number
+    assert by_alias["version"] == 1
+    assert by_alias["tau"] != predict(api, arm).json()["tau"]
+    assert predict(api, arm, alias="serving").json() == predict(api, arm).json()
+    batch = {name: [values] * 2 for name, values in QUERY.items()}
+    assert predict(api, arm, **batch, alias="production").json()["tau"] == [by_number["tau"]] * 2
+
+
+def test_the_hot_route_knows_aliases(api, arm):
+    query = decode(b'{"q": [0, 0], "dq": [0, 0], "ddq": [0, 0], "alias": "production"}')
+    assert query.alias == "production"
+    assert service_of(api).loaded.hot(arm, query.version, query.alias).version == 1
+    assert decode(b'{"q": [0, 0], "dq": [0, 0], "ddq": [0, 0], "alias": "production\\n"}') is None
+    assert decode(b'{"q": [0, 0], "dq": [0, 0], "ddq": [0, 0], "alias": "production", "version": 1}') is None
+
+
+@pytest.mark.parametrize(
+    ("chosen", "status", "field"),
+    [
+        ({"alias": "production", "version": 1}, 422, "alias"),
+        ({"alias": "Production"}, 422, "alias"),
+        ({"alias": "production\n"}, 422, "alias"),
+        ({"alias": 1}, 422, "alias"),
+        ({"alias": "nowhere"}, 404, "alias"),
+    ],
+)
+def test_bad_aliases_are_named(api, arm, chosen, status, field):
+    code = {422: "invalid_request", 404: "not_found"}[status]
+    assert error(predict(api, arm, **chosen), status, code)["detail"][0]["field"] == field
+
+
+def test_an_unknown_model_is_said_before_its_alias(api):
+    assert error(predict(api, "nobody", alias="production"), 404, "not_found")["detail"][0]["field"] == "model"
+
+
+def test_evaluations_follow_an_alias(api, arm):
+    dataset = upload(api, stream(seed=7))["id"]
+    asked = {"dataset": dataset, "alias": "production"}
+    found = api.post(f"/v1/models/{arm}/evaluate", json=asked).json()
+    assert found["version"] == 1
+    assert found == api.post(f"/v1/models/{arm}/evaluate", json={"dataset": dataset, "version": 1}).json()
+
+
+def test_the_open_inference_protocol_takes_an_alias_for_a_version(api, arm):
+    found = api.post(f"/v2/models/{arm}/versions/production/infer", json=BINARY).json()
+    assert found["model_version"] == "1"
+    assert found["outputs"][0]["data"] == predict(api, arm, version=1).json()["tau"]
+    assert api.get(f"/v2/models/{arm}/versions/production").json()["parameters"]["version"] == "1"
+    assert api.get(f"/v2/models/{arm}/versions/serving/ready").json()["ready"]
+    assert api.post(f"/v2/models/{arm}/versions/serving/infer", json=BINARY).json()["model_version"] == "2"
+    refused = api.post(f"/v2/models/{arm}/versions/nowhere/infer", json=BINARY)
+    assert refused.status_code == 404
+    assert "one of production, 1, 2" in refused.json()["error"]
+
+
+def test_queries_follow_every_move_at_once_and_none_fails(api, arm):
+    """Each answer is of a version that the alias pointed to while it was asked, and that version's to the last bit."""
+    expected = {version: predict(api, arm, version=version).json()["tau"] for version in (1, 2)}
+    api.put(f"/v1/models/{arm}/aliases/moving", json={"version": 1})
+    loaded, seen, stop = service_of(api).loaded, [], threading.Event()
+
+    def ask():
+        while not stop.is_set():
+            served = loaded.hot(arm, None, "moving")
+            seen.append(None if served is None else served.version)
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    try:
+        for version in (2, 1) * 5:
+            assert api.put(f"/v1/models/{arm}/aliases/moving", json={"version": version}).status_code == 200
+            answer = predict(api, arm, alias="moving").json()
+            assert (answer["version"], answer["tau"]) == (version, expected[version])
+    finally:
+        stop.set()
+        thread.join()
+    assert set(seen) == {1, 2}
+    assert sum(one != other for one, other in pairwise(seen)) <= 10
+
+
+def test_moves_at_the_same_time_leave_memory_and_database_of_one_mind(api, arm):
+    def move(version):
+        for _ in range(5):
+            assert api.put(f"/v1/models/{arm}/aliases/contested", json={"version": version}).status_code == 200
+
+    threads = [threading.Thread(target=move, args=(version,)) for version in (1, 2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    listed = {item["alias"]: item for item in api.get(f"/v1/models/{arm}/aliases").json()["items"]}["contested"]
+    assert service_of(api).loaded.newest(arm, "contested") == listed["version"]
+    moves = listed["history"]
+    assert all(later["before"] == earlier["version"] for later, earlier in pairwise(moves))
+
+
+def test_an_alias_to_a_version_that_was_dropped_from_memory_loads_it(api, arm):
+    loaded = service_of(api).loaded
+    for number in range(loaded.capacity):
+        publish(api, f"crowd-{number}")
+        predict(api, f"crowd-{number}")
+    assert loaded.hot(arm, None, "production") is None
+    assert predict(api, arm, alias="production").json()["version"] == 1
+    assert loaded.hot(arm, None, "production").version == 1

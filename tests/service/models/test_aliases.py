@@ -1,0 +1,172 @@
+"""Aliases: made, moved, taken back and removed, and what the service says of them."""
+
+from __future__ import annotations
+
+import pytest
+
+from service.errors import NotFoundError
+from service.inference.loaded import LoadedModels
+from service.models import registry
+from tests.service.data import error, service_of
+from tests.service.models.versions import predict, publish
+
+
+def put(api, model, alias, /, **body):
+    return api.put(f"/v1/models/{model}/aliases/{alias}", json=body)
+
+
+def rollback(api, model, alias):
+    return api.post(f"/v1/models/{model}/aliases/{alias}/rollback")
+
+
+def listed(api, model):
+    answer = api.get(f"/v1/models/{model}/aliases").json()
+    assert answer["next_cursor"] is None
+    return {item["alias"]: item for item in answer["items"]}
+
+
+def pointers(api, model):
+    return {alias: item["version"] for alias, item in listed(api, model).items()}
+
+
+@pytest.fixture
+def arm(api, request):
+    """A model of three versions, one for each test."""
+    name = "aliases-" + request.node.name.removeprefix("test_").replace("_", "-")[:50].rstrip("-")
+    assert [publish(api, name) for _ in range(3)] == [1, 2, 3]
+    return name
+
+
+def test_an_alias_is_made_moved_and_removed(api, arm):
+    made = put(api, arm, "production", version=1)
+    assert made.status_code == 200
+    assert (made.json()["alias"], made.json()["version"], made.json()["previous"]) == ("production", 1, None)
+    moved = put(api, arm, "production", version=2).json()
+    assert (moved["version"], moved["previous"]) == (2, 1)
+    assert [(move["before"], move["version"]) for move in moved["history"]] == [(1, 2), (None, 1)]
+    assert pointers(api, arm) == {"serving": 3, "production": 2}
+    assert api.get(f"/v1/models/{arm}").json()["aliases"] == {"production": 2}
+    assert api.delete(f"/v1/models/{arm}/aliases/production").status_code == 204
+    assert pointers(api, arm) == {"serving": 3}
+    error(api.delete(f"/v1/models/{arm}/aliases/production"), 404, "not_found")
+    error(predict(api, arm, alias="production"), 404, "not_found")
+
+
+def test_pointing_to_where_it_points_is_no_move(api, arm):
+    first = put(api, arm, "production", version=1).json()
+    assert put(api, arm, "production", version=1).json() == first
+
+
+def test_an_alias_is_pointed_to_where_another_one_points(api, arm):
+    put(api, arm, "candidate", version=2)
+    assert put(api, arm, "production", alias="candidate").json()["version"] == 2
+    assert put(api, arm, "serving", alias="candidate").json()["version"] == 2
+    put(api, arm, "candidate", version=3)
+    assert pointers(api, arm) == {"serving": 2, "candidate": 3, "production": 2}
+
+
+def test_rollbacks_go_back_move_by_move(api, arm):
+    for version in (1, 2, 3):
+        put(api, arm, "production", version=version)
+    back = rollback(api, arm, "production").json()
+    assert (back["version"], back["previous"], back["history"][0]["rollback"]) == (2, 1, True)
+    assert put(api, arm, "production", version=3).json()["previous"] == 2
+    assert [rollback(api, arm, "production").json()["version"] for _ in range(2)] == [2, 1]
+    said = error(rollback(api, arm, "production"), 409, "conflict")
+    assert "nothing before version 1" in said["message"]
+    assert predict(api, arm, alias="production").json()["version"] == 1
+
+
+def test_a_rollback_brings_a_removed_alias_back(api, arm):
+    put(api, arm, "production", version=2)
+    api.delete(f"/v1/models/{arm}/aliases/production")
+    assert rollback(api, arm, "production").json()["version"] == 2
+    assert predict(api, arm, alias="production").json()["version"] == 2
+    error(rollback(api, arm, "never-was"), 404, "not_found")
+
+
+def test_a_rollback_to_a_deleted_version_says_so(api, arm):
+    put(api, arm, "production", version=1)
+    put(api, arm, "production", version=2)
+    assert api.delete(f"/v1/models/{arm}/versions/1").status_code == 204
+    said = error(rollback(api, arm, "production"), 409, "conflict")
+    assert "version 1 before, which has been deleted" in said["message"]
+    assert pointers(api, arm)["production"] == 2
+
+
+def test_serving_is_moved_by_training_and_by_its_owner_and_taken_back(api, arm):
+    assert [(each["before"], each["version"]) for each in listed(api, arm)["serving"]["history"]] == [
+        (2, 3),
+        (1, 2),
+        (None, 1),
+    ]
+    assert put(api, arm, "serving", version=1).json()["version"] == 1
+    assert predict(api, arm).json()["version"] == 1
+    assert rollback(api, arm, "serving").json()["version"] == 3
+    assert rollback(api, arm, "serving").json()["version"] == 2
+    assert predict(api, arm).json()["version"] == predict(api, arm, alias="serving").json()["version"] == 2
+    assert api.get(f"/v1/models/{arm}").json()["serving_version"] == 2
+    said = error(api.delete(f"/v1/models/{arm}/aliases/serving"), 409, "conflict")
+    assert "built in" in said["message"]
+
+
+@pytest.mark.parametrize(
+    ("alias", "body", "status", "field"),
+    [
+        ("production", {}, 422, "version or alias"),
+        ("production", {"version": 1, "alias": "serving"}, 422, "version or alias"),
+        ("production", {"version": 0}, 422, "version"),
+        ("production", {"version": 7}, 404, "version"),
+        ("production", {"alias": "nowhere"}, 404, "alias"),
+        ("production", {"alias": "No"}, 422, "alias"),
+        ("production", {"version": 1, "to": 2}, 422, "to"),
+        ("Production", {"version": 1}, 422, "alias"),
+        ("1", {"version": 1}, 422, "alias"),
+        ("a" * 65, {"version": 1}, 422, "alias"),
+    ],
+)
+def test_bad_requests_name_what_is_wrong(api, trained, alias, body, status, field):
+    said = error(put(api, trained.name, alias, **body), status, {422: "invalid_request", 404: "not_found"}[status])
+    assert said["detail"][0]["field"] == field
+    assert pointers(api, trained.name) == {"serving": 1}
+
+
+def test_models_that_are_not_there_have_no_aliases(api):
+    error(api.get("/v1/models/nobody/aliases"), 404, "not_found")
+    error(put(api, "nobody", "production", version=1), 404, "not_found")
+    error(rollback(api, "nobody", "production"), 404, "not_found")
+    error(api.delete("/v1/models/nobody/aliases/production"), 404, "not_found")
+
+
+def test_a_model_has_so_many_aliases_and_no_more(api, arm, monkeypatch):
+    monkeypatch.setitem(vars(service_of(api).settings), "max_aliases", 2)
+    put(api, arm, "one", version=1)
+    put(api, arm, "two", version=1)
+    assert "2 aliases, the most" in error(put(api, arm, "three", version=1), 409, "conflict")["message"]
+    assert put(api, arm, "two", version=2).status_code == 200
+    api.delete(f"/v1/models/{arm}/aliases/one")
+    assert put(api, arm, "three", version=1).status_code == 200
+
+
+def test_a_version_that_cannot_be_read_is_not_pointed_to(api, arm):
+    put(api, arm, "production", version=1)
+    service = service_of(api)
+    publish(api, arm, candidate=True)
+    folder = service.files.versions / registry.find(service.database, arm, 4).folder
+    (folder / "model.safetensors").write_bytes(b"")
+    error(put(api, arm, "production", version=4), 500, "unreadable_version")
+    error(put(api, arm, "serving", version=4), 500, "unreadable_version")
+    assert pointers(api, arm) == {"serving": 3, "production": 1}
+    assert predict(api, arm, alias="production").json()["version"] == 1
+
+
+def test_aliases_outlive_a_restart(api, arm):
+    put(api, arm, "production", version=2)
+    put(api, arm, "production", version=1)
+    put(api, arm, "gone", version=1)
+    api.delete(f"/v1/models/{arm}/aliases/gone")
+    service = service_of(api)
+    started = LoadedModels(service.database, service.files, capacity=2)
+    assert started.get(arm, None, "production").version == 1
+    with pytest.raises(NotFoundError, match="no alias 'gone'"):
+        started.get(arm, None, "gone")

@@ -1,0 +1,143 @@
+"""Comparing two versions on a data set: figures, paired errors, and a verdict that does not go beyond them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lipcore.paired import Answer, Comparison, Difference, compare
+from service.models.comparison import _verdict
+from tests.service.data import arrays, error, npz, post, stream, upload
+from tests.service.models.versions import publish, trained, worse
+
+SAMPLES = {"seed": 9, "samples": 400}
+
+
+@pytest.fixture(scope="module")
+def recorded(api):
+    """A data set of 40 s that no version was trained on."""
+    return upload(api, stream(**SAMPLES))
+
+
+@pytest.fixture(scope="module")
+def arm(api, recorded):
+    """A model of three versions: one of another pendulum, one of the one that was recorded, and that one over again."""
+    lineage = {"datasets": [{"id": "ds_of_another_service", "sha256": recorded["sha256"]}]}
+    assert publish(api, "compared", worse()) == 1
+    assert publish(api, "compared") == 2
+    assert publish(api, "compared", lineage=lineage) == 3
+    return "compared"
+
+
+def ask(api, model, dataset, *versions):
+    return api.post(f"/v1/models/{model}/compare", json={"dataset": dataset, "versions": list(versions)})
+
+
+def expected():
+    samples = stream(**SAMPLES)
+    found = [model.predict(samples.q, samples.dq, samples.ddq) for model in (worse(), trained())]
+    return compare(samples, *(Answer(each.tau, each.tau_std, each.noise_std) for each in found))
+
+
+def test_the_better_version_is_named_with_the_evidence(api, arm, recorded):
+    found = ask(api, arm, recorded["id"], 1, 2).json()
+    assert (found["outcome"], found["better"]) == ("second_better", 2)
+    assert found["verdict"].startswith("Version 2 predicts better than version 1: its negative log predictive density")
+    assert (found["samples"], found["samples_used"], found["blocks"]) == (400, 400, 40)
+    wanted = expected()
+    for name in ("nmse", "rmse", "coverage", "nlpd"):
+        shown, wants = found["differences"][name], getattr(wanted, name)
+        np.testing.assert_allclose(shown["difference"], wants.mean, rtol=1e-9)
+        np.testing.assert_allclose(shown["standard_error"], wants.standard_error, rtol=1e-9)
+        np.testing.assert_allclose(shown["half_width"], wants.half_width, rtol=1e-9)
+    for place, name in enumerate(("nlpd", "nmse")):
+        np.testing.assert_allclose(found[name]["difference"], wanted.total.mean[place], rtol=1e-9)
+    assert found["warnings"] == []
+
+
+def test_figures_are_those_of_an_evaluation(api, arm, recorded):
+    found = ask(api, arm, recorded["id"], 1, 2).json()
+    for shown in found["versions"]:
+        asked = {"dataset": recorded["id"], "version": shown["version"]}
+        evaluated = api.post(f"/v1/models/{arm}/evaluate", json=asked).json()
+        assert shown == {name: evaluated[name] for name in shown}
+
+
+def test_the_order_turns_the_signs_and_not_the_verdict(api, arm, recorded):
+    one, other = ask(api, arm, recorded["id"], 1, 2).json(), ask(api, arm, recorded["id"], 2, 1).json()
+    assert (other["outcome"], other["better"], other["verdict"]) == ("first_better", 2, one["verdict"])
+    assert other["nlpd"]["difference"] == pytest.approx(-one["nlpd"]["difference"])
+
+
+def test_versions_that_answer_alike_do_not_differ_and_training_data_are_noticed(api, arm, recorded):
+    found = ask(api, arm, recorded["id"], 2, 3).json()
+    assert (found["outcome"], found["better"], found["nlpd"]["difference"]) == ("no_difference", None, 0.0)
+    assert found["verdict"].startswith("These data show no difference between versions 2 and 3")
+    assert [each["in_training"] for each in found["versions"]] == [False, True]
+    assert found["warnings"] == ["version 3 was trained on this data set: its figures flatter it"]
+
+
+def test_a_short_recording_cannot_tell(api, arm):
+    short = upload(api, stream(seed=7))["id"]
+    found = ask(api, arm, short, 1, 2).json()
+    assert (found["outcome"], found["better"], found["blocks"]) == ("cannot_tell", None, 8)
+    assert "they make 8 stretches" in found["verdict"]
+    assert "Record longer" in found["verdict"]
+
+
+def test_versions_are_named_by_aliases_too(api, arm, recorded):
+    api.put(f"/v1/models/{arm}/aliases/old", json={"version": 1})
+    found = ask(api, arm, recorded["id"], "old", "serving").json()
+    assert [each["version"] for each in found["versions"]] == [1, 3]
+
+
+@pytest.mark.parametrize(
+    ("versions", "status", "field"),
+    [
+        ([1], 422, "versions"),
+        ([1, 2, 3], 422, "versions"),
+        ([1, 1], 422, "versions[1]"),
+        ([3, "serving"], 422, "versions[1]"),
+        ([1, 9], 404, "version"),
+        ([1, "nowhere"], 404, "alias"),
+    ],
+)
+def test_bad_choices_are_named(api, arm, recorded, versions, status, field):
+    code = {422: "invalid_request", 404: "not_found"}[status]
+    assert error(ask(api, arm, recorded["id"], *versions), status, code)["detail"][0]["field"] == field
+
+
+def test_data_sets_have_to_fit(api, arm):
+    error(ask(api, arm, "ds_none", 1, 2), 404, "not_found")
+    others = stream(seed=7)
+    answer = post(api, npz(**arrays(others), joint_names=np.array(["a", "b"])))
+    said = error(ask(api, arm, answer.json()["id"], 1, 2), 422, "invalid_request")
+    assert said["detail"][0]["field"] == "dataset"
+
+
+def compared(density, nmse, blocks=30):
+    """A comparison with these totals, each a mean and the half width of its interval."""
+    nothing = Difference(np.zeros(1), np.zeros(1), np.zeros(1))
+    mean, width = np.array([[density[0], nmse[0]], [density[1], nmse[1]]])
+    return Comparison(nothing, nothing, nothing, nothing, Difference(mean, width / 2, width), blocks)
+
+
+@pytest.mark.parametrize(
+    ("density", "nmse", "outcome", "words"),
+    [
+        ((-1.0, 0.2), (-0.01, 0.002), "second_better", "The errors of version 5 are smaller: its mean nMSE is lower"),
+        ((-1.0, 0.2), (0.01, 0.002), "second_better", "The errors of version 5 are larger: its mean nMSE is higher"),
+        ((-1.0, 0.2), (0.001, 0.002), "second_better", "which shows no difference"),
+        ((1.0, 0.2), (0.01, 0.002), "first_better", "The errors of version 4 are smaller"),
+        ((0.1, 0.2), (0.01, 0.002), "no_difference", "The errors of version 5 are larger"),
+        ((0.1, 0.2), (0.001, 0.002), "no_difference", "differ by 0.1 ± 0.2 nats a sample"),
+    ],
+)
+def test_the_words_say_what_the_numbers_do(density, nmse, outcome, words):
+    found, text = _verdict(4, 5, compared(density, nmse))
+    assert found == outcome
+    assert words in text
+    assert ("how true its stated uncertainty is" in text) == (outcome == "second_better" and nmse[0] > nmse[1])
+    assert _verdict(4, 5, replace(compared(density, nmse), blocks=19))[0] == "cannot_tell"

@@ -1,0 +1,257 @@
+"""Deleting versions and models: what is needed stays, the rest goes whole, and no number comes back."""
+
+from __future__ import annotations
+
+import threading
+from types import SimpleNamespace
+
+import pytest
+from sqlalchemy import select, update
+
+from service.database import (
+    AlarmRow,
+    AliasMoveRow,
+    AliasRow,
+    Base,
+    Database,
+    DeletedModelRow,
+    EventRow,
+    JobRow,
+    LearnerRow,
+    LearningRow,
+    ModelRow,
+    ServingRow,
+    SnapshotRow,
+    StreamRow,
+    VersionRow,
+    now,
+)
+from service.errors import ConflictError, NotFoundError, UnreadableVersionError
+from service.files import Files
+from service.inference.loaded import LoadedModels
+from service.models import registry
+from service.training.states import CANCELLED, RUNNING
+from service.updates.storage import snapshots
+from tests.service.data import error, service_of
+from tests.service.models.versions import QUERY, predict, publish
+
+
+def delete(api, path):
+    return api.delete(f"/v1/models/{path}")
+
+
+def refusal(api, path):
+    return error(delete(api, path), 409, "conflict")["message"]
+
+
+def folder(api, model, version):
+    service = service_of(api)
+    return service.files.versions / registry.find(service.database, model, version).folder
+
+
+def job(api, model, state, **request):
+    """A job of a model, as a row."""
+    row = JobRow(id=f"job_{model[-30:]}", model=model, state=state, created_at=now(), heartbeat_at=now())
+    row.request, row.progress = {"estimator": "lip-chain", "datasets": []} | request, {"stage": "waiting"}
+    with service_of(api).database.transaction() as session:
+        session.add(row)
+    return row.id
+
+
+def end(api, name):
+    with service_of(api).database.transaction() as session:
+        session.execute(update(JobRow).where(JobRow.id == name).values(state=CANCELLED))
+
+
+def snapshot(api, model, version, number=1):
+    service = service_of(api)
+    return snapshots.save(service.database, service.files, model, version, number, b"state", seen=number, most=5)
+
+
+def observe(api, model, sequence=1):
+    batch = {name: [values] for name, values in QUERY.items()} | {"tau": [[0.1, 0.2]], "t": [float(sequence)]}
+    body = {"stream_id": "arm", "sequence": sequence, **batch}
+    return api.post(f"/v1/models/{model}/observations", json=body)
+
+
+@pytest.fixture
+def arm(api, request):
+    """A model of three versions, of which the third serves, one for each test."""
+    name = "deletion-" + request.node.name.removeprefix("test_").replace("_", "-")[:50].rstrip("-")
+    assert [publish(api, name) for _ in range(3)] == [1, 2, 3]
+    return name
+
+
+def test_a_version_goes_with_its_files_and_its_number(api, arm):
+    service, place = service_of(api), folder(api, arm, 2)
+    kept, gone = snapshot(api, arm, 1), snapshot(api, arm, 2)
+    assert predict(api, arm, version=2).status_code == 200
+    assert delete(api, f"{arm}/versions/2").status_code == 204
+    assert not place.exists()
+    assert [path.stem for path in service.files.learning.glob("snap_*") if path.stem in (kept, gone)] == [kept]
+    error(predict(api, arm, version=2), 404, "not_found")
+    error(delete(api, f"{arm}/versions/2"), 404, "not_found")
+    assert [each["version"] for each in api.get(f"/v1/models/{arm}").json()["versions"]] == [1, 3]
+    with service.database.session() as session:
+        assert session.get(LearnerRow, (arm, 2)) is None
+        assert session.scalars(select(SnapshotRow.version).where(SnapshotRow.model == arm)).all() == [1]
+    assert publish(api, arm) == 4
+    assert delete(api, f"{arm}/versions/3").status_code == 204
+    assert delete(api, f"{arm}/versions/1").status_code == 204
+    assert publish(api, arm) == 5
+
+
+def test_the_newest_number_is_not_given_again(api, arm):
+    api.put(f"/v1/models/{arm}/aliases/serving", json={"version": 1})
+    assert delete(api, f"{arm}/versions/3").status_code == 204
+    assert publish(api, arm) == 4
+
+
+def test_what_serves_stays(api, arm):
+    assert f"version 3 of model '{arm}' serves" in refusal(api, f"{arm}/versions/3")
+    assert predict(api, arm).json()["version"] == 3
+
+
+def test_what_an_alias_points_to_stays(api, arm):
+    for alias in ("production", "canary"):
+        api.put(f"/v1/models/{arm}/aliases/{alias}", json={"version": 1})
+    assert "has the alias 'canary', 'production'" in refusal(api, f"{arm}/versions/1")
+    delete(api, f"{arm}/aliases/canary")
+    api.put(f"/v1/models/{arm}/aliases/production", json={"version": 2})
+    assert delete(api, f"{arm}/versions/1").status_code == 204
+
+
+def test_a_candidate_in_contest_stays(api, arm):
+    assert publish(api, arm, candidate=True) == 4
+    assert "is compared with the version that serves" in refusal(api, f"{arm}/versions/4")
+    with service_of(api).database.transaction() as session:
+        session.get(LearnerRow, (arm, 4)).role = "dismissed"
+    assert delete(api, f"{arm}/versions/4").status_code == 204
+
+
+def test_what_a_job_trains_anew_stays(api, arm):
+    name = job(api, arm, RUNNING, refresh={"version": 1, "through": 0, "trigger": "asked"})
+    assert f"job '{name}' trains version 1" in refusal(api, f"{arm}/versions/1")
+    assert delete(api, f"{arm}/versions/2").status_code == 204
+    assert f"job '{name}' of model '{arm}' is running" in refusal(api, arm)
+    end(api, name)
+    assert delete(api, f"{arm}/versions/1").status_code == 204
+    assert delete(api, arm).status_code == 204
+
+
+def test_nothing_of_a_model_is_left_but_its_history(api, arm):
+    """Every table that names a model is looked at, so that one that is added later is not forgotten."""
+    service, places = service_of(api), [folder(api, arm, version) for version in (1, 2, 3)]
+    assert observe(api, arm).status_code == 200
+    api.put(f"/v1/models/{arm}/learning", json={"auto_refresh": False})
+    api.put(f"/v1/models/{arm}/aliases/production", json={"version": 1})
+    name, kept = job(api, arm, CANCELLED), snapshot(api, arm, 1)
+    with service.database.transaction() as session:
+        session.add(AlarmRow(model=arm, kind="change", at=now(), message="", evidence={}))
+    every = {AlarmRow, AliasMoveRow, AliasRow, EventRow, LearnerRow, LearningRow, ServingRow, SnapshotRow, StreamRow}
+    every |= {VersionRow, JobRow}
+    assert {mapper.class_ for mapper in Base.registry.mappers if "model" in mapper.columns} == every
+    with service.database.session() as session:
+        assert all(session.scalars(select(table).where(table.model == arm)).first() for table in every)
+    assert delete(api, arm).status_code == 204
+    with service.database.session() as session:
+        left = {table for table in every if session.scalars(select(table).where(table.model == arm)).first()}
+        assert left == {JobRow}
+        assert session.scalar(select(ModelRow).where(ModelRow.name == arm)) is None
+        assert session.get(DeletedModelRow, arm).last_version == 3
+    assert not any(place.exists() for place in places)
+    assert not list(service.files.learning.glob(f"{kept}*"))
+    assert arm not in service.updates.monitors()
+    assert api.get(f"/v1/jobs/{name}").json()["model"] == arm
+    for answer in (predict(api, arm), predict(api, arm, alias="production"), predict(api, arm, version=1)):
+        error(answer, 404, "not_found")
+    error(api.get(f"/v1/models/{arm}"), 404, "not_found")
+    error(observe(api, arm, 2), 404, "not_found")
+    error(delete(api, arm), 404, "not_found")
+    assert arm not in [each["name"] for each in api.get("/v1/models", params={"limit": 100}).json()["items"]]
+
+
+def test_a_model_of_the_same_name_begins_with_the_next_number(api, arm):
+    observe(api, arm)
+    assert delete(api, arm).status_code == 204
+    assert publish(api, arm) == 4
+    found = predict(api, arm).json()
+    assert (found["version"], found["revision"]) == (4, 0)
+    assert api.get(f"/v1/models/{arm}/aliases").json()["items"][0]["history"][0]["before"] is None
+    assert delete(api, arm).status_code == 204
+    assert publish(api, arm) == 5
+
+
+def test_a_deleted_version_is_not_published_by_who_still_holds_it(api, arm):
+    """A query that has begun keeps its version; a load, a revision or a snapshot that comes late changes nothing."""
+    service = service_of(api)
+    held, row = service.loaded.get(arm, 1), registry.find(service.database, arm, 1)
+    assert delete(api, f"{arm}/versions/1").status_code == 204
+    assert service.loaded.is_deleted(arm, 1)
+    assert service.loaded._publish(held, registry.Serving(1, 99)) is held
+    assert service.loaded.revise(arm, 1, 5, None) is False
+    assert service.loaded.hot(arm, 1) is None
+    assert service.loaded.newest(arm) != 1
+    assert snapshot(api, arm, 1) is None
+    with pytest.raises(NotFoundError, match="no version '1'"):
+        service.loaded._load(row)
+
+
+def test_a_batch_that_was_predicted_by_what_is_deleted_is_not_logged(api, arm):
+    service = service_of(api)
+    served = service.loaded.get(arm, None)
+    ingest = service.updates._ingest
+    monitor, came = service.updates.monitor(arm), SimpleNamespace(rows=1)
+    assert delete(api, arm).status_code == 204
+    with pytest.raises(NotFoundError, match="no model"):
+        ingest.append(monitor, served, None, came, None, {})
+    publish(api, arm)
+    with pytest.raises(ConflictError, match=r"version 3 .* was deleted meanwhile"):
+        ingest.append(monitor, served, None, came, None, {})
+
+
+def test_who_asks_for_a_pointer_is_answered_though_it_moves_and_the_version_before_goes(api, arm, monkeypatch):
+    service = service_of(api)
+    fresh = LoadedModels(service.database, service.files, capacity=2)
+    find = registry.find
+    moved = threading.Event()
+
+    def find_late(database, model, version):
+        if not moved.is_set():  # between the look at the pointer and the look at the version
+            moved.set()
+            api.put(f"/v1/models/{arm}/aliases/serving", json={"version": 1})
+            assert delete(api, f"{arm}/versions/3").status_code == 204
+        return find(database, model, version)
+
+    monkeypatch.setattr(registry, "find", find_late)
+    assert fresh.get(arm, None).version == 1
+
+
+def test_files_that_are_damaged_are_told_from_files_that_were_deleted(api, arm):
+    (folder(api, arm, 1) / "model.safetensors").write_bytes(b"")
+    with pytest.raises(UnreadableVersionError):
+        service_of(api).loaded.get(arm, 1)
+    assert delete(api, f"{arm}/versions/1").status_code == 204
+
+
+def test_the_shipped_model_stays_deleted(home):
+    database, files = Database(home), Files(home)
+    registry.install_shipped(database, files)
+    registry.install_shipped(database, files)
+    with database.session() as session:
+        assert session.scalars(select(VersionRow.version)).all() == [1]
+    with database.transaction() as session:
+        for table in (AliasMoveRow, ServingRow, LearnerRow, VersionRow, ModelRow):
+            session.query(table).delete()
+        session.add(DeletedModelRow(name=registry.SHIPPED, last_version=1, deleted_at=now()))
+    registry.install_shipped(database, files)
+    with database.session() as session:
+        assert session.scalars(select(VersionRow.version)).all() == []
+    database.close()
+
+
+@pytest.mark.parametrize(
+    ("path", "field"), [("nobody", "model"), ("nobody/versions/1", "model"), ("panda-sim/versions/9", "version")]
+)
+def test_what_is_not_there_cannot_be_deleted(api, path, field):
+    assert error(delete(api, path), 404, "not_found")["detail"][0]["field"] == field
