@@ -6,10 +6,9 @@ from collections.abc import Awaitable, Callable
 from typing import NamedTuple
 
 from fastapi import Response
-from fastapi.routing import APIRoute
 from starlette.types import Message, Receive, Scope, Send
 
-JSON, OCTETS = b"application/json", b"application/octet-stream"
+from service.route import JSON, Route, check_query
 
 
 class Reply(NamedTuple):
@@ -39,18 +38,19 @@ Answerer = Callable[[Scope, bytes], Awaitable[Reply | None]]
 """Answers a request from its scope and body, or None where it is not as usual; an error it raises is the answer."""
 
 
-def hot_route(answer: Answerer) -> type[APIRoute]:
+def hot_route(answer: Answerer) -> type[Route]:
     """Make a route class whose POST requests `answer` sees first.
 
     What it does not answer goes on to the endpoint as if it had not been seen. So the endpoint is what explains a
     wrong request, and its signature is what documents the route; `answer` only has to know a right one.
     """
 
-    class HotRoute(APIRoute):
+    class HotRoute(Route):
         async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
             if scope["method"] != "POST":
                 await super().handle(scope, receive, send)
                 return
+            check_query(scope)
             body = await _read(receive)
             if body is None:  # the client went away
                 return
@@ -62,17 +62,6 @@ def hot_route(answer: Answerer) -> type[APIRoute]:
             await send({"type": "http.response.body", "body": reply.body})
 
     return HotRoute
-
-
-def media_type(scope: Scope) -> bytes:
-    """The content-type of a request, empty where none is given."""
-    return next((value for name, value in scope["headers"] if name == b"content-type"), b"")
-
-
-def is_json(scope: Scope) -> bool:
-    """Whether the body is announced as JSON, in one of the usual ways."""
-    given = media_type(scope)
-    return given == JSON or given.partition(b";")[0].strip().lower() == JSON
 
 
 async def _read(receive: Receive) -> bytes | None:

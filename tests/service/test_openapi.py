@@ -65,9 +65,20 @@ def test_every_route_of_the_design_is_there(operations):
         "GET /v1/jobs",
         "GET /v1/jobs/{job}",
         "POST /v1/jobs/{job}/cancel",
+        "GET /v1/jobs/{job}/events",
+        "POST /v1/jobs/{job}/retry",
         "GET /v1/models",
         "GET /v1/models/{model}",
+        "DELETE /v1/models/{model}",
         "GET /v1/models/{model}/versions/{version}",
+        "DELETE /v1/models/{model}/versions/{version}",
+        "GET /v1/models/{model}/aliases",
+        "PUT /v1/models/{model}/aliases/{alias}",
+        "DELETE /v1/models/{model}/aliases/{alias}",
+        "POST /v1/models/{model}/aliases/{alias}/rollback",
+        "POST /v1/models/{model}/compare",
+        "GET /v1/models/{model}/export",
+        "POST /v1/models/import",
         "POST /v1/models/{model}/predict",
         "POST /v1/models/{model}/evaluate",
         "POST /v1/models/{model}/observations",
@@ -160,8 +171,18 @@ def test_every_documented_error_has_the_one_shape(operations):
         ("POST /v1/jobs", {404, 413, 422, 429}),
         ("GET /v1/jobs/{job}", {404}),
         ("POST /v1/jobs/{job}/cancel", {404, 409}),
+        ("POST /v1/jobs/{job}/retry", {404, 409, 429}),
+        ("GET /v1/jobs/{job}/events", {404}),
         ("GET /v1/models/{model}", {404}),
         ("GET /v1/models/{model}/versions/{version}", {404, 422}),
+        ("DELETE /v1/models/{model}", {404, 409}),
+        ("DELETE /v1/models/{model}/versions/{version}", {404, 409, 422}),
+        ("PUT /v1/models/{model}/aliases/{alias}", {404, 409, 413, 422, 500}),
+        ("DELETE /v1/models/{model}/aliases/{alias}", {404, 409, 422}),
+        ("POST /v1/models/{model}/aliases/{alias}/rollback", {404, 409, 422, 500}),
+        ("POST /v1/models/{model}/compare", {404, 413, 422, 500}),
+        ("GET /v1/models/{model}/export", {404, 422, 500}),
+        ("POST /v1/models/import", {413, 415, 422}),
         ("POST /v1/models/{model}/predict", {404, 413, 422}),
         ("POST /v1/models/{model}/evaluate", {404, 413, 422}),
         ("POST /v1/models/{model}/observations", {404, 409, 413, 422, 429}),
@@ -188,12 +209,34 @@ def test_errors_that_a_route_answers_are_documented(operations, operation, statu
     assert {str(status) for status in statuses} <= set(operations[operation]["responses"])
 
 
+def test_errors_that_any_route_answers_are_documented_at_each(operations):
+    for name, operation in operations.items():
+        answered = set(operation["responses"])
+        wrong = "400" if " /v2" in name else "422"
+        assert {wrong, "403", "429", "500", "503"} <= answered, name
+        assert ("401" in answered) != name.endswith(("/health/live", "/health/ready")), name
+        assert ("requestBody" in operation) == ("408" in answered) == ("413" in answered) == ("415" in answered), name
+        stores = not name.startswith("GET") and not name.endswith(
+            ("/predict", "/evaluate", "/compare", "/echo", "/infer")
+        )
+        assert ("507" in answered) == stores, name
+
+
+def test_error_codes_are_in_the_description(document):
+    description = document["info"]["description"]
+    for code in ("not_found", "method_not_allowed", "expired", "learning_disabled", "storage_full", "internal_error"):
+        assert f"`{code}`" in description
+
+
 def test_requests_have_examples(document, operations):
     bodies = {name: operation["requestBody"] for name, operation in operations.items() if "requestBody" in operation}
     assert set(bodies) == {
         "POST /v1/datasets",
         "POST /v1/robots",
         "POST /v1/jobs",
+        "POST /v1/models/import",
+        "PUT /v1/models/{model}/aliases/{alias}",
+        "POST /v1/models/{model}/compare",
         "POST /v1/models/{model}/predict",
         "POST /v1/models/{model}/evaluate",
         "POST /v1/models/{model}/observations",
@@ -210,7 +253,8 @@ def test_requests_have_examples(document, operations):
         media = next(iter(body["content"].values()))
         schema = media["schema"]
         schema = resolve(document, schema["$ref"]) if "$ref" in schema else schema
-        assert media.get("example") or schema.get("examples"), name
+        binary = schema.get("format") == "binary"  # an archive, which no page can show
+        assert media.get("example") or schema.get("examples") or binary, name
 
 
 def test_the_example_of_a_query_is_answered(api, document):

@@ -1,0 +1,112 @@
+"""Uploads that are refused before, or because of, what is in them."""
+
+from __future__ import annotations
+
+from tests.service.bad_requests.bad import DATASETS, ROBOTS, Bad
+
+CSV, NPZ, XML, FORM = "text/csv", "application/x-npz", "application/xml", "multipart/form-data; boundary=x"
+IMPORT, TAR = "/v1/models/import", "application/x-tar"
+NO_NAMES = (
+    "",
+    "%20",
+    "%0A",
+    "a%00",
+    "%1B[31ma",
+    "a%E2%80%AEvsc",
+    "a%E2%80%8Bb",
+    "%EF%BB%BFa",
+    "a%E2%80%A8b",
+    "a%C2%85",
+    "a" * 201,
+)
+"""What is no name for people."""
+
+
+def upload(
+    path: str, content: bytes, named: str | None, kind: str = CSV, code: str = "invalid_data", status: int = 422
+) -> Bad:
+    return Bad("POST", path, status, code, named, content, {"content-type": kind} if kind else {})
+
+
+def form(file_name: bytes, content: bytes = b"", field: bytes = b"file") -> bytes:
+    disposition = b'form-data; name="%b"' % field + (b'; filename="%b"' % file_name if file_name else b"")
+    return b"--x\r\nContent-Disposition: " + disposition + b"\r\n\r\n" + content + b"\r\n--x--\r\n"
+
+
+def parameter(path: str, query: str, named: str, kind: str = CSV) -> Bad:
+    return upload(f"{path}?{query}", b"t,q1\n", named, kind, "invalid_request")
+
+
+BAD: list[Bad] = [
+    *(parameter(DATASETS, f"name={name}", "name") for name in NO_NAMES),
+    *(parameter(ROBOTS, f"name={name}", "name", XML) for name in NO_NAMES),
+    *(
+        parameter(DATASETS, f"cutoff={value}", "cutoff")
+        for value in ("0", "-1", "nan", "inf", "1e400", "1001", "x", "")
+    ),
+    *(
+        parameter(DATASETS, f"torque_convention={value}", "torque_convention")
+        for value in ("", "gravity", "GRAVITY_INCLUDED")
+    ),
+    parameter(DATASETS, f"joint_names={'a' * 4001}", "joint_names"),
+    parameter(DATASETS, "joint_name=a", "joint_name"),
+    parameter(DATASETS, "name=a&name=b", "name"),
+    parameter(ROBOTS, "joint_names=a", "joint_names", XML),
+    *(
+        upload(path, b"{}", "content-type", kind, "unsupported_media_type", 415)
+        for path in (DATASETS, ROBOTS, IMPORT)
+        for kind in ("", "application/json", "text/plain", "application/octet-stream", "text/csvx", "*/*", "a" * 500)
+    ),
+    *(
+        upload(path, form(name), "file name", FORM, "unsupported_media_type", 415)
+        for path in (DATASETS, ROBOTS)
+        for name in (b"data.xlsx", b"data", b".csv.exe", b"../data.sh")
+    ),
+    upload(DATASETS, form("a\u202evsc.csv".encode()), "file name", FORM, "invalid_request"),
+    upload(DATASETS, form(b"a\x07.csv"), "file name", FORM, "invalid_request"),
+    upload(DATASETS, form(b""), "file", FORM, "invalid_request"),
+    upload(DATASETS, form(b"a.csv", field=b"data"), "file", FORM, "invalid_request"),
+    upload(ROBOTS, form(b""), "file", FORM, "invalid_request"),
+    upload(DATASETS, b"garbage", "body", FORM, "invalid_request"),
+    upload(DATASETS, b"--x\r\n", None, FORM, "invalid_request"),
+    upload(DATASETS, form(b"a.csv"), "content-type", "multipart/form-data", "invalid_request"),
+    *(
+        upload(DATASETS, content, None)
+        for content in (b"", b"\n", b"q1,tau1\n", b"\x00" * 100, b"q1;tau1\n1;2\n", b"\xff\xfe")
+    ),
+    *(upload(DATASETS, content, None, NPZ) for content in (b"", b"PK\x03\x04", b"\x93NUMPY", b"not a zip")),
+    *(
+        upload(ROBOTS, content, "urdf", XML)
+        for content in (
+            b"",
+            b"<robot",
+            b"<html/>",
+            b"\xff",
+            b'<robot name="a"/>',
+            b'<!DOCTYPE r [<!ENTITY a "b">]><robot name="&a;"/>',
+            b'<!DOCTYPE r SYSTEM "file:///etc/passwd"><robot name="a"/>',
+        )
+    ),
+    *(
+        upload(IMPORT, content, None, TAR)
+        for content in (b"", b"\0" * 1024, b"garbage", b"\x1f\x8b\x08", b"PK\x03\x04")
+    ),
+    *(
+        parameter(IMPORT, f"name={name}", "name", TAR)
+        for name in ("", "A", "a%20b", "..", "a%2fb", "a%E2%80%AEb", "a" * 65)
+    ),
+    upload(IMPORT, form(b"a.zip"), "file name", FORM, "unsupported_media_type", 415),
+    upload(ROBOTS, b" " * (2 * 2**20 + 1), None, XML, "too_large", 413),
+    *(
+        Bad(
+            "POST",
+            path,
+            415,
+            "unsupported_media_type",
+            "Content-Encoding",
+            b"",
+            {"content-type": kind, "content-encoding": "gzip"},
+        )
+        for path, kind in ((DATASETS, CSV), (ROBOTS, XML))
+    ),
+]

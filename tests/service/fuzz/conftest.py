@@ -1,0 +1,84 @@
+"""A service to send generated requests to, and what has come of them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from math import inf
+from typing import Any
+
+import pytest
+import schemathesis
+from fastapi.testclient import TestClient
+
+from service.app import create_app
+from service.observability import readiness
+from service.settings import Settings
+from tests.service.data import ADDRESS, service_of, stream, upload
+from tests.service.fuzz.document import fitting, narrowed
+from tests.service.test_robots import urdf
+
+TALLY: Counter[tuple[str, int]] = Counter()
+"""Generated requests by operation and status of the answer, of the whole session."""
+
+
+@dataclass
+class Fuzzed:
+    """A service and the document that requests are made from: as it is, with what is there in paths, and in bodies."""
+
+    client: TestClient
+    document: Any
+    narrowed: Any
+    fitting: Any
+    tally: Counter[tuple[str, int]] = field(default_factory=lambda: TALLY)
+
+
+@pytest.fixture(scope="module")
+def fuzzed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fuzzed]:
+    """A service whose jobs stay queued: it is its answers that count."""
+    settings = Settings(home=tmp_path_factory.mktemp("fuzzed"), max_queued_jobs=10_000)
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        TestClient(create_app(settings), ADDRESS, raise_server_exceptions=False) as client,
+    ):
+        patch.setattr(service_of(client).jobs, "submit", lambda job: None)
+        patch.setattr(readiness, "START_S", inf)  # it is ready although none of these jobs ever starts
+        known = {
+            "model": ["panda-sim"],
+            "version": [1],
+            "dataset": [upload(client, stream())["id"]],
+            "robot": [_robot(client)],
+            "stream_id": ["cell-3"],
+            "sequence": [0],
+            "alias": ["serving", "best"],
+        }
+        known["job"] = [_job(client, known["dataset"][0])]
+        document = client.get("/openapi.json").json()
+        batch = document["components"]["schemas"]["ObservationRequest"]["examples"][0]
+        assert client.post("/v1/models/panda-sim/observations", json=batch).status_code == 200
+        read = schemathesis.openapi.from_dict
+        yield Fuzzed(client, read(document), read(narrowed(document, known)), read(fitting(document, known, joints=7)))
+
+
+def _robot(client: TestClient) -> str:
+    answer = client.post("/v1/robots", content=urdf(), headers={"content-type": "application/xml"})
+    assert answer.status_code == 201, answer.text
+    return str(answer.json()["id"])
+
+
+def _job(client: TestClient, dataset: str) -> str:
+    answer = client.post("/v1/jobs", json={"model": "fuzzed", "datasets": [dataset]})
+    assert answer.status_code == 202, answer.text
+    return str(answer.json()["id"])
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say how many generated requests there were, and how they were answered."""
+    if TALLY:
+        statuses: Counter[int] = Counter()
+        for (_, status), count in TALLY.items():
+            statuses[status] += count
+        answered = ", ".join(f"{count} x {status}" for status, count in sorted(statuses.items()))
+        operations = len({operation for operation, _ in TALLY})
+        terminalreporter.write_line(f"generated requests: {TALLY.total()} to {operations} operations: {answered}")

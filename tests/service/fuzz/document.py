@@ -1,0 +1,45 @@
+"""The OpenAPI document narrowed to what is there, so that generated requests get beyond "not found"."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from typing import Any
+
+METHODS = ("get", "put", "post", "delete")
+NUMBERS = ("q", "dq", "ddq", "tau")
+
+
+def narrowed(document: dict[str, Any], known: dict[str, list[Any]]) -> dict[str, Any]:
+    """Let parameters of these names be among the values that are known."""
+    document = deepcopy(document)
+    for path, operations in document["paths"].items():
+        for method in METHODS:
+            for parameter in operations.get(method, {}).get("parameters", []):
+                if parameter["name"] in known and (method, path) != ("delete", "/v1/models/{model}"):
+                    parameter["schema"] = {"enum": known[parameter["name"]]}
+    return document
+
+
+def fitting(document: dict[str, Any], known: dict[str, list[Any]], joints: int) -> dict[str, Any]:
+    """Let also fields of bodies be among the values that are known, and motions fit a robot."""
+    document = narrowed(document, known)
+    row = {"type": "array", "items": {"type": "number", "minimum": -3, "maximum": 3}}
+    row |= {"minItems": joints, "maxItems": joints}
+    fields = {name: {"enum": values} for name, values in known.items()} | dict.fromkeys(NUMBERS, row)
+    fields["datasets"] = {"type": "array", "items": {"enum": known["dataset"]}, "minItems": 1, "maxItems": 1}
+    for schema in _bodies(document):
+        properties = schema.get("properties", {})
+        properties |= {name: fields[name] for name in properties if name in fields}
+    return document
+
+
+def _bodies(document: dict[str, Any]) -> list[dict[str, Any]]:
+    """Schemas of JSON bodies of requests."""
+    found = []
+    for operations in document["paths"].values():
+        for method in METHODS:
+            content = operations.get(method, {}).get("requestBody", {}).get("content", {})
+            reference = content.get("application/json", {}).get("schema", {}).get("$ref")
+            if reference is not None:
+                found.append(document["components"]["schemas"][reference.rpartition("/")[2]])
+    return found

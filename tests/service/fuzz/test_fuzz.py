@@ -1,0 +1,85 @@
+"""Generated requests to every operation of the OpenAPI document: answers are as documented, and never a failure."""
+
+from __future__ import annotations
+
+import pytest
+import requests
+from hypothesis import HealthCheck, Phase, given, settings
+from schemathesis import GenerationMode
+from schemathesis.checks import CHECKS, load_all_checks
+
+from tests.service.data import ADDRESS
+
+FEW, MANY = 3, 60
+"""Requests of each operation in each way."""
+NAMES = (
+    "not_a_server_error",
+    "status_code_conformance",
+    "content_type_conformance",
+    "response_headers_conformance",
+    "response_schema_conformance",
+    "negative_data_rejection",
+)
+ENDLESS = ("GET /v1/jobs/{job}/events",)
+"""Answers that end with the job: of one that stays queued, never."""
+ANYTHING = ("POST /v1/echo",)
+"""Operations that take any body."""
+WAYS = {
+    "what is there": ("fitting", GenerationMode.POSITIVE),
+    "anything documented": ("document", GenerationMode.POSITIVE),
+    "what is not documented": ("narrowed", GenerationMode.NEGATIVE),
+}
+
+
+def checks():
+    load_all_checks()
+    return [CHECKS.get_one(name) for name in NAMES]
+
+
+def operations(fuzzed, part, mode):
+    """Every operation that there are requests of, deletions last: what they delete, others ask for."""
+    found = [result.ok() for result in getattr(fuzzed, part).get_all_operations()]
+    if part == "fitting":
+        found = [one for one in found if one.label not in ENDLESS]
+    if mode is GenerationMode.NEGATIVE:  # nothing is wrong with a path that leads to nothing
+        found = [one for one in found if (one.query or one.body) and one.label not in ANYTHING]
+    return sorted(found, key=lambda one: one.method == "delete")
+
+
+def send(client, case):
+    """Send a request as schemathesis would, bytes and all."""
+    prepared = requests.Request(**case.as_transport_kwargs(base_url=ADDRESS)).prepare()
+    return client.request(prepared.method, prepared.url, content=prepared.body, headers=dict(prepared.headers))
+
+
+def fuzz(fuzzed, subtests, way, count):
+    (part, mode), chosen = WAYS[way], checks()
+    for operation in operations(fuzzed, part, mode):
+
+        @settings(
+            max_examples=count,
+            database=None,
+            derandomize=True,
+            deadline=None,
+            phases=[Phase.generate],
+            suppress_health_check=list(HealthCheck),
+        )
+        @given(case=operation.as_strategy(generation_mode=mode))
+        def run(case):
+            answer = send(fuzzed.client, case)
+            fuzzed.tally[case.operation.label, answer.status_code] += 1
+            case.validate_response(answer, checks=chosen)
+
+        with subtests.test(operation.label):
+            run()
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_answers_to_generated_requests(fuzzed, subtests, way):
+    fuzz(fuzzed, subtests, way, FEW)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", WAYS)
+def test_answers_to_many_generated_requests(fuzzed, subtests, way):
+    fuzz(fuzzed, subtests, way, MANY)

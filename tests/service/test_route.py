@@ -1,0 +1,122 @@
+"""What all routes refuse alike: that they are of the one class, and its reader of JSON."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from fastapi.routing import APIRoute, iter_route_contexts
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.errors import InvalidRequestError, problem, readable
+from service.inference.wire import decode
+from service.route import Route, each_once, read_json
+from service.updates.ingest import wire as observations
+from tests.service.data import error, service_of
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
+    lambda below: st.lists(below, max_size=4) | st.dictionaries(st.text(), below, max_size=4),
+    max_leaves=12,
+)
+DOCUMENTATION = {"/docs", "/docs/oauth2-redirect"}
+
+
+def test_every_route_is_of_the_class_that_checks_requests(api):
+    routes = [found.original_route for found in iter_route_contexts(api.app.routes)]
+    unchecked = {route.path for route in routes if isinstance(route, APIRoute) and not isinstance(route, Route)}
+    assert unchecked == DOCUMENTATION
+    assert sum(isinstance(route, Route) for route in routes) > 40
+
+
+@given(VALUES)
+def test_json_is_read_as_python_reads_it(value):
+    assert read_json(json.dumps(value).encode()) == value
+    text = json.dumps(value, ensure_ascii=False).encode(errors="surrogatepass")
+    try:
+        text.decode()
+    except UnicodeDecodeError:
+        with pytest.raises(InvalidRequestError, match="not UTF-8"):
+            read_json(text)
+    else:
+        assert read_json(text) == value
+
+
+@given(st.dictionaries(st.text(), VALUES, min_size=1, max_size=4), st.data())
+def test_a_field_that_comes_twice_is_named(value, data):
+    name = data.draw(st.sampled_from(sorted(value)))
+    members = [*value.items(), (name, data.draw(VALUES))]
+    text = "{" + ", ".join(f"{json.dumps(key)}: {json.dumps(item)}" for key, item in members) + "}"
+    for wrong in (text, f"[{text}]", f'{{"options": {text}}}'):
+        with pytest.raises(InvalidRequestError) as raised:
+            read_json(wrong.encode())
+        assert raised.value.detail == [problem(name, "given twice", "each field once")]
+
+
+def test_fields_are_counted_once():
+    assert each_once(b'{"q": [0], "dq": [0]}', b"q", b"dq")
+    assert each_once(b'{"dq": [0]}', b"q", b"dq")
+    assert not each_once(b'{"q": [0], "dq": [0], "q": 0}', b"q", b"dq")
+    assert not each_once(b'{"q": [0], "\\u0071": [0]}', b"q", b"dq")
+
+
+@pytest.mark.parametrize("twice", ['"q": [1], ', '"\\u0071": [1], ', '"version": 1, "version": 1, '])
+def test_the_readers_of_hot_routes_leave_a_field_that_comes_twice_to_the_one_that_explains_it(twice):
+    query = '{%s"q": [0], "dq": [0], "ddq": [0]}'
+    assert decode((query % "").encode()) is not None
+    assert decode((query % twice).encode()) is None
+    batch = '{%s"stream_id": "a", "sequence": 0, "q": [0], "dq": [0], "ddq": [0], "tau": [0]}'
+    assert observations.decode((batch % "").encode()) is not None
+    assert observations.decode((batch % twice).encode()) is None
+
+
+@pytest.mark.parametrize("media_type", ["application/json", "Application/JSON ; charset=utf-8", "application/ld+json"])
+def test_json_by_its_names(api, media_type):
+    answer = api.post("/v1/jobs", content=b"{}", headers={"content-type": media_type})
+    assert error(answer, 422, "invalid_request")["detail"][0]["field"] == "model"
+
+
+@given(st.text())
+def test_what_is_shown_can_be_shown_and_tells_texts_apart(text):
+    shown = readable(text)
+    assert shown.isprintable()
+    assert shown.encode().decode() == shown
+    if text.isprintable():
+        assert shown == text
+
+
+def test_values_that_are_large_or_deep_are_shown_in_short():
+    deep = []
+    for _ in range(5000):
+        deep = [deep]
+    for value in (deep, [deep] * 3, ["x" * 10**6] * 1000, {"a": deep}, list(range(10**6))):
+        assert len(problem("q", value, "a number").value) <= 201
+
+
+def test_the_page_of_error_codes_is_what_the_document_says(api):
+    page = (Path(__file__).parents[2] / "docs/errors.md").read_text()
+    description = api.get("/openapi.json").json()["info"]["description"]
+    table = page[page.index("| status |") :]
+    assert table in description, "run: python docs/errors.py"
+    assert len(table.splitlines()) > 20
+
+
+@pytest.mark.parametrize(("path", "kind"), [("/v1/jobs", b"application/json"), ("/v1/datasets", b"text/csv")])
+def test_a_client_that_goes_away_is_no_failure(api, caplog, path, kind):
+    arriving = iter([{"type": "http.request", "body": b"{", "more_body": True}, {"type": "http.disconnect"}])
+    sent = []
+
+    async def receive():
+        return next(arriving)
+
+    async def send(part):
+        sent.append(part)
+
+    headers = [(b"host", b"localhost"), (b"content-type", kind)]
+    scope = {"type": "http", "method": "POST", "path": path, "headers": headers, "query_string": b""}
+    api.portal.call(api.app, scope | {"root_path": "", "client": None}, receive, send)
+    assert sent[0]["status"] == 422
+    assert "unexpected error" not in caplog.text
+    assert list(service_of(api).files.uploads.iterdir()) == []
