@@ -1,0 +1,263 @@
+"""What failing storage is called: errors that databases and operating systems really make, and what a client hears."""
+
+from __future__ import annotations
+
+import errno
+import os
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy import create_engine, event, text
+from sqlalchemy.exc import DBAPIError
+
+from service.app import create_app
+from service.database.engine import FILE, Database
+from service.errors import ServiceError, StorageFullError, StorageUnavailableError
+from service.files import Files
+from service.home import HomeError, check_home
+from service.settings import Settings
+from service.storage_errors import translated
+from tests.service.data import arrays, error, npz, service_of, stream
+from tests.service.faults.storage import small_disk
+from tests.service.test_robots import urdf
+
+ZERO = {name: [0.0] * 7 for name in ("q", "dq", "ddq")}
+
+
+def failed(path: Path, *statements: str, readonly: bool = False) -> DBAPIError:
+    """The error of statements on a database, the last of which fails."""
+    engine = create_engine(
+        f"sqlite:///file:{path}?mode={'ro' if readonly else 'rwc'}&uri=true", connect_args={"timeout": 0}
+    )
+
+    def run() -> None:
+        with engine.connect() as connection:
+            for statement in statements:
+                connection.execute(text(statement))
+
+    with pytest.raises(DBAPIError) as found:
+        run()
+    engine.dispose()
+    return found.value
+
+
+def made(path: Path) -> Path:
+    """A small database."""
+    with closing(sqlite3.connect(path)) as database:
+        database.executescript("CREATE TABLE t (x PRIMARY KEY); INSERT INTO t VALUES (1)")
+    return path
+
+
+def locked(path: Path) -> DBAPIError:
+    with closing(sqlite3.connect(made(path), isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        return failed(path, "INSERT INTO t VALUES (2)")
+
+
+def full(path: Path) -> DBAPIError:
+    return failed(made(path), "PRAGMA max_page_count = 3", "INSERT INTO t VALUES (zeroblob(100000))")
+
+
+def damaged(path: Path) -> DBAPIError:
+    made(path)
+    content = bytearray(path.read_bytes())
+    content[4096:] = os.urandom(len(content) - 4096)
+    path.write_bytes(content)
+    return failed(path, "SELECT x FROM t WHERE x = 1")
+
+
+def no_database(path: Path) -> DBAPIError:
+    path.write_bytes(b"no database" * 1000)
+    return failed(path, "SELECT 1 FROM t")
+
+
+def readonly(path: Path) -> DBAPIError:
+    return failed(made(path), "INSERT INTO t VALUES (2)", readonly=True)
+
+
+def folder(path: Path) -> DBAPIError:
+    path.mkdir()
+    return failed(path, "SELECT 1")
+
+
+def twice(path: Path) -> DBAPIError:
+    return failed(made(path), "INSERT INTO t VALUES (1)")
+
+
+@pytest.mark.parametrize(
+    ("fail", "expected", "said"),
+    [
+        (locked, StorageUnavailableError, "locked by another writer"),
+        (full, StorageFullError, "full"),
+        (damaged, StorageUnavailableError, "damaged"),
+        (no_database, StorageUnavailableError, "damaged"),
+        (readonly, StorageUnavailableError, "readonly"),
+        (folder, StorageUnavailableError, "unable to open"),
+        (twice, None, ""),
+    ],
+)
+def test_errors_of_the_database(tmp_path, fail: Callable, expected: type[ServiceError] | None, said: str):
+    found = translated(fail(tmp_path / "database"))
+    assert type(found) is (expected or type(None))
+    assert found is None or said in found.message
+
+
+def test_a_device_without_space_is_a_full_disk():
+    with pytest.raises(OSError, match="No space left") as found, open("/dev/full", "wb", buffering=0) as file:
+        file.write(b"0")
+    assert type(translated(found.value)) is StorageFullError
+
+
+@pytest.mark.parametrize(
+    ("number", "expected"),
+    [
+        (errno.EDQUOT, StorageFullError),
+        (errno.EFBIG, StorageFullError),
+        (errno.EROFS, StorageUnavailableError),
+        (errno.EIO, StorageUnavailableError),
+        (errno.EACCES, StorageUnavailableError),
+        (errno.EMFILE, StorageUnavailableError),
+        (errno.ECONNRESET, None),
+        (errno.ENOENT, None),
+    ],
+)
+def test_errors_of_the_operating_system(number, expected):
+    assert type(translated(OSError(number, os.strerror(number)))) is (expected or type(None))
+
+
+@pytest.mark.parametrize("unexpected", [ValueError("no"), OSError("without a number"), KeyError("x")])
+def test_other_errors_say_nothing_of_storage(unexpected):
+    assert translated(unexpected) is None
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory) -> Iterator[TestClient]:
+    """A service whose requests do not wait for the database for long."""
+    settings = Settings(home=tmp_path_factory.mktemp("storage"), database_timeout_s=0.1)
+    with TestClient(create_app(settings), "http://127.0.0.1", raise_server_exceptions=False) as api:
+        yield api
+
+
+def uploaded(api):
+    body = npz(**arrays(stream(samples=60)))
+    return api.post("/v1/datasets", content=body, headers={"content-type": "application/x-npz"})
+
+
+def robot(api):
+    return api.post("/v1/robots", content=urdf("late"), headers={"content-type": "application/xml"})
+
+
+def alias(api):
+    return api.put("/v1/models/panda-sim/aliases/production", json={"version": 1})
+
+
+def still_answers(api):
+    assert api.post("/v1/models/panda-sim/predict", json=ZERO).status_code == 200
+    for path in ("/v1/models", "/v1/datasets", "/health/live"):
+        assert api.get(path).status_code == 200
+
+
+def files(api):
+    return [path for path in service_of(api).settings.home.glob("[du]*/*") if path.is_file()]
+
+
+def test_while_another_process_writes_requests_are_told_to_come_again(service):
+    with closing(sqlite3.connect(service_of(service).settings.home / FILE, isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        for ask in (uploaded, robot, alias):
+            answer = ask(service)
+            error(answer, 503, "storage_unavailable")
+            assert answer.headers["retry-after"] == "1"
+        still_answers(service)
+        assert files(service) == []  # of what was refused
+    for ask, status in ((uploaded, 201), (robot, 201), (alias, 200)):
+        assert ask(service).status_code == status
+    for each in service.get("/v1/datasets").json()["items"]:
+        assert service.delete(f"/v1/datasets/{each['id']}").status_code == 204
+
+
+def test_a_full_database_is_said_to_be_full_and_keeps_what_it_has(service):
+    engine = service_of(service).database.engine
+
+    def no_page_more(connection, *_):
+        connection.execute("PRAGMA max_page_count = 1")
+
+    event.listen(engine, "checkout", no_page_more)
+    try:
+        with closing(sqlite3.connect(service_of(service).settings.home / FILE, isolation_level=None)) as other:
+            other.execute("CREATE TABLE ballast (x)")
+        answers = [service.post("/v1/robots", content=_large(), headers={"content-type": "application/xml"})]
+        answers += [service.post("/v1/robots", content=_large(), headers={"content-type": "application/xml"})]
+        error(answers[-1], 507, "storage_full")
+        still_answers(service)
+    finally:
+        event.remove(engine, "checkout", no_page_more)
+    with engine.connect() as connection:
+        connection.execute(text("PRAGMA max_page_count = 1000000"))
+    engine.dispose()
+    answer = service.post("/v1/robots", content=_large(), headers={"content-type": "application/xml"})
+    assert answer.status_code == 201
+
+
+def _large() -> bytes:
+    """A URDF that needs many pages."""
+    return urdf("large").replace(b"</robot>", b"<!--" + b"x" * 500_000 + b"--></robot>")
+
+
+def test_what_does_not_fit_leaves_nothing_on_a_full_disk(tmp_path):
+    files = Files(tmp_path)
+    (files.learning / "snap_1.draft").symlink_to("/dev/full")
+    with pytest.raises(OSError, match="No space left"):
+        files.write_snapshot("snap_1", b"0" * 10_000)
+    assert list(files.learning.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_no_service_starts_on_a_disk_that_can_only_be_read(tmp_path):
+    with small_disk(tmp_path / "disk", 1 << 23) as mounted:
+        if not mounted:
+            pytest.skip("this process may not mount a disk")
+        Database(tmp_path / "disk" / "home").close()
+        subprocess.run(["mount", "-o", "remount,ro", str(tmp_path / "disk")], check=True)
+        with pytest.raises(HomeError, match=r"expected a folder that the service may write to: Read-only file system"):
+            check_home(Settings(home=tmp_path / "disk" / "home"))
+
+
+def test_no_service_starts_where_there_can_be_no_folder(tmp_path):
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(HomeError, match=r"home is '.*file/home', expected a folder that .*: Not a directory"):
+        check_home(Settings(home=tmp_path / "file" / "home"))
+
+
+def test_no_service_starts_on_the_database_of_a_later_release(tmp_path):
+    database = Database(tmp_path)
+    with database.transaction() as session:
+        session.execute(text("UPDATE alembic_version SET version_num = '9999'"))
+    database.close()
+    with pytest.raises(HomeError, match=r"a later release of LIPServe has used this home"):
+        check_home(Settings(home=tmp_path))
+
+
+def test_no_service_starts_while_another_process_writes_all_the_time(tmp_path):
+    Database(tmp_path).close()
+    with closing(sqlite3.connect(tmp_path / FILE, isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        with pytest.raises(HomeError, match="database is locked"):
+            check_home(Settings(home=tmp_path, database_timeout_s=0.1))
+    check_home(Settings(home=tmp_path))
+
+
+def test_a_service_says_why_it_cannot_start(tmp_path):
+    (tmp_path / FILE).write_bytes(b"no database" * 1000)
+    command = [sys.executable, "-m", "service", "serve", "--port", "0"]
+    environment = {**os.environ, "LIPSERVE_HOME": str(tmp_path)}
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert ended.returncode == 1
+    assert ended.stderr.startswith(f"error: the database {tmp_path / FILE} cannot be used: file is not a database.")
+    assert "Traceback" not in ended.stderr
