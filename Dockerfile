@@ -31,10 +31,9 @@ ENV PATH=/opt/lipserve/bin:$PATH \
     PYTHONUNBUFFERED=1 \
     NUMBA_CACHE_DIR=/opt/numba \
     LIPSERVE_HOME=/data \
-    LIPSERVE_HOST=0.0.0.0 \
-    LIPSERVE_INSECURE=1
-# LIPSERVE_INSECURE: a container must listen on all its addresses to be reached; publish the port to loopback only
-# (-p 127.0.0.1:8000:8000) or behind a proxy that checks who asks
+    LIPSERVE_HOST=0.0.0.0
+# a container listens on all its addresses to be reached, so the service asks for API keys; make the first one with
+# `docker exec CONTAINER lipserve keys create --name admin --scope admin`
 VOLUME /data
 EXPOSE 8000
 USER lipserve

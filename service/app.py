@@ -5,16 +5,21 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, nullcontext
 
 import torch
 from anyio import CapacityLimiter, to_thread
 from fastapi import FastAPI
 from fastapi_offline import FastAPIOffline
 from sqlalchemy import select
+from starlette.routing import BaseRoute
 from threadpoolctl import threadpool_limits
 
-from service import __version__, errors, health
+from service import __version__, errors, health, openapi, storage_errors
+from service.access import openapi as access
+from service.access.keyring import Keyring
+from service.access.local import LocalAccess
+from service.access.middleware import KeyAccess
 from service.context import Service
 from service.database import Database, DatasetRow, SnapshotRow, VersionRow
 from service.datasets import routes as datasets
@@ -24,8 +29,18 @@ from service.inference import echo
 from service.inference import routes as inference
 from service.inference.loaded import LoadedModels
 from service.limits import BodyLimit
+from service.limits.disk import Disk
+from service.limits.gate import Gate
+from service.limits.rate import RateLimit
+from service.limits.stopping import Stopping
+from service.models import archive_routes as archives
 from service.models import registry
 from service.models import routes as models
+from service.observability import routes as metrics
+from service.observability import tracing
+from service.observability.meters import Meters
+from service.observability.request_log import RequestLog
+from service.observability.requests import RequestContext
 from service.oip import routes as oip
 from service.robots import routes as robots
 from service.settings import Settings
@@ -34,7 +49,6 @@ from service.training import routes as training
 from service.training.queue import JobQueue
 from service.updates import routes as observations
 from service.updates.control import routes as control
-from service.updates.quality import metrics
 from service.updates.refreshing import routes as refreshing
 from service.updates.refreshing.wiring import attach
 from service.updates.updates import Updates
@@ -54,22 +68,27 @@ Errors are `{"error": {code, message, detail}}`, below /v2 `{"error": message}` 
 def create_app(settings: Settings | None = None) -> FastAPI:
     """Build the application. Nothing is opened before it starts."""
     settings = settings or Settings()
+    stopping, meters = Stopping(), Meters(settings.max_metric_models)
+    keyring = Keyring(settings.keys_refresh_s) if settings.keys_needed else None
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         lock = hold_home(settings.home)
         torch.set_num_threads(settings.serving_threads)  # here, for this thread and those that come later
-        service = await to_thread.run_sync(_open, settings)
+        service = await to_thread.run_sync(_open, settings, stopping, meters)
         threadpool_limits(settings.serving_threads)  # of BLAS, whose libraries the models have brought in
         app.state.service = service
         try:
-            yield
+            async with nullcontext() if keyring is None else keyring.watching(service.database):
+                yield
         finally:
-            await to_thread.run_sync(service.updates.close)
-            service.jobs.close()
-            service.database.close()
-            lock.close()
+            async with AsyncExitStack() as rest:
+                rest.callback(lock.close)
+                rest.callback(service.database.close)
+                rest.push_async_callback(to_thread.run_sync, service.updates.close)
+                await to_thread.run_sync(service.jobs.close)  # first: what learns needs the CPU to store its state
 
+    hot = [*inference.hot.routes, *echo.hot.routes, *oip.hot.routes, *observations.hot.routes]
     # the documentation page loads nothing from other hosts: robots' networks often have no way out
     app = FastAPIOffline(
         title="LIPServe",
@@ -78,21 +97,23 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         version=__version__,
         lifespan=lifespan,
         redoc_url=None,
+        redirect_slashes=False,  # to an address that the client's Host header would choose
         # tried first, and not through an included router: 50 µs less a request
-        routes=[*inference.hot.routes, *echo.hot.routes, *oip.hot.routes, *observations.hot.routes],
+        routes=hot,
+        telemetry=tracing.telemetry(settings),
     )
+    app.state.stopping = stopping
     errors.install(app)
-    app.add_middleware(
-        BodyLimit,
-        max_upload_bytes=settings.max_upload_bytes,
-        max_urdf_bytes=settings.max_urdf_bytes,
-        max_request_bytes=settings.max_request_bytes,
-    )
+    openapi.install(app)
+    storage_errors.install(app)
+    _add_middleware(app, settings, keyring, meters, hot)
+    access.install(app, settings.keys_needed)
     app.include_router(health.router)
     app.include_router(metrics.router)
     app.include_router(datasets.router)
     app.include_router(robots.router)
     app.include_router(training.router)
+    app.include_router(archives.router)
     app.include_router(models.router)
     app.include_router(inference.router)
     app.include_router(control.router)
@@ -102,10 +123,37 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     return app
 
 
-def _open(settings: Settings) -> Service:
+def _add_middleware(
+    app: FastAPI, settings: Settings, keyring: Keyring | None, meters: Meters, hot: list[BaseRoute]
+) -> None:
+    """Add what every request passes, from the inside out."""
+    app.add_middleware(
+        BodyLimit,
+        limits={
+            "/v1/datasets": settings.max_upload_bytes,
+            "/v1/robots": settings.max_urdf_bytes,
+            "/v1/models/import": settings.max_archive_bytes,
+        },
+        others=settings.max_request_bytes,
+        seconds=settings.body_s,
+        bytes_per_s=settings.body_bytes_per_s,
+    )
+    if settings.max_requests_per_s is not None:
+        app.add_middleware(RateLimit, per_s=settings.max_requests_per_s, burst=settings.max_request_burst)
+    if keyring is None:
+        app.add_middleware(LocalAccess)
+    else:
+        app.add_middleware(KeyAccess, keyring=keyring)
+    app.add_middleware(Gate, most=settings.max_requests)
+    quiet = (str(getattr(route, "path", "")) for route in hot)
+    log = RequestLog(quiet, settings.log_slow_s, settings.log_refusals_per_s)
+    app.add_middleware(RequestContext, meters=meters, log=log, tracing=settings.opentelemetry)  # the outermost
+
+
+def _open(settings: Settings, stopping: Stopping, meters: Meters) -> Service:
     """Open the home, finish what an earlier run left, and load the models that are asked for first."""
     sys.setswitchinterval(SWITCH_INTERVAL)
-    database, files = Database(settings.home), Files(settings.home)
+    database, files = Database(settings.home, settings.database_timeout_s), Files(settings.home)
     with database.session() as session:
         datasets_known = set(session.scalars(select(DatasetRow.id)))
         versions_known = set(session.scalars(select(VersionRow.folder)))
@@ -119,7 +167,8 @@ def _open(settings: Settings) -> Service:
     if recovered := jobs.recover():
         logger.warning("queued again after an interruption: %s", ", ".join(recovered))
     limiter = CapacityLimiter(settings.max_concurrent_predictions)
-    updates = Updates(settings, database, files, loaded)
-    service = Service(settings, database, files, loaded, jobs, limiter, updates)
+    disk = Disk(settings)
+    updates = Updates(settings, database, files, loaded, disk)
+    service = Service(settings, database, files, loaded, jobs, limiter, updates, disk, stopping, meters)
     attach(service)
     return service

@@ -20,8 +20,11 @@ from lipcore.estimators import DEFAULT_ESTIMATOR, ESTIMATORS
 from lipcore.robots import ROBOTS, SimulationUnavailableError, load_robot
 from lipcore.simulation import FAST, Payload, Stream, simulate
 from service import __version__, recordings, sockets
+from service.access import commands as keys
 from service.app import create_app
-from service.home import HomeInUseError, hold_home
+from service.home import HomeError, check_home
+from service.limits.connections import guarded
+from service.observability import logs
 from service.settings import DEFAULT_URL, Settings
 from service.stream.protocol import StreamProtocol
 from service.tables import prediction_tables
@@ -51,7 +54,7 @@ def main() -> None:
     """Run the command line; errors that a user can act on are printed without a traceback."""
     try:
         app()
-    except (HomeInUseError, SimulationUnavailableError, ValueError, OSError) as error:
+    except (HomeError, SimulationUnavailableError, ValueError, OSError) as error:
         _fail(str(error))
 
 
@@ -74,21 +77,25 @@ def serve(
         settings = Settings(**given)  # type: ignore[arg-type]  # validated here
     except ValidationError as error:
         _fail("; ".join(f"{'.'.join(map(str, e['loc'])) or 'settings'}: {e['msg']}" for e in error.errors()))
-    hold_home(settings.home).close()  # the app holds it for good; asking first gives a message without a traceback
+    logs.configure(logs.LogOptions(settings.log_level, settings.log_format))
+    check_home(settings)  # before the app opens it for good: what is wrong is said without a traceback
+    served = create_app(settings)
     config = uvicorn.Config(
-        create_app(settings),
+        served,
         host=settings.host,
         port=settings.port,
-        log_level=settings.log_level,
-        log_config=_log_config(settings.log_level),
-        access_log=settings.log_level == "debug",
+        log_config=None,  # as configured above
+        access_log=False,  # the service's own says more
         loop="uvloop",
-        http="httptools",
+        http=guarded(settings),
         ws=StreamProtocol,
         ws_max_size=settings.max_stream_frame_bytes,
         ws_per_message_deflate=False,
+        timeout_keep_alive=settings.keep_alive_s,
+        timeout_graceful_shutdown=settings.drain_s,
+        forwarded_allow_ips=settings.trusted_proxies,
     )
-    sockets.serve(config, settings.uds, settings.uds_mode)
+    sockets.serve(config, settings.uds, settings.uds_mode, served.state.stopping, settings.stop_notice_s)
 
 
 @app.command("simulate")
@@ -235,6 +242,26 @@ def bench(context: typer.Context) -> None:
         _fail(str(error))
 
 
+@app.command()
+def verify(as_json: Json = False) -> None:
+    """Read everything that the home LIPSERVE_HOME stores and report what is damaged; also while the service runs."""
+    from service import verification  # noqa: PLC0415 - serving does without it
+
+    found = verification.verify(Settings())
+    if as_json:
+        out.print_json(json.dumps(found.shown()))
+    else:
+        for damage in found.damages:
+            err.print(f"[red]damaged:[/red] {escape(str(damage))}", highlight=False, soft_wrap=True)
+        counts = ", ".join(f"{count} {kind}" for kind, count in found.read.items())
+        out.print(f"read {counts}: {len(found.damages) or 'nothing'} damaged")
+    if found.damages:
+        raise typer.Exit(1)
+
+
+app.add_typer(keys.app, name="keys")
+
+
 @contextmanager
 def _client(url: str) -> Iterator[Client]:
     """A client of the service at `url`; what the service refuses is printed."""
@@ -261,14 +288,6 @@ def _numbers(name: str, text: str) -> list[float]:
 def _fail(message: str) -> NoReturn:
     err.print(f"[red]error:[/red] {escape(message)}", highlight=False, soft_wrap=True)
     sys.exit(1)
-
-
-def _log_config(level: str) -> dict[str, object]:
-    config: dict[str, object] = json.loads(json.dumps(uvicorn.config.LOGGING_CONFIG))
-    loggers = config["loggers"]
-    assert isinstance(loggers, dict)
-    loggers |= {name: {"handlers": ["default"], "level": level.upper(), "propagate": False} for name in ("service",)}
-    return config
 
 
 if __name__ == "__main__":

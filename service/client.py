@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -12,8 +13,11 @@ import httpx
 import numpy as np
 from numpy.typing import ArrayLike
 
+from service.access.credentials import headers_of
 from service.datasets.schema import Dataset
 from service.inference.schema import EvaluateResponse, PredictResponse
+from service.models.alias_schema import Alias, AliasList
+from service.models.comparison_schema import CompareResponse
 from service.models.schema import Model, Version
 from service.robots.schema import Robot
 from service.settings import DEFAULT_URL
@@ -52,16 +56,19 @@ class ApiError(RuntimeError):
 class Client:
     """Synchronous client; use it as a context manager or close it.
 
-    url: http://host:port, or unix:///path of the service's Unix-domain socket.
+    url: http://host:port, or unix:///path of the service's Unix-domain socket; key: API key, that of the environment
+    variable LIPSERVE_KEY where None.
     """
 
-    def __init__(self, url: str = DEFAULT_URL, timeout: float = 120.0) -> None:
+    def __init__(self, url: str = DEFAULT_URL, timeout: float = 120.0, key: str | None = None) -> None:
         self.url = url
         path = url.removeprefix(UNIX) if url.startswith(UNIX) else None
         if path is not None and not path.startswith("/"):
             raise ValueError(f"url is {url!r}, expected unix:// and an absolute path, as unix:///run/lipserve.sock")
         transport = None if path is None else httpx.HTTPTransport(uds=path)
-        self._http = httpx.Client(base_url=url if path is None else NO_HOST, timeout=timeout, transport=transport)
+        self._http = httpx.Client(
+            base_url=url if path is None else NO_HOST, timeout=timeout, transport=transport, headers=headers_of(key)
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -139,6 +146,20 @@ class Client:
         """Cancel a job."""
         return Job.model_validate(self._send("POST", f"/v1/jobs/{job}/cancel"))
 
+    def retry(self, job: str) -> Job:
+        """Queue a new job that repeats one that failed or was cancelled."""
+        return Job.model_validate(self._send("POST", f"/v1/jobs/{job}/retry"))
+
+    def job_events(self, job: str) -> Iterator[Job]:
+        """Yield a job as it is and at every change, until it ends or the service stops."""
+        with self._reached(), self._http.stream("GET", f"/v1/jobs/{job}/events") as answer:
+            if not answer.is_success:
+                answer.read()
+                raise _refused(answer)
+            for line in answer.iter_lines():
+                if line.startswith("data: "):
+                    yield Job.model_validate_json(line.removeprefix("data: "))
+
     def wait(self, job: str, on_progress: Callable[[Job], None] | None = None) -> Job:
         """Wait for a job's end, however it ends; on_progress is called with every look at it."""
         while True:
@@ -167,22 +188,55 @@ class Client:
         covariance: bool = False,
         components: Sequence[str] = (),
         tau: ArrayLike | None = None,
+        alias: str | None = None,
     ) -> PredictResponse:
-        """Torque for arrays of shape (n,) or (N, n), and components by name; tau is for `forward_dynamics` only."""
+        """Torque for arrays of shape (n,) or (N, n), and components by name; tau is for `forward_dynamics` only.
+
+        The version that serves answers, unless one is named by its number or an alias.
+        """
         body: dict[str, Any] = {"covariance": covariance, "components": list(components)}
         for name, values in (("q", q), ("dq", dq), ("ddq", ddq), ("tau", tau)):
             if values is not None:
                 body[name] = np.asarray(values, dtype=np.float64).tolist()
-        if version is not None:
-            body["version"] = version
+        body |= _named(version, alias)
         return PredictResponse.model_validate(self._send("POST", f"/v1/models/{model}/predict", json=body))
 
-    def evaluate(self, model: str, dataset: str, version: int | None = None) -> EvaluateResponse:
-        """Compare a model with a data set."""
-        body: dict[str, Any] = {"dataset": dataset}
-        if version is not None:
-            body["version"] = version
+    def evaluate(
+        self, model: str, dataset: str, version: int | None = None, alias: str | None = None
+    ) -> EvaluateResponse:
+        """Compare a model with a data set: the version that serves, unless one is named by its number or an alias."""
+        body = {"dataset": dataset} | _named(version, alias)
         return EvaluateResponse.model_validate(self._send("POST", f"/v1/models/{model}/evaluate", json=body))
+
+    def compare(self, model: str, dataset: str, first: int | str, second: int | str) -> CompareResponse:
+        """Compare two versions, each a number or an alias, on a data set."""
+        body = {"dataset": dataset, "versions": [first, second]}
+        return CompareResponse.model_validate(self._send("POST", f"/v1/models/{model}/compare", json=body))
+
+    def aliases(self, model: str) -> list[Alias]:
+        """Every alias of a model, `serving` first."""
+        return AliasList.model_validate(self._send("GET", f"/v1/models/{model}/aliases")).items
+
+    def set_alias(self, model: str, alias: str, version: int | str) -> Alias:
+        """Point an alias to a version, or to where another alias points; `serving` answers where none is named."""
+        body = {"alias": version} if isinstance(version, str) else {"version": version}
+        return Alias.model_validate(self._send("PUT", f"/v1/models/{model}/aliases/{alias}", json=body))
+
+    def rollback_alias(self, model: str, alias: str) -> Alias:
+        """Take back the last move of an alias, the next time the one before it."""
+        return Alias.model_validate(self._send("POST", f"/v1/models/{model}/aliases/{alias}/rollback"))
+
+    def remove_alias(self, model: str, alias: str) -> None:
+        """Remove an alias; its version stays."""
+        self._send("DELETE", f"/v1/models/{model}/aliases/{alias}")
+
+    def delete_version(self, model: str, version: int) -> None:
+        """Delete a version that nothing needs, for good."""
+        self._send("DELETE", f"/v1/models/{model}/versions/{version}")
+
+    def delete_model(self, model: str) -> None:
+        """Delete a model with all that it has observed and learnt, for good."""
+        self._send("DELETE", f"/v1/models/{model}")
 
     def observe(
         self,
@@ -263,20 +317,68 @@ class Client:
         params = {} if cursor is None else {"cursor": cursor}
         return AlarmPage.model_validate(self._send("GET", f"/v1/models/{model}/alarms", params=params))
 
-    def _send(self, method: str, path: str, **request: Any) -> Any:
+    def export_model(
+        self, model: str, path: Path, version: int | None = None, alias: str | None = None, learnt: bool = True
+    ) -> Path:
+        """Write a version as an archive to `path`, whole or not at all, and return it; see `import_model`.
+
+        The version that serves, unless one is named. learnt: with what it has learnt online, else as it was trained.
+        """
+        params = _named(version, alias) | {"learnt": learnt}
+        draft = path.with_name(f"{path.name}.part")
         try:
+            with self._reached(), self._http.stream("GET", f"/v1/models/{model}/export", params=params) as answer:
+                if not answer.is_success:
+                    answer.read()
+                    raise _refused(answer)
+                with draft.open("wb") as file:
+                    for piece in answer.iter_bytes():
+                        file.write(piece)
+            draft.replace(path)
+        finally:
+            draft.unlink(missing_ok=True)
+        return path
+
+    def import_model(self, path: Path, name: str | None = None) -> Version:
+        """Make a new version of an archive that a service has exported; raise ApiError where it is refused.
+
+        name: of the model, that of the archive by default. The version answers where the model had none before.
+        """
+        params = {} if name is None else {"name": name}
+        headers = {"content-type": "application/x-tar"}
+        with path.open("rb") as file:
+            answer = self._send("POST", "/v1/models/import", params=params, content=_chunks(file), headers=headers)
+        return Version.model_validate(answer)
+
+    def _send(self, method: str, path: str, **request: Any) -> Any:
+        with self._reached():
             answer = self._http.request(method, path, **request)
+        if not answer.is_success:
+            raise _refused(answer)
+        return answer.json() if answer.content else None
+
+    @contextmanager
+    def _reached(self) -> Iterator[None]:
+        try:
+            yield
         except httpx.TransportError as error:
             raise ServiceUnreachableError(
                 f"no service answers at {self.url} ({error}): start one with `lipserve serve`"
             ) from error
-        if answer.is_success:
-            return answer.json()
-        try:
-            body = answer.json()["error"]
-            raise ApiError(answer.status_code, body["code"], body["message"], body["detail"])
-        except (ValueError, KeyError, TypeError):
-            raise ApiError(answer.status_code, "http_error", answer.text[:500], []) from None
+
+
+def _refused(answer: httpx.Response) -> ApiError:
+    """The error that an answer tells."""
+    try:
+        body = answer.json()["error"]
+        return ApiError(answer.status_code, body["code"], body["message"], body["detail"])
+    except (ValueError, KeyError, TypeError):
+        return ApiError(answer.status_code, "http_error", answer.text[:500], [])
+
+
+def _named(version: int | None, alias: str | None) -> dict[str, Any]:
+    """The fields of a body that name a version."""
+    return {name: value for name, value in (("version", version), ("alias", alias)) if value is not None}
 
 
 def _chunks(file: Any) -> Iterator[bytes]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from anyio import CapacityLimiter
@@ -11,6 +11,10 @@ from fastapi import Depends, Request
 from service.database import Database
 from service.files import Files
 from service.inference.loaded import LoadedModels
+from service.limits.disk import Disk
+from service.limits.stopping import Stopping
+from service.observability.meters import Meters
+from service.observability.readiness import Readiness
 from service.settings import Settings
 from service.training.queue import JobQueue
 from service.updates.updates import Updates
@@ -27,6 +31,11 @@ class Service:
     jobs: JobQueue
     predictions: CapacityLimiter
     updates: Updates
+    disk: Disk
+    stopping: Stopping
+    meters: Meters = field(default_factory=Meters)
+    readiness: Readiness = field(default_factory=Readiness)
+    archives: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))
 
 
 async def _service(request: Request) -> Service:

@@ -45,7 +45,8 @@ class ServiceProcess:
         self.port = port if port and _free(port) else _free_port()
         self.url = f"http://127.0.0.1:{self.port}"
         command = [sys.executable, "-m", "service", "serve", "--host", "127.0.0.1", "--port", str(self.port)]
-        self.process = subprocess.Popen(command, env={**os.environ, **(env or {})})  # noqa: S603 - our own command
+        quiet = {"LIPSERVE_LOG_LEVEL": "warning"}  # unless the user wants more: its lines would stand among the demo's
+        self.process = subprocess.Popen(command, env={**quiet, **os.environ, **(env or {})})  # noqa: S603 - our own
 
     def wait_ready(self, client: Client) -> float:
         """Wait until the service is ready; return the seconds it took. Raise DemoError where it ends or hangs."""

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import logging
+import reprlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from fastapi.routing import iter_route_contexts
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 from starlette.types import Receive, Scope, Send
 
 logger = logging.getLogger(__name__)
@@ -19,6 +22,12 @@ OPEN_INFERENCE = "/v2"
 """Routes below it speak the Open Inference Protocol, whose errors have a shape of their own."""
 ERROR_CODE = "lipserve.error_code"
 """Key of the code in the ASGI scope of a request that ended in an error: for metrics and logs."""
+
+
+_REPR = reprlib.Repr()  # Python's own takes as long as the value is large, and fails where it is nested deep
+_REPR.maxlevel = 10
+_REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = 200
+_REPR.maxstring = _REPR.maxlong = _REPR.maxother = 1000
 
 
 class Problem(BaseModel):
@@ -151,15 +160,17 @@ class UnreadableVersionError(ServiceError):
 
 
 def problem(field: str, value: object, expected: str) -> Problem:
-    """Describe one wrong value; long values are cut."""
-    text = value if isinstance(value, str) else repr(value)
+    """Describe one wrong value; long values are cut, and what is nested deep."""
+    text = value if isinstance(value, str) else _REPR.repr(value)
     text = text if len(text) <= 200 else text[:200] + "…"
-    return Problem(field=_encodable(field[:200]), value=_encodable(text), expected=expected)
+    return Problem(field=readable(field[:200]), value=readable(text), expected=expected)
 
 
-def _encodable(text: str) -> str:
-    """Escape lone surrogates, which JSON can bring in and UTF-8 cannot take out."""
-    return text.encode(errors="backslashreplace").decode()
+def readable(text: str) -> str:
+    """Escape what a terminal or a log would not show as it is: control and bidirectional characters, half ones."""
+    if text.isprintable():
+        return text
+    return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
 
 
 def sentence(item: Problem) -> str:
@@ -203,6 +214,7 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(ServiceError, _service_error)
     app.add_exception_handler(RequestValidationError, _validation_error)
     app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(ClientDisconnect, _cut_off)
     app.add_exception_handler(Exception, _unexpected_error)
 
 
@@ -257,17 +269,35 @@ def _explain(item: dict[str, Any]) -> Problem:
     return problem(field, found, said.removeprefix("Input should be ").replace("String should", "to", 1))
 
 
+async def _cut_off(request: Request, error: Exception) -> JSONResponse:
+    """The client went away before its body was there: nobody reads this, but it is no failure of the service."""
+    return answer_of(request.scope, invalid_request("body", "cut off", "the whole of it"))
+
+
 async def _http_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
-    codes = {404: "not_found", 405: "method_not_allowed", 413: "too_large", 400: "invalid_request"}
+    codes = {404: "not_found", 405: "method_not_allowed", 408: "request_timeout", 413: "too_large"}
     message = str(error.detail)
     if error.status_code in (404, 405):
-        message = f"no route {request.method} {request.url.path[:200]}: /docs lists all"
+        message = f"no route {request.method} {readable(request.url.path[:200])}: /docs lists all"
     answer = _answer(request.scope, error.status_code, codes.get(error.status_code, "http_error"), message)
     answer.headers.update(error.headers or {})
+    if error.status_code == 405:  # Starlette names the methods of one route, but others have the same path
+        answer.headers["allow"] = ", ".join(_methods(request))
     return answer
 
 
+def _methods(request: Request) -> list[str]:
+    """What may be asked for at the path of a request."""
+    found: set[str] = set()
+    for route in iter_route_contexts(request.app.routes):
+        pattern, methods = getattr(route, "path_regex", None), getattr(route, "methods", None)
+        if pattern is not None and methods and pattern.match(request.scope["path"]):
+            found.update(methods)
+    return sorted(found)
+
+
 async def _unexpected_error(request: Request, error: Exception) -> JSONResponse:
-    logger.error("unexpected error at %s %s", request.method, request.url.path, exc_info=error)
+    if request.scope.get(ERROR_CODE) != "internal_error":  # else answered before, and seen again on its way out
+        logger.error("unexpected error at %s %s", request.method, request.url.path, exc_info=error)
     return _answer(request.scope, 500, "internal_error", "an unexpected error; the service's log says more")

@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Literal
 
 from fastapi import APIRouter
-from pydantic import BaseModel
-from sqlalchemy import text
+from pydantic import BaseModel, Field
 
 from service import __version__
 from service.context import ServiceDep
-from service.errors import NotReadyError, responses
+from service.errors import NotReadyError, problem, responses
+from service.route import Route
 
-router = APIRouter(prefix="/health", tags=["health"])
+router = APIRouter(prefix="/health", tags=["health"], route_class=Route)
 
 
 class Live(BaseModel):
@@ -21,11 +21,20 @@ class Live(BaseModel):
     status: Literal["alive"] = "alive"
 
 
+class Part(BaseModel):
+    """One part of the service."""
+
+    name: str = Field(examples=["database"])
+    state: Literal["ok", "warning"] = Field(description="warning: some clients may notice something")
+    message: str = Field(examples=["can be read and written"])
+
+
 class Ready(BaseModel):
-    """The service can answer queries."""
+    """The service can do what it is for."""
 
     status: Literal["ready"] = "ready"
     version: str
+    checks: list[Part]
 
 
 @router.get("/live", summary="Is the process alive?")
@@ -36,10 +45,13 @@ async def live() -> Live:
 
 @router.get("/ready", summary="Can the service answer?", responses=responses(NotReadyError))
 def ready(service: ServiceDep) -> Ready:
-    """Answer once the models are loaded and while the database answers."""
-    try:
-        with service.database.session() as session:
-            session.execute(text("SELECT 1"))
-    except Exception as error:
-        raise NotReadyError(f"the database does not answer: {error}") from error
-    return Ready(version=__version__)
+    """Answer once the models are loaded, and while each part works: the database and the home can be written and are
+    not full, the versions that serve can be read, the learner runs where something learns, training jobs are started,
+    and the service is not stopping. Otherwise `detail` names the parts that do not. Looked at once a second at most.
+    """
+    report = service.readiness.report(service)
+    if report.failed:
+        message = "; ".join(f"{each.name}: {each.message}" for each in report.failed)
+        raise NotReadyError(message, [problem(each.name, each.message, "ok") for each in report.failed])
+    checks = [Part(name=each.name, state=each.state, message=each.message) for each in report.checks]
+    return Ready(version=__version__, checks=checks)

@@ -6,7 +6,7 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 CHECKOUT_MODELS = Path(__file__).resolve().parents[1] / "models"
@@ -45,18 +45,41 @@ class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix="LIPSERVE_", extra="ignore", frozen=True)
 
     home: Path = Field(default_factory=_default_home, description="Folder of the database and all files.")
-    host: str = Field("127.0.0.1", description="Address to listen on; anything but loopback needs `insecure`.")
+    host: str = Field("127.0.0.1", description="Address to listen on; anything but loopback asks for API keys.")
     port: int = Field(8000, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
     uds: Path | None = Field(None, description="Unix-domain socket to listen on too, for clients on the same host.")
     uds_mode: FileMode = Field(
         0o660, ge=0, le=0o777, description="File mode of that socket, octal: whoever may write to it may ask."
     )
-    insecure: bool = Field(False, description="Allow requests without keys from other hosts.")
     log_level: str = Field("info", pattern="^(critical|error|warning|info|debug)$")
+    log_format: Literal["console", "json"] = Field(
+        "console", description="Form of the log's lines: for people, or JSON, one object a line."
+    )
+    log_slow_s: float = Field(
+        0.25, gt=0, description="Seconds from which on a query or batch of a control loop is logged."
+    )
+    log_refusals_per_s: Count = Field(
+        10, description="Most lines a second about refused requests of one route and code; the others are counted."
+    )
+    stream_deadline_s: float = Field(
+        0.002, gt=0, description="Seconds after which a stream's answer is late, where its frame names none."
+    )
+    max_metric_models: Count = Field(
+        200, description="Most models that metrics of requests and streams tell apart; the others are taken together."
+    )
+    opentelemetry: bool = Field(
+        False, description="Send a trace of every request to where OTEL_EXPORTER_OTLP_ENDPOINT says."
+    )
 
     max_upload_bytes: Count = Field(256 * MiB, description="Largest upload of a data set.")
     max_unpacked_bytes: Count = Field(1024 * MiB, description="Largest data set once unpacked.")
     max_urdf_bytes: Count = Field(2 * MiB, description="Largest upload of a URDF.")
+    max_archive_bytes: Count = Field(128 * MiB, description="Largest archive of a version that is imported.")
+    max_archive_torques: Count = Field(
+        10_000,
+        description="Most torques, samples times joints, that an imported version may stand on: reading it takes "
+        "memory that grows with the square, 10000 of them 0.8 GB.",
+    )
     max_request_bytes: Count = Field(8 * MiB, description="Largest body of any other request.")
     max_joints: Count = Field(32, description="Most joints of a robot.")
     min_samples: int = Field(30, ge=10, description="Fewest samples of a data set.")
@@ -78,6 +101,28 @@ class Settings(BaseSettings):
     max_inducing_outputs: Count = Field(4000, description="Most inducing outputs that a training job may ask for.")
     max_queued_jobs: Count = Field(100, description="Most jobs that may wait; more are answered 429.")
     max_loaded_models: Count = Field(4, description="Model versions kept in memory.")
+
+    max_connections: Count = Field(512, description="Most connections at a time, streams included; more are refused.")
+    max_requests: Count = Field(256, description="Most requests that are answered at a time; more are answered 429.")
+    max_requests_per_s: float | None = Field(
+        None, gt=0, description="Most requests per s of one key, or address without keys; not limited by default."
+    )
+    max_request_burst: Count = Field(1000, description="Requests that a client may send at once where that is limited.")
+    header_s: float = Field(10.0, gt=0, description="Longest time in s that a request's line and headers may take.")
+    max_header_bytes: int = Field(64 * 1024, ge=4096, description="Largest line and headers of a request.")
+    body_s: float = Field(20.0, gt=0, description="Longest wait in s for a body, beside what its size allows.")
+    body_bytes_per_s: Count = Field(1000, description="Slowest body: for so many bytes it may take one second more.")
+    answer_s: float = Field(30.0, gt=0, description="Longest wait in s for a client to read any of its answer.")
+    keep_alive_s: Count = Field(5, description="Seconds after which a connection without a request is closed.")
+    max_home_bytes: Count | None = Field(None, description="Quota of the home; not limited by default.")
+    min_free_bytes: int = Field(64 * MiB, ge=0, description="Space that stays free on the disk of the home.")
+    stop_notice_s: float = Field(
+        0.0, ge=0, description="Seconds for which a service told to stop still answers, but says that it is not ready."
+    )
+    drain_s: Count = Field(5, description="Longest wait in s for answers in progress when the service stops.")
+
+    max_aliases: Count = Field(100, description="Most aliases of one model, `serving` aside.")
+    max_alias_moves: Count = Field(20, description="Last moves of an alias that an answer lists.")
 
     max_observation_rows: Count = Field(5000, description="Most samples of one observation batch.")
     max_observation_streams: Count = Field(1000, description="Most sources of observations of one model.")
@@ -113,6 +158,10 @@ class Settings(BaseSettings):
     promotion_rows: Count = Field(2000, description="Samples on which a refreshed version must be better.")
     promotion_patience_s: float = Field(3600.0, gt=0, description="Time after which one that is not is dismissed, s.")
 
+    database_timeout_s: float = Field(
+        10.0, gt=0, description="Longest wait in s of a request for another writer of the database; then it gets a 503."
+    )
+
     training_workers: Count = Field(1, description="Training processes.")
     training_threads: Count = Field(1, description="Threads of each training process.")
     training_niceness: int = Field(10, ge=0, le=19, description="Niceness of training processes.")
@@ -125,17 +174,37 @@ class Settings(BaseSettings):
         None, description="CPUs that training processes may use, on Linux: all but one where not set."
     )
     max_job_attempts: Count = Field(3, description="Times a job is started before an interruption fails it.")
+    job_cancel_grace_s: float = Field(
+        1.0, gt=0, le=1.5, description="Time in s that a training process has to obey a cancel; then it is killed."
+    )
+    job_heartbeat_s: float = Field(
+        60.0, ge=5, description="Time in s without a sign of life after which a training process is killed."
+    )
+    job_start_s: float = Field(
+        120.0, gt=0, description="Time in s that a training process may take to start; then it is killed."
+    )
+    max_job_s: float = Field(86400.0, gt=0, description="Longest that one attempt at a job may run, s; then it fails.")
+    max_job_followers: Count = Field(100, description="Most streams of jobs' events at a time; more are answered 429.")
     serving_threads: Count = Field(1, description="Threads of one prediction.")
     max_concurrent_predictions: Count = Field(2, description="Predictions computed at the same time.")
 
-    @model_validator(mode="after")
-    def _loopback_or_insecure(self) -> Settings:
-        if not self.insecure and not is_loopback(self.host):
-            raise ValueError(
-                f"host is {self.host!r}: other hosts could use the service without a key. Listen on 127.0.0.1, "
-                "or set LIPSERVE_INSECURE=1 where a firewall, container or reverse proxy guards the port"
-            )
-        return self
+    keys: Literal["auto", "on"] = Field(
+        "auto",
+        description="Whether requests need API keys: `auto`, unless the service listens on loopback only, or `on`, "
+        "always, as it should be behind a reverse proxy.",
+    )
+    keys_refresh_s: float = Field(
+        1.0, gt=0, le=3600, description="Seconds after which a running service knows of keys that are made or revoked."
+    )
+    trusted_proxies: str = Field(
+        "127.0.0.1",
+        description="Reverse proxies whose X-Forwarded-For names the client: addresses or networks, with commas.",
+    )
+
+    @property
+    def keys_needed(self) -> bool:
+        """Whether requests need API keys."""
+        return self.keys == "on" or not is_loopback(self.host)
 
 
 def is_loopback(host: str) -> bool:

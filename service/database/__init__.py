@@ -1,6 +1,6 @@
 """The database: tables, sessions, and migrations of what earlier releases stored."""
 
-from service.database.engine import BUSY_TIMEOUT_MS, Database
+from service.database.engine import Database
 from service.database.tables import (
     AlarmRow,
     AliasMoveRow,
@@ -8,6 +8,7 @@ from service.database.tables import (
     ApiKeyRow,
     Base,
     DatasetRow,
+    DeletedModelRow,
     EventRow,
     JobRow,
     LearnerRow,
@@ -22,7 +23,6 @@ from service.database.tables import (
 )
 
 __all__ = [
-    "BUSY_TIMEOUT_MS",
     "AlarmRow",
     "AliasMoveRow",
     "AliasRow",
@@ -30,6 +30,7 @@ __all__ = [
     "Base",
     "Database",
     "DatasetRow",
+    "DeletedModelRow",
     "EventRow",
     "JobRow",
     "LearnerRow",

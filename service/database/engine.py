@@ -12,15 +12,24 @@ from sqlalchemy.orm import Session, sessionmaker
 
 from service.database.migrations import migrate
 
-BUSY_TIMEOUT_MS = 30_000
+FILE = "lipserve.sqlite3"
+PATIENCE_S = 30.0
+"""Longest wait for another writer, of processes that nobody waits for."""
+MOST_CONNECTIONS = 64
+"""More than there are threads: who only reads shall not wait for those that wait to write."""
 
 
 class Database:
-    """Sessions on one database; safe to share between threads."""
+    """Sessions on one database; safe to share between threads. timeout_s: longest wait for another writer."""
 
-    def __init__(self, home: Path) -> None:
+    def __init__(self, home: Path, timeout_s: float = PATIENCE_S) -> None:
         home.mkdir(parents=True, exist_ok=True)
-        self.engine = create_engine(f"sqlite:///{home / 'lipserve.sqlite3'}", connect_args={"timeout": 30})
+        self.engine = create_engine(
+            f"sqlite:///{home / FILE}",
+            connect_args={"timeout": timeout_s},
+            max_overflow=MOST_CONNECTIONS,
+            pool_timeout=timeout_s,
+        )
         event.listen(self.engine, "connect", _configure)
         migrate(self.engine)
         self._sessions = sessionmaker(self.engine, expire_on_commit=False)
@@ -51,5 +60,4 @@ def _configure(connection: Any, _: object) -> None:
     cursor.execute("PRAGMA journal_mode=WAL")
     cursor.execute("PRAGMA synchronous=FULL")
     cursor.execute("PRAGMA foreign_keys=ON")
-    cursor.execute(f"PRAGMA busy_timeout={BUSY_TIMEOUT_MS}")
     cursor.close()

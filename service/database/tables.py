@@ -94,6 +94,16 @@ class ModelRow(Base):
     last_version: Mapped[int] = mapped_column(default=0, server_default="0")
 
 
+class DeletedModelRow(Base):
+    """A model that was deleted: one of the same name goes on with the numbers after `last_version`."""
+
+    __tablename__ = "deleted_models"
+
+    name: Mapped[str] = mapped_column(String(64), primary_key=True)
+    last_version: Mapped[int]
+    deleted_at: Mapped[str]
+
+
 class VersionRow(Base):
     """An immutable trained version of a model; its files lie in the file store under `folder`.
 
@@ -124,7 +134,7 @@ class AliasRow(Base):
 
 class AliasMoveRow(Base):
     """One move of an alias, so that it can be taken back. version: where to, None where it was removed; before: where
-    from, None where it was new."""
+    from, None where it was new; takes_back: `seq` of the move that this one has taken back."""
 
     __tablename__ = "alias_moves"
     __table_args__ = (Index("alias_moves_alias", "model", "alias"),)
@@ -134,6 +144,7 @@ class AliasMoveRow(Base):
     alias: Mapped[str] = mapped_column(String(64))
     version: Mapped[int | None]
     before: Mapped[int | None]
+    takes_back: Mapped[int | None]
     at: Mapped[str]
 
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
-from anyio import open_file, to_thread
+from anyio import to_thread
 from fastapi import APIRouter, Query, Request, Response, status
-from starlette.datastructures import UploadFile
 
 from lipcore.model import TorqueConvention
 from lipcore.signals import CUTOFF
-from service.context import Service, ServiceDep
+from service.context import ServiceDep
 from service.datasets import store
 from service.datasets.schema import UPLOAD_BODY, Dataset, DatasetPage
 from service.errors import (
@@ -21,15 +19,18 @@ from service.errors import (
     NotFoundError,
     TooLargeError,
     UnsupportedMediaTypeError,
-    invalid_request,
-    problem,
     responses,
 )
+from service.limits.upload import Kinds, receive_to
+from service.names import NameForPeople
 from service.pages import PageQuery
+from service.route import Route
 
-MEDIA_TYPES = {"text/csv": "csv", "application/x-npz": "npz"}
+KINDS = Kinds({"text/csv": "csv", "application/x-npz": "npz"}, {".csv": "csv", ".npz": "npz"})
 
-router = APIRouter(prefix="/v1/datasets", tags=["data sets"], responses=responses(InvalidRequestError))
+router = APIRouter(
+    prefix="/v1/datasets", tags=["data sets"], responses=responses(InvalidRequestError), route_class=Route
+)
 
 
 @router.post(
@@ -43,7 +44,7 @@ async def upload(
     request: Request,
     response: Response,
     service: ServiceDep,
-    name: Annotated[str | None, Query(max_length=200, description="A name for people; the file's by default")] = None,
+    name: Annotated[NameForPeople | None, Query(description="A name for people; the file's by default")] = None,
     joint_names: Annotated[
         str | None, Query(max_length=4000, description="Names of joints 1..n, separated by commas")
     ] = None,
@@ -58,7 +59,7 @@ async def upload(
     names = None if joint_names is None else tuple(part.strip() for part in joint_names.split(","))
     path = service.files.upload()
     try:
-        kind, file_name = await _receive(request, service, path)
+        kind, file_name = await receive_to(request, path, KINDS, service.disk)
         dataset = await to_thread.run_sync(
             store.add, service, path, kind, name or file_name or "unnamed", names, torque_convention, cutoff
         )
@@ -89,31 +90,3 @@ def show(service: ServiceDep, dataset: str) -> Dataset:
 def delete(service: ServiceDep, dataset: str) -> None:
     """Delete the samples. Models trained on them stay."""
     store.delete(service, dataset)
-
-
-async def _receive(request: Request, service: Service, path: Path) -> tuple[str, str | None]:
-    """Write the body to `path`, never more than the limit; return its kind and file name."""
-    media_type = request.headers.get("content-type", "").split(";")[0].strip().lower()
-    if media_type == "multipart/form-data":
-        async with request.form(max_files=1, max_fields=8) as form:
-            part = form.get("file")
-            if not isinstance(part, UploadFile):
-                raise invalid_request("file", "missing", "a file in the form field `file`")
-            file_name = Path(part.filename or "").name
-            kind = store.suffix_kind(file_name)
-            if kind is None:
-                raise _unsupported("file name", file_name, f"the ending .{' or .'.join(store.READERS)}")
-            async with await open_file(path, "wb") as file:
-                while chunk := await part.read(1 << 20):
-                    await file.write(chunk)
-        return kind, file_name[:200]
-    if media_type not in MEDIA_TYPES:
-        raise _unsupported("content-type", media_type, f"{', '.join(MEDIA_TYPES)} or multipart/form-data")
-    async with await open_file(path, "wb") as file:
-        async for chunk in request.stream():
-            await file.write(chunk)
-    return MEDIA_TYPES[media_type], None
-
-
-def _unsupported(field: str, value: str, expected: str) -> UnsupportedMediaTypeError:
-    return UnsupportedMediaTypeError(f"{field} is {value!r}, expected {expected}", [problem(field, value, expected)])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from sqlalchemy import select
+from sqlalchemy.exc import SQLAlchemyError
 
 from lipcore.model import TorqueConvention
 from lipcore.samples import Samples
@@ -17,7 +18,7 @@ from service.datasets.npz import read_npz
 from service.datasets.preparation import prepare
 from service.datasets.schema import Dataset, DatasetPage
 from service.errors import ConflictError, not_found
-from service.files import Files, new_id
+from service.files import ARRAYS, Files, new_id
 from service.pages import Page, newest
 from service.training.states import ACTIVE
 
@@ -40,6 +41,7 @@ def add(
     names = joint_names or columns.joint_names or tuple(f"joint{i}" for i in range(1, n + 1))
     check_names(names, n)
     prepared = prepare(columns, names, cutoff, service.settings.min_samples)
+    service.disk.take(sum(getattr(prepared.samples, each).nbytes for each in ARRAYS))
     dataset = new_id("ds")
     digest = service.files.write_samples(dataset, prepared.samples)
     row = DatasetRow(
@@ -52,8 +54,12 @@ def add(
         rows=len(prepared.samples),
         report=prepared.report,
     )
-    with service.database.transaction() as session:
-        session.add(row)
+    try:
+        with service.database.transaction() as session:
+            session.add(row)
+    except SQLAlchemyError:
+        service.files.delete_samples(dataset)
+        raise
     return _show(row)
 
 
@@ -72,8 +78,8 @@ def find(database: Database, dataset: str) -> DatasetRow:
 
 
 def samples(files: Files, row: DatasetRow) -> Samples:
-    """Read the samples of a data set."""
-    return files.read_samples(row.id, row.joint_names)
+    """Read the samples of a data set; raise DamagedDataError."""
+    return files.read_samples(row.id, row.joint_names, row.sha256)
 
 
 def page(database: Database, part: Page) -> DatasetPage:
@@ -94,12 +100,6 @@ def delete(service: Service, dataset: str) -> None:
                 raise ConflictError(f"data set {dataset!r} is in use by job {job.id!r}: cancel it or wait for its end")
         session.delete(row)
     service.files.delete_samples(dataset)
-
-
-def suffix_kind(file_name: str) -> str | None:
-    """Kind of an upload by its file name, None where it is not known."""
-    kind = Path(file_name).suffix.lower().removeprefix(".")
-    return kind if kind in READERS else None
 
 
 def _show(row: DatasetRow) -> Dataset:

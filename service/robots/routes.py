@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 from anyio import to_thread
 from fastapi import APIRouter, Query, Request, Response, status
-from starlette.datastructures import UploadFile
 
 from lipcore.robots import installed_profiles
 from service.context import ServiceDep
@@ -18,18 +16,18 @@ from service.errors import (
     NotFoundError,
     TooLargeError,
     UnsupportedMediaTypeError,
-    invalid_request,
-    problem,
     responses,
 )
+from service.limits.upload import Kinds, receive
+from service.names import NameForPeople
 from service.pages import PageQuery
 from service.robots import store
 from service.robots.schema import UPLOAD_BODY, ProfileList, Robot, RobotPage
+from service.route import Route
 
-MEDIA_TYPES = ("application/xml", "text/xml")
-SUFFIXES = (".urdf", ".xml")
+KINDS = Kinds({"application/xml": "urdf", "text/xml": "urdf"}, {".urdf": "urdf", ".xml": "urdf"})
 
-router = APIRouter(prefix="/v1/robots", tags=["robots"], responses=responses(InvalidRequestError))
+router = APIRouter(prefix="/v1/robots", tags=["robots"], responses=responses(InvalidRequestError), route_class=Route)
 
 
 @router.post(
@@ -43,10 +41,12 @@ async def upload(
     request: Request,
     response: Response,
     service: ServiceDep,
-    name: Annotated[str | None, Query(max_length=200, description="A name for people; the URDF's by default")] = None,
+    name: Annotated[NameForPeople | None, Query(description="A name for people; the URDF's by default")] = None,
 ) -> Robot:
     """Check a URDF and store it, or say what is wrong with it. No file that it names is opened."""
-    robot = await to_thread.run_sync(store.add, service.database, await _receive(request), name)
+    _, content = await receive(request, KINDS)
+    await to_thread.run_sync(service.disk.take, len(content))
+    robot = await to_thread.run_sync(store.add, service.database, content, name)
     response.headers["Location"] = f"/v1/robots/{robot.id}"
     return robot
 
@@ -78,23 +78,3 @@ def show(service: ServiceDep, robot: str) -> Robot:
 def delete(service: ServiceDep, robot: str) -> None:
     """Delete an uploaded URDF. Models trained with it keep their copy."""
     store.delete(service.database, robot)
-
-
-async def _receive(request: Request) -> bytes:
-    """The URDF of a body, whose size is limited before it gets here."""
-    media_type = request.headers.get("content-type", "").split(";")[0].strip().lower()
-    if media_type == "multipart/form-data":
-        async with request.form(max_files=1, max_fields=8) as form:
-            part = form.get("file")
-            if not isinstance(part, UploadFile):
-                raise invalid_request("file", "missing", "a file in the form field `file`")
-            if Path(part.filename or "").suffix.lower() not in SUFFIXES:
-                raise _unsupported("file name", Path(part.filename or "").name, f"the ending {' or '.join(SUFFIXES)}")
-            return await part.read()
-    if media_type not in MEDIA_TYPES:
-        raise _unsupported("content-type", media_type, f"{', '.join(MEDIA_TYPES)} or multipart/form-data")
-    return await request.body()
-
-
-def _unsupported(field: str, value: str, expected: str) -> UnsupportedMediaTypeError:
-    return UnsupportedMediaTypeError(f"{field} is {value!r}, expected {expected}", [problem(field, value, expected)])

@@ -13,6 +13,7 @@ from lipcore.urdf import MOVABLE, RigidBody, UrdfError, describe
 from service.database import Database, JobRow, RobotRow, now
 from service.errors import ConflictError, InvalidDataError, not_found, problem
 from service.files import new_id
+from service.names import LONGEST, for_people
 from service.pages import Page, newest
 from service.robots.schema import Robot, RobotPage
 from service.training.states import ACTIVE
@@ -29,7 +30,7 @@ def add(database: Database, content: bytes, name: str | None) -> Robot:
         raise _invalid(str(error)) from None
     row = RobotRow(
         id=new_id("urdf"),
-        name=name or said.name or "unnamed",
+        name=name or for_people("robot name", said.name[:LONGEST] or "unnamed"),
         created_at=now(),
         sha256=hashlib.sha256(urdf.encode()).hexdigest(),
         joints=[{"name": joint.name, "type": MOVABLE[joint.kind]} for joint in said.joints],

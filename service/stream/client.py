@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 from websockets.sync.client import connect
 
+from service.access.credentials import headers_of
 from service.settings import DEFAULT_URL
 from service.stream.frames import ASK_LEARN, ASK_STD, NUMBER, REQUEST
 from service.stream.messages import (
@@ -41,9 +42,11 @@ class StreamClient:
     """One stream; use it as a context manager or close it. Not to be shared between threads.
 
     model: its name; unix: path of the service's Unix-domain socket, instead of host and port of the address; version:
-    pins one, else the newest answers; timeout: longest wait for the connection, and for one answer, in s; stream_id:
-    name of the source of the torques that are sent to learn from, None where only answers are wanted; first_sequence:
-    of the first frame: to send frames again after a lost connection, take the first of them above `learnt.through`.
+    pins one, alias: follows what that points to, else the version that serves answers; timeout: longest wait for the
+    connection, and for one answer, in s; stream_id: name of the source of the torques that are sent to learn from, None
+    where only answers are wanted; first_sequence: of the first frame: to send frames again after a lost connection,
+    take the first of them above `learnt.through`; key: API key, that of the environment variable LIPSERVE_KEY where
+    None.
     hello: what the service said of the version that answers.
     Raise StreamError where the service cannot be reached or refuses.
     """
@@ -57,9 +60,12 @@ class StreamClient:
         timeout: float = 10.0,
         stream_id: str | None = None,
         first_sequence: int = 1,
+        alias: str | None = None,
+        key: str | None = None,
     ) -> None:
         if not 0 <= first_sequence < _SEQUENCES:
             raise ValueError(f"first_sequence is {first_sequence}, expected 0 to {_SEQUENCES - 1}")
+        headers = headers_of(key)
         self.timeout = timeout
         self._stream_id, self._sequence, self._stack = stream_id, first_sequence - 1, ExitStack()
         self._answers: deque[StreamAnswer | StreamError] = deque()
@@ -68,14 +74,21 @@ class StreamClient:
         self._refusals: deque[StreamRefusal] = deque(maxlen=_REFUSALS)
         parts = urlsplit(url)
         secure = parts.scheme in ("https", "wss")
-        query = {"version": version, "stream_id": stream_id}
+        query = {"version": version, "alias": alias, "stream_id": stream_id}
         asked = urlencode({name: value for name, value in query.items() if value is not None})
         path = f"/v1/models/{quote(model, safe='')}/stream" + (f"?{asked}" if asked else "")
         address = f"{'wss' if secure else 'ws'}://{parts.netloc}{path}"
         try:
             made = _connect(parts.hostname or "127.0.0.1", parts.port or (443 if secure else 80), unix, timeout)
             self._socket = self._stack.enter_context(
-                connect(address, sock=made, compression=None, open_timeout=timeout, close_timeout=1.0)
+                connect(
+                    address,
+                    sock=made,
+                    compression=None,
+                    open_timeout=timeout,
+                    close_timeout=1.0,
+                    additional_headers=headers,
+                )
             )
         except InvalidStatus as error:
             raise _refused(error.response.status_code, error.response.body) from error

@@ -10,6 +10,7 @@ from time import perf_counter
 
 from starlette.types import Message, Receive, Send
 
+from service.access.credentials import subprotocol_of
 from service.settings import Settings
 from service.stream.protocol import StreamProtocol
 
@@ -40,7 +41,7 @@ class Conversation(ABC):
         """Accept the connection and talk until either side ends it."""
         receive, send, connection, reply = self.receive, self.send, self.connection, self.reply
         await receive()
-        await send({"type": "websocket.accept"})
+        await send({"type": "websocket.accept", "subprotocol": subprotocol_of(connection.scope["subprotocols"])})
         await self.greet()
         self._watch()
         try:

@@ -16,6 +16,7 @@ import numpy as np
 from service.context import Service
 from service.errors import ErrorBody, ServiceError, invalid_request
 from service.inference.loaded import Served
+from service.storage_errors import translated
 from service.stream.frames import NUMBER, REQUEST
 from service.updates.ingest.frames import Frames, FramesResult
 
@@ -133,8 +134,11 @@ class Learning:
         except ServiceError as error:
             said = error
         except Exception as error:  # the next block may be logged
-            logger.error("unexpected error while stream %r was learnt from", self._stream_id, exc_info=error)
-            said = ServiceError("an unexpected error; the service's log says more")
+            known = translated(error)
+            logger.error(
+                "error while stream %r was learnt from: %s", self._stream_id, error, exc_info=None if known else error
+            )
+            said = known or ServiceError("an unexpected error; the service's log says more")
         else:
             return {
                 "learnt": {

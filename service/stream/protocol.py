@@ -16,6 +16,8 @@ from websockets.protocol import State
 CONNECTION = "lipserve.connection"
 """Key of the connection in the `state` of an ASGI scope."""
 FLUSH_SECONDS = 1.0
+CLOSE_SECONDS = 3.0
+"""How long a client may take to answer a close before it is cut off."""
 
 
 class StreamProtocol(WebSocketsSansIOProtocol):
@@ -54,6 +56,20 @@ class StreamProtocol(WebSocketsSansIOProtocol):
     def abort(self) -> None:
         """Close at once, whatever is still to be written: for a client that does not read."""
         self.transport.abort()
+
+    def end(self, code: int, reason: str) -> None:
+        """Close although the client goes on asking: what it sends is dropped until it has answered the close."""
+        if not self.handshake_complete or self.close_sent or self.conn.state is not State.OPEN:
+            return
+        self.stop_keepalive()
+        self.queue.put_nowait({"type": "websocket.disconnect", "code": code, "reason": reason})
+        self.conn.send_close(code, reason)
+        self.transport.write(b"".join(self.conn.data_to_send()))
+        self.close_sent = self.disconnected = True  # nothing is sent any more: the application learns so when it tries
+        if self.read_paused:
+            self.read_paused = False
+            self.transport.resume_reading()
+        self.close_timer = self.loop.call_later(CLOSE_SECONDS, self.transport.abort)
 
     def shutdown(self) -> None:
         """Close because the server stops: 1001, "going away", where uvicorn says 1012, "service restart"."""

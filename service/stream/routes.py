@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from urllib.parse import parse_qsl
 
 from anyio import to_thread
 from fastapi import APIRouter
-from starlette.datastructures import Headers
 from starlette.types import Receive, Scope, Send
+from uvicorn.protocols.utils import ClientDisconnected
 
 from service.context import Service
-from service.errors import BusyError, ForbiddenError, NotFoundError, NotReadyError, invalid_request
+from service.errors import BusyError, NotFoundError, NotReadyError, invalid_request
+from service.inference import checks
+from service.models.schema import ALIAS
 from service.stream.conversation import Conversation, Echo
 from service.stream.protocol import CONNECTION, StreamProtocol
 from service.stream.session import Session
@@ -52,18 +54,20 @@ class Streams:
 
 
 class EchoRoute:
-    """ASGI application of the echo."""
+    """ASGI application of the echo. path: its address, by which metrics and logs name it."""
+
+    path = ECHO_PATH
 
     def __init__(self, streams: Streams) -> None:
         self.streams = streams
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Talk with one client. What is raised before it is accepted is answered in HTTP."""
-        _check_origin(scope)
         service: Service = scope["app"].state.service
         with self.streams.one_more(service.settings.max_streams):
             conversation = await self.conversation(service, scope, receive, send)
-            await conversation.run()
+            with suppress(ClientDisconnected):  # no error: it went away while it was answered, or its key ended
+                await conversation.run()
 
     async def conversation(self, service: Service, scope: Scope, receive: Receive, send: Send) -> Conversation:
         """Return what talks with the client; raise ServiceError where the address is wrong."""
@@ -73,14 +77,16 @@ class EchoRoute:
 class StreamRoute(EchoRoute):
     """ASGI application of torque streams."""
 
+    path = PATH
+
     async def conversation(self, service: Service, scope: Scope, receive: Receive, send: Send) -> Conversation:
         """Return what talks with the client; raise InvalidRequestError, NotFoundError or UnreadableVersionError."""
-        version, std, stream_id = _parameters(scope["query_string"])
+        version, alias, std, stream_id = _parameters(scope["query_string"])
         model = scope["path_params"]["model"]
-        served = service.loaded.hot(model, version)
+        served = service.loaded.hot(model, version, alias)
         if served is None:
-            served = await to_thread.run_sync(service.loaded.get, model, version)
-        return Session(_connection(scope), receive, send, service, served, version is not None, std, stream_id)
+            served = await to_thread.run_sync(service.loaded.get, model, version, alias)
+        return Session(_connection(scope), receive, send, service, served, version is not None, std, stream_id, alias)
 
 
 class NoRoute:
@@ -91,14 +97,18 @@ class NoRoute:
         raise NotFoundError(f"no stream at {scope['path'][:200]}: streams are at {PATH}")
 
 
-def _parameters(query: bytes) -> tuple[int | None, bool, str | None]:
-    """Read version, std and stream_id; raise InvalidRequestError."""
-    version, std, stream_id = None, False, None
+def _parameters(query: bytes) -> tuple[int | None, str | None, bool, str | None]:
+    """Read version, alias, std and stream_id; raise InvalidRequestError."""
+    version, alias, std, stream_id = None, None, False, None
     for name, value in parse_qsl(query.decode("ascii", "backslashreplace"), keep_blank_values=True):
         if name == "version":
             if not re.fullmatch("[0-9]{1,10}", value) or not 0 < int(value) < 2**31:
                 raise invalid_request("version", value, "the number of a version")
             version = int(value)
+        elif name == "alias":
+            if not re.fullmatch(ALIAS, value):
+                raise invalid_request("alias", value, f"a name that matches {ALIAS}")
+            alias = value
         elif name == "std":
             if value not in ("0", "1"):
                 raise invalid_request("std", value, "0 or 1")
@@ -108,15 +118,9 @@ def _parameters(query: bytes) -> tuple[int | None, bool, str | None]:
                 raise invalid_request("stream_id", value, f"a name that matches {STREAM_ID}")
             stream_id = value
         else:
-            raise invalid_request(name, value, "no parameter but version, std and stream_id")
-    return version, std, stream_id
-
-
-def _check_origin(scope: Scope) -> None:
-    headers = Headers(scope=scope)
-    origin = headers.get("origin")
-    if origin is not None and origin.partition("://")[2] != headers.get("host"):
-        raise ForbiddenError(f"the origin {origin[:200]!r} is not this service: web pages of other sites may not ask")
+            raise invalid_request(name, value, "no parameter but version, alias, std and stream_id")
+    checks.one_choice(version, alias)
+    return version, alias, std, stream_id
 
 
 def _connection(scope: Scope) -> StreamProtocol:

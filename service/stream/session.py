@@ -14,6 +14,7 @@ from service.context import Service
 from service.errors import ErrorBody, ErrorResponse, ServiceError, invalid_request
 from service.inference import checks
 from service.inference.loaded import Served
+from service.models.moves import SERVING
 from service.stream.conversation import Conversation
 from service.stream.frames import ANSWER, ASK_LEARN, ASK_STD, ERROR, HAS_STD, LATE, LAYOUT, REQUEST, UNREAD
 from service.stream.learning import Learning, Taught
@@ -27,7 +28,7 @@ class Session(Conversation):
     """Answers every frame from the version that is current when the frame is taken; holds that version in memory.
 
     pinned: whether it stays with this version; std: whether every answer carries tau_std; stream_id: source of the
-    torques that frames carry, None where they carry none.
+    torques that frames carry, None where they carry none; alias: that it follows, None: the version that serves.
     """
 
     def __init__(
@@ -40,11 +41,14 @@ class Session(Conversation):
         pinned: bool,
         std: bool,
         stream_id: str | None = None,
+        alias: str | None = None,
     ) -> None:
         super().__init__(connection, receive, send, service.settings)
         self._loaded, self._name = service.loaded, served.name
         self._pin = served.version if pinned else None
+        self._alias = None if alias == SERVING else alias
         self._std, self._late, self._due = std, 0, inf
+        self._meter, self._deadline = service.meters.stream(served.name), service.settings.stream_deadline_s
         self._learning = None if stream_id is None else Learning(service, stream_id, self.say)
         self._take(served)
 
@@ -76,6 +80,7 @@ class Session(Conversation):
         """Return the answer frame; whatever is wrong becomes an error frame."""
         if self.left > self._due:  # the last answer left in time, but its client did not read it
             self._late += 1
+            self._meter.late += 1
         self._due = inf
         sequence, flags = 0, UNREAD
         try:
@@ -87,7 +92,7 @@ class Session(Conversation):
                 raise invalid_request("frame", f"{len(data)} bytes long", expected)
             sequence, asked, n, budget = REQUEST.unpack_from(data)
             flags = 0
-            current = self._loaded.hot(self._name, self._pin)
+            current = self._loaded.hot(self._name, self._pin, self._alias)
             if current is not self._served:
                 await self._follow(current)
             motion = self._reader.read(data, asked, n, budget)
@@ -113,17 +118,25 @@ class Session(Conversation):
             if asked == ASK_LEARN and not self._std:  # its standard deviation is for the record alone
                 flags, numbers = 0, tau.tobytes()
         now = perf_counter()
+        seconds = now - arrived
+        self._meter.durations.add(seconds)
         if budget:
             self._due = arrived + budget
             if now > self._due:
                 self._late, self._due = self._late + 1, inf
+                self._meter.late += 1
                 flags |= LATE
-        return ANSWER.pack(sequence, flags, n, served.version, self._late, served.revision, now - arrived) + numbers
+        elif seconds > self._deadline:
+            self._meter.late += 1
+        return ANSWER.pack(sequence, flags, n, served.version, self._late, served.revision, seconds) + numbers
 
     async def _admit(self, sequence: int, flags: int) -> None:
         """Wait until there is room for a frame to learn from; raise InvalidRequestError where it may not be learnt."""
         if self._pin is not None:
             expected = f"no {ASK_LEARN}: a stream pinned to a version only asks; leave version out of the address"
+            raise invalid_request("flags", flags, expected)
+        if self._alias is not None:
+            expected = f"no {ASK_LEARN}: only the version that serves learns; leave alias out of the address"
             raise invalid_request("flags", flags, expected)
         if self._learning is None:
             expected = f"a name of the torque's source in the address, as in ?stream_id=arm-1, for flag {ASK_LEARN}"
@@ -131,17 +144,22 @@ class Session(Conversation):
         await self._learning.admit(sequence)
 
     def _refuse(self, sequence: int, flags: int, arrived: float, error: ServiceError) -> bytes:
+        self._meter.refuse(error.code)
         body = ErrorResponse(error=ErrorBody(code=error.code, message=error.message, detail=error.detail))
         served, seconds = self._served, perf_counter() - arrived
         header = ANSWER.pack(sequence, flags | ERROR, 0, served.version, self._late, served.revision, seconds)
         return header + body.model_dump_json().encode()
 
     async def _follow(self, current: Served | None) -> None:
-        """Take the version that is current; None: it has been dropped from memory, maybe for a newer one."""
+        """Take the version that is current; None: it has been dropped from memory, maybe for a newer one.
+
+        Raise NotFoundError where the version, the alias or the model has been deleted.
+        """
         if current is None:
-            if self._pin is not None or self._loaded.newest(self._name) == self._served.version:
+            meant = self._loaded.newest(self._name, self._alias) if self._pin is None else self._pin
+            if meant == self._served.version and not self._loaded.is_deleted(self._name, meant):
                 return  # it is held here
-            current = await to_thread.run_sync(self._loaded.get, self._name, None)
+            current = await to_thread.run_sync(self._loaded.get, self._name, self._pin, self._alias)
         known = self._served.version
         self._take(current)
         if current.version != known:

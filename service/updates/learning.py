@@ -18,7 +18,7 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 class LearningOptions(BaseModel):
     """How a model learns from observations."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
     enabled: bool = Field(True, description="Whether observations are taken at all")
     forgetting_s: float | None = Field(

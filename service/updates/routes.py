@@ -7,7 +7,8 @@ from starlette.types import Scope
 
 from service.context import Service, ServiceDep
 from service.errors import BusyError, ConflictError, InvalidRequestError, NotFoundError, TooLargeError, responses
-from service.hot import Reply, hot_route, is_json
+from service.hot import Reply, hot_route
+from service.route import is_json
 from service.updates.errors import ExpiredError, LearningDisabledError
 from service.updates.ingest import wire
 from service.updates.schema import ObservationRequest, ObservationResponse

@@ -61,6 +61,7 @@ class ObservationRequest(BaseModel):
 
     model_config = ConfigDict(
         extra="forbid",
+        strict=True,
         arbitrary_types_allowed=True,
         json_schema_extra={
             "examples": [

@@ -12,6 +12,7 @@ from typing import Any
 from service.database import Database
 from service.files import Files
 from service.inference.loaded import LoadedModels, Served
+from service.limits.disk import Disk
 from service.settings import Settings
 from service.updates.ingest.frames import Frames, FramesResult, observe_frames
 from service.updates.ingest.intake import Ingest
@@ -42,7 +43,7 @@ class Updates:
     first batch comes.
     """
 
-    def __init__(self, settings: Settings, database: Database, files: Files, loaded: LoadedModels) -> None:
+    def __init__(self, settings: Settings, database: Database, files: Files, loaded: LoadedModels, disk: Disk) -> None:
         self.settings, self.database, self.loaded = settings, database, loaded
         self.when_published: list[Callable[[Published], None]] = []
         self.when_contested: list[Callable[[Contested], None]] = []
@@ -52,7 +53,7 @@ class Updates:
         self._said: dict[tuple[str, int], Status] = {}
         self.learner = LearnerProcess(settings, self._hear)
         loaded.learn_from(self.learner.wake)
-        self._ingest = Ingest(settings, database, loaded, self._monitor, self.learner.wake)
+        self._ingest = Ingest(settings, database, loaded, self._monitor, self.learner.wake, disk)
 
     def close(self) -> None:
         """Finish the batches that have begun, and end the learner process, which stores what it knows."""
@@ -75,6 +76,12 @@ class Updates:
         """Those of the models that have learnt or have been looked at since the service started."""
         with self._lock:
             return dict(self._monitors)
+
+    def forget(self, model: str) -> None:
+        """Keep nothing of a model that has been deleted."""
+        with self._lock:
+            self._monitors.pop(model, None)
+            self._said = {key: status for key, status in self._said.items() if key[0] != model}
 
     def status(self, model: str, version: int) -> Status:
         """What the learner process said last of a version."""

@@ -14,7 +14,7 @@ from lipcore import Samples, TorqueModel
 from service.app import create_app
 from service.models import registry
 from service.settings import Settings
-from tests.service.data import service_of, stream, train, upload
+from tests.service.data import ADDRESS, service_of, stream, train, upload
 from tests.service.server import Server
 from tests.service.streams import Streaming, saved_model
 
@@ -22,6 +22,7 @@ LIMITS = {
     "max_upload_bytes": 200_000,
     "max_unpacked_bytes": 400_000,
     "max_urdf_bytes": 5_000,
+    "max_archive_bytes": 100_000,
     "max_request_bytes": 20_000,
     "max_joints": 8,
     "max_samples": 500,
@@ -39,14 +40,14 @@ LIMITS = {
 @pytest.fixture(scope="session")
 def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
     """A service with default settings; its data sets and models accumulate over the session."""
-    with TestClient(create_app(Settings(home=tmp_path_factory.mktemp("api")))) as client:
+    with TestClient(create_app(Settings(home=tmp_path_factory.mktemp("api"))), ADDRESS) as client:
         yield client
 
 
 @pytest.fixture(scope="session")
 def strict_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
     """A service with small limits."""
-    with TestClient(create_app(Settings(home=tmp_path_factory.mktemp("strict"), **LIMITS))) as client:
+    with TestClient(create_app(Settings(home=tmp_path_factory.mktemp("strict"), **LIMITS)), ADDRESS) as client:
         yield client
 
 
@@ -106,6 +107,14 @@ def no_worker(strict: TestClient, monkeypatch: pytest.MonkeyPatch) -> TestClient
     """The service with small limits, where queued jobs stay queued."""
     monkeypatch.setattr(service_of(strict).jobs, "submit", lambda job: None)
     return strict
+
+
+@pytest.fixture
+def fresh_looks(api: TestClient) -> Iterator[None]:
+    """Health is looked at again: what was found before does not count, nor what is found here later."""
+    service_of(api).readiness.forget()
+    yield
+    service_of(api).readiness.forget()
 
 
 @pytest.fixture

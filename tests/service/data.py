@@ -20,6 +20,8 @@ QUICK = {"hyperparameter_samples": 20, "posterior_samples": 60, "max_iterations"
 """Options of a fit that takes a fraction of a second."""
 ENDLESS = {"hyperparameter_samples": 200, "posterior_samples": 60, "max_iterations": 10_000}
 """Options of a fit that takes about half a minute on 200 samples of `panda`: far longer than a test needs to end it."""
+ADDRESS = "http://localhost"
+"""Where an in-process client finds the service: one without keys answers to names of this machine only."""
 DEADLINE = 60.0
 """Seconds after which a condition that a test waits for has failed."""
 

@@ -19,6 +19,9 @@ from tests.service.data import DEADLINE, eventually
 class Server:
     """`lipserve serve` on a home; settings are environment variables."""
 
+    patience = DEADLINE
+    """Seconds that it may take to start."""
+
     def __init__(self, home: Path, **settings: str) -> None:
         self.home, self.log = home, home.with_name(home.name + ".log")
         self.port = free_port()
@@ -32,7 +35,7 @@ class Server:
                 stderr=log,
             )
         try:
-            eventually(self._ready)
+            eventually(self._ready, self.patience)
         except BaseException:
             self.kill()
             raise

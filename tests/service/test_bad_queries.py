@@ -78,13 +78,13 @@ def test_bodies_that_are_no_query(strict, body):
 @pytest.mark.parametrize("body", [b'{"q": "\xff"}', b"[" * 15_000, b'{"q": ' + b"9" * 5000 + b"}"])
 def test_bodies_that_cannot_be_parsed(strict, body):
     answer = strict.post("/v1/models/panda-sim/predict", content=body, headers={"content-type": "application/json"})
-    error(answer, 400, "invalid_request")
+    error(answer, 422, "invalid_request")
 
 
 @pytest.mark.parametrize("media_type", ["text/plain", "application/x-www-form-urlencoded"])
 def test_json_has_to_be_announced(strict, media_type):
     answer = strict.post("/v1/models/panda-sim/predict", content=b"{}", headers={"content-type": media_type})
-    assert "application/json" in error(answer, 422, "invalid_request")["message"]
+    assert "application/json" in error(answer, 415, "unsupported_media_type")["message"]
 
 
 @pytest.mark.parametrize("width", [1, 6, 8])

@@ -60,7 +60,14 @@ def test_cancelling(client, files):
     running = client.train("cancelled", [dataset], options={"max_iterations": 10_000, "posterior_samples": 80})
     job = client.cancel(running.id)
     assert job.id == running.id
-    assert client.wait(job.id).state == "cancelled"
+    seen = list(client.job_events(job.id))
+    assert seen[-1].state == client.wait(job.id).state == "cancelled"
+    again = client.retry(job.id)
+    assert (again.retry_of, again.model) == (job.id, "cancelled")
+    assert client.cancel(again.id).id == again.id
+    with pytest.raises(ApiError) as caught:
+        next(client.job_events("job_nowhere"))
+    assert caught.value.status == 404
 
 
 def test_refusals_carry_code_message_and_detail(client):

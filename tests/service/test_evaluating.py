@@ -152,6 +152,6 @@ def test_derived_samples_are_what_is_compared(api, trained):
     fine = stream(samples=300, rate=50.0, seed=6)
     service = service_of(api)
     dataset = post(api, npz(**arrays(fine, "t", "q", "tau"))).json()
-    kept = service.files.read_samples(dataset["id"], dataset["joint_names"])
+    kept = service.files.read_samples(dataset["id"], dataset["joint_names"], dataset["sha256"])
     assert len(kept) < len(fine)
     compare(ask(api, trained.name, dataset["id"]).json(), expected(trained.model, kept))

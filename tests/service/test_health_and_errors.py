@@ -7,7 +7,7 @@ from fastapi.testclient import TestClient
 
 from service import __version__
 from service.inference import answer as inference
-from tests.service.data import error, service_of
+from tests.service.data import ADDRESS, error, service_of
 
 
 def test_alive(api):
@@ -17,10 +17,11 @@ def test_alive(api):
 
 def test_ready(api):
     answer = api.get("/health/ready")
-    assert (answer.status_code, answer.json()) == (200, {"status": "ready", "version": __version__})
+    assert answer.status_code == 200, answer.text
+    assert (answer.json()["status"], answer.json()["version"]) == ("ready", __version__)
 
 
-def test_not_ready_while_the_database_does_not_answer(api, monkeypatch):
+def test_not_ready_while_the_database_does_not_answer(api, monkeypatch, fresh_looks):
     def broken():
         raise OSError("disk on fire")
 
@@ -57,7 +58,7 @@ def test_unexpected_errors_tell_nothing_of_the_inside(api, monkeypatch):
 
     monkeypatch.setattr(inference, "predict", broken)
     # the same application without a start of its own
-    quiet = TestClient(api.app, raise_server_exceptions=False)
+    quiet = TestClient(api.app, ADDRESS, raise_server_exceptions=False)
     answer = quiet.post("/v1/models/panda-sim/predict", json={"q": [0], "dq": [0], "ddq": [0]})
     assert "secret" not in str(error(answer, 500, "internal_error"))
 

@@ -16,13 +16,13 @@ from service.files import Files
 from service.home import HomeInUseError
 from service.models import registry
 from service.settings import Settings, shipped_models
-from tests.service.data import QUICK, ended, error, job, stream, train, upload
+from tests.service.data import ADDRESS, QUICK, ended, error, job, stream, train, upload
 
 QUERY = {"q": [0.3, -0.2], "dq": [0.1, 0.4], "ddq": [1.0, -0.5], "covariance": True}
 
 
 def started(home, **settings):
-    return TestClient(create_app(Settings(home=home, **settings)))
+    return TestClient(create_app(Settings(home=home, **settings)), ADDRESS)
 
 
 def interrupted(name, dataset, attempts, model="again", state="running", **fields):
@@ -138,12 +138,12 @@ def test_a_damaged_version_does_not_keep_the_others_from_answering(home):
     (files.versions / "mv_damaged/model.safetensors").write_bytes(b"")
 
     zero = {"q": [0.0] * 7, "dq": [0.0] * 7, "ddq": [0.0] * 7}
-    with TestClient(create_app(Settings(home=home)), raise_server_exceptions=False) as api:
+    with TestClient(create_app(Settings(home=home)), ADDRESS, raise_server_exceptions=False) as api:
         assert api.get("/health/ready").status_code == 200
         assert api.post("/v1/models/panda-sim/predict", json=zero).status_code == 200
         said = error(api.post("/v1/models/damaged/predict", json=zero), 500, "unreadable_version")
         assert said["message"].startswith("version 1 of model 'damaged' cannot be loaded: ")
-        assert "does not match the sha256 of its manifest" in said["message"]
+        assert "does not have the sha256 that was kept of it" in said["message"]
 
 
 def earlier_release(home, job):
@@ -160,7 +160,7 @@ def earlier_release(home, job):
 
 def test_an_upgrade_brings_its_shipped_model(home):
     earlier_release(home, job=None)
-    with TestClient(create_app(Settings(home=home))) as api:
+    with TestClient(create_app(Settings(home=home)), ADDRESS) as api:
         assert api.get("/v1/models/panda-sim").json()["latest_version"] == 2
         query = {"q": [0.0] * 7, "dq": [0.0] * 7, "ddq": [0.0] * 7}
         assert api.post("/v1/models/panda-sim/predict", json=query).json()["version"] == 2
@@ -171,5 +171,5 @@ def test_an_upgrade_brings_its_shipped_model(home):
 
 def test_an_upgrade_leaves_a_model_alone_that_the_user_has_trained(home):
     earlier_release(home, job="job_of_the_user")
-    with TestClient(create_app(Settings(home=home))) as api:
+    with TestClient(create_app(Settings(home=home)), ADDRESS) as api:
         assert api.get("/v1/models/panda-sim").json()["latest_version"] == 1

@@ -80,14 +80,8 @@ def test_numbers_are_those_of_the_model_to_the_last_bit(api, trained):
         BATCH | {"covariance": True, "components": ["friction", "gravity"]},
         QUERY | {"components": ["forward_dynamics"], "tau": [0.1, 0]},
         QUERY | {"version": None, "tau": None},
-        # what pydantic takes for a number or a truth value
-        QUERY | {"version": "1"},
-        QUERY | {"version": 1.0, "covariance": "yes"},
-        QUERY | {"version": True, "covariance": 1},
-        json.dumps(QUERY).encode("utf-16"),
         json.dumps(QUERY).encode("utf-8-sig"),
         f" \n{json.dumps(QUERY, indent=3)}\t",
-        '{"q": [9, 9], "q": [0.25, -1.5], "dq": [1, 0.125], "ddq": [-2e0, 3E-1]}',
         '{"\\u0071": [0.25, -1.5], "dq": [1, 0.125], "ddq": [-2e0, 3E-1]}',
         '{"q": [-0, -0.0], "dq": [9007199254740993, 1e-400], "ddq": [0.1000000000000000055511151231257827, 1e22]}',
     ],
@@ -121,6 +115,16 @@ def test_right_queries(api, trained, body):
         QUERY | {"components": ["gravity", "gravity"]},
         QUERY | {"components": ["gravity", "mass"]},
         QUERY | {"components": None},
+        # what pydantic would take for a number or a truth value
+        QUERY | {"version": "1"},
+        QUERY | {"version": 1.0},
+        QUERY | {"version": True},
+        QUERY | {"covariance": "yes"},
+        QUERY | {"covariance": 1},
+        json.dumps(QUERY).encode("utf-16"),
+        '{"q": [9, 9], "q": [0.25, -1.5], "dq": [1, 0.125], "ddq": [-2e0, 3E-1]}',
+        '{"q": [9, 9], "\\u0071": [0.25, -1.5], "dq": [1, 0.125], "ddq": [-2e0, 3E-1]}',
+        '{"q": [0.25, -1.5], "dq": [1, 0.125], "ddq": [-2e0, 3E-1], "version": 1, "version": null}',
         QUERY | {"version": 2},
         QUERY | {"version": 0},
         QUERY | {"version": 2**31},
@@ -150,7 +154,7 @@ def test_bodies_with_a_fault_anywhere(api, trained):
             case _:
                 body.insert(at, body[at])
         statuses.add(as_fastapi_does(api, trained.name, bytes(body)).status_code)
-    assert {200, 400, 422} <= statuses
+    assert {200, 422} <= statuses
 
 
 def test_unknown_models(api):
@@ -168,7 +172,7 @@ def test_json_by_its_names(no_thread, trained, media_type):
 
 @pytest.mark.parametrize("media_type", ["text/json", "application/jsonx", "json", "", "multipart/form-data"])
 def test_what_is_not_announced_as_json_is_not_read(api, trained, media_type):
-    said = error(post(api, trained.name, QUERY, media_type), 422, "invalid_request")
+    said = error(post(api, trained.name, QUERY, media_type), 415, "unsupported_media_type")
     assert "application/json" in said["message"]
 
 

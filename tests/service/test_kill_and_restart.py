@@ -11,7 +11,7 @@ from fastapi.testclient import TestClient
 
 from service.app import create_app
 from service.settings import Settings
-from tests.service.data import ENDLESS, ended, eventually, queue, running, stream, train, upload
+from tests.service.data import ADDRESS, ENDLESS, ended, eventually, queue, running, stream, train, upload
 from tests.service.server import Server, command
 
 QUERY = {"q": [0.3, -0.2], "dq": [0.1, 0.4], "ddq": [1.0, -0.5], "covariance": True}
@@ -89,7 +89,7 @@ def test_asked_to_end_while_it_trains_a_server_ends_and_the_job_goes_on_at_the_n
         assert server.terminate() in (0, -signal.SIGTERM)  # long before the fit can have ended
         assert "Application shutdown complete" in server.log.read_text()
         assert all(command(pid) == "" for pid in workers)
-    with TestClient(create_app(Settings(home=home))) as api:
+    with TestClient(create_app(Settings(home=home)), ADDRESS) as api:
         again = running(api, name)
         assert (again["state"], again["attempts"]) == ("running", 1)  # ending in order costs no attempt
         api.post(f"/v1/jobs/{name}/cancel")

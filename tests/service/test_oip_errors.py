@@ -11,7 +11,7 @@ from fastapi.testclient import TestClient
 
 from lipcore import dynamics
 from service.oip import outputs
-from tests.service.data import error, service_of
+from tests.service.data import ADDRESS, error, service_of
 from tests.service.oip import listed, message, path_of, refused
 
 MOTION = {"q": [0.3, -0.7], "dq": [1.1, 0.2], "ddq": [-2.0, 0.9]}
@@ -225,7 +225,7 @@ def test_unexpected_errors_tell_nothing_of_the_inside(api, trained, monkeypatch)
         raise RuntimeError("secret")
 
     monkeypatch.setattr(outputs, "compute", broken)
-    quiet = TestClient(api.app, raise_server_exceptions=False)
+    quiet = TestClient(api.app, ADDRESS, raise_server_exceptions=False)
     said = refused(quiet.post(PATH, json=message(MOTION)), 500)
     assert said == "an unexpected error; the service's log says more"
 

@@ -52,7 +52,7 @@ def test_one_connection_answers_many_requests(server):
         }
     ).encode()
     body = text + b"".join(packed(values) for values in MOTION.values())
-    head = f"POST {PATH} HTTP/1.1\r\nHost: x\r\nContent-Length: {len(body)}\r\n{HEADER}: "
+    head = f"POST {PATH} HTTP/1.1\r\nHost: localhost\r\nContent-Length: {len(body)}\r\n{HEADER}: "
     right, wrong = (f"{head}{length}\r\n\r\n".encode() + body for length in (len(text), len(text) - 1))
     expected = plain(server, MOTION)
     with socket.create_connection(("127.0.0.1", server.port), DEADLINE) as connection:

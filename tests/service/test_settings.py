@@ -45,16 +45,19 @@ def test_arguments_come_before_the_environment(monkeypatch):
 
 def test_defaults_are_safe():
     settings = Settings()
-    assert (settings.host, settings.insecure) == ("127.0.0.1", False)
+    assert (settings.host, settings.keys, settings.keys_needed) == ("127.0.0.1", "auto", False)
     assert settings.home == CHECKOUT_MODELS
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.5", "robot.example.org", ""])
-def test_other_hosts_need_a_word(monkeypatch, host):
-    with pytest.raises(ValidationError, match="LIPSERVE_INSECURE=1"):
-        Settings(host=host)
-    monkeypatch.setenv("LIPSERVE_INSECURE", "1")
-    assert Settings(host=host).host == host
+def test_other_hosts_need_keys(host):
+    assert Settings(host=host).keys_needed is True
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1", "localhost", "0.0.0.0"])
+def test_keys_can_be_asked_for_on_every_host(monkeypatch, host):
+    monkeypatch.setenv("LIPSERVE_KEYS", "on")
+    assert Settings(host=host).keys_needed is True
 
 
 @pytest.mark.parametrize(
@@ -90,7 +93,8 @@ def test_loopback(host, loopback):
         ("training_niceness", "20"),
         ("training_workers", "0"),
         ("max_job_attempts", "0"),
-        ("insecure", "perhaps"),
+        ("keys", "off"),
+        ("keys_refresh_s", "0"),
         ("uds_mode", "rw-rw----"),
         ("uds_mode", "680"),
         ("uds_mode", "1777"),

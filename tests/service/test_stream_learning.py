@@ -14,6 +14,7 @@ import pytest
 from anyio import to_thread
 
 from service.errors import ConflictError, invalid_request
+from service.observability.meters import Meters
 from service.settings import Settings
 from service.stream.session import Session
 from service.updates.ingest.frames import FramesResult
@@ -78,13 +79,14 @@ class Talk:
         for passing in self.passing.values():
             passing.set()
         self.current = served()
-        loaded = SimpleNamespace(hot=lambda name, version: self.current, newest=lambda name: self.current.version)
+        loaded = SimpleNamespace(hot=lambda name, version, alias: self.current)
         service = SimpleNamespace(
             settings=Settings(**{**QUICK, **settings}),
             loaded=loaded,
             updates=updates,
+            meters=Meters(),
         )
-        self.connection = SimpleNamespace(arrived=perf_counter(), abort=self.aborted.set)
+        self.connection = SimpleNamespace(arrived=perf_counter(), abort=self.aborted.set, scope={"subprotocols": []})
         self.session = Session(
             self.connection, self.messages.get, self.send, service, self.current, pinned, std, stream_id
         )

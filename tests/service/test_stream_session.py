@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from service.observability.meters import Meters
 from service.settings import Settings
 from service.stream.conversation import Echo
 from service.stream.session import Session
@@ -35,19 +36,27 @@ class Loaded:
         self.stored = {int(name[1:]): served(int(name[1:]), model) for name, model in stored.items()}
         self.memory, self.latest, self.loads = dict(self.stored), max(self.stored), 0
 
-    def hot(self, name, version):
+    def hot(self, name, version, alias):
         return self.memory.get(self.latest if version is None else version)
 
-    def newest(self, name):
+    def newest(self, name, alias):
         return self.latest
 
-    def get(self, name, version):
+    def is_deleted(self, name, version):
+        return False
+
+    def get(self, name, version, alias):
         self.loads += 1
         return self.memory.setdefault(self.latest, self.stored[self.latest])
 
 
 def served(version, model, revision=0):
     return SimpleNamespace(name="m", version=version, revision=revision, model=model, noise_std=[0.1, 0.2])
+
+
+def connection():
+    """What a conversation asks of its connection."""
+    return SimpleNamespace(arrived=0.0, scope={"subprotocols": []})
 
 
 def session(loaded, version, pinned=False):
@@ -57,7 +66,7 @@ def session(loaded, version, pinned=False):
     async def send(message):
         said.append(message["text"])
 
-    service = SimpleNamespace(settings=Settings(), loaded=loaded)
+    service = SimpleNamespace(settings=Settings(), loaded=loaded, meters=Meters())
     return Session(None, None, send, service, loaded.stored[version], pinned, std=False), said
 
 
@@ -177,11 +186,11 @@ def test_a_stream_without_frames_is_closed():
     async def idle():
         messages.put_nowait({"type": "websocket.connect"})
         settings = Settings(stream_idle_s=0.01)
-        await asyncio.wait_for(Echo(SimpleNamespace(arrived=0.0), messages.get, send, settings).run(), DEADLINE)
+        await asyncio.wait_for(Echo(connection(), messages.get, send, settings).run(), DEADLINE)
 
     asyncio.run(idle())
     assert said == [
-        {"type": "websocket.accept"},
+        {"type": "websocket.accept", "subprotocol": None},
         {"type": "websocket.close", "code": 1000, "reason": "no frame for 0.01 s (LIPSERVE_STREAM_IDLE_S)"},
     ]
 
@@ -205,7 +214,7 @@ def test_others_have_their_turn_between_frames_sent_ahead():
             await asyncio.sleep(0)
 
     async def both():
-        await asyncio.gather(Echo(SimpleNamespace(arrived=0.0), receive, send, Settings()).run(), other())
+        await asyncio.gather(Echo(connection(), receive, send, Settings()).run(), other())
 
     asyncio.run(both())
     assert turns == [0, "other", 1, "other", 2, "other", 3, "other", 4, "other"]

@@ -50,12 +50,12 @@ def test_a_form_without_a_file_is_refused(strict, form):
 
 @pytest.mark.parametrize("media_type", ["multipart/form-data", "multipart/form-data; boundary=x"])
 def test_a_broken_form_is_refused(strict, media_type):
-    refused(strict, b"garbage", media_type, 400, "invalid_request")
+    refused(strict, b"garbage", media_type, 422, "invalid_request")
 
 
 def test_two_files_are_refused(strict):
     files = [("file", ("a.csv", GOOD)), ("file", ("b.csv", GOOD))]
-    error(strict.post("/v1/datasets", files=files), 400, "invalid_request")
+    error(strict.post("/v1/datasets", files=files), 422, "invalid_request")
     nothing_stays(strict)
 
 

@@ -117,9 +117,8 @@ def run(options: Options, console: Console) -> Results:
 
 def _models(options: Options) -> dict[str, LearningOptions]:
     """Copies of the model by name. Nothing is trained beside the measurements."""
-    alone = {"auto_refresh": False, "auto_promote": False}
-    adapting = LearningOptions(forgetting_s=options.forgetting_s, on_change="adapt", **alone)
-    learning = LearningOptions(on_change="learn", **alone)
+    learning = LearningOptions(on_change="learn", auto_refresh=False, auto_promote=False)
+    adapting = learning.model_copy(update={"forgetting_s": options.forgetting_s, "on_change": "adapt"})
     return {LIVE: adapting, BURST: adapting, LEARNING: learning, ADAPTING: adapting}
 
 

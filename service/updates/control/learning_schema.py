@@ -75,7 +75,9 @@ class Learning(BaseModel):
 class ChangeRequest(BaseModel):
     """What to do about a change that learning is held for."""
 
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"decision": "adapt", "replay": True}]})
+    model_config = ConfigDict(
+        extra="forbid", strict=True, json_schema_extra={"examples": [{"decision": "adapt", "replay": True}]}
+    )
 
     decision: Literal["adapt", "ignore"] = Field(
         description="adapt: the robot has changed, what was learnt before counts less from then on; ignore: go on"

@@ -16,6 +16,7 @@ from service.errors import (
     responses,
 )
 from service.pages import PageQuery
+from service.route import Route
 from service.updates.control import decisions, inspection, replaying, status, undoing
 from service.updates.control.learning_schema import AlarmPage, ChangeRequest, Decided, Learning
 from service.updates.control.schema import (
@@ -36,7 +37,9 @@ Sequence = Annotated[int, Path(ge=0, le=MOST_SEQUENCE)]
 EXAMPLE = {"forgetting_s": 3600.0, "on_change": "hold", "contact_threshold": 8.0}
 BATCH = "/{model}/observations/{stream_id}/{sequence}"
 
-router = APIRouter(prefix="/v1/models", tags=["learning"], responses=responses(InvalidRequestError, NotFoundError))
+router = APIRouter(
+    prefix="/v1/models", tags=["learning"], responses=responses(InvalidRequestError, NotFoundError), route_class=Route
+)
 
 
 @router.get("/{model}/quality", summary="How well a model predicts what it has not learnt yet")

@@ -135,7 +135,7 @@ Code = Annotated[str, PlainValidator(_code), WithJsonSchema({"type": "string", "
 class ReplayRequest(BaseModel):
     """Which rows of a batch to learn after all."""
 
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"codes": ["contact"]}]})
+    model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [{"codes": ["contact"]}]})
 
     codes: list[Code] | None = Field(
         None, min_length=1, max_length=len(CODES), description="Rows kept out by these codes; by any code by default"
@@ -154,7 +154,9 @@ class Replayed(Revised):
 class RollbackRequest(BaseModel):
     """Where to go back to: a revision of the version that serves, or another version."""
 
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"revision": 120}, {"version": 1}]})
+    model_config = ConfigDict(
+        extra="forbid", strict=True, json_schema_extra={"examples": [{"revision": 120}, {"version": 1}]}
+    )
 
     revision: int | None = Field(
         None, ge=0, le=MOST_SEQUENCE, description="What was learnt after it is forgotten; the log keeps the rows"

@@ -64,7 +64,7 @@ def observe_frames(ingest: Ingest, monitor: Monitor, frames: Frames) -> FramesRe
     """Log frames; once this returns they are durable. All of them or none.
 
     Raise LearningDisabledError, ConflictError for a sequence that was used for something else or does not rise,
-    ExpiredError or BusyError.
+    ExpiredError, BusyError or StorageFullError.
     """
     _check_order(frames)
     with monitor.lock:

@@ -9,11 +9,14 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from service.database import Database, EventRow, StreamRow
-from service.errors import ConflictError
+from service.database import Database, EventRow, ModelRow, StreamRow
+from service.errors import ConflictError, not_found
 from service.inference.loaded import LoadedModels, Served
+from service.limits.disk import Disk
+from service.models import registry
 from service.settings import Settings
 from service.updates import learning
 from service.updates.errors import LearningDisabledError
@@ -33,6 +36,8 @@ logger = logging.getLogger(__name__)
 
 RETAIN_EVERY = 200
 """Batches of a model after which its log is brought within its limits."""
+ROW_NUMBERS, NUMBER_BYTES = 6, 8
+"""What a row takes of the disk, for each joint: motion and torque, and half as much again for times and indices."""
 MOST_GAPS = 100
 """Gaps that an acknowledgement names."""
 CONSEQUENCES = {
@@ -70,14 +75,16 @@ class Ingest:
         loaded: LoadedModels,
         monitor: Callable[[Served], Monitor],
         wake: Callable[[str], None],
+        disk: Disk,
     ) -> None:
-        self.settings, self.database, self.loaded = settings, database, loaded
+        self.settings, self.database, self.loaded, self.disk = settings, database, loaded, disk
         self._monitor, self._wake = monitor, wake
 
     def observe(self, model: str, request: ObservationRequest) -> ObservationResponse:
         """Take a batch; once this returns it is durable.
 
-        Raise NotFoundError, LearningDisabledError, InvalidRequestError, ConflictError, ExpiredError or BusyError.
+        Raise NotFoundError, LearningDisabledError, InvalidRequestError, ConflictError, ExpiredError, BusyError or
+        StorageFullError.
         """
         served, received = self.loaded.get(model, None), time.time()
         came = measured(request, served.model, self.settings)
@@ -133,7 +140,9 @@ class Ingest:
         Return the report that is kept of it: what is said of every batch, and `said`.
         """
         model = served.name
+        self.disk.take(ROW_NUMBERS * NUMBER_BYTES * served.model.n_joints * arrival.rows)
         with self.database.transaction() as session:
+            _check_kept(session, served)
             held = learning.held(session, model) is not None
             if monitor.held and not held:
                 monitor.decided()
@@ -211,6 +220,15 @@ def check_kind(source: StreamRow | None, kind: StreamKind) -> None:
             f"stream {source.stream_id!r} of model {source.model!r} carries {source.kind}, not {kind}: use another "
             "stream_id"
         )
+
+
+def _check_kept(session: Session, served: Served) -> None:
+    """Raise an error where a model, or the version that has predicted a batch, was deleted since the batch came."""
+    if registry.exists(session, served.name, served.version):
+        return
+    if session.scalar(select(ModelRow.name).where(ModelRow.name == served.name)) is None:
+        raise not_found("model", served.name)
+    raise ConflictError(f"version {served.version} of model {served.name!r} was deleted meanwhile: send it again")
 
 
 def _alarm(session: Session, served: Served, options: LearningOptions, verdict: Verdict, event: EventRow) -> None:

@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from typing import Any, TypeVar
 
 from service.errors import BusyError
@@ -40,7 +41,8 @@ class IngestThreads:
         self._waiting += 1
         try:
             # what has begun is done to its end, whether anyone still waits for it or not
-            return await asyncio.shield(asyncio.get_running_loop().run_in_executor(self._threads, work, *args))
+            run = copy_context().run  # what is logged names the request
+            return await asyncio.shield(asyncio.get_running_loop().run_in_executor(self._threads, run, work, *args))
         finally:
             self._waiting -= 1
 

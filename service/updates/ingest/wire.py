@@ -9,6 +9,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
+from service.route import each_once
 from service.updates.schema import MOST_SEQUENCE, ObservationRequest
 
 Array = NDArray[np.float64]
@@ -47,14 +48,16 @@ class Batch(Struct, forbid_unknown_fields=True):
 
 
 _decoder = msgspec.json.Decoder(Batch)
+_FIELDS = tuple(name.encode() for name in Batch.__struct_fields__)
 
 
 def decode(body: bytes) -> ObservationRequest | None:
     """Decode a batch, or return None where anything in it is not as it should be."""
     try:
-        return _decoder.decode(body).request()
+        batch = _decoder.decode(body)
     except msgspec.MsgspecError:
         return None
+    return batch.request() if each_once(body, *_FIELDS) else None
 
 
 def _array(values: Numbers) -> Array:

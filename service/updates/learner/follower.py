@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from sqlalchemy.exc import DBAPIError
 
 from lipcore.model import TorqueModel
 from lipcore.online import state
@@ -15,13 +17,18 @@ from lipcore.online.learner import OnlineModel
 from lipcore.online.revision import Revision
 from lipcore.samples import Array
 from service.database import Database
+from service.errors import StorageFullError
 from service.files import Files
+from service.limits.disk import Disk
 from service.settings import Settings
+from service.storage_errors import translated
 from service.updates.learner import publication, recent
 from service.updates.learner.messages import Published
 from service.updates.learner.novelty import Novelty
 from service.updates.learner.restore import Arrival, RewoundError, advance, restore
 from service.updates.storage import log, snapshots
+
+logger = logging.getLogger(__name__)
 
 Watcher = Callable[["Follower", Sequence[Arrival]], None]
 
@@ -39,6 +46,7 @@ class Follower:
     ) -> None:
         self.database, self.files, self.settings = database, files, settings
         self.model, self.version, self.base = model, version, base
+        self.disk = Disk(settings)
         with database.session() as session:
             self.start = log.start_of(session, model, version)
         # only what needs no learning: pages are taken one by one, and others have their turn in between
@@ -114,19 +122,33 @@ class Follower:
         return self._stored_at + self.settings.snapshot_every_s
 
     def store(self) -> None:
-        """Store the state, unless it is stored or would not be what the log says."""
-        if self.number != self._stored and self.known.settled:
+        """Store the state, unless it is stored or would not be what the log says.
+
+        Where there is no room for it, learning goes on all the same: the log has everything.
+        """
+        if self.number == self._stored or not self.known.settled:
+            return
+        self._stored_at = time.monotonic()
+        payload = state.dump(self.known.online)
+        try:
+            self.disk.take(len(payload))
             snapshots.save(
                 self.database,
                 self.files,
                 self.model,
                 self.version,
                 self.number,
-                state.dump(self.known.online),
+                payload,
                 seen=self.known.seen,
                 most=self.settings.max_snapshots,
             )
-            self._stored, self._stored_at = self.number, time.monotonic()
+        except (StorageFullError, OSError, DBAPIError) as error:
+            said = translated(error)
+            if said is None:
+                raise
+            logger.warning("what version %d of model %s has learnt is not stored: %s", self.version, self.model, said)
+            return
+        self._stored = self.number
 
     def _solve(self, floor: Array) -> Revision:
         """The arrays of the state; those of the last time where nothing but the number has changed."""

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from sqlalchemy.orm import Session
 
 from lipcore.model import TorqueModel
+from lipcore.online.consolidation import consolidate
 from service.database import Database, LearnerRow, ServingRow
 from service.files import Files
 from service.updates.learner import recent
-from service.updates.learner.restore import restore
+from service.updates.learner.restore import Restored, restore
 from service.updates.storage import log, snapshots
 
 MOST_ROWS = 500
@@ -31,6 +32,34 @@ def find(database: Database, files: Files, model: str, version: int, base: Torqu
 
     One that neither serves nor is a candidate has learnt what its last snapshot says.
     """
+    state = _restored(database, files, model, version, base, MOST_ROWS)
+    if state is None:
+        return None
+    known, start, newest = state
+    behind = newest is not None and known.number < newest
+    if known.number == start:
+        return Learnt(base, 0, behind)
+    floor = recent.floor(database, model, version, known.number, base.n_joints)
+    return Learnt(known.online.model(floor), known.number - start, behind)
+
+
+def consolidated(database: Database, files: Files, model: str, version: int, base: TorqueModel) -> Learnt | None:
+    """Return all that a version has learnt as a model that can be saved, None where that is nothing; see `find`.
+
+    It takes the time to learn what has come since the last snapshot.
+    """
+    state = _restored(database, files, model, version, base, None)
+    if state is None or state[0].number == state[1]:
+        return None
+    known, start, _ = state
+    floor = recent.floor(database, model, version, known.number, base.n_joints)
+    return Learnt(consolidate(known.online, floor), known.number - start, False)
+
+
+def _restored(
+    database: Database, files: Files, model: str, version: int, base: TorqueModel, most_rows: int | None
+) -> tuple[Restored, int, int | None] | None:
+    """The state of a version, the event that it starts after, and the newest one, None where it no longer learns."""
     with database.session() as session:
         start, newest = log.start_of(session, model, version), log.newest(session, model)
         if newest == start:
@@ -40,12 +69,8 @@ def find(database: Database, files: Files, model: str, version: int, base: Torqu
     if not learns and row is None:
         return None
     at_most = None if learns or row is None else row.number
-    known = restore(database, files, model, version, base, at_most, most_rows=MOST_ROWS)
-    behind = learns and known.number < newest
-    if known.number == start:
-        return Learnt(base, 0, behind)
-    floor = recent.floor(database, model, version, known.number, base.n_joints)
-    return Learnt(known.online.model(floor), known.number - start, behind)
+    known = restore(database, files, model, version, base, at_most, most_rows=most_rows)
+    return known, start, newest if learns else None
 
 
 def _learns(session: Session, model: str, version: int) -> bool:

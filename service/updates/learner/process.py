@@ -16,6 +16,7 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 
+from service.observability import logs
 from service.settings import Settings
 from service.training.process import Place, start_process, training_cpus
 from service.updates.learner.messages import Message
@@ -33,7 +34,7 @@ def learner_place(settings: Settings) -> Place:
     cpus = None
     if hasattr(os, "sched_getaffinity"):  # Linux
         cpus = training_cpus(os.sched_getaffinity(0), settings.training_cpus)
-    return Place(threads=1, niceness=settings.learner_niceness, cpus=cpus)
+    return Place(threads=1, niceness=settings.learner_niceness, cpus=cpus, log=logs.current())
 
 
 class LearnerProcess:
@@ -57,6 +58,11 @@ class LearnerProcess:
         """Id of the process, None while there is none."""
         process = self._process
         return None if process is None or not process.is_alive() else process.pid
+
+    @property
+    def wanted(self) -> bool:
+        """Whether there should be a process: a model has been woken, and the service is not closing."""
+        return bool(self._threads) and not self._closing
 
     def wake(self, model: str) -> None:
         """Say that a model's log has grown, or that other versions of it learn. Never waits for the process."""

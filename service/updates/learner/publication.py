@@ -36,8 +36,12 @@ def write(target: Path, revision: Revision) -> Path:
     """Write the arrays of a revision below a folder; return where."""
     path = target / new_id("rev")
     path.mkdir()
-    for name in NAMES:
-        np.save(path / f"{name}.npy", getattr(revision, name), allow_pickle=False)
+    try:
+        for name in NAMES:
+            np.save(path / f"{name}.npy", getattr(revision, name), allow_pickle=False)
+    except OSError:
+        shutil.rmtree(path, ignore_errors=True)  # nobody will read it
+        raise
     return path
 
 

@@ -20,6 +20,7 @@ from service.updates.learner import publication
 from service.updates.learner.follower import Follower
 from service.updates.learner.messages import Failed, Message
 from service.updates.refreshing.duel import Duels
+from service.updates.storage import snapshots
 
 logger = logging.getLogger(__name__)
 
@@ -32,6 +33,7 @@ def run(settings: Settings, connection: Connection) -> None:
     """Follow the models whose names come over the connection, until it ends or None comes."""
     database, files = Database(settings.home), Files(settings.home)
     publication.clear(files)
+    snapshots.sweep(database, files)
     learner = Learner(database, files, settings)
     try:
         with suppress(EOFError, BrokenPipeError):  # the service is gone
@@ -151,7 +153,7 @@ class Learner:
         while len(self.followers) >= self.settings.max_learning_models:
             self._drop(next(iter(self.followers)))
         row = registry.find(self.database, *key)
-        base = lipcore.load(self.files.versions / row.folder)
+        base = lipcore.load(self.files.versions / row.folder, row.checksums)
         return Follower(self.database, self.files, self.settings, *key, base)
 
     def _drop(self, key: Key) -> None:

@@ -1,22 +1,19 @@
-"""What monitoring reads at /metrics, in the format of Prometheus: computed when it is asked for, and kept nowhere."""
+"""Metrics of models that learn: computed when they are asked for, and kept nowhere."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
 
-from fastapi import APIRouter, Request, Response
-from fastapi.responses import PlainTextResponse
-from prometheus_client import CollectorRegistry
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
-from prometheus_client.exposition import choose_encoder
+from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 from sqlalchemy import select
 
 from lipcore.online.batch import CODES
-from service.context import Service, ServiceDep
+from service.context import Service
 from service.database import StreamRow
 from service.inference.loaded import Served
+from service.observability.metric import MetricKind
 from service.updates.control import revisions
 from service.updates.control.status import novel_share
 from service.updates.quality import summary
@@ -27,35 +24,22 @@ FIGURES = {
     "coverage": "Share of measurements inside the 95 % interval, noise included",
     "nlpd": "Mean negative log predictive density, nats",
 }
-EXAMPLE = """# HELP lipserve_quality_coverage Share of measurements inside the 95 % interval, noise included
-# TYPE lipserve_quality_coverage gauge
-lipserve_quality_coverage{joint="panda_joint1",model="panda-sim",window="60"} 0.953
-# HELP lipserve_observations_total Rows of observations since the service has started, by what became of them
-# TYPE lipserve_observations_total counter
-lipserve_observations_total{model="panda-sim",outcome="learnt"} 12000.0
-lipserve_observations_total{model="panda-sim",outcome="contact"} 34.0
-"""
-
-router = APIRouter(tags=["health"])
-
-
-@router.get(
-    "/metrics",
-    summary="Metrics for Prometheus",
-    response_class=PlainTextResponse,
-    responses={
-        200: {
-            "description": "Text of Prometheus, or OpenMetrics where that is accepted",
-            "content": {"text/plain": {"example": EXAMPLE}},
-        }
-    },
+QUALITY = {
+    name: MetricKind("gauge", f"lipserve_quality_{name}", said, ("model", "joint", "window"))
+    for name, said in FIGURES.items()
+}
+REVISION = MetricKind("gauge", "lipserve_revision", "Revision that answers contain", ("model", "version"))
+NOVEL = MetricKind("gauge", "lipserve_novel_share", "Share of the latest samples that lie beyond the basis", ("model",))
+LAG = MetricKind(
+    "gauge", "lipserve_learning_lag_events", "Events of the log that answers do not contain yet", ("model",)
 )
-def metrics(request: Request, service: ServiceDep) -> Response:
-    """Quality, revision, lag and counts of every model that has got observations."""
-    registry = CollectorRegistry()
-    registry.register(Learning(service))
-    encode, media_type = choose_encoder(request.headers.get("accept", ""))
-    return Response(encode(registry), media_type=media_type)
+ROWS = MetricKind(
+    "counter",
+    "lipserve_observations_total",
+    "Rows of observations since the service has started, by what became of them",
+    ("model", "outcome"),
+)
+KINDS = (*QUALITY.values(), REVISION, NOVEL, LAG, ROWS)
 
 
 class Learning(Collector):
@@ -70,22 +54,8 @@ class Learning(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Yield every metric with a sample for each model."""
-        gauges = {
-            name: GaugeMetricFamily(f"lipserve_quality_{name}", said, labels=["model", "joint", "window"])
-            for name, said in FIGURES.items()
-        }
-        revision = GaugeMetricFamily("lipserve_revision", "Revision that answers contain", labels=["model", "version"])
-        novel = GaugeMetricFamily(
-            "lipserve_novel_share", "Share of the latest samples that lie beyond the basis", labels=["model"]
-        )
-        lag = GaugeMetricFamily(
-            "lipserve_learning_lag_events", "Events of the log that answers do not contain yet", labels=["model"]
-        )
-        rows = CounterMetricFamily(
-            "lipserve_observations",
-            "Rows of observations since the service has started, by what became of them",
-            labels=["model", "outcome"],
-        )
+        gauges = {name: kind.family() for name, kind in QUALITY.items()}
+        revision, novel, lag, rows = (kind.family() for kind in (REVISION, NOVEL, LAG, ROWS))
         for model, monitor in self._monitors().items():
             _add_quality(gauges, model, monitor)
             for outcome in CODES:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from math import inf
 
 from lipcore.online.batch import Rows
 from lipcore.samples import Array
@@ -15,6 +17,8 @@ from service.updates.refreshing.contest import Contest, Verdict, sample
 
 PENDING = 2000
 """Events that one follower may be ahead of the other before the oldest is dropped uncompared."""
+TELL_EVERY_S = 30.0
+"""Seconds after which a verdict that nothing has followed from is told again."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +108,7 @@ class Duels:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self._duels: dict[str, list[Duel]] = {}
-        self._told: set[Duel] = set()
+        self._told: dict[Duel, float] = {}
 
     def arrange(self, model: str, serving: Follower | None, candidates: Sequence[Follower]) -> None:
         """Let these followers of a model be in contest, and no others; contests under way go on."""
@@ -113,13 +117,14 @@ class Duels:
         for pair, duel in going.items():
             if pair not in wanted:
                 duel.close()
-                self._told.discard(duel)
+                self._told.pop(duel, None)
         if wanted:
             self._duels[model] = [going.get(pair) or Duel(*pair, self.settings) for pair in wanted]
 
     def outcomes(self) -> Iterator[Contested]:
-        """Verdicts that have not been told yet."""
-        for duel in (each for duels in self._duels.values() for each in duels if each not in self._told):
-            if (found := duel.outcome()) is not None:
-                self._told.add(duel)
+        """Verdicts that have not been told yet, or not lately: the service may not have been able to act on them."""
+        now = time.monotonic()
+        for duel in (each for duels in self._duels.values() for each in duels):
+            if now - self._told.get(duel, -inf) >= TELL_EVERY_S and (found := duel.outcome()) is not None:
+                self._told[duel] = now
                 yield found

@@ -11,7 +11,7 @@ from sqlalchemy import Select, select
 from sqlalchemy.orm import Session
 
 from service.database import AlarmRow, Database, JobRow, LearnerRow, ServingRow, VersionRow
-from service.errors import BusyError, ConflictError
+from service.errors import BusyError, ConflictError, not_found
 from service.models import registry
 from service.settings import Settings
 from service.training import jobs
@@ -31,15 +31,23 @@ Trigger = Literal["novelty", "asked"]
 MOST_DOUBLINGS = 10
 
 
-def ask(settings: Settings, database: Database, queue: JobQueue, model: str) -> Job:
+def ask(
+    settings: Settings,
+    database: Database,
+    queue: JobQueue,
+    model: str,
+    trigger: Trigger = "asked",
+    retry_of: str | None = None,
+) -> Job:
     """Queue a refresh of the version that serves; return its job. Not for the event loop.
 
+    retry_of: the job that it repeats.
     Raise NotFoundError, BusyError for a full queue, ConflictError where a refresh of the model is under way or there is
     nothing to train on.
     """
     version = registry.find(database, model, None)
     with database.transaction() as session:
-        job = _queue(session, settings, version, "asked")
+        job = _queue(session, settings, version, trigger, retry_of)
     queue.submit(job.id)
     return jobs.shown(job)
 
@@ -80,9 +88,13 @@ def consider(settings: Settings, database: Database, queue: JobQueue, published:
     return jobs.shown(job)
 
 
-def _queue(session: Session, settings: Settings, version: VersionRow, trigger: Trigger) -> JobRow:
+def _queue(
+    session: Session, settings: Settings, version: VersionRow, trigger: Trigger, retry_of: str | None = None
+) -> JobRow:
     """Add the job of a refresh; raise ConflictError or BusyError."""
     model, manifest = version.model, version.manifest
+    if not registry.exists(session, model, version.version):  # deleted since it was found
+        raise not_found("version", version.version)
     for job in session.scalars(_refreshes(model).where(JobRow.state.in_(ACTIVE))):
         raise ConflictError(f"job {job.id!r} refreshes model {model!r} already: wait for its end or cancel it")
     through = log.newest(session, model)
@@ -101,7 +113,7 @@ def _queue(session: Session, settings: Settings, version: VersionRow, trigger: T
         "options": manifest["options"],
         "refresh": {"version": version.version, "through": through, "trigger": trigger},
     }
-    return jobs.add(session, settings, model, request)
+    return jobs.add(session, settings, model, request, retry_of)
 
 
 def _nothing(version: VersionRow, rows: int, left_out: list[dict[str, str]], least: int) -> str:

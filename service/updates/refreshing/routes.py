@@ -14,16 +14,17 @@ from service.errors import (
     TooLargeError,
     responses,
 )
+from service.route import Route
 from service.training.schema import Job
 from service.updates.refreshing import refresh
 
-router = APIRouter(prefix="/v1/models", tags=["learning"], responses=responses(InvalidRequestError))
+router = APIRouter(prefix="/v1/models", tags=["learning"], responses=responses(InvalidRequestError), route_class=Route)
 
 
 class RefreshRequest(BaseModel):
     """Nothing to choose: estimator, options and robot are those of the version that serves."""
 
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{}]})
+    model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [{}]})
 
 
 @router.post(

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from sqlalchemy import Select, delete, select
+from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
-from service.database import Database, EventRow, SnapshotRow, now
+from service.database import Database, EventRow, SnapshotRow, VersionRow, now
 from service.files import Files, new_id
 
 
@@ -17,16 +18,31 @@ def save(
     """Store a version's state after event `number` durably and return its id; thin what is kept to `most`.
 
     seen: newest event that had been read when the state was made. None, and nothing is stored, where an event since
-    then took something out that the state may contain: the state of that number is another one now.
+    then took something out that the state may contain: the state of that number is another one now; and where the
+    version has been deleted.
     """
     snapshot = new_id("snap")
-    files.write_snapshot(snapshot, payload)
-    with database.transaction() as session:
-        outdated = _is_outdated(session, model, number, seen)
-        gone = [snapshot] if outdated else _add(session, snapshot, model, version, number, most)
+    digest = files.write_snapshot(snapshot, payload)
+    try:
+        with database.transaction() as session:
+            outdated = _is_outdated(session, model, version, number, seen)
+            gone = [snapshot] if outdated else _add(session, snapshot, digest, model, version, number, most)
+    except SQLAlchemyError:
+        files.delete_snapshot(snapshot)
+        raise
     for name in gone:  # only after the commit: until then the rows still name them
         files.delete_snapshot(name)
     return None if outdated else snapshot
+
+
+def sweep(database: Database, files: Files) -> int:
+    """Delete the files that an interrupted `save` has left; return how many. Only for the process that saves."""
+    with database.session() as session:
+        known = {f"{snapshot}.safetensors" for snapshot in session.scalars(select(SnapshotRow.id))}
+    left = [path for path in files.learning.iterdir() if path.is_file() and path.name not in known]
+    for path in left:
+        path.unlink(missing_ok=True)
+    return len(left)
 
 
 def latest(session: Session, model: str, version: int, at_most: int | None) -> SnapshotRow | None:
@@ -36,8 +52,8 @@ def latest(session: Session, model: str, version: int, at_most: int | None) -> S
 
 
 def read(files: Files, row: SnapshotRow) -> bytes:
-    """What was stored; raise FileNotFoundError where its file is lost."""
-    return files.read_snapshot(row.id)
+    """What was stored; raise DamagedFileError where its file is another one, or lost."""
+    return files.read_snapshot(row.id, row.sha256)
 
 
 def thinned(numbers: Sequence[int], most: int) -> list[int]:
@@ -61,8 +77,11 @@ def _of(model: str, version: int) -> Select[SnapshotRow]:
     )
 
 
-def _is_outdated(session: Session, model: str, number: int, seen: int) -> bool:
-    """Whether an event after `seen` took out something at or before `number`."""
+def _is_outdated(session: Session, model: str, version: int, number: int, seen: int) -> bool:
+    """Whether an event after `seen` took out something at or before `number`, or the version is no more."""
+    of_version = (VersionRow.model == model, VersionRow.version == version)
+    if session.scalar(select(VersionRow.version).where(*of_version)) is None:
+        return True
     since = select(EventRow).where(
         EventRow.model == model, EventRow.number > seen, EventRow.kind.in_(("rollback", "unlearn"))
     )
@@ -73,10 +92,11 @@ def _is_outdated(session: Session, model: str, number: int, seen: int) -> bool:
     return False
 
 
-def _add(session: Session, snapshot: str, model: str, version: int, number: int, most: int) -> list[str]:
+def _add(session: Session, snapshot: str, digest: str, model: str, version: int, number: int, most: int) -> list[str]:
     """Add a snapshot's row; return the ids of those that gave way to it."""
     rows = list(session.scalars(_of(model, version)))
-    session.add(SnapshotRow(id=snapshot, model=model, version=version, number=number, created_at=now()))
+    row = SnapshotRow(id=snapshot, model=model, version=version, number=number, created_at=now(), sha256=digest)
+    session.add(row)
     others = [row for row in rows if row.number != number]
     numbers = sorted([number, *(row.number for row in others)], reverse=True)
     kept = {numbers[place] for place in thinned(numbers, most)}

@@ -17,7 +17,7 @@ from service.context import Service
 from service.files import new_id
 from service.models import registry
 from service.settings import Settings
-from tests.service.data import error, eventually, service_of, stream
+from tests.service.data import ADDRESS, error, eventually, service_of, stream
 
 LESSON = 10
 """Rows of a batch: so few that the stated uncertainty is not yet held against the errors seen."""
@@ -102,7 +102,7 @@ class Pupil:
 @contextmanager
 def school(home: Path, trained: Path, **settings: Any) -> Iterator[School]:
     """A service that publishes what it has learnt at once."""
-    with TestClient(create_app(Settings(home=home, publish_every_s=0.02, **settings))) as client:
+    with TestClient(create_app(Settings(home=home, publish_every_s=0.02, **settings)), ADDRESS) as client:
         yield School(client, trained)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
@@ -25,7 +26,7 @@ from service.updates.refreshing.contest import (
     sample,
     surprise,
 )
-from service.updates.refreshing.duel import Duel, Duels
+from service.updates.refreshing.duel import TELL_EVERY_S, Duel, Duels
 from tests.service.updates.batches import rows
 
 ONE = np.ones(1)
@@ -262,7 +263,7 @@ def test_a_log_that_goes_back_begins_the_contest_anew(settings):
     assert duel.contest.rows == 20
 
 
-def test_a_verdict_is_told_once_and_ends_with_its_roles(settings):
+def test_a_verdict_is_told_until_its_roles_have_changed(settings, monkeypatch):
     serving, candidate = Pupil(1, Constant(0.0)), Pupil(2, Constant(1.0))
     duels = Duels(settings)
     duels.arrange("arm", serving, [candidate])
@@ -274,5 +275,9 @@ def test_a_verdict_is_told_once_and_ends_with_its_roles(settings):
     assert (told.model, told.serving, told.candidate, told.verdict) == ("arm", 1, 2, "promote")
     assert told.evidence["rows"] >= settings.promotion_rows
     assert list(duels.outcomes()) == []
+    later = time.monotonic() + TELL_EVERY_S
+    monkeypatch.setattr(time, "monotonic", lambda: later)
+    assert list(duels.outcomes()) == [told]  # nothing has followed from it: the database may have been locked
     duels.arrange("arm", candidate, [])
+    assert list(duels.outcomes()) == []
     assert serving.watchers == candidate.watchers == []

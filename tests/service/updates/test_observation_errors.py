@@ -138,7 +138,7 @@ def test_json_has_to_be_announced(pupil, body):
     answer = pupil.client.post(
         pupil.url("observations"), content=json.dumps(batch(0, body)), headers={"content-type": "text/plain"}
     )
-    assert "application/json" in error(answer, 422, "invalid_request")["message"]
+    assert "application/json" in error(answer, 415, "unsupported_media_type")["message"]
 
 
 def test_too_many_rows(pupil, school):

@@ -155,8 +155,8 @@ def test_what_is_learnt_while_a_version_is_being_loaded_is_not_lost(arm, loaded,
     drop(arm, loaded)
     load = memory.lipcore.load
 
-    def meanwhile(folder):
-        model = load(folder)
+    def meanwhile(*given):
+        model = load(*given)
         assert not adopt(loaded, published(arm, 4))
         return model
 

@@ -149,6 +149,21 @@ def test_unlearnt_rows_are_not_trained_on(waiting, pupil):
     cancel(pupil, job)
 
 
+def test_a_repeated_refresh_starts_from_what_is_known_now(waiting, pupil):
+    pupil.teach(0, 1, 2)
+    job = answered_202(pupil)
+    pupil.teach(3)
+    cancel(pupil, job)
+    answer = pupil.client.post(f"/v1/jobs/{job['id']}/retry")
+    assert answer.status_code == 202, answer.text
+    again = answer.json()
+    assert again["retry_of"] == job["id"]
+    assert again["refresh"] == {**job["refresh"], "through": job["refresh"]["through"] + 1}
+    said = pupil.client.post(f"/v1/jobs/{job['id']}/retry").json()["error"]
+    assert (said["code"], again["id"] in said["message"]) == ("conflict", True)  # it is being refreshed already
+    cancel(pupil, again)
+
+
 def test_a_refresh_goes_on_after_the_service_was_killed(tmp_path):
     recorded, moved = stream("panda", 60), stream("panda", 40, seed=2)
     body = {name: values.tolist() for name, values in arrays(moved).items()}

@@ -12,6 +12,7 @@ from service.errors import NotFoundError
 from service.inference.loaded import LoadedModels
 from service.models import registry
 from service.models.registry import Serving
+from tests.service.data import ADDRESS
 from tests.service.updates.pendulums import ARM, Arm
 
 QUERY = {"q": [0.1, 0.2], "dq": [0.0, 0.0], "ddq": [0.0, 0.0]}
@@ -178,7 +179,7 @@ def test_the_service_answers_from_the_version_that_serves(arm):
     from fastapi.testclient import TestClient
 
     arm.publish(candidate=True)
-    with TestClient(create_app(arm.settings)) as api:
+    with TestClient(create_app(arm.settings), ADDRESS) as api:
         shown = api.get(f"/v1/models/{ARM}").json()
         assert (shown["latest_version"], shown["serving_version"]) == (2, 1)
         assert api.post(f"/v1/models/{ARM}/predict", json=QUERY).json()["version"] == 1

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from sqlalchemy import select
 
 from service.app import create_app
-from service.database import SnapshotRow
-from service.files import Files
+from service.database import SnapshotRow, VersionRow, now
+from service.files import DamagedFileError, Files
 from service.settings import Settings
 from service.updates.storage import snapshots
 from service.updates.storage.snapshots import thinned
@@ -22,6 +22,8 @@ from tests.service.updates.batches import MODEL, OTHER, batch, opened, roll_back
 @pytest.fixture
 def database(home):
     database = opened(home)
+    with database.transaction() as session:
+        session.add(VersionRow(model=MODEL, version=2, folder="mv_2", created_at=now(), job=None, manifest={}))
     write(database, *(batch(k) for k in range(40)))
     yield database
     database.close()
@@ -79,7 +81,7 @@ def test_a_lost_file_is_said_to_be_lost(database, files):
     save(database, files, 5)
     for path in files.learning.iterdir():
         path.unlink()
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(DamagedFileError, match="is missing"):
         snapshots.read(files, latest(database))
 
 
@@ -151,10 +153,10 @@ def test_old_snapshots_stay_evenly_apart_however_long_it_goes_on(most):
 
 def test_a_start_sweeps_what_no_row_names_and_keeps_what_one_does(home):
     database, files = opened(home), Files(home)
+    kept = save(database, files, 0)
     with database.transaction() as session:  # a service that starts loads versions, and these have no files
         for table in ("versions", "models"):
             session.connection().exec_driver_sql(f"DELETE FROM {table}")
-    kept = save(database, files, 0)
     files.write_snapshot("snap_without_row", b"left")
     (files.learning / "snap_half.draft").write_bytes(b"le")
     (files.learning / "published").mkdir()
@@ -170,3 +172,12 @@ def test_sweeping_counts_what_it_deletes(files):
     files.write_snapshot("snap_unknown", b"unknown")
     assert files.sweep(set(), set(), {"snap_known"}) == 1
     assert files.read_snapshot("snap_known") == b"known"
+
+
+def test_files_that_an_interrupted_save_has_left_are_swept(database, files):
+    kept = save(database, files, 10)
+    (files.learning / "snap_half.draft").write_bytes(b"half")
+    (files.learning / "snap_unnamed.safetensors").write_bytes(b"whole")
+    assert snapshots.sweep(database, files) == 2
+    assert stored(files) == {kept}
+    assert snapshots.sweep(database, files) == 0

@@ -33,6 +33,7 @@ def upgrade() -> None:
         sa.Column("alias", sa.String(length=64), nullable=False),
         sa.Column("version", sa.Integer(), nullable=True),
         sa.Column("before", sa.Integer(), nullable=True),
+        sa.Column("takes_back", sa.Integer(), nullable=True),
         sa.Column("at", sa.String(), nullable=False),
         sa.ForeignKeyConstraint(
             ["model"],
@@ -52,6 +53,13 @@ def upgrade() -> None:
             ["models.name"],
         ),
         sa.PrimaryKeyConstraint("model", "alias"),
+    )
+    op.create_table(
+        "deleted_models",
+        sa.Column("name", sa.String(length=64), nullable=False),
+        sa.Column("last_version", sa.Integer(), nullable=False),
+        sa.Column("deleted_at", sa.String(), nullable=False),
+        sa.PrimaryKeyConstraint("name"),
     )
     op.add_column("jobs", sa.Column("history", sa.JSON(), server_default="[]", nullable=False))
     op.add_column("jobs", sa.Column("retry_of", sa.String(length=40), nullable=True))
