@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,10 @@ from service.settings import Settings
 from tests.service.data import ADDRESS, service_of, stream, train, upload
 from tests.service.server import Server
 from tests.service.streams import Streaming, saved_model
+
+# parts of the tests run side by side: where these processes give way as they should, they hardly get to run
+for name in ("LIPSERVE_TRAINING_NICENESS", "LIPSERVE_LEARNER_NICENESS"):
+    os.environ.setdefault(name, "0")
 
 LIMITS = {
     "max_upload_bytes": 200_000,

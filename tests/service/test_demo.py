@@ -37,6 +37,7 @@ def test_demo_learns_a_panda_and_predicts_unseen_trajectories(tmp_path):
     assert (tmp_path / "demo.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_demo_on_a_home_in_use_says_so_without_a_traceback(server):
     ended = demo(server.home)
     assert ended.returncode == 1

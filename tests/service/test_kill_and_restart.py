@@ -80,6 +80,7 @@ def test_exactly_one_version_is_made(story):
     assert story.versions_on_disk == 3  # panda-sim, pendulum, panda
 
 
+@pytest.mark.slow
 def test_asked_to_end_while_it_trains_a_server_ends_and_the_job_goes_on_at_the_next_start(tmp_path):
     home = tmp_path / "home"
     with Server(home) as server:

@@ -71,6 +71,7 @@ def test_no_library_starts_more_threads_than_the_place_has(monkeypatch):
     assert set(found) == {Thread(os.nice(0) + 7, os.SCHED_IDLE, cpus)}
 
 
+@pytest.mark.slow
 @linux
 def test_a_place_of_its_own_accord_leaves_priority_and_cpus_as_they_are():
     found, of_torch = probe(Place(threads=2))
@@ -115,6 +116,7 @@ def test_a_place_follows_the_settings(monkeypatch, tmp_path):
     assert place == Place(threads=3, niceness=2, policy="idle", cpus=frozenset({1, 2}))
 
 
+@pytest.mark.slow
 @linux
 def test_a_machine_that_forbids_a_place_trains_all_the_same():
     found, _ = probe(Place(threads=1, niceness=3, cpus=frozenset({100_000})))

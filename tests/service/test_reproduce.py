@@ -156,6 +156,7 @@ def test_summary_has_the_quartiles(finished):
             assert int(summary["sets"]) == len(of) == 2
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_with_what_is_missing(finished, tmp_path, capsys):
     """Killed while it wrote the third result: two are kept, the torn line is not."""
     out = tmp_path / "killed"

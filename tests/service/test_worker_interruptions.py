@@ -30,6 +30,7 @@ def test_a_job_whose_process_is_killed_is_tried_again(api):
     assert api.get("/v1/models/killed").json()["latest_version"] == 1
 
 
+@pytest.mark.slow
 def test_a_process_killed_while_it_has_nothing_to_do_is_replaced(api, pendulum):
     train(api, "idle", pendulum["id"])
     for pid in workers():
@@ -38,6 +39,7 @@ def test_a_process_killed_while_it_has_nothing_to_do_is_replaced(api, pendulum):
     assert api.get("/v1/models/idle").json()["latest_version"] == 2
 
 
+@pytest.mark.slow
 def test_an_interrupt_from_the_keyboard_does_not_reach_a_job(api):
     """Ctrl-C goes to the whole process group: the service decides what becomes of its processes."""
     name = queue(api, "interrupted", upload(api, stream("panda", 100))["id"], options=LONG)["id"]

@@ -29,7 +29,7 @@ class Serving:
     """What the service does with a learner process: answer with what it publishes. arm: a model that learns."""
 
     def __init__(self, home):
-        self.arm = Arm.open(home)
+        self.arm = Arm.open(home, learner_niceness=1)
         self.loaded = LoadedModels(self.arm.database, self.arm.files, capacity=4)
         self.loaded.preload()
         self.messages = []

@@ -21,6 +21,8 @@ from tests.service.updates.lessons import Pupil, School, answered
 from tests.service.updates.lessons import school as opened
 from tests.service.updates.motions import OPTIONS, batch, fast, slow
 
+PAUSE_S = 0.01
+"""Between two questions of the watcher: the learner needs the processor too."""
 SETTINGS = {"novelty_rows": 400, "promotion_rows": 600, "refresh_pause_s": 0.0}
 
 
@@ -37,7 +39,7 @@ class Watcher:
         self._thread = threading.Thread(target=self._watch)
 
     def _watch(self) -> None:
-        while not self._end.is_set():
+        while not self._end.wait(PAUSE_S):
             self.answers.append(self.pupil.client.post(self.pupil.url("predict"), json=self.queries))
 
     def __enter__(self) -> Watcher:

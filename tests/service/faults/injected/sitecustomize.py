@@ -39,8 +39,8 @@ def _come_to(target: str, when: str) -> None:
     os.close(handle)
     with open(f"{FILE}.service", encoding="utf-8") as file:
         service = int(file.read())
-    if fault["victim"] == "service" and os.getpid() != service:
-        os.kill(os.getppid(), signal.SIGKILL)
+    if fault["victim"] == "service" and os.getppid() == service:  # and never a process that has taken in an orphan
+        os.kill(service, signal.SIGKILL)
     os.kill(os.getpid(), signal.SIGSTOP if fault["victim"] == "frozen" else signal.SIGKILL)
 
 
