@@ -65,7 +65,7 @@ class Trained(NamedTuple):
     inertia: np.ndarray
 
 
-@pytest.fixture(scope="module", params=CASES)
+@pytest.fixture(scope="module", params=["ur5", pytest.param("panda", marks=pytest.mark.slow)])
 def trained(request: pytest.FixtureRequest) -> Trained:
     case = CASES[request.param]
     robot = load_robot(case.robot)

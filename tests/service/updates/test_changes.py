@@ -193,6 +193,7 @@ def test_errors_below_a_contact_are_a_change_too(school):
         assert joint["rmse"]["after"] == pytest.approx(RATTLE, rel=0.3)
 
 
+@pytest.mark.slow
 def test_a_service_that_starts_again_still_waits_and_still_follows(school, tmp_path):
     home = tmp_path / "home"
     with lessons.school(home, school.trained) as first:

@@ -219,6 +219,7 @@ def test_the_python_client_teaches(streaming):
         assert (again.rows, again.accepted, again.rejected) == (1, 1, {})
 
 
+@pytest.mark.slow
 def test_a_service_that_starts_again_knows_what_has_come(school, tmp_path):
     home = tmp_path / "home"
     with lessons.school(home, school.trained) as first:

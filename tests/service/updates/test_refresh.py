@@ -164,6 +164,7 @@ def test_a_repeated_refresh_starts_from_what_is_known_now(waiting, pupil):
     cancel(pupil, again)
 
 
+@pytest.mark.slow
 def test_a_refresh_goes_on_after_the_service_was_killed(tmp_path):
     recorded, moved = stream("panda", 60), stream("panda", 40, seed=2)
     body = {name: values.tolist() for name, values in arrays(moved).items()}
