@@ -5,14 +5,14 @@ BIN := $(VENV)/bin
 # one thread a process: the tests' matrices are small, and three parts run side by side, each in its fixed order
 TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: demo test warm-lip warm-chain test-lipcore test-service test-updates test-kills test-all lint install serve image clean
+.PHONY: demo test warm-lip warm-chain test-lipcore test-service test-packages test-updates test-kills test-all lint install serve image clean
 
 demo: install
 	$(BIN)/lipserve demo
 
 test: install
 	$(MAKE) -j2 warm-lip warm-chain
-	$(MAKE) -j3 test-service test-updates test-lipcore test-kills
+	$(MAKE) -j3 test-service test-updates test-lipcore test-packages test-kills
 
 # compiles what the parts below would else compile once each, side by side: a minute of one core
 warm-lip: install
@@ -25,7 +25,10 @@ test-lipcore: install
 	$(TEST) -m "not slow" tests/lipcore
 
 test-service: install
-	$(TEST) -m "not slow" tests/service --ignore tests/service/updates
+	$(TEST) -m "not slow" $(wildcard tests/service/test_*.py)
+
+test-packages: install
+	$(TEST) -m "not slow" $(filter-out %/updates/ %/__pycache__/,$(wildcard tests/service/*/))
 
 test-updates: install
 	$(TEST) -m "not slow" tests/service/updates --ignore tests/service/updates/test_kill_trials.py
