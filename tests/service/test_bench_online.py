@@ -193,7 +193,7 @@ def test_merged_statistics_equal_training_on_all(monkeypatch, model):
 
 
 def test_an_update_is_timed_after_each_number_of_samples(monkeypatch, model):
-    rows = rows_of(PENDULUM.more(5.0))
+    rows = rows_of(PENDULUM.more(7.0))
     learnt = []
     real = lipcore.online.learner.OnlineModel.learn
 
@@ -206,9 +206,10 @@ def test_an_update_is_timed_after_each_number_of_samples(monkeypatch, model):
     assert [cost.samples for cost in found] == [200, 3000]
     assert all(cost.learn > 0 and cost.solve > 0 for cost in found)
     starts = [start for start, _ in learnt]
-    assert starts == [0, *range(200, 2200, CHUNK), 2200, *range(3000, 5000, CHUNK)]  # every row once, in order
-    assert sum(count for _, count in learnt) == 3000 + TIMED * CHUNK
-    with pytest.raises(ValueError, match="expected at least 6000"):
+    in_turn = [at for number in range(TIMED) for at in (200 + number * CHUNK, 3000 + number * CHUNK)]
+    assert starts == [0, 200, 1200, 2200, *in_turn]  # every row once, in order; then both sizes side by side
+    assert sum(count for _, count in learnt) == 3000 + 2 * TIMED * CHUNK
+    with pytest.raises(ValueError, match="expected at least 8000"):
         update_costs(model, rows, (4000,), None)
 
 

@@ -15,7 +15,7 @@ from service.bench.timing import no_collection
 
 CHUNK = 100
 """Rows that are learnt together and timed: a batch."""
-TIMED, SOLVED = 20, 3
+TIMED, SOLVED = 40, 5
 """Chunks and solutions that are timed at every size."""
 _LONG = 1000
 """Rows that are learnt together in between."""
@@ -31,30 +31,36 @@ class Cost:
 
 
 def update_costs(model: TorqueModel, rows: Rows, sizes: Sequence[int], forgetting_s: float | None) -> list[Cost]:
-    """Learn rows one chunk after the other and time it after each of `sizes`, ascending; raise ValueError for too few.
+    """Learn rows up to each of `sizes`, ascending, then time more of them there; raise ValueError for too few.
 
-    Rows are needed for the sizes and the chunks that are timed after the last.
+    All sizes are timed in turn, chunk by chunk: what else the machine does meanwhile meets all of them alike. Rows are
+    needed for the sizes and the chunks that are timed after the last.
     """
     if len(rows) < sizes[-1] + TIMED * CHUNK:
         raise ValueError(f"rows has {len(rows)} rows, expected at least {sizes[-1] + TIMED * CHUNK}")
-    online, at, found = OnlineModel.start(model, forgetting_s), 0, []
+    states, at = list[OnlineModel](), 0
+    online = OnlineModel.start(model, forgetting_s)
     with no_collection():
         for size in sizes:
             for part in _chunks(at, size, _LONG):
                 online = online.learn(rows.take(part))
-            at = size + TIMED * CHUNK
-            times = []
-            for part in _chunks(size, at, CHUNK):
-                chunk, began = rows.take(part), time.perf_counter()
-                online = online.learn(chunk)
-                times.append((time.perf_counter() - began) / len(chunk))
-            solved = []
-            for _ in range(SOLVED):
+            states.append(online)
+            at = size
+        learn = [[0.0] * TIMED for _ in sizes]
+        solve = [[0.0] * SOLVED for _ in sizes]
+        for number in range(TIMED):
+            for index, size in enumerate(sizes):
+                start = size + number * CHUNK
+                chunk, began = rows.take(slice(start, start + CHUNK)), time.perf_counter()
+                states[index] = states[index].learn(chunk)
+                learn[index][number] = (time.perf_counter() - began) / CHUNK
+        for number in range(SOLVED):
+            for index, state in enumerate(states):
                 began = time.perf_counter()
-                online.model()
-                solved.append(time.perf_counter() - began)
-            found.append(Cost(size, 1e6 * float(np.median(times)), 1e3 * float(np.median(solved))))
-    return found
+                state.model()
+                solve[index][number] = time.perf_counter() - began
+    figures = zip(sizes, learn, solve, strict=True)
+    return [Cost(size, 1e6 * float(np.median(one)), 1e3 * float(np.median(other))) for size, one, other in figures]
 
 
 def _chunks(start: int, stop: int, size: int) -> Iterator[slice]:
