@@ -41,6 +41,7 @@ def _numbered(pattern: str, *numbers: int) -> tuple[str, ...]:
 _UR = tuple(f"{j}_joint" for j in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"))
 # the gripper's jaw is the last joint of the chain; Pinocchio cannot lock it, since a link has the same name
 _SO = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+_PR2 = ("shoulder_pan", "shoulder_lift", "upper_arm_roll", "elbow_flex", "forearm_roll", "wrist_flex", "wrist_roll")
 
 ROBOTS: dict[str, RobotSource] = {
     "panda": RobotSource("panda_description/urdf/panda.urdf", _numbered("panda_joint{}", *range(1, 8))),
@@ -55,10 +56,21 @@ ROBOTS: dict[str, RobotSource] = {
     "baxter-left": RobotSource(
         "baxter_description/urdf/baxter.urdf", tuple(f"left_{j}" for j in ("s0", "s1", "e0", "e1", "w0", "w1", "w2"))
     ),
+    "baxter-right": RobotSource(
+        "baxter_description/urdf/baxter.urdf", tuple(f"right_{j}" for j in ("s0", "s1", "e0", "e1", "w0", "w1", "w2"))
+    ),
+    "pr2-left": RobotSource("pr2_description/urdf/pr2.urdf", tuple(f"l_{j}_joint" for j in _PR2)),
+    "pr2-right": RobotSource("pr2_description/urdf/pr2.urdf", tuple(f"r_{j}_joint" for j in _PR2)),
     "talos-left": RobotSource("talos_data/robots/talos_left_arm.urdf", _numbered("arm_left_{}_joint", *range(2, 8))),
     "tiago": RobotSource(
         "tiago_description/robots/tiago_no_hand.urdf",
         ("torso_lift_joint", *_numbered("arm_{}_joint", *range(1, 8))),
+    ),
+    "tiago-pro-left": RobotSource(
+        "tiago_pro_description/robots/tiago_pro.urdf", _numbered("arm_left_{}_joint", *range(1, 8))
+    ),
+    "tiago-pro-right": RobotSource(
+        "tiago_pro_description/robots/tiago_pro.urdf", _numbered("arm_right_{}_joint", *range(1, 8))
     ),
     "double-pendulum": RobotSource("double_pendulum_description/urdf/double_pendulum.urdf", ("joint1", "joint2")),
     "asr-twodof": RobotSource("asr_twodof_description/urdf/TwoDofs.urdf", ("J1", "J2")),

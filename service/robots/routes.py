@@ -7,7 +7,6 @@ from typing import Annotated
 from anyio import to_thread
 from fastapi import APIRouter, Query, Request, Response, status
 
-from lipcore.robots import installed_profiles
 from service.context import ServiceDep
 from service.errors import (
     ConflictError,
@@ -21,8 +20,9 @@ from service.errors import (
 from service.limits.upload import Kinds, receive
 from service.names import NameForPeople
 from service.pages import PageQuery
+from service.robots import profiles as shown_profiles
 from service.robots import store
-from service.robots.schema import UPLOAD_BODY, ProfileList, Robot, RobotPage
+from service.robots.schema import UPLOAD_BODY, ProfileList, Robot, RobotPage, RobotProfile
 from service.route import Route
 
 KINDS = Kinds({"application/xml": "urdf", "text/xml": "urdf"}, {".urdf": "urdf", ".xml": "urdf"})
@@ -59,8 +59,14 @@ def list_robots(service: ServiceDep, page: PageQuery) -> RobotPage:
 
 @router.get("/profiles", summary="List the robots known by name")
 def profiles() -> ProfileList:
-    """Names that a training job may give as its robot without an upload."""
-    return ProfileList(items=list(installed_profiles()))
+    """Joints, limits and the meaning of effort of each. Uploads may name any as their robot, jobs those with a URDF."""
+    return ProfileList(items=shown_profiles.every())
+
+
+@router.get("/profiles/{name}", summary="One robot known by name, or uploaded", responses=responses(NotFoundError))
+def profile(service: ServiceDep, name: str) -> RobotProfile:
+    """Joints, limits and the meaning of effort of a robot, by its name or the id of an uploaded URDF."""
+    return shown_profiles.show(service.database, name)
 
 
 @router.get("/{robot}", summary="One uploaded robot", responses=responses(NotFoundError))

@@ -7,6 +7,7 @@ from typing import Any
 from pydantic import BaseModel, Field
 
 from lipcore.motion import JointType
+from lipcore.profiles import EffortMeaning
 
 
 class RobotJoint(BaseModel):
@@ -33,10 +34,39 @@ class RobotPage(BaseModel):
     next_cursor: str | None
 
 
+class ProfileJoint(RobotJoint):
+    """A joint and its limits; null where it has none, or where none is known."""
+
+    aliases: list[str] = Field(description="Other names that recordings have for it")
+    turns_freely: bool = Field(description="Whether it turns without end, so that it has no range")
+    lower: float | None = Field(description="rad, or m where it is prismatic")
+    upper: float | None = Field(description="rad, or m where it is prismatic")
+    max_speed: float | None = Field(description="rad/s or m/s")
+    max_acceleration: float | None = Field(description="rad/s² or m/s²")
+    max_torque: float | None = Field(description="N·m or N")
+    torque_constant: float | None = Field(description="N·m/A, of its motor current")
+
+
+class RobotProfile(BaseModel):
+    """What is known of a robot: what data of it are read, checked and reported with."""
+
+    name: str
+    title: str
+    joints: list[ProfileJoint] = Field(description="From base to tip")
+    effort: EffortMeaning = Field(
+        description="What the effort field of its recordings is, unless the upload says: measured torque, gravity "
+        "included; commanded torque, added to gravity compensation; motor current, A"
+    )
+    effort_note: str
+    source: str = Field(description="Of the numbers")
+    urdf_available: bool = Field(description="Whether its name will do as the robot of a job with rigid bodies")
+    urdf_note: str | None = Field(description="Why not")
+
+
 class ProfileList(BaseModel):
     """Robots known by name, all on one page."""
 
-    items: list[str] = Field(description="Names; empty where example-robot-data is not installed")
+    items: list[RobotProfile] = Field(description="Some are known only where example-robot-data is installed")
     next_cursor: str | None = None
 
 

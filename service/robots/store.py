@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from dataclasses import replace
 
 from sqlalchemy import select
 from sqlalchemy.orm import undefer
 
-from lipcore.robots import ROBOTS, UnknownRobotError
+from lipcore import profiles
+from lipcore.profiles import Profile
+from lipcore.profiles.names import is_number
+from lipcore.profiles.reading import read_limits
+from lipcore.robots import ROBOTS, UnknownRobotError, profile_urdf
 from lipcore.urdf import MOVABLE, RigidBody, UrdfError, describe
 from service.database import Database, JobRow, RobotRow, now
-from service.errors import ConflictError, InvalidDataError, not_found, problem
+from service.errors import ConflictError, InvalidDataError, invalid_request, not_found, problem
 from service.files import new_id
 from service.names import LONGEST, for_people
 from service.pages import Page, newest
@@ -24,6 +29,7 @@ def add(database: Database, content: bytes, name: str | None) -> Robot:
     try:
         urdf = content.decode("utf-8-sig")
         said = describe(urdf)
+        read_limits(urdf, said.joint_names)
     except UnicodeDecodeError as error:
         raise _invalid(f"the URDF is not text in UTF-8: {error.reason} at byte {error.start}") from None
     except UrdfError as error:
@@ -75,14 +81,40 @@ def resolve(database: Database, robot: str, joint_names: Sequence[str], joint_ty
     Raise UnknownRobotError, JointMismatchError, UrdfError, or SimulationUnavailableError where profiles are missing.
     """
     if robot in ROBOTS:
-        return RigidBody.from_profile(robot, joint_names, joint_types)
-    with database.session() as session:
-        row = session.scalar(select(RobotRow).where(RobotRow.id == robot).options(undefer(RobotRow.urdf)))
+        return _of_profile(robot, joint_names, joint_types)
+    if robot in profiles.names():
+        raise UrdfError(profiles.profile(robot).why_no_urdf())
+    row = _find(database, robot)
     if row is None:
         raise UnknownRobotError(
             f"robot is {robot!r}, expected one of {', '.join(ROBOTS)}, or the id of an uploaded URDF"
         )
     return RigidBody.from_urdf(row.urdf, joint_names, joint_types, name=row.name)
+
+
+def profile_of(database: Database, robot: str) -> Profile:
+    """The profile of a robot known by name or of an uploaded URDF; raise InvalidRequestError naming what there is."""
+    known = profiles.names()
+    if robot in known:
+        return profiles.profile(robot)
+    row = _find(database, robot)
+    if row is None:
+        raise invalid_request("robot", robot, f"one of {', '.join(known)}, or the id of an uploaded URDF")
+    return profiles.from_urdf(row.urdf, row.name)
+
+
+def _of_profile(robot: str, joint_names: Sequence[str], joint_types: Sequence[str]) -> RigidBody:
+    urdf = profile_urdf(robot)  # where it is missing, says how to install it
+    called = profiles.profile(robot).called(joint_names)
+    if called is None or (called == ROBOTS[robot].free and all(map(is_number, joint_names))):
+        return RigidBody.from_profile(robot, joint_names, joint_types)
+    # data of some of its joints, or under the names of another driver: the others are locked
+    return replace(RigidBody.from_urdf(urdf, joint_names, joint_types, called, robot), matched="name")
+
+
+def _find(database: Database, robot: str) -> RobotRow | None:
+    with database.session() as session:
+        return session.scalar(select(RobotRow).where(RobotRow.id == robot).options(undefer(RobotRow.urdf)))
 
 
 def _invalid(message: str) -> InvalidDataError:

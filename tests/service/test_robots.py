@@ -10,7 +10,9 @@ import pytest
 import lipcore
 from lipcore.robots import ROBOTS, load_robot, profile_urdf
 from service.client import ApiError, Client
+from service.errors import InvalidRequestError
 from service.models import registry
+from service.robots import store
 from tests.service.data import QUICK, error, post, queue, service_of, stream, train, upload
 from tests.service.data import csv as csv_file
 from tests.service.test_cli import lipserve  # noqa: F401 - a fixture
@@ -82,7 +84,68 @@ def test_robots_are_paged_and_deleted(empty):
 
 
 def test_profiles_are_listed(api):
-    assert api.get("/v1/robots/profiles").json() == {"items": list(ROBOTS), "next_cursor": None}
+    answer = api.get("/v1/robots/profiles").json()
+    assert answer["next_cursor"] is None
+    found = {profile["name"]: profile for profile in answer["items"]}
+    assert set(ROBOTS) | {"fr3", "ur5e", "xarm6"} <= set(found)
+    assert {name for name, profile in found.items() if profile["urdf_available"]} == set(ROBOTS)
+    assert found["panda"]["urdf_note"] is None
+    assert "no URDF is installed" in found["fr3"]["urdf_note"]
+    for name, profile in found.items():
+        assert api.get(f"/v1/robots/profiles/{name}").json() == profile
+
+
+def test_a_profile_says_joints_limits_and_what_effort_means(api):
+    panda, ur = (api.get(f"/v1/robots/profiles/{name}").json() for name in ("panda", "ur3"))
+    assert panda["joints"][3] == {
+        "name": "panda_joint4",
+        "type": "revolute",
+        "aliases": ["fer_joint4"],
+        "turns_freely": False,
+        "lower": -3.0718,
+        "upper": -0.0698,
+        "max_speed": 2.175,
+        "max_acceleration": 12.5,
+        "max_torque": 87.0,
+        "torque_constant": None,
+    }
+    assert (panda["effort"], ur["effort"]) == ("measured", "current")
+    assert "gravity included" in panda["effort_note"]
+    # what is infinite, and what nobody publishes, is null
+    last = ur["joints"][5]
+    assert (last["turns_freely"], last["lower"], last["max_acceleration"]) == (True, None, None)
+
+
+def test_the_profile_of_an_uploaded_urdf(empty):
+    robot = added(empty, urdf(kind="revolute"), name="mine")
+    profile = empty.get(f"/v1/robots/profiles/{robot['id']}").json()
+    assert (profile["name"], profile["effort"], profile["urdf_available"]) == ("mine", "unknown", True)
+    assert [joint["name"] for joint in profile["joints"]] == ["joint1", "joint2"]
+    assert [joint["max_torque"] for joint in profile["joints"]] == [1.0, 1.0]
+    said = error(empty.get("/v1/robots/profiles/r2d2"), 404, "not_found")
+    assert "r2d2" in said["message"]
+    database = service_of(empty).database
+    assert store.profile_of(database, robot["id"]).urdf == urdf(kind="revolute").decode()
+    assert store.profile_of(database, "fr3").title == "Franka Research 3"
+    with pytest.raises(InvalidRequestError, match=r"robot is r2d2, expected one of panda, fr3.*uploaded URDF"):
+        store.profile_of(database, "r2d2")
+
+
+@pytest.mark.parametrize(
+    ("robot", "names", "called", "matched"),
+    [
+        ("double-pendulum", ("joint1", "joint2"), ("joint1", "joint2"), "name"),
+        ("double-pendulum", ("shoulder", "elbow"), ("joint1", "joint2"), "order"),
+        ("double-pendulum", ("joint2", "joint1"), ("joint2", "joint1"), "name"),
+        ("panda", tuple(f"fer_joint{i}" for i in range(7, 0, -1)), ROBOTS["panda"].free[::-1], "name"),
+        ("panda", tuple(f"joint{i}" for i in range(7, 0, -1)), ROBOTS["panda"].free[::-1], "name"),
+        ("panda", ("fer_joint2", "fer_joint4"), ("panda_joint2", "panda_joint4"), "name"),
+        ("panda", ("a", "b", "c", "d", "e", "f", "g"), ROBOTS["panda"].free, "order"),
+    ],
+)
+def test_rigid_bodies_follow_the_names_of_other_drivers(empty, robot, names, called, matched):
+    body = store.resolve(service_of(empty).database, robot, names, ("revolute",) * len(names))
+    assert (body.joint_names, body.urdf_joints, body.matched, body.name) == (names, called, matched, robot)
 
 
 @pytest.mark.parametrize(
@@ -132,6 +195,7 @@ def test_jobs_whose_robot_does_not_fit(api, pendulum):
         ({"robot": other}, ["shoulder, elbow; the data have joint1, joint2"]),
         ({"robot": sliding}, ["joint 'joint1' is revolute in the data", "is prismatic"]),
         ({"robot": "r2d2"}, ["robot is 'r2d2', expected one of panda, ur3", "uploaded URDF"]),
+        ({"robot": "fr3"}, ["Franka Research 3 has a profile", "no URDF is installed", "upload its URDF"]),
         ({"robot": "urdf_0123456789abcdef"}, ["expected one of panda"]),
         ({"robot": "double-pendulum", "estimator": "lip-chain"}, ["'lip-chain' takes no robot, only rigid-body"]),
     ):

@@ -1,0 +1,118 @@
+"""Which joint of a robot a name in a recording means: prefixes, spellings and numbers.
+
+Drivers prefix names (`left_panda_joint1`, `ur5e_elbow_joint`), rename them (`fer_joint1`), or number them (`joint1`,
+`J0`). Names are compared as words: lower case, split at punctuation, capitals and digits, without the word "joint".
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+
+MOST_NAMES = 1000
+"""Of so many names none but equal ones are looked for: no robot has that many joints."""
+
+Words = tuple[str, ...]
+Assignment = dict[int, int]
+"""Joint of the robot → place among the names."""
+
+_WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+|\d+")
+_CHUNK = re.compile(r"[^a-z0-9]+")
+_EMPTY = frozenset({"joint", "joints", "jnt", "j"})
+"""Words that say nothing of which joint is meant."""
+
+MAKES = frozenset(
+    {"panda", "fer", "fr3"}
+    | {"ur3", "ur5", "ur10", "ur3e", "ur5e", "ur10e", "ur16e"}
+    | {"xarm", "xarm5", "xarm6", "xarm7", "lite6"}
+    | {"kinova", "jaco", "j2s6s200", "j2s6s300", "gen3"}
+    | {"kuka", "lbr", "iiwa", "iiwa7", "iiwa14"}
+    | {"z1", "so100", "so101", "baxter", "talos", "tiago", "pr2"}
+)
+"""Words by which a prefix names a make: `panda_joint1` is no joint of an xArm, though its first is `joint1`."""
+
+
+def makes(text: str) -> frozenset[str]:
+    """The words of MAKES in a name or a title."""
+    return frozenset(_CHUNK.split(text.lower())) & MAKES
+
+
+def words(name: str) -> Words:
+    """A name as words, those that say nothing left out."""
+    return tuple(word for word in (found.lower() for found in _WORD.findall(name)) if word not in _EMPTY)
+
+
+def is_number(name: str) -> bool:
+    """Whether a name is a number and no more: every robot has a joint 1."""
+    return "".join(words(name)).isdigit()
+
+
+def assignments(
+    names: Sequence[str], aliases: Sequence[Sequence[str]], own: frozenset[str], numbers: bool = True
+) -> Iterator[Assignment]:
+    """Each reading of the names as joints of one robot; two arms side by side give two. May hold some joints only.
+
+    aliases: (n) names of each joint; own: the makes that a prefix of plain numbers may name; numbers: whether joints
+    may be known by their number alone.
+    """
+    place_of = {name: place for place, name in enumerate(names)}
+    exact = {joint: place_of[each[0]] for joint, each in enumerate(aliases) if each[0] in place_of}
+    if len(exact) == len(aliases) and len(place_of) == len(names):
+        yield exact
+        return
+    if len(names) > MOST_NAMES:
+        return
+    split = [words(name) for name in names]
+    by_words = _by_words(split, aliases)
+    if by_words:
+        yield from by_words
+    elif numbers and all(makes(name) <= own for name in names):
+        yield from _by_number(split, len(aliases))
+
+
+@lru_cache(maxsize=64)
+def _forms(aliases: tuple[tuple[str, ...], ...]) -> list[frozenset[Words]]:
+    return [frozenset(form for form in map(words, each) if form and not "".join(form).isdigit()) for each in aliases]
+
+
+def _by_words(split: Sequence[Words], aliases: Sequence[Sequence[str]]) -> list[Assignment]:
+    """Names that end in an alias, those with one prefix together; aliases that are a number only are left out."""
+    forms = _forms(tuple(map(tuple, aliases)))
+    found: defaultdict[Words, defaultdict[int, set[int]]] = defaultdict(lambda: defaultdict(set))
+    for place, name in enumerate(split):
+        for joint, each in enumerate(forms):
+            for form in each:
+                if name[-len(form) :] == form:
+                    found[name[: -len(form)]][joint].add(place)
+    groups = ({joint: min(places) for joint, places in group.items() if len(places) == 1} for group in found.values())
+    return _distinct(group for group in groups if group)
+
+
+def _by_number(split: Sequence[Words], n_joints: int) -> list[Assignment]:
+    """Names that are numbers behind one prefix, counted from 1, or from 0 where there is a 0."""
+    found: defaultdict[Words, list[tuple[int, int]]] = defaultdict(list)
+    for place, name in enumerate(split):
+        if name and name[-1].isdigit() and len(name[-1]) < 4:
+            found[name[:-1]].append((int(name[-1]), place))
+    groups = []
+    for group in found.values():
+        first = 0 if any(number == 0 for number, _ in group) else 1
+        numbered = {number - first: place for number, place in group}
+        # a number too many or twice, or other names in the majority, say that another robot is meant
+        if len(numbered) == len(group) and max(numbered) < n_joints and 2 * len(group) > len(split):
+            groups.append(numbered)
+    return _distinct(groups)
+
+
+def _distinct(groups: Iterator[Assignment] | Sequence[Assignment]) -> list[Assignment]:
+    """Groups without those that another one holds."""
+    found: list[Assignment] = []
+    holders: defaultdict[tuple[int, int], list[Assignment]] = defaultdict(list)
+    for group in sorted(groups, key=len, reverse=True):
+        if not any(group.items() <= larger.items() for larger in holders[next(iter(group.items()))]):
+            found.append(group)
+            for item in group.items():
+                holders[item].append(group)
+    return found

@@ -1,0 +1,139 @@
+"""What is known of a robot apart from its data: joints, limits, and what its effort field means."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from lipcore.motion import Array, JointType
+from lipcore.profiles.names import Assignment, assignments, is_number, makes
+
+EffortMeaning = Literal["measured", "commanded", "current", "unknown"]
+"""Measured torque, gravity included; commanded torque, what is added to gravity compensation; motor current, A."""
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """An arm with n joints, from base to tip.
+
+    lower, upper: (n,) rad or m, infinite where the joint turns without end; speed, acceleration: (n,) rad/s, rad/s² or
+    m/s, m/s²; torque: (n,) N·m or N. Each is NaN where it is not known. torque_constants: (n,) N·m/A of motor currents.
+    joint_aliases: (n) other names of each joint; urdf: its text, None where none is at hand; source: of the numbers;
+    whole: whether data of this robot hold every joint, as those of an uploaded URDF with its fingers need not.
+    """
+
+    name: str
+    title: str
+    joint_names: tuple[str, ...]
+    joint_types: tuple[JointType, ...]
+    lower: Array
+    upper: Array
+    speed: Array
+    acceleration: Array
+    torque: Array
+    effort: EffortMeaning
+    effort_note: str
+    torque_constants: Array | None
+    joint_aliases: tuple[tuple[str, ...], ...]
+    urdf: str | None = field(repr=False)
+    source: str
+    whole: bool = True
+
+    def __post_init__(self) -> None:
+        n = len(self.joint_names)
+        for what in ("lower", "upper", "speed", "acceleration", "torque", "torque_constants"):
+            values = getattr(self, what)
+            if values is not None and values.shape != (n,):
+                raise ValueError(f"{what} of {self.name!r} has shape {values.shape}, expected {(n,)}")
+        for what in ("joint_types", "joint_aliases"):
+            if len(getattr(self, what)) != n:
+                raise ValueError(f"{what} of {self.name!r} has {len(getattr(self, what))} entries, expected {n}")
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints n."""
+        return len(self.joint_names)
+
+    @cached_property
+    def makes(self) -> frozenset[str]:
+        """Makes that names of its joints may mention."""
+        text = " ".join((self.name, self.title, *self.joint_names, *sum(self.joint_aliases, ())))
+        return makes(text)
+
+    def readings(self, names: Sequence[str], numbers: bool = True) -> list[Assignment]:
+        """Each way to read the names as joints of this robot, joint → place; two arms side by side give two.
+
+        numbers: whether a joint may be known by its number alone.
+        """
+        aliases = [(name, *others) for name, others in zip(self.joint_names, self.joint_aliases, strict=True)]
+        return list(assignments(tuple(names), aliases, self.makes, numbers))
+
+    def match(self, names: Sequence[str]) -> tuple[int | None, ...]:
+        """Which joint each of the names means, None where none or not one alone: (N,)."""
+        found = self.readings(names)
+        largest = max(map(len, found), default=0)
+        best = [each for each in found if len(each) == largest]
+        if len(best) != 1 or 2 * largest <= min(self.n_joints, len(names)):
+            return (None,) * len(names)
+        joint_at = {place: joint for joint, place in best[0].items()}
+        return tuple(joint_at.get(place) for place in range(len(names)))
+
+    def order_of(self, names: Sequence[str]) -> list[int] | None:
+        """Places of this robot's joints among the names, from base to tip; other names, as of grippers, are left out.
+
+        None where a joint is missing, or where more than one name could be it. Not `whole`: those that are there.
+        """
+        matched = self.match(names)
+        places = {joint: place for place, joint in enumerate(matched) if joint is not None}
+        if not places or (self.whole and len(places) < self.n_joints):
+            return None
+        return [places[joint] for joint in sorted(places)]
+
+    def called(self, names: Sequence[str]) -> tuple[str, ...] | None:
+        """What this robot calls each of the names; None unless every one is a joint of it.
+
+        Where only some of its joints are named, numbers do not do: joints 1 and 2 are those of any robot.
+        """
+        matched = [joint for joint in self.match(names) if joint is not None]
+        if len(matched) < len(names) or (len(names) < self.n_joints and all(map(is_number, names))):
+            return None
+        return tuple(self.joint_names[joint] for joint in matched)
+
+    def for_joints(self, names: Sequence[str]) -> Profile:
+        """Return a profile with one joint for each of the names, in their order and so called.
+
+        A name that is none of this robot's joints gets a revolute joint of which nothing is known. `urdf` stays that of
+        the whole robot.
+        """
+        matched = self.match(names)
+        pick = np.array([self.n_joints if joint is None else joint for joint in matched], dtype=np.int64)
+
+        def picked(values: Array) -> Array:
+            found: Array = np.append(values, np.nan)[pick]
+            return found
+
+        return replace(
+            self,
+            joint_names=tuple(names),
+            joint_types=tuple("revolute" if joint is None else self.joint_types[joint] for joint in matched),
+            joint_aliases=tuple(
+                () if joint is None else (self.joint_names[joint], *self.joint_aliases[joint]) for joint in matched
+            ),
+            lower=picked(self.lower),
+            upper=picked(self.upper),
+            speed=picked(self.speed),
+            acceleration=picked(self.acceleration),
+            torque=picked(self.torque),
+            torque_constants=None if self.torque_constants is None else picked(self.torque_constants),
+        )
+
+    def why_no_urdf(self) -> str:
+        """A sentence that says why rigid bodies cannot be built by this name."""
+        return (
+            f"{self.title} has a profile, for data, but no URDF is installed for it: for rigid bodies upload its URDF "
+            "and give the id"
+        )

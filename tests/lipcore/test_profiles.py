@@ -1,0 +1,310 @@
+"""Robot profiles: limits against the URDFs they come from, joint names as drivers write them, and uploaded URDFs."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lipcore.profiles import from_urdf, names, profile, profiles, recognise
+from lipcore.profiles.arms import ARMS
+from lipcore.profiles.catalogue import SHEETS
+from lipcore.profiles.names import MAKES, words
+from lipcore.robots import ROBOTS, UnknownRobotError, load_robot, profile_urdf
+from lipcore.urdf import RigidBody, UrdfError
+from tests.lipcore.test_urdf import joint, link, robot
+
+ALL = tuple(SHEETS)
+UR = tuple(f"{each}_joint" for each in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"))
+SO = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+ANOTHER_SOURCE = {"ur3", "ur5", "ur10"}
+"""Whose numbers are the maker's, not those of example-robot-data."""
+
+
+def numbered(pattern: str, count: int) -> tuple[str, ...]:
+    return tuple(pattern.format(i) for i in range(1, count + 1))
+
+
+def test_the_catalogue_holds_every_robot_of_the_simulator_and_those_the_service_promises() -> None:
+    assert set(ROBOTS) <= set(ALL)
+    promised = "panda fr3 ur3 ur5 ur10 ur3e ur5e ur10e xarm6 xarm7 kinova z1 so100 so101"
+    assert set(promised.split()) <= set(ARMS)
+    assert names() == tuple(each.name for each in profiles()) == ALL
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_every_profile_is_complete(name: str) -> None:
+    found = profile(name)
+    assert found.joint_names == (ROBOTS[name].free if name in ROBOTS else SHEETS[name].joints)
+    assert found.title
+    assert found.source
+    assert len(found.effort_note) > 20
+    assert (found.urdf is not None) == (name in ROBOTS)
+    assert found.torque_constants is None
+    # a range is an interval or unknown as a whole, other limits are positive or unknown: never 0, never a guess
+    known = ~np.isnan(found.lower)
+    assert np.array_equal(known, ~np.isnan(found.upper))
+    assert (found.lower[known] < found.upper[known]).all()
+    for limit in (found.speed, found.acceleration, found.torque):
+        assert (np.isnan(limit) | (np.isfinite(limit) & (limit > 0))).all()
+    # no two joints may be called the same
+    spellings = [{words(each) for each in (a, *b)} for a, b in zip(found.joint_names, found.joint_aliases, strict=True)]
+    assert sum(map(len, spellings)) == len(set().union(*spellings))
+
+
+@pytest.mark.parametrize("name", [name for name in ALL if name in ROBOTS])
+def test_limits_are_those_of_the_urdf_as_pinocchio_reads_it(name: str) -> None:
+    found, model = profile(name), load_robot(name).model
+    assert found.joint_types == load_robot(name).joint_types
+    for joint_index in range(1, model.njoints):
+        q, v, at = model.joints[joint_index].idx_q, model.joints[joint_index].idx_v, joint_index - 1
+        if model.joints[joint_index].nq == 2:
+            assert np.isinf(found.lower[at])
+            assert np.isinf(found.upper[at])
+        elif name != "ur3" and np.isfinite(found.lower[at]):
+            assert found.lower[at] == pytest.approx(model.lowerPositionLimit[q], abs=1e-9)
+            assert found.upper[at] == pytest.approx(model.upperPositionLimit[q], abs=1e-9)
+        elif np.isnan(found.lower[at]):
+            assert not model.lowerPositionLimit[q] < model.upperPositionLimit[q]
+        if name not in ANOTHER_SOURCE:
+            for ours, theirs in ((found.speed, model.velocityLimit), (found.torque, model.effortLimit)):
+                assert np.isnan(ours[at]) or ours[at] == pytest.approx(theirs[v], rel=1e-9)
+
+
+def test_numbers_that_makers_publish() -> None:
+    """A few read off the makers' documents by hand."""
+    panda, fr3, ur3e, ur10e = (profile(name) for name in ("panda", "fr3", "ur3e", "ur10e"))
+    assert panda.torque.tolist() == fr3.torque.tolist() == [87, 87, 87, 87, 12, 12, 12]
+    assert panda.acceleration.tolist() == [15, 7.5, 10, 12.5, 15, 20, 20]
+    assert fr3.speed.tolist() == [2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26]
+    assert fr3.upper[5] == 4.5169
+    assert ur3e.torque.tolist() == [56, 56, 28, 12, 12, 12]
+    assert np.degrees(ur10e.speed) == pytest.approx([120, 120, 180, 180, 180, 180])
+    assert np.isnan(ur10e.acceleration).all()
+    assert np.degrees(profile("iiwa7").upper) == pytest.approx([170, 120, 170, 120, 170, 120, 175])
+    assert (panda.effort, ur3e.effort, profile("so101").effort) == ("measured", "current", "unknown")
+
+
+def test_without_example_robot_data_the_arms_with_numbers_of_their_own_are_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("lipcore.profiles.catalogue.installed_profiles", lambda: ())
+    assert names() == tuple(ARMS)
+    assert profile("panda").urdf is None
+    assert "no URDF is installed" in profile("panda").why_no_urdf()
+    assert profile("panda").lower[0] == -2.8973
+    with pytest.raises(UnknownRobotError, match="robot is 'tiago', expected one of panda, fr3"):
+        profile("tiago")
+    monkeypatch.undo()
+    assert profile("panda").urdf == profile_urdf("panda")
+
+
+def test_an_unknown_robot_names_those_that_are_known() -> None:
+    with pytest.raises(UnknownRobotError, match=r"robot is '\.\./panda', expected one of panda, fr3") as caught:
+        profile("../panda")
+    assert all(name in str(caught.value) for name in ALL)
+
+
+@pytest.mark.parametrize(
+    ("name", "joints"),
+    [
+        ("panda", numbered("fer_joint{}", 7)),
+        ("panda", numbered("left_panda_joint{}", 7)),
+        ("panda", numbered("robot1/panda_joint{}", 7)),
+        ("panda", numbered("joint{}", 7)),
+        ("panda", numbered("J{}", 7)),
+        ("panda", tuple(f"joint_{i}" for i in range(7))),
+        ("panda", numbered("my_arm_joint{}", 7)),
+        ("fr3", numbered("fr3_joint{}", 7)),
+        ("ur5e", tuple(f"ur5e_{each}" for each in UR)),
+        ("ur5e", ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")),
+        ("xarm7", numbered("xarm7_joint{}", 7)),
+        ("gen3", numbered("gen3_joint_{}", 7)),
+        ("iiwa14", numbered("joint_a{}", 7)),
+        ("iiwa7", numbered("lbr_A{}", 7)),
+        ("so101", tuple(f"left_{each}" for each in SO)),
+        ("baxter-left", ROBOTS["baxter-left"].free),
+        ("pr2-right", ROBOTS["pr2-right"].free),
+    ],
+)
+@settings(max_examples=10, deadline=None)
+@given(data=st.data())
+def test_joints_are_found_under_the_names_of_drivers_in_any_order(
+    name: str, joints: tuple[str, ...], data: st.DataObject
+) -> None:
+    found = profile(name)
+    others = ("head_pan", "torso_height", "panda_finger_joint1", "left_hand_thumb")
+    others = () if any(each.isdigit() for each in joints[0][-1:]) and "panda" not in joints[0] else others[:1]
+    mixed = data.draw(st.permutations([*joints, *others]))
+    order = found.order_of(mixed)
+    assert order is not None
+    assert [mixed[place] for place in order] == list(joints)
+    assert found.match(mixed) == tuple(joints.index(each) if each in joints else None for each in mixed)
+    assert found.called(joints) == found.joint_names
+
+
+def test_fingers_beside_an_arm_are_left_out() -> None:
+    fingers = ("panda_finger_joint1", "panda_finger_joint2")
+    arm = numbered("panda_joint{}", 7)
+    assert profile("panda").order_of((*fingers, *arm)) == list(range(2, 9))
+    assert profile("panda").called((*fingers, *arm)) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "joints"),
+    [
+        ("panda", numbered("joint{}", 6)),
+        ("panda", numbered("joint{}", 8)),
+        ("panda", numbered("fr3_joint{}", 7)),
+        ("xarm7", numbered("panda_joint{}", 7)),
+        ("z1", numbered("xarm6_joint{}", 6)),
+        ("ur5", SO),
+        ("finger-edu", UR),
+        ("so100", UR),
+        ("panda", ("a", "b", "c", "d", "e", "f", "g")),
+        ("panda", ()),
+        ("panda", ("",) * 7),
+        ("panda", (*numbered("left_panda_joint{}", 7), *numbered("right_panda_joint{}", 7))),
+        ("panda", ("joint1", "joint1", *numbered("joint{}", 5))),
+        ("panda", ("panda_joint3", *numbered("panda_joint{}", 7))),
+    ],
+)
+def test_joints_of_another_robot_or_of_two_are_no_order(name: str, joints: tuple[str, ...]) -> None:
+    assert profile(name).order_of(joints) is None
+
+
+def test_some_joints_of_a_robot_are_matched_but_no_whole() -> None:
+    panda = profile("panda")
+    some = ("panda_joint4", "panda_joint2")
+    assert panda.match(some) == (3, 1)
+    assert panda.order_of(some) is None
+    assert panda.called(some) == some
+    assert panda.called(("fer_joint4", "fer_joint2")) == some
+    assert panda.match(("joint4", "joint2")) == (3, 1)
+    assert panda.called(("joint4", "joint2")) is None
+
+
+def test_a_profile_for_the_joints_of_data() -> None:
+    found = profile("panda").for_joints(("fer_joint6", "wheel", "fer_joint1", "fer_joint2", "fer_joint7"))
+    assert found.joint_names == ("fer_joint6", "wheel", "fer_joint1", "fer_joint2", "fer_joint7")
+    assert found.joint_aliases[0] == ("panda_joint6", "fer_joint6")
+    for name in ("lower", "upper", "speed", "acceleration", "torque"):
+        values, whole = getattr(found, name), getattr(profile("panda"), name)
+        assert np.isnan(values[1])
+        assert values[[0, 2, 3, 4]].tolist() == whole[[5, 0, 1, 6]].tolist()
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_the_own_names_of_a_robot_are_recognised_unless_they_are_numbers(name: str) -> None:
+    found = recognise(profile(name).joint_names)
+    assert (name in found) == (not all("".join(words(each)).isdigit() for each in profile(name).joint_names))
+
+
+def test_what_is_recognised() -> None:
+    assert recognise(numbered("fer_joint{}", 7)) == ("panda",)
+    assert recognise(numbered("right_fr3_joint{}", 7)) == ("fr3",)
+    assert recognise(tuple(f"ur5e_{each}" for each in UR)) == ("ur5e",)
+    assert recognise(sorted(UR)) == ("ur3", "ur5", "ur10", "ur3e", "ur5e", "ur10e", "ur16e")
+    assert recognise(SO) == ("so100", "so101")
+    assert recognise(numbered("xarm7_joint{}", 7)) == ("xarm7",)
+    assert recognise((*numbered("left_panda_joint{}", 7), *numbered("right_panda_joint{}", 7))) == ("panda",)
+    assert recognise(ROBOTS["tiago-pro-left"].free) == ("tiago-pro-left", "talos-left")
+    for nothing in (numbered("joint{}", 7), numbered("q{}", 6), ("shoulder", "elbow"), (), ("",)):
+        assert recognise(nothing) == ()
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.text(max_size=30), max_size=12))
+def test_any_names_are_taken(joints: list[str]) -> None:
+    recognise(joints)
+    for name in ("panda", "ur5", "z1"):
+        found = profile(name)
+        order = found.order_of(joints)
+        assert order is None or len(set(order)) == found.n_joints
+        assert len(found.match(joints)) == len(joints)
+        assert found.for_joints(joints).n_joints == len(joints)
+
+
+def test_of_too_many_names_only_equal_ones_are_found() -> None:
+    columns = tuple(f"n{i}_elbow" for i in range(2000))
+    assert profile("ur5").match(columns) == (None,) * 2000
+    assert recognise((*columns, *UR)) == ("ur3", "ur5", "ur10", "ur3e", "ur5e", "ur10e", "ur16e")
+
+
+def test_makes_are_words_that_names_can_hold() -> None:
+    assert all(re.fullmatch(r"[a-z0-9]+", each) for each in MAKES)
+    mentioned = frozenset().union(*(profile(name).makes for name in ALL))
+    assert {"panda", "fer", "fr3", "iiwa", "xarm7", "gen3"} <= mentioned
+
+
+def test_a_urdf_of_ones_own() -> None:
+    text = robot(
+        link("base"), link("upper"), link("lower"), link("jaw"), link("rail"),
+        joint("grip", "lower", "jaw", extra='<mimic joint="elbow"/>'),
+        joint("elbow", "upper", "lower"),
+        joint("shoulder", "rail", "upper", "continuous"),
+        joint("slide", "base", "rail", "prismatic"),
+    )  # fmt: skip
+    text = text.replace('<limit lower="-1" upper="1" effort="1" velocity="1"/>', "{}")
+    ours = (
+        '<limit lower="0" upper="0" effort="0" velocity="0"/>',
+        '<limit lower="-1" upper="2" effort="3" velocity="4"/>',
+    )
+    text = text.format(ours[0], ours[1], ours[0], ours[1])
+    found = from_urdf(text, "mine")
+    assert (found.name, found.urdf, found.effort) == ("mine", text, "unknown")
+    # from base to tip, whatever the order of the text; what mimics is left out
+    assert found.joint_names == ("slide", "shoulder", "elbow")
+    assert found.joint_types == ("prismatic", "revolute", "revolute")
+    for name, expected in (
+        ("lower", [-1, -np.inf, -1]),
+        ("upper", [2, np.inf, 2]),
+        ("speed", [4, np.nan, 4]),
+        ("torque", [3, np.nan, 3]),
+        ("acceleration", [np.nan] * 3),
+    ):
+        assert np.array_equal(getattr(found, name), expected, equal_nan=True), name
+    # data need not hold every joint of an uploaded URDF
+    assert found.order_of(("elbow", "t", "shoulder")) == [2, 0]
+    assert found.order_of(("left_elbow", "left_shoulder", "left_slide")) == [2, 1, 0]
+    assert found.order_of(("wrist",)) is None
+
+
+@pytest.mark.parametrize("name", ["panda", "so101", "tiago", "kinova", "baxter-right"])
+def test_a_catalogued_urdf_uploaded_is_the_same_arm(name: str) -> None:
+    known, uploaded = profile(name), from_urdf(profile_urdf(name), "mine")
+    places = [uploaded.joint_names.index(each) for each in known.joint_names]
+    assert places == sorted(places)
+    assert uploaded.order_of(known.joint_names) == list(range(known.n_joints))
+    for what in ("lower", "upper"):
+        assert getattr(uploaded, what)[places] == pytest.approx(getattr(known, what), nan_ok=True)
+    assert known.urdf is not None
+    body = RigidBody.from_urdf(known.urdf, known.joint_names, known.joint_types)
+    assert body.order == tuple(range(known.n_joints))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "not well-formed"),
+        (robot(link("base")), "no joint that moves"),
+        ('<!DOCTYPE r [<!ENTITY a "aa">]>' + robot(link("base")), "document type"),
+        (robot(link("a"), link("b"), joint("j", "a", "b").replace('velocity="1"', 'velocity="fast"')), None),
+    ],
+)
+def test_a_urdf_that_cannot_be_used(text: str, message: str | None) -> None:
+    with pytest.raises(UrdfError, match=message):
+        from_urdf(text, "mine")
+
+
+def test_arrays_have_to_fit_the_joints() -> None:
+    found = profile("ur5")
+    values = {field.name: getattr(found, field.name) for field in fields(found)}
+    with pytest.raises(ValueError, match=r"torque of 'ur5' has shape \(2,\), expected \(6,\)"):
+        type(found)(**{**values, "torque": np.ones(2)})
+    with pytest.raises(ValueError, match="joint_aliases of 'ur5' has 1 entries, expected 6"):
+        type(found)(**{**values, "joint_aliases": ((),)})
