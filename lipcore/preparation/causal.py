@@ -1,0 +1,143 @@
+"""The recipe as a live stream can follow it: from rows so far only, late by a delay that is known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from lipcore.preparation.errors import PreparationError
+from lipcore.preparation.filtering import QUANTITIES, Work, settle
+from lipcore.preparation.recipe import Recipe
+from lipcore.preparation.resampling import SAME_RATE
+from lipcore.samples import Array
+from lipcore.signals import ORDER
+
+
+class CausalFilter:
+    """Low-pass and differences of evenly spaced rows, one after the other, as `Work` says; thins nothing.
+
+    All quantities pass one and the same filter, so that they stay those of one moment, `delay_s` before the last row.
+    Differences are central, hence exact on quadratics and of the row before the last: two rows tell nothing yet.
+    """
+
+    def __init__(self, work: Work, n_joints: int) -> None:
+        from scipy.signal import butter, sosfilt, sosfilt_zi  # noqa: PLC0415 - half a second
+
+        self.work, self.n_joints = work, n_joints
+        self._sosfilt = sosfilt
+        self._sections: Array | None = None
+        self._at_rest: Array | None = None
+        if work.cutoff is not None:
+            self._sections = butter(ORDER, work.cutoff, fs=work.rate, output="sos")
+            self._at_rest = sosfilt_zi(self._sections)
+        self.lag = 1 if work.derived else 0
+        self.delay_s = (self._group_delay() + self.lag) / work.rate
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the rows so far: after a gap, or before another recording."""
+        self._state: Array | None = None
+        self._history = np.empty((0, len(self.work.given) * self.n_joints))
+
+    def batch(self, rows: Mapping[str, Array]) -> dict[str, Array]:
+        """Further rows, (N, n) of every quantity given; all of q, dq, ddq, tau of N rows, (N, n) each.
+
+        The first time two rows fewer come out where something is derived. Raise ValueError for rows of another shape,
+        or that are not finite: the filter would never forget these.
+        """
+        signals = np.hstack([self._checked(name, rows) for name in self.work.given])
+        smooth = self._low_pass(signals)
+        if not self.lag:
+            return self._named(smooth)
+        known = np.concatenate([self._history, smooth])
+        self._history = known[-2:].copy()
+        if len(known) < 3:
+            return self._named(known[:0])
+        before, now, after = known[:-2], known[1:-1], known[2:]
+        slope = self._named((after - before) * (0.5 * self.work.rate))
+        found = self._named(now)
+        if "ddq" in self.work.derived:
+            bend = self._named((after - 2 * now + before) * self.work.rate**2)
+            found["ddq"] = bend["q"] if "dq" in self.work.derived else slope["dq"]
+        if "dq" in self.work.derived:
+            found["dq"] = slope["q"]
+        return found
+
+    def _checked(self, name: str, rows: Mapping[str, Array]) -> Array:
+        values = np.asarray(rows[name], dtype=np.float64)
+        if values.ndim != 2 or values.shape != (len(rows["q"]), self.n_joints):
+            raise ValueError(f"{name} has shape {values.shape}, expected {(len(rows['q']), self.n_joints)}")
+        if not np.isfinite(values).all():
+            raise ValueError(f"{name} is not finite in row {int(np.flatnonzero(~np.isfinite(values).all(1))[0])}")
+        return values
+
+    def _low_pass(self, signals: Array) -> Array:
+        if self._sections is None or self._at_rest is None or not len(signals):
+            return signals
+        if self._state is None:  # as if the first row had always been there
+            self._state = self._at_rest[:, :, None] * signals[0]
+        smooth, self._state = self._sosfilt(self._sections, signals, axis=0, zi=self._state)
+        return np.asarray(smooth)
+
+    def _named(self, table: Array) -> dict[str, Array]:
+        """Columns of the quantities given; those derived are there, to be replaced."""
+        n = self.n_joints
+        found = {name: table[:, index * n : (index + 1) * n] for index, name in enumerate(self.work.given)}
+        return {name: found.get(name, found["q"]) for name in QUANTITIES}
+
+    def _group_delay(self) -> float:
+        """Of slow motions, in samples: minus the slope of the phase at frequency 0, section by section."""
+        if self._sections is None:
+            return 0.0
+        late = 0.0
+        for section in self._sections:
+            for sign, taps in ((1, section[:3]), (-1, section[3:])):
+                late += sign * float(taps @ np.arange(3.0)) / float(taps.sum())
+        return late
+
+
+class CausalPreparation:
+    """A recipe on a live stream of rows at `rate` Hz: what comes out is late by `delay_s`.
+
+    rate: Hz, of the rows, which count as evenly spaced; given: the quantities that rows have, q and tau among them.
+    The rate may be lowered by whole numbers. Raise PreparationError where the recipe is impossible at this rate.
+    """
+
+    def __init__(
+        self, rate: float, n_joints: int, recipe: Recipe | None = None, given: tuple[str, ...] = ("q", "dq", "tau")
+    ) -> None:
+        work = settle(rate, tuple(name for name in QUANTITIES if name in given), recipe or Recipe(form="causal"))
+        self._every = round(work.every)
+        if abs(work.every / self._every - 1) > SAME_RATE:
+            near = ", ".join(f"{rate / every:g}" for every in (self._every, self._every + 1))
+            raise PreparationError("rate", f"{rate / work.every:g} Hz", f"a whole part of {rate:g} Hz, such as {near}")
+        self._filter = CausalFilter(work, n_joints)
+        self._count = 0
+
+    @property
+    def delay_s(self) -> float:
+        """How long before the last row the moment was that an answer tells of, s: of motions well below the cut-off."""
+        return self._filter.delay_s
+
+    @property
+    def rate_hz(self) -> float:
+        """Of what comes out."""
+        return self._filter.work.rate / self._every
+
+    def reset(self) -> None:
+        """Forget the rows so far: after a gap, or before another recording."""
+        self._filter.reset()
+        self._count = 0
+
+    def step(self, row: Mapping[str, Array]) -> dict[str, Array] | None:
+        """One more row, (n,) a quantity; q, dq, ddq, tau, (n,) each, or None where nothing comes out with this row."""
+        found = self.batch({name: np.asarray(row[name])[None] for name in self._filter.work.given})
+        return {name: values[0] for name, values in found.items()} if len(found["q"]) else None
+
+    def batch(self, rows: Mapping[str, Array]) -> dict[str, Array]:
+        """Further rows, (N, n) a quantity; what `step` returns for each of them, (M, n) a quantity, M ≤ N."""
+        found = self._filter.batch(rows)
+        first = -self._count % self._every
+        self._count += len(found["q"])
+        return {name: values[first :: self._every] for name, values in found.items()}

@@ -1,0 +1,57 @@
+"""What is to be done with a recording before it is learnt from."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Literal, get_args
+
+from lipcore.signals import CUTOFF
+
+Form = Literal["acausal", "causal"]
+"""acausal: without delay, from what came before and after, for recordings; causal: as a live stream can, late."""
+Filtering = Literal["derived", "always", "never"]
+"""When signals are low-passed: where velocity or acceleration is derived (as in the paper), always, or never."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """The choices; the defaults are the paper's: 4 Hz without delay, acausal differentiation.
+
+    cutoff_hz: of the low-pass; filtering: when it is used; rate_hz: of the samples that come out, None keeps the
+    recording's; trim_s: cut off at both ends of every part, None cuts what the filter spoils (one period of its
+    cut-off); gap_steps: a step of time longer than so many usual ones splits a recording, where signals are low-passed
+    only if it is also longer than 0.3 periods of the cut-off; jitter: largest deviation of
+    a step from the usual one, as a share of it, that counts as even: what is less even is resampled.
+    Raise ValueError where a value is impossible.
+    """
+
+    cutoff_hz: float = CUTOFF
+    filtering: Filtering = "derived"
+    form: Form = "acausal"
+    rate_hz: float | None = None
+    trim_s: float | None = None
+    gap_steps: float = 1.5
+    jitter: float = 0.25
+
+    def __post_init__(self) -> None:
+        for name, choices in (("filtering", get_args(Filtering)), ("form", get_args(Form))):
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name} is {getattr(self, name)!r}, expected one of {', '.join(choices)}")
+        for name, least in (("cutoff_hz", 0.0), ("rate_hz", 0.0), ("gap_steps", 1.0), ("jitter", 0.0)):
+            value = getattr(self, name)
+            if value is not None and not least < value < float("inf"):
+                raise ValueError(f"{name} is {value!r}, expected a number above {least:g}")
+        if self.trim_s is not None and not 0 <= self.trim_s < float("inf"):
+            raise ValueError(f"trim_s is {self.trim_s!r}, expected seconds, at least 0")
+
+    def to_json(self) -> dict[str, Any]:
+        """The choices by name."""
+        return asdict(self)
+
+    @staticmethod
+    def from_json(said: dict[str, Any]) -> Recipe:
+        """The inverse of `to_json`; raise ValueError for a name that is unknown."""
+        known = [each.name for each in fields(Recipe)]
+        if unknown := sorted(set(said) - set(known)):
+            raise ValueError(f"recipe has {unknown[0]!r}, expected names out of {', '.join(known)}")
+        return Recipe(**said)

@@ -1,0 +1,120 @@
+"""The clock of a recording: its usual step, gaps in it, whether it is even; and signals put on an even one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lipcore.preparation.errors import PreparationError
+from lipcore.samples import Array
+
+MAX_RATE = 1e6
+"""Hz; times that rise faster than this are not in seconds."""
+SAME_RATE = 0.01
+"""Rates that differ by less than this share are the same."""
+BLOCK = 65_536
+"""Rows that are interpolated between at a time: the cubics of all would take four times the memory of the values."""
+AROUND = 3
+"""Rows beyond a block that its cubics depend on."""
+NEAR = 0.5
+"""A step that differs from the usual one by less than this share is one tick of the clock."""
+
+
+@dataclass(frozen=True)
+class Clock:
+    """How times advance.
+
+    usual: the median step, s; longest: the longest step that is no gap, s; ends: (N - 1,), where a part ends; gaps:
+    how many of these are gaps, not episodes; worst: largest deviation of a step from the usual one, as a share of it;
+    rate: of an even clock in its place, Hz; even: whether steps may be taken as equal.
+    """
+
+    usual: float
+    longest: float
+    ends: NDArray[np.bool_]
+    gaps: int
+    worst: float
+    rate: float
+    even: bool
+
+
+def clock_of(t: Array, episode: Array, gap_steps: float, jitter: float, bridge_s: float = 0.0) -> Clock:
+    """Read the clock of a recording: t (N,) s, rising within an episode; episode (N,) numbers.
+
+    A step longer than gap_steps usual ones and than bridge_s is a gap. The clock is even where steps within a part
+    differ from the usual one by at most the share jitter, and on average by SAME_RATE: stamps rounded to ms have a
+    median step that is none of the clock's. Raise PreparationError where there is no step, or none is of seconds.
+    """
+    step = np.diff(t)
+    within = np.diff(episode) == 0
+    if not within.any():
+        raise PreparationError("episode", "one sample each", "episodes of several samples")
+    usual = float(np.median(step[within]))
+    if usual < 1 / MAX_RATE:
+        raise PreparationError("t", f"in steps of {usual:g}", f"seconds, in steps of at least {1 / MAX_RATE:g}")
+    ticks = step / usual
+    most = max(gap_steps, bridge_s / usual)
+    gap = within & (ticks > most)
+    ticks = ticks[within & ~gap]
+    deviation = np.abs(ticks - 1)
+    worst = float(deviation.max(initial=0.0))
+    single = ticks[deviation < NEAR]  # rows that are not there would make the clock seem slow
+    mean = float(single.mean()) if len(single) else 1.0
+    even = worst <= jitter and abs(mean - 1) <= SAME_RATE
+    return Clock(usual, most * usual, ~within | gap, int(gap.sum()), worst, 1 / (usual * mean), even)
+
+
+def grid(first: float, last: float, rate: float) -> Array:
+    """Times from `first` on, s, one over `rate` apart, none later than `last`."""
+    count = int((last - first) * rate + 1e-6) + 1
+    return np.asarray(first + np.arange(count) / rate)
+
+
+def interpolate(t: Array, values: Array, at: Array) -> Array:
+    """Values (N,) at rising times t (N,), read at rising times (M,) between the first and the last of them: (M,).
+
+    By Akima's cubics, a block at a time, as each depends on five values only. Measured on sums of sinusoids up to
+    1.6 Hz, sampled at 30, 100 and 500 Hz with steps that vary by 80 %, with gamma-distributed ones and with 5 % of the
+    rows missing, then low-passed at 4 Hz: without noise, accelerations are as good as from cubic splines (3.7 % beside
+    3.2 % at worst, where straight lines give 6.5 %); with noise, splines overshoot between stamps that lie far apart:
+    torque is off by 0.18 % beside 0.10 % in gamma-distributed steps at 500 Hz, and by 1 beside 0.15 N·m in a gap of
+    75 ms at 1 kHz.
+    """
+    from scipy.interpolate import Akima1DInterpolator  # noqa: PLC0415 - slow to import, for uneven recordings only
+
+    if len(t) == 1:
+        return np.repeat(values, len(at))
+    found = np.empty(len(at))
+    for begin in range(0, len(t) - 1, BLOCK):
+        end = min(begin + BLOCK, len(t) - 1)
+        around = slice(max(0, begin - AROUND), end + AROUND + 1)
+        last = len(at) if end == len(t) - 1 else int(np.searchsorted(at, t[end]))
+        inside = slice(int(np.searchsorted(at, t[begin])) if begin else 0, last)
+        curve = Akima1DInterpolator(t[around] - t[begin], values[around])
+        found[inside] = curve(np.clip(at[inside], t[begin], t[end]) - t[begin])
+    return found
+
+
+def between(values: Array, positions: Array) -> Array:
+    """Smooth values (N,), evenly spaced, read at positions (M,) from 0 to N - 1, by quintics through six: (M,)."""
+    count = min(6, len(values))
+    first = np.clip(np.floor(positions).astype(np.int64) - (count // 2 - 1), 0, len(values) - count)
+    place = positions - first
+    found = np.zeros(len(positions))
+    for one in range(count):
+        weight = np.ones(len(positions))
+        for other in range(count):
+            if other != one:
+                weight *= (place - other) / (one - other)
+        found += weight * values[first + one]
+    return found
+
+
+def thinned(count: int, every: float) -> NDArray[np.int64] | Array:
+    """Positions among `count` even samples of every `every`-th, from the first on; whole numbers where it is one."""
+    whole = round(every)
+    if abs(every / whole - 1) <= SAME_RATE:
+        return np.arange(0, count, whole)
+    return np.asarray(np.arange(int((count - 1) / every + 1e-9) + 1) * every)

@@ -1,0 +1,82 @@
+"""What was done with a recording: JSON objects, each with `step`, its parameters and `text`, a sentence for people."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lipcore.preparation.filtering import Work
+
+Step = dict[str, Any]
+
+
+def left_out(why: str, rows: int, first: int) -> Step:
+    """Rows left out, the first of them counted from 1; why: "missing" or "repeated"."""
+    reason = {"missing": "with missing values", "repeated": "whose time stamp was there before"}[why]
+    text = f"{_count(rows, 'row')} {reason} left out, the first is row {first}"
+    return {"step": "leave_out", "why": why, "rows": rows, "first_row": first, "text": text}
+
+
+def split_by_episodes(episodes: int) -> Step:
+    """Episodes kept apart."""
+    return {"step": "split", "by": "episode", "episodes": episodes, "text": f"{episodes} episodes kept apart"}
+
+
+def split_at_gaps(gaps: int, longer_than_s: float) -> Step:
+    """Parts made of what lies between gaps in time."""
+    text = f"split at {_count(gaps, 'gap')} in time"
+    return {"step": "split", "by": "gap", "gaps": gaps, "longer_than_s": longer_than_s, "text": text}
+
+
+def resampled(rate: float, worst: float, bridged_s: float) -> Step:
+    """Uneven stamps replaced by an even clock."""
+    text = f"put on an even clock of {rate:.4g} Hz: steps of time differed from the usual one by up to {worst:.0%}"
+    return {
+        "step": "resample",
+        "rate_hz": rate,
+        "method": "akima",
+        "worst_deviation": worst,
+        "longest_step_s": bridged_s,
+        "text": text,
+    }
+
+
+def low_passed(work: Work, delay_s: float) -> Step:
+    """A Butterworth filter, run both ways or, as in a live stream, forwards only."""
+    late = "without delay" if work.form == "acausal" else f"as in a live stream, {delay_s:.3g} s late"
+    return {
+        "step": "low_pass",
+        "quantities": list(work.low_passed),
+        "cutoff_hz": work.cutoff,
+        "form": work.form,
+        "rate_hz": work.rate,
+        "delay_s": delay_s,
+        "text": f"{', '.join(work.low_passed)} low-passed at {work.cutoff:g} Hz {late}",
+    }
+
+
+def differentiated(work: Work) -> Step:
+    """Velocities or accelerations derived."""
+    text = f"{' and '.join(work.derived)} derived by central differences"
+    return {"step": "differentiate", "derived": list(work.derived), "rate_hz": work.rate, "text": text}
+
+
+def trimmed(work: Work, samples: int) -> Step:
+    """Ends of parts cut off, and parts with nothing between them."""
+    where = "at the filter's edges" if work.cutoff is not None else "at the ends of parts"
+    return {
+        "step": "trim",
+        "first": work.edges[0],
+        "last": work.edges[1],
+        "shortest_part": work.shortest,
+        "samples": samples,
+        "text": f"{_count(samples, 'sample')} cut off {where}",
+    }
+
+
+def thinned(work: Work, rate: float) -> Step:
+    """A lower rate."""
+    return {"step": "thin", "rate_hz": rate, "every": work.every, "text": f"thinned to {rate:.4g} Hz"}
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

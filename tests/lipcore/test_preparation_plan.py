@@ -1,0 +1,303 @@
+"""A plan of a recipe: the paper's choices by default, computed here anew; other choices; what is refused."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import butter, sosfiltfilt
+
+from lipcore.preparation.errors import PreparationError
+from lipcore.preparation.plan import plan
+from lipcore.preparation.recipe import Recipe
+
+RATE = 90.0
+"""Hz; a period of the cut-off is 22.5 samples, far from a whole number, where rounding would decide."""
+ALL = ("q", "dq", "ddq", "tau")
+NONE_MISSING = np.zeros(1000, dtype=bool)
+FREQUENCIES = np.array([0.1, 0.23, 0.41, 0.7, 1.1])
+
+
+def motion(t, seed=0):
+    """Position, velocity, acceleration and a torque of a joint, known at any time."""
+    rng = np.random.default_rng(seed)
+    speed = 2 * np.pi * FREQUENCIES
+    size, angle = rng.uniform(0.2, 1, len(speed)) / speed, np.outer(t, speed) + rng.uniform(0, 6, len(speed))
+    q, dq, ddq = np.sin(angle) @ size, np.cos(angle) @ (size * speed), -np.sin(angle) @ (size * speed**2)
+    return {"q": q, "dq": dq, "ddq": ddq, "tau": 3 * ddq + 5 * np.cos(q)}
+
+
+def chosen(columns, names):
+    return {name: columns[name] for name in names}
+
+
+def paper(columns, rate, cutoff=4.0):
+    """The preparation of one even recording, with SciPy alone."""
+    sections = butter(4, cutoff, fs=rate, output="sos")
+    found = {name: sosfiltfilt(sections, columns[name]) for name in ("q", "tau")}
+    if "dq" in columns:
+        found["dq"] = sosfiltfilt(sections, columns["dq"])
+    else:
+        found["dq"] = np.gradient(found["q"], 1 / rate, edge_order=2)
+    found["ddq"] = np.gradient(sosfiltfilt(sections, found["dq"]), 1 / rate, edge_order=2)
+    edge = int(np.ceil(rate / cutoff))
+    return {name: found[name][edge:-edge] for name in ALL}
+
+
+def texts(made):
+    return [step["text"] for step in made.steps]
+
+
+@pytest.mark.parametrize("names", [("q", "tau"), ("q", "dq", "tau")])
+def test_the_defaults_are_the_paper_s(names):
+    t = np.arange(1000) / RATE
+    columns = chosen(motion(t), names)
+    made = plan(t, None, NONE_MISSING, names, Recipe())
+    found = made.apply(columns)
+    for name, expected in paper(columns, RATE).items():
+        np.testing.assert_allclose(found[name], expected, rtol=0, atol=1e-12 * max(1, np.abs(expected).max()))
+    np.testing.assert_array_equal(made.t, t[23:-23])
+    assert (made.rate, made.cutoff, made.delay_s, made.edges) == (pytest.approx(RATE), 4.0, 0.0, 46)
+    assert texts(made) == [
+        f"{', '.join(['q', 'tau', *names[1:-1]])} low-passed at 4 Hz without delay",
+        f"{' and '.join(made.derived)} derived by central differences",
+        "46 samples cut off at the filter's edges",
+    ]
+
+
+def test_what_is_complete_is_left_as_it_is():
+    t = np.cumsum(np.random.default_rng(0).uniform(0.5, 1.4, 1000)) / RATE
+    columns = motion(t)
+    made = plan(t, None, NONE_MISSING, ALL, Recipe())
+    assert made.steps == [] or [step["step"] for step in made.steps] == ["split"]
+    for name, values in made.apply(columns).items():
+        np.testing.assert_array_equal(values, columns[name])
+
+
+def test_complete_columns_need_no_times():
+    made = plan(None, np.repeat([5.0, 2.0, 5.0], [300, 300, 400]), NONE_MISSING, ALL, Recipe())
+    np.testing.assert_array_equal(made.t, np.arange(1000))
+    np.testing.assert_array_equal(made.episode, np.repeat([0, 1, 2], [300, 300, 400]))
+    assert made.rate is None
+    assert texts(made) == ["3 episodes kept apart"]
+
+
+def test_nothing_is_filtered_across_episodes_or_gaps():
+    """Three parts together come out as each of them does alone."""
+    t = np.arange(1000) / RATE
+    t[600:] += 1.0
+    columns = chosen(motion(t), ("q", "tau"))
+    made = plan(t, np.repeat([0.0, 1.0], [300, 700]), NONE_MISSING, ("q", "tau"), Recipe())
+    found = made.apply(columns)
+    assert (made.gaps, made.episodes) == (1, 3)
+    assert texts(made)[:2] == ["2 episodes kept apart", "split at 1 gap in time"]
+    for index, part in enumerate((slice(0, 300), slice(300, 600), slice(600, 1000))):
+        expected = paper({name: values[part] for name, values in columns.items()}, RATE)
+        for name in ALL:
+            np.testing.assert_allclose(found[name][made.episode == index], expected[name], rtol=1e-9, atol=1e-11)
+
+
+def test_rows_with_missing_values_are_left_out_and_short_runs_of_them_bridged():
+    """Three of them, 44 ms, are bridged where signals are filtered at 4 Hz; a second of them splits the recording."""
+    t = np.arange(1000) / RATE
+    missing = np.zeros(1000, dtype=bool)
+    missing[200:203] = missing[600:700] = True
+    columns = chosen(motion(t), ("q", "tau"))
+    for values in columns.values():
+        values[missing] = np.nan
+    made = plan(t, None, missing, ("q", "tau"), Recipe())
+    found = made.apply(columns)
+    assert (made.missing, made.first_missing, made.gaps, made.resampled) == (103, 201, 1, True)
+    assert texts(made)[0] == "103 rows with missing values left out, the first is row 201"
+    assert len(made) == (600 - 46) + (300 - 46)
+    true = motion(made.t)
+    for name, tolerance in (("q", 2e-3), ("dq", 1e-2), ("ddq", 4e-2), ("tau", 1e-2)):
+        wrong = np.abs(found[name] - true[name])
+        assert wrong.max() < tolerance * np.ptp(true[name])  # which is at the ends of parts
+        assert wrong[160:200].max() < 0.2 * tolerance * np.ptp(true[name])  # in the gap that was bridged
+
+
+def test_missing_rows_without_times_split_the_recording():
+    missing = np.zeros(10, dtype=bool)
+    missing[[3, 4, 9]] = True
+    made = plan(None, None, missing, ALL, Recipe())
+    np.testing.assert_array_equal(made.episode, [0, 0, 0, 1, 1, 1, 1])
+    np.testing.assert_array_equal(made.apply({name: np.arange(10.0) for name in ALL})["q"], [0, 1, 2, 5, 6, 7, 8])
+
+
+def test_missing_rows_of_complete_columns_split_the_recording():
+    t = np.arange(1000) / RATE
+    missing = NONE_MISSING.copy()
+    missing[500] = True
+    made = plan(t, None, missing, ALL, Recipe())
+    assert (made.gaps, made.missing, len(made), made.episodes) == (1, 1, 999, 2)
+
+
+def test_of_rows_with_the_same_stamp_the_first_is_kept():
+    t = np.arange(1000) / RATE
+    t[[11, 12, 40]] = t[[10, 10, 39]]
+    made = plan(t, None, NONE_MISSING, ALL, Recipe(gap_steps=5))
+    assert (made.repeated, len(made)) == (3, 997)
+    assert texts(made) == ["3 rows whose time stamp was there before left out, the first is row 12"]
+    kept = made.apply({name: np.arange(1000.0) for name in ALL})["q"]
+    assert 10 in kept
+    assert not {11, 12, 40} & set(kept)
+
+
+@pytest.mark.parametrize(("rate", "spread"), [(30.0, 0.4), (100.0, 0.4), (500.0, 0.4), (100.0, 0.9)])
+def test_uneven_stamps_are_put_on_an_even_clock(rate, spread):
+    rng = np.random.default_rng(4)
+    count = int(20 * rate)
+    t = 1.7e9 + (np.arange(count) + rng.uniform(-spread / 2, spread / 2, count)) / rate
+    columns = chosen(motion(t - 1.7e9), ("q", "tau"))
+    made = plan(t, None, np.zeros(count, dtype=bool), ("q", "tau"), Recipe())
+    found, true = made.apply(columns), motion(made.t - 1.7e9)
+    assert made.resampled
+    assert made.rate == pytest.approx(rate, rel=0.01)
+    np.testing.assert_allclose(np.diff(made.t), 1 / made.rate, rtol=1e-3)
+    for name, tolerance in (("q", 0.001), ("dq", 0.01), ("ddq", 0.03), ("tau", 0.02)):
+        wrong = found[name] - true[name]
+        assert np.sqrt(np.mean(wrong**2)) < tolerance * true[name].std()
+
+
+def test_stamps_rounded_to_milliseconds_are_uneven():
+    """300 Hz in steps of 3 and 4 ms: the median step says 333 Hz."""
+    t = np.round(np.arange(6000) / 300, 3)
+    made = plan(t, None, np.zeros(6000, dtype=bool), ("q", "tau"), Recipe())
+    assert made.rate == pytest.approx(300, rel=1e-3)
+    found, true = made.apply(chosen(motion(t), ("q", "tau"))), motion(made.t)
+    assert np.sqrt(np.mean((found["dq"] - true["dq"]) ** 2)) < 0.01 * true["dq"].std()
+
+
+@pytest.mark.parametrize(("rate", "whole"), [(45.0, True), (18.0, True), (25.0, False), (64.0, False)])
+def test_a_lower_rate_may_be_chosen(rate, whole):
+    t = np.arange(2000) / RATE
+    made = plan(t, None, np.zeros(2000, dtype=bool), ("q", "tau"), Recipe(rate_hz=rate))
+    found, true = made.apply(chosen(motion(t), ("q", "tau"))), motion(made.t)
+    assert made.rate == pytest.approx(rate)
+    np.testing.assert_allclose(np.diff(made.t), 1 / rate, rtol=1e-9)
+    for name in ALL:
+        assert np.abs(found[name] - true[name]).max() < 0.02 * np.ptp(true[name])
+    every = plan(t, None, np.zeros(2000, dtype=bool), ("q", "tau"), Recipe()).apply(chosen(motion(t), ("q", "tau")))
+    if whole:
+        np.testing.assert_array_equal(found["ddq"], every["ddq"][:: int(RATE / rate)])
+
+
+def test_what_a_lower_rate_cannot_hold_is_filtered_out_even_where_all_is_given():
+    """A vibration of 17 Hz would be seen as one of 1 Hz at 18 Hz."""
+    t = np.arange(2000) / RATE
+    vibration = np.sin(2 * np.pi * 17 * t)
+    made = plan(t, None, np.zeros(2000, dtype=bool), ALL, Recipe(rate_hz=18))
+    columns = motion(t)
+    shaken = made.apply({name: values + vibration for name, values in columns.items()})
+    smooth = made.apply(columns)
+    assert made.cutoff == pytest.approx(7.2)
+    for name in ALL:
+        assert np.abs(shaken[name] - smooth[name]).max() < 0.01
+
+
+def test_a_rate_that_is_the_recording_s_changes_nothing():
+    t = np.arange(1000) / 99.7
+    made = plan(t, None, NONE_MISSING, ALL, Recipe(rate_hz=100.0))
+    assert made.steps == []
+    assert len(made) == 1000
+
+
+def test_filtering_may_be_forced_or_left_out():
+    t = np.arange(1000) / RATE
+    columns = motion(t)
+    always = plan(t, None, NONE_MISSING, ALL, Recipe(filtering="always", cutoff_hz=11)).apply(columns)
+    sections = butter(4, 11, fs=RATE, output="sos")
+    for name in ALL:
+        np.testing.assert_allclose(always[name], sosfiltfilt(sections, columns[name])[9:-9], rtol=0, atol=1e-12)
+    never = plan(t, None, NONE_MISSING, ("q", "tau"), Recipe(filtering="never"))
+    found = never.apply(columns)
+    np.testing.assert_array_equal(found["q"], columns["q"])
+    dq = np.gradient(columns["q"], 1 / RATE, edge_order=2)
+    np.testing.assert_allclose(found["ddq"], np.gradient(dq, 1 / RATE, edge_order=2), rtol=0, atol=1e-9)
+
+
+def test_ends_may_be_cut_off():
+    t = np.arange(1000) / RATE
+    made = plan(t, np.repeat([0.0, 1.0], 500), NONE_MISSING, ALL, Recipe(trim_s=0.5))
+    np.testing.assert_array_equal(made.t, np.concatenate([t[45:455], t[545:955]]))
+    assert texts(made)[-1] == "180 samples cut off at the ends of parts"
+    kept = plan(t, None, NONE_MISSING, ("q", "tau"), Recipe(trim_s=0.0))
+    assert len(kept) == 1000
+
+
+def test_parts_too_short_to_filter_are_left_out_and_counted():
+    t = np.arange(1000) / RATE
+    t[960:] += 1
+    made = plan(t, None, NONE_MISSING, ("q", "tau"), Recipe())
+    assert (made.episodes, len(made), made.edges) == (1, 914, 86)
+
+
+@pytest.mark.parametrize(
+    ("changed", "field", "value", "expected"),
+    [
+        ({"t": None}, "t", "missing", "times, since dq and ddq must be derived"),
+        ({"t": None, "names": ALL, "recipe": Recipe(rate_hz=10)}, "t", "missing", "a rate of 10 Hz is asked for"),
+        ({"t": None, "names": ALL, "recipe": Recipe(filtering="always")}, "t", "missing", "to be low-passed"),
+        ({"t": None, "names": ALL, "recipe": Recipe(trim_s=1)}, "t", "missing", "are to be cut off"),
+        ({"recipe": Recipe(cutoff_hz=45)}, "cutoff", "45 Hz", "less than half the rate of 90 Hz"),
+        ({"recipe": Recipe(rate_hz=200)}, "rate", "200 Hz", "at most the recording's, 90 Hz"),
+        ({"episode": np.arange(1000.0)}, "episode", "one sample each", "episodes of several samples"),
+        ({"episode": np.arange(1000) // 20}, "rows", 1000, "long enough to filter at 4 Hz: at least 47 samples"),
+        ({"names": ALL, "recipe": Recipe(trim_s=6)}, "rows", 1000, "long enough to use: at least 1081 samples"),
+        ({"t": np.arange(1000) * 1e-9}, "t", "in steps of 1e-09", "seconds, in steps of at least 1e-06"),
+        ({"t": 5 - np.arange(1000.0)}, "t, row 2", "4", "at least 5, the time before it"),
+        ({"names": ("q", "dq")}, "tau", "missing", "columns of it"),
+        ({"missing": np.ones(1000, dtype=bool)}, "rows", 0, "rows without missing values"),
+    ],
+)
+def test_what_a_recording_does_not_allow_is_refused(changed, field, value, expected):
+    known = {"t": np.arange(1000) / RATE, "episode": None, "missing": NONE_MISSING, "names": ("q", "tau")}
+    known |= {"recipe": Recipe(), **changed}
+    with pytest.raises(PreparationError) as caught:
+        plan(*(known[name] for name in ("t", "episode", "missing", "names", "recipe")))
+    assert (caught.value.field, caught.value.value) == (field, value)
+    assert expected in caught.value.expected
+
+
+recipes = st.builds(
+    Recipe,
+    cutoff_hz=st.floats(1, 20),
+    filtering=st.sampled_from(["derived", "always", "never"]),
+    form=st.sampled_from(["acausal", "causal"]),
+    rate_hz=st.none() | st.floats(5, 85),
+    trim_s=st.none() | st.floats(0, 0.5),
+    gap_steps=st.floats(1.5, 10),
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(recipe=recipes, uneven=st.booleans(), names=st.sampled_from([ALL, ("q", "tau"), ("q", "dq", "tau")]))
+def test_every_recipe_is_linear_finite_consistent_and_repeatable_from_its_json(recipe, uneven, names):
+    rng = np.random.default_rng(7)
+    t = np.arange(800) / RATE
+    t[500:] += 0.7
+    t += rng.uniform(0, 0.6, 800) / RATE if uneven else 0
+    missing = np.zeros(800, dtype=bool)
+    missing[[100, 101, 300]] = True
+    made = plan(t, None, missing, names, recipe)
+    again = plan(t, None, missing, names, Recipe.from_json(json.loads(json.dumps(recipe.to_json()))))
+    assert json.loads(json.dumps(made.steps)) == again.steps
+    one, two = (chosen(motion(t, seed), names) for seed in (1, 2))
+    first, second = made.apply(one), again.apply(two)
+    both = made.apply({name: one[name] for name in names})
+    for name in ALL:
+        assert first[name].shape == made.t.shape == made.episode.shape
+        assert np.isfinite(first[name]).all()
+        np.testing.assert_array_equal(first[name], both[name])
+    scaled = made.apply({name: -2.5 * one[name] for name in names})
+    for name in ALL:
+        size = np.abs(first[name]).max()
+        np.testing.assert_allclose(scaled[name], -2.5 * first[name], rtol=0, atol=1e-9 * size)
+    assert np.isfinite(second["ddq"]).all()
+    within = np.diff(made.episode) == 0
+    assert (np.diff(made.t)[within] > 0).all()
+    assert made.episodes == made.episode[-1] + 1
