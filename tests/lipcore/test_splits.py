@@ -1,0 +1,263 @@
+"""Splits: the two sides never share an episode, a stretch or a moment, and are found again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lipcore.samples import Samples
+from lipcore.splits import GUARD_S, Split, SplitError, choose, split, taken
+
+KINDS = ("episodes", "last", "blocks")
+
+
+@st.composite
+def recordings(draw):
+    """Episodes and times of rows in order: episodes whose clocks go on after a pause, or start anew."""
+    lengths, random = (
+        draw(st.lists(st.integers(1, 30), min_size=2, max_size=6)),
+        np.random.default_rng(draw(st.integers(0, 99))),
+    )
+    episode, t, now = [], [], 0.0
+    for number, length in enumerate(lengths):
+        now = draw(st.sampled_from([0.0, now + 0.01, now + 0.3, now + 50.0]))
+        times = now + np.cumsum(random.choice([0.01, 0.02, 0.05], length))
+        episode += [number] * length
+        t += times.tolist()
+        now = t[-1]
+    return np.array(episode), np.array(t)
+
+
+splits = st.builds(
+    Split,
+    st.sampled_from(KINDS),
+    st.floats(0.05, 0.95),
+    st.integers(2, 12),
+    st.sampled_from([0.0, 0.015, 0.1, GUARD_S]),
+    st.integers(0, 5),
+)
+
+
+def courses(episode, t):
+    """The course of time that each row belongs to, (N,); one by one."""
+    found, course = [], 0
+    for row in range(len(t)):
+        if row and episode[row] != episode[row - 1] and t[row] <= t[row - 1]:
+            course += 1
+        found.append(course)
+    return np.array(found)
+
+
+def parts_of(episode, t, how):
+    """The parts, or None where nothing is left of one side."""
+    try:
+        return split(episode, t, how)
+    except SplitError:
+        return None
+
+
+@given(recordings(), splits)
+def test_no_row_is_on_both_sides_and_both_have_rows(recording, how):
+    found = parts_of(*recording, how)
+    if found is None:
+        return
+    assert not (found.train & found.held_out).any()
+    assert found.train.any()
+    assert found.held_out.any()
+    assert found.guarded == (~found.train & ~found.held_out).sum()
+
+
+@given(recordings(), splits)
+def test_sides_are_further_apart_than_the_guard(recording, how):
+    """Every pair of rows of opposite sides that lies in one course of time, one by one."""
+    episode, t = recording
+    found = parts_of(episode, t, how)
+    if found is None:
+        return
+    course = courses(episode, t)
+    for row in np.flatnonzero(found.held_out):
+        others = np.flatnonzero(found.train & (course == course[row]))
+        assert (abs(t[others] - t[row]) > how.guard_s).all()
+
+
+@given(recordings(), splits)
+def test_no_more_rows_are_left_out_than_the_guard_asks_for(recording, how):
+    """Without a guard no row is lost; a row that is lost has one of the other side near it."""
+    episode, t = recording
+    whole, found = parts_of(episode, t, replace(how, guard_s=0.0)), parts_of(episode, t, how)
+    if whole is None:
+        return
+    assert whole.guarded == 0
+    if found is None:
+        return
+    course = courses(episode, t)
+    for row in range(len(t)):
+        other = whole.held_out if whole.train[row] else whole.train
+        near = (other & (course == course[row]) & (abs(t - t[row]) <= how.guard_s)).any()
+        kept = found.train[row] if whole.train[row] else found.held_out[row]
+        assert kept == (not near)
+
+
+@given(recordings(), splits, st.randoms(use_true_random=False))
+def test_rows_in_another_order_are_split_alike(recording, how, random):
+    episode, t = recording
+    found = parts_of(episode, t, how)
+    order = list(range(len(t)))
+    random.shuffle(order)
+    again = parts_of(episode[order], t[order], how)
+    assert (found is None) == (again is None)
+    if found is not None:
+        np.testing.assert_array_equal(again.train, found.train[order])
+        np.testing.assert_array_equal(again.held_out, found.held_out[order])
+
+
+@given(recordings(), splits, st.integers(-5, 5), st.integers(1, 7))
+def test_numbers_of_episodes_do_not_matter_but_for_their_order(recording, how, offset, factor):
+    episode, t = recording
+    found, again = parts_of(episode, t, how), parts_of(offset + factor * episode, t, how)
+    assert (found is None) == (again is None)
+    if found is not None:
+        np.testing.assert_array_equal(again.held_out, found.held_out)
+
+
+@given(recordings(), splits)
+def test_equal_arguments_give_equal_parts(recording, how):
+    first, second = parts_of(*recording, how), parts_of(*recording, how)
+    if first is not None:
+        np.testing.assert_array_equal(first.train, second.train)
+        np.testing.assert_array_equal(first.held_out, second.held_out)
+
+
+@given(recordings(), st.floats(0.05, 0.95), st.integers(0, 5))
+def test_whole_episodes_are_on_one_side(recording, share, seed):
+    episode, t = recording
+    found = parts_of(episode, t, Split("episodes", share, guard_s=0.0, seed=seed))
+    assert found is not None
+    for number in np.unique(episode):
+        assert len(set(found.held_out[episode == number])) == 1
+
+
+@given(recordings(), st.floats(0.05, 0.95))
+def test_the_last_rows_come_after_all_others(recording, share):
+    found = parts_of(*recording, Split("last", share, guard_s=0.0))
+    assert found is not None
+    first = np.flatnonzero(found.held_out)[0]
+    assert found.held_out[first:].all()
+    assert abs(found.held_out.sum() - share * len(found.held_out)) <= 1
+
+
+@given(st.integers(20, 300), st.integers(2, 20), st.floats(0.05, 0.95), st.integers(0, 9))
+def test_blocks_are_stretches_of_equal_length(rows, blocks, share, seed):
+    """Without a guard each stretch of held-out rows is as long as so many blocks."""
+    t = np.arange(rows) / 100
+    found = split(np.zeros(rows, dtype=np.int64), t, Split("blocks", share, blocks, 0.0, seed))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], found.held_out, [0]])))
+    lengths = edges[1::2] - edges[::2]
+    for length in lengths:
+        count = round(length * blocks / rows)
+        assert count >= 1
+        assert abs(length - count * rows / blocks) <= 1
+    wanted = min(max(share * blocks, 1), blocks - 1)
+    assert abs(found.held_out.sum() * blocks / rows - wanted) <= 0.5 + blocks**2 / rows
+
+
+@given(st.lists(st.integers(1, 1000), min_size=2, max_size=50), st.floats(0.01, 0.99), st.integers(0, 3))
+def test_choices_are_near_the_share(lengths, share, seed):
+    counts = np.array(lengths)
+    chosen = choose(counts, share, seed)
+    assert chosen.any()
+    assert not chosen.all()
+    held, wanted = counts[chosen].sum(), share * counts.sum()
+    assert abs(held - wanted) <= max(counts.max(), wanted - counts[chosen].sum())
+    if chosen.sum() > 1 and held > wanted:  # each of them brought it nearer
+        assert held - wanted < counts[chosen].max()
+
+
+def test_the_seed_decides():
+    found = {choose(np.full(20, 50), 0.3, seed).tobytes() for seed in range(20)}
+    assert len(found) > 10
+    assert all(np.frombuffer(each, dtype=bool).sum() == 6 for each in found)
+
+
+def test_what_was_held_out_is_found_again_in_later_releases():
+    """Lineages count on it: these numbers never change."""
+    chosen = choose(np.array([10, 20, 30, 40, 50, 60]), 0.3, 7)
+    assert np.flatnonzero(chosen).tolist() == [0, 2, 3]
+
+
+def test_a_pause_ends_the_guard_and_clocks_that_start_anew_need_none():
+    t = np.arange(10) / 10
+    episode = np.repeat([0, 1], 10)
+    how = Split("last", 0.5, guard_s=0.25)
+    assert split(episode, np.concatenate([t, t + 1.0]), how).guarded == 4  # two steps on each side
+    assert split(episode, np.concatenate([t, t + 1.2]), how).guarded == 0
+    assert split(episode, np.concatenate([t, t]), how).guarded == 0
+
+
+def test_the_guard_in_figures():
+    """100 Hz, the last 300 of 1000 rows: 0.25 s before the boundary and after it belong to nobody."""
+    t = np.arange(1000) / 100
+    found = split(np.zeros(1000, dtype=np.int64), t, Split("last", 0.3, guard_s=0.25001))
+    assert np.flatnonzero(found.train).tolist() == list(range(675))
+    assert np.flatnonzero(found.held_out).tolist() == list(range(725, 1000))
+
+
+@pytest.mark.parametrize(
+    ("episodes", "rows", "how", "message"),
+    [
+        (1, 50, Split("episodes"), "episodes is 1, expected at least 2"),
+        (1, 50, Split("blocks", blocks=51), "blocks is 51, expected at most as many as there are rows, 50"),
+        (
+            1,
+            50,
+            Split("last", guard_s=10.0),
+            "guarded rows is 50, expected fewer: no row held out is further than 10 s",
+        ),
+        (1, 50, Split("last", 0.99, guard_s=0.02), "no row to train on is further"),
+        (1, 1, Split("last"), "rows is 1, expected at least 2"),
+    ],
+)
+def test_what_cannot_be_held_out_is_said(episodes, rows, how, message):
+    episode = np.arange(rows) * episodes // rows
+    with pytest.raises(SplitError, match=message):
+        split(episode, np.arange(rows) / 100, how)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"kind": "rows"}, "kind is 'rows', expected one of episodes, last, blocks"),
+        ({"share": 0.0}, "share is 0.0"),
+        ({"share": 1.0}, "share is 1.0"),
+        ({"share": float("nan")}, "share is nan"),
+        ({"blocks": 1}, "blocks is 1"),
+        ({"guard_s": -1.0}, "guard_s is -1.0"),
+        ({"guard_s": float("inf")}, "guard_s is inf"),
+    ],
+)
+def test_impossible_splits_are_refused(given, message):
+    with pytest.raises(SplitError, match=message):
+        Split(**given)
+
+
+def test_arrays_that_do_not_go_together_are_refused():
+    with pytest.raises(ValueError, match="t has shape"):
+        split(np.zeros(3, dtype=np.int64), np.zeros(4), Split())
+    with pytest.raises(ValueError, match="not finite"):
+        split(np.zeros(3, dtype=np.int64), np.array([0.0, np.nan, 1.0]), Split())
+
+
+def test_rows_that_are_taken_begin_an_episode_after_every_interruption():
+    rows = np.arange(24.0).reshape(12, 2)
+    episode = np.repeat([3, 5], 6)
+    samples = Samples(("a", "b"), np.arange(12.0), episode, rows, rows + 1, rows + 2, rows + 3)
+    kept = np.array([1, 1, 0, 0, 1, 1, 1, 0, 1, 1, 1, 1], dtype=bool)
+    found = taken(samples, kept)
+    assert found.episode.tolist() == [0, 0, 1, 1, 2, 3, 3, 3, 3]
+    np.testing.assert_array_equal(found.tau, samples.tau[kept])
+    np.testing.assert_array_equal(found.t, samples.t[kept])
+    assert len(taken(samples, np.zeros(12, dtype=bool))) == 0
