@@ -59,7 +59,7 @@ def simulate(robot: Robot, stream: Stream, seed: int) -> Samples:
     _check(stream)
     rng = np.random.default_rng(seed)
     t = np.arange(stream.n_samples) / stream.rate
-    q, dq, ddq = _sinusoids(robot, stream, t, rng)
+    q, dq, ddq = sinusoids(robot, stream, t, rng)
     tau = inverse_dynamics(robot, q, dq, ddq, _payload_mask(stream, t), stream.payload)
     tau += _per_joint("viscous", stream.viscous, robot) * dq + _per_joint("coulomb", stream.coulomb, robot) * np.sign(
         dq
@@ -86,7 +86,7 @@ def inverse_dynamics(
     return out
 
 
-def _sinusoids(robot: Robot, stream: Stream, t: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+def sinusoids(robot: Robot, stream: Stream, t: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
     """Random sums of sinusoids within the joint's range and speed: q, dq, ddq, each (N, n)."""
     omega = FUNDAMENTAL * stream.speed * np.arange(1, stream.n_sinusoids + 1)
     a, b = rng.uniform(-1, 1, (2, stream.n_sinusoids, robot.n_joints))

@@ -1,0 +1,127 @@
+"""How far, how fast and how hard a robot may be moved."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lipcore.motion import JointType
+from lipcore.profiles import Profile
+from lipcore.robots import Robot
+from lipcore.samples import Array
+
+USUAL_SPEED: dict[str, float] = {"revolute": 1.0, "prismatic": 0.2}
+"""Speed limit of a joint of which none is known, rad/s (m/s)."""
+RISE_S = 0.25
+"""A joint of which no acceleration limit is known reaches its speed limit in this time from rest. The Panda's data
+sheet allows 0.13 to 0.29 s."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of n joints, SI units, each (n,): position `lower` to `upper`, and the magnitudes of speed, acceleration
+    and torque. torque: infinite where none is known.
+
+    Raise ValueError where shapes differ or a range is empty.
+    """
+
+    joint_names: tuple[str, ...]
+    lower: Array
+    upper: Array
+    speed: Array
+    acceleration: Array
+    torque: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.joint_names)
+        for name in ("lower", "upper", "speed", "acceleration", "torque"):
+            values = getattr(self, name)
+            if values.shape != (n,):
+                raise ValueError(f"{name} has shape {values.shape}, expected {(n,)}, one a joint")
+            finite = np.isfinite(values).all() if name != "torque" else not np.isnan(values).any()
+            if not finite or (name not in ("lower", "upper") and (values <= 0).any()):
+                raise ValueError(f"{name} is {values.tolist()}, expected a positive number for every joint")
+        for joint, low, high in zip(self.joint_names, self.lower, self.upper, strict=True):
+            if not low < high:
+                raise ValueError(f"joint {joint!r} may move from {low} to {high}, expected a range that is not empty")
+
+    @classmethod
+    def known(
+        cls,
+        joint_names: Sequence[str],
+        joint_types: Sequence[JointType],
+        lower: Array,
+        upper: Array,
+        speed: Array,
+        acceleration: Array,
+        torque: Array,
+    ) -> Limits:
+        """Limits of which some are unknown, NaN, infinite or not above zero; usual ones stand in, see the constants."""
+        usual = np.array([USUAL_SPEED[kind] for kind in joint_types])
+        speed = np.where(_given(speed), speed, usual)
+        acceleration = np.where(_given(acceleration), acceleration, speed / RISE_S)
+        span = np.where(np.array(joint_types) == "prismatic", 0.5, np.pi)
+        lower, upper = np.where(np.isfinite(lower), lower, -span), np.where(np.isfinite(upper), upper, span)
+        return cls(tuple(joint_names), lower, upper, speed, acceleration, np.where(_given(torque), torque, np.inf))
+
+    @classmethod
+    def of_robot(cls, robot: Robot) -> Limits:
+        """Those of a URDF, which knows no accelerations."""
+        unknown = np.full(robot.n_joints, np.nan)
+        torque = np.asarray(robot.model.effortLimit, dtype=np.float64)
+        return cls.known(robot.joint_names, robot.joint_types, robot.lower, robot.upper, robot.speed, unknown, torque)
+
+    @classmethod
+    def of_profile(cls, profile: Profile) -> Limits:
+        """Those of a robot's profile, usual ones where it knows none."""
+        return cls.known(
+            profile.joint_names,
+            profile.joint_types,
+            profile.lower,
+            profile.upper,
+            profile.speed,
+            profile.acceleration,
+            profile.torque,
+        )
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints n."""
+        return len(self.joint_names)
+
+    @property
+    def middle(self) -> Array:
+        """Middle of every joint's range, (n,)."""
+        return (self.lower + self.upper) / 2
+
+    @property
+    def half(self) -> Array:
+        """Half of every joint's range, (n,)."""
+        return (self.upper - self.lower) / 2
+
+    def within(self, position: float = 1.0, motion: float = 1.0, reach: float | None = None) -> Limits:
+        """A share of these limits: `position` of the range about its middle, `motion` of speed, acceleration, torque.
+
+        reach: at most so far from the middle, rad or m. Raise ValueError for shares that are not above 0, 1 at most.
+        """
+        for name, share in (("position", position), ("motion", motion)):
+            if not 0 < share <= 1:
+                raise ValueError(f"the share of {name} is {share!r}, expected a number above 0, 1 at most")
+        if reach is not None and not 0 < reach < np.inf:
+            raise ValueError(f"reach is {reach!r}, expected a positive number")
+        half = np.minimum(position * self.half, np.inf if reach is None else reach)
+        return replace(
+            self,
+            lower=self.middle - half,
+            upper=self.middle + half,
+            speed=motion * self.speed,
+            acceleration=motion * self.acceleration,
+            torque=motion * self.torque,
+        )
+
+
+def _given(values: Array) -> NDArray[np.bool_]:
+    return np.isfinite(values) & (np.nan_to_num(values) > 0)

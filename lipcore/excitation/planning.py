@@ -1,0 +1,127 @@
+"""The motion within limits that takes most of a model's variance away."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from lipcore.excitation.belief import Belief
+from lipcore.excitation.information import Information
+from lipcore.excitation.limits import Limits
+from lipcore.excitation.reference import draw
+from lipcore.excitation.searching import INSTANTS, Goal, search
+from lipcore.excitation.series import Series
+from lipcore.excitation.shape import Shape, harmonics
+from lipcore.excitation.torque import TorqueCheck
+from lipcore.motion import Motion
+from lipcore.robots import Robot
+from lipcore.samples import Array
+
+
+@dataclass(frozen=True)
+class PlanOptions:
+    """What to plan. seconds, rate (Hz): of the motion; harmonics: of its series, None for what the limits allow.
+
+    iterations, starts: of the search; budget_s: it ends at the latest then, with what it has. references: motions all
+    over the range that variance is counted at.
+    Raise ValueError where a value is impossible.
+    """
+
+    seconds: float = 50.0
+    rate: float = 100.0
+    harmonics: int | None = None
+    iterations: int = 30
+    starts: int = 8
+    budget_s: float = 60.0
+    references: int = 100
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("seconds", "rate", "budget_s"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise ValueError(f"{name} is {getattr(self, name)!r}, expected a positive number")
+        if self.harmonics is not None and not 2 <= self.harmonics <= 1000:
+            raise ValueError(f"harmonics is {self.harmonics!r}, expected a whole number from 2 to 1000")
+        for name, low, high in (
+            ("iterations", 0, 100_000),
+            ("starts", 1, 1000),
+            ("references", 2, 5000),
+            ("seed", 0, 2**63),
+        ):
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"{name} is {getattr(self, name)!r}, expected a whole number from {low} to {high}")
+        if self.samples < 2:
+            raise ValueError(f"{self.seconds} s at {self.rate} Hz are {self.samples} samples, expected at least 2")
+
+    @property
+    def samples(self) -> int:
+        """Samples of the motion: it ends where its period does, at rest."""
+        return round(self.seconds * self.rate) + 1
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A planned motion.
+
+    left: (n,) share of the variance at the references that is left after measuring it, geometric mean over them; used:
+    (4, n) largest share of the limits of position, speed, acceleration and torque, NaN for a torque that could not be
+    checked. out_of_time: whether the budget ended the search.
+    """
+
+    series: Series
+    limits: Limits
+    options: PlanOptions
+    information: Information
+    left: Array
+    used: Array
+    iterations: int
+    seconds: float
+    out_of_time: bool
+
+    def table(self) -> tuple[Array, Array, Array, Array]:
+        """Times (N,), and positions, velocities and accelerations (N, n) at the rate asked for."""
+        t = np.arange(self.options.samples) / self.options.rate
+        return t, *self.series.at(np.minimum(t, self.series.seconds))
+
+    def left_by(self, q: Array, dq: Array, ddq: Array, repeats: float = 1.0) -> Array:
+        """What another motion of N samples would leave, each of which stands for `repeats`: (n,)."""
+        every = -(-len(q) // INSTANTS)
+        motion = Motion.from_arrays(q[::every], dq[::every], ddq[::every])
+        return np.asarray(self.information.left(motion, repeats * len(q) / len(motion)))
+
+
+def plan(
+    belief: Belief,
+    limits: Limits,
+    options: PlanOptions | None = None,
+    robot: Robot | None = None,
+    on_progress: Callable[[int, float], None] | None = None,
+) -> Plan:
+    """Search for the motion that leaves least of the variance; equal arguments give equal motions.
+
+    What is minimised is the mean logarithm of the share of variance left, over joints and motions all over the limits.
+    robot: for torque limits. on_progress: told iterations and that share (geometric mean).
+    Raise ValueError where joints differ or no motion keeps the limits.
+    """
+    options = options or PlanOptions()
+    if belief.kernel.n_joints != limits.n_joints:
+        raise ValueError(f"limits have {limits.n_joints} joints, the model has {belief.kernel.n_joints}")
+    began = time.monotonic()
+    reference = draw(limits, options.references, options.seed + 1)
+    information = Information.about(belief, reference)
+    shape = Shape.build(limits, options.seconds, options.harmonics or harmonics(limits, options.seconds))
+    check = TorqueCheck(robot, limits) if robot is not None and np.isfinite(limits.torque).any() else None
+    goal = Goal.build(shape, information, check, options.samples)
+    until = began + options.budget_s
+    found = search(goal, options.starts, options.iterations, options.seed, until, on_progress)
+    series = shape.series(found.x)
+    if check is not None:
+        series = check.hold(series)
+    torque = np.full(limits.n_joints, np.nan) if check is None else check.used(series)
+    used = np.vstack([series.used(limits), torque])
+    took = time.monotonic() - began
+    left = goal.left(series)
+    return Plan(series, limits, options, information, left, used, found.iterations, took, found.out_of_time)

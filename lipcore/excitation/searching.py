@@ -1,0 +1,144 @@
+"""The search for a motion: random starts, the best of which is followed downhill."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lipcore.excitation.information import Information
+from lipcore.excitation.series import Series
+from lipcore.excitation.shape import Shape
+from lipcore.excitation.torque import TorqueCheck
+from lipcore.motion import Motion
+from lipcore.samples import Array
+
+INSTANTS = 128
+"""Instants that a motion is judged by: samples between them tell little more."""
+OVER_WEIGHT = 100.0
+"""Of the squared share by which a torque exceeds its limit, against nats of variance."""
+MEMORY = 20
+"""Corrections that L-BFGS keeps."""
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What a matrix x (see Shape) is worth: mean log share of variance left, and a penalty on too large torques.
+
+    t: instants judged; repeats: samples that each of them stands for.
+    """
+
+    shape: Shape
+    information: Information
+    check: TorqueCheck | None
+    t: Tensor
+    repeats: float
+
+    @classmethod
+    def build(cls, shape: Shape, information: Information, check: TorqueCheck | None, samples: int) -> Goal:
+        """For a motion of so many samples."""
+        count = min(samples, INSTANTS)
+        # in the middle of each interval: at the ends of the motion the robot rests
+        t = (torch.arange(count, dtype=torch.float64) + 0.5) / count * shape.seconds
+        return cls(shape, information, check, t, samples / count)
+
+    def left(self, series: Series) -> Array:
+        """Share of each joint's variance that a series leaves, (n,)."""
+        motion = Motion.from_arrays(*series.at(self.t.numpy()))
+        return np.asarray(self.information.left(motion, self.repeats))
+
+    def value(self, x: Array) -> float:
+        """What is to be small."""
+        with torch.no_grad():
+            motion = Motion(*self.shape.motion(torch.from_numpy(x), self.t))
+            value = float(self.information.left(motion, self.repeats).log().mean())
+        return value + self._over(motion)[0]
+
+    def slope(self, x: Array) -> tuple[float, Array]:
+        """The value and its derivatives by x."""
+        variable = torch.from_numpy(x.copy()).requires_grad_(True)
+        parts = self.shape.motion(variable, self.t)
+        motion = Motion(*(part.detach() for part in parts))
+        value, slope = self.information.slope(motion, self.repeats)
+        over, more = self._over(motion)
+        slopes = [one + other for one, other in zip((slope.q, slope.dq, slope.ddq), more, strict=True)]
+        (found,) = torch.autograd.grad(parts, variable, slopes)
+        return value + over, found.numpy()
+
+    def _over(self, motion: Motion) -> tuple[float, list[Tensor]]:
+        parts = (motion.q, motion.dq, motion.ddq)
+        if self.check is None:
+            return 0.0, [torch.zeros_like(part) for part in parts]
+        value, slopes = self.check.excess(*(part.numpy() for part in parts))
+        return OVER_WEIGHT * value, [OVER_WEIGHT * torch.from_numpy(slope) for slope in slopes]
+
+
+@dataclass(frozen=True)
+class Found:
+    """Where a search ended. out_of_time: whether that was because of the time."""
+
+    x: Array
+    iterations: int
+    out_of_time: bool
+
+
+def search(
+    goal: Goal,
+    starts: int,
+    iterations: int,
+    seed: int,
+    until: float,
+    on_progress: Callable[[int, float], None] | None = None,
+) -> Found:
+    """The best of random starts, followed by L-BFGS for so many iterations, or until that time of the monotonic clock.
+
+    on_progress: told iterations and the exponential of the lowest value so far.
+    """
+    rng = np.random.default_rng(seed)
+    begun = [goal.shape.random(rng) for _ in range(starts)]
+    best = min(begun, key=goal.value)
+    return _Walk(goal, best, until, on_progress).run(iterations)
+
+
+class _OutOfTimeError(Exception):
+    pass
+
+
+class _Walk:
+    """One descent, which remembers the lowest point that it came by."""
+
+    def __init__(
+        self, goal: Goal, begin: Array, until: float, on_progress: Callable[[int, float], None] | None
+    ) -> None:
+        self.goal, self.begin, self.until, self.on_progress = goal, begin, until, on_progress
+        self.best, self.lowest, self.iterations = begin, np.inf, 0
+
+    def run(self, iterations: int) -> Found:
+        from scipy.optimize import minimize  # noqa: PLC0415 - serving does without it
+
+        if iterations == 0:
+            return Found(self.best, 0, False)
+        options = {"maxiter": iterations, "maxcor": MEMORY, "ftol": 0.0, "gtol": 0.0}
+        try:
+            minimize(self, self.begin.ravel(), jac=True, method="L-BFGS-B", callback=self._step, options=options)
+        except _OutOfTimeError:
+            return Found(self.best, self.iterations, True)
+        return Found(self.best, self.iterations, False)
+
+    def __call__(self, flat: Array) -> tuple[float, Array]:
+        if time.monotonic() > self.until:
+            raise _OutOfTimeError
+        x = flat.reshape(self.begin.shape)
+        value, slope = self.goal.slope(x)
+        if value < self.lowest:
+            self.lowest, self.best = value, x.copy()
+        return value, slope.ravel()
+
+    def _step(self, _: Array) -> None:
+        self.iterations += 1
+        if self.on_progress is not None:
+            self.on_progress(self.iterations, float(np.exp(self.lowest)))

@@ -1,0 +1,107 @@
+"""Any vector of numbers as a motion within limits: what an optimiser searches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lipcore.excitation.limits import Limits
+from lipcore.excitation.series import Series, frequencies, overshoot
+from lipcore.samples import Array
+
+INSTANTS = 12
+"""Instants for each harmonic that limits are watched at while searching."""
+LEAST_HARMONICS, MOST_HARMONICS = 5, 60
+SHARPNESS = 40
+"""Exponent of the norm that stands for the largest share of a limit: large is near, but its slope jumps."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Maps a matrix x (2 K + 1, n) to a motion of n joints that keeps its limits, differentiably.
+
+    Row 0 shifts the middle, the next K are sine and the last K cosine amplitudes, each in units of what the limits
+    allow to that harmonic alone. Two projections bring both ends to rest; each joint is then shrunk towards its middle
+    as far as the limits ask for: by (1 + g^p)^(1/p), g the p-norm of all shares of its limits.
+
+    amplitude: (K, n) velocity of each unit; at_rest: (2, K, n) unit directions that are projected out; watched:
+    (3, m, 2 K + 1) shares of limits up to `unit` (3, n).
+    """
+
+    limits: Limits
+    seconds: float
+    amplitude: Tensor
+    at_rest: Tensor
+    omega: Tensor
+
+    @classmethod
+    def build(cls, limits: Limits, seconds: float, harmonics: int) -> Shape:
+        """For a motion of so many seconds and harmonics; raise ValueError for fewer than two."""
+        if harmonics < 2:
+            raise ValueError(f"harmonics is {harmonics}, expected at least 2: one cannot start and end at rest")
+        omega = frequencies(seconds, harmonics)[:, None]
+        reach = np.minimum.reduce([limits.half * omega, limits.speed + 0 * omega, limits.acceleration / omega])
+        direction = np.stack([reach, reach * omega])
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        return cls(limits, seconds, *(torch.from_numpy(part) for part in (reach, direction, omega[:, 0])))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Shape of x."""
+        harmonics, n = self.amplitude.shape
+        return 2 * harmonics + 1, n
+
+    def coefficients(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Shift from the middle (n,), sine and cosine amplitudes (K, n) of a motion within the limits."""
+        harmonics, half = len(self.omega), torch.from_numpy(self.limits.half)
+        waves = x[1:].reshape(2, harmonics, -1)
+        waves = waves - self.at_rest * (self.at_rest * waves).sum(1, keepdim=True)
+        shift, sine, cosine = x[0] * half, *(waves * self.amplitude)
+        m = INSTANTS * harmonics
+        motion = self._motion(shift, sine, cosine, torch.arange(m, dtype=torch.float64) / m * self.seconds)
+        speed, acceleration = (torch.from_numpy(part) for part in (self.limits.speed, self.limits.acceleration))
+        unit = torch.stack([half, speed, acceleration])[:, None] / overshoot(harmonics, m)
+        shares = (torch.stack(motion) / unit).abs().reshape(-1, len(half))
+        # every joint by the largest share first: powers overflow otherwise
+        largest = shares.detach().amax(0).clamp_min(1.0)
+        powers = (shares / largest).pow(SHARPNESS).sum(0) + largest.pow(-SHARPNESS)
+        shrink = largest * powers.pow(1 / SHARPNESS)
+        return shift / shrink, sine / shrink, cosine / shrink
+
+    def motion(self, x: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Position, velocity and acceleration at times t (N,), each (N, n), differentiable in x."""
+        q, dq, ddq = self._motion(*self.coefficients(x), t)
+        return torch.from_numpy(self.limits.middle) + q, dq, ddq
+
+    def series(self, x: Array) -> Series:
+        """The motion as a series, held to the limits by their strict bound."""
+        shift, sine, cosine = (part.numpy() for part in self.coefficients(torch.from_numpy(x)))
+        found = Series(self.seconds, self.limits.middle + shift, sine, cosine)
+        return found.scaled(self.limits.middle, 1 / np.maximum(1.0, found.used(self.limits).max(0)))
+
+    def random(self, rng: np.random.Generator) -> Array:
+        """A start for a search: harmonics of random strength and phase, faster ones weaker."""
+        rows, n = self.size
+        x = rng.standard_normal((rows, n))
+        x[0] *= 0.3
+        # so that some starts are mostly slow and far, others fast and short
+        fall = rng.uniform(0.0, 1.0, n)
+        harmonics = np.arange(1, len(self.omega) + 1)[:, None]
+        x[1:] *= np.tile(harmonics**-fall, (2, 1))
+        return np.asarray(x)
+
+    def _motion(self, shift: Tensor, sine: Tensor, cosine: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        omega = self.omega[:, None]
+        phase = t[:, None] * self.omega
+        sin, cos = torch.sin(phase), torch.cos(phase)
+        q = shift + sin @ (sine / omega) - cos @ (cosine / omega)
+        return q, cos @ sine + sin @ cosine, -sin @ (sine * omega) + cos @ (cosine * omega)
+
+
+def harmonics(limits: Limits, seconds: float) -> int:
+    """Up to the frequency at which the acceleration limit takes over from the speed limit."""
+    fastest = float(np.max(limits.acceleration / limits.speed)) / (2 * np.pi)
+    return int(np.clip(np.ceil(fastest * seconds), LEAST_HARMONICS, MOST_HARMONICS))

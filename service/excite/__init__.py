@@ -1,0 +1,1 @@
+"""`lipserve excite`: a motion within a robot's limits that tells its model most."""

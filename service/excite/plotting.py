@@ -1,0 +1,58 @@
+"""Drawing a planned motion. Needs matplotlib (extra `plot`)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lipcore.excitation import Plan
+
+HEADINGS = ("position, rad (m)", "speed, per s", "acceleration, per s²")
+
+
+class PlotUnavailableError(RuntimeError):
+    """Matplotlib is not installed."""
+
+
+def pyplot() -> Any:
+    """Matplotlib's plotting module; raise PlotUnavailableError with the remedy where it is missing."""
+    try:
+        import matplotlib  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise PlotUnavailableError("a plot needs matplotlib: pip install 'lipserve[plot]'") from error
+    matplotlib.use("agg")
+    from matplotlib import pyplot as plt  # noqa: PLC0415
+
+    return plt
+
+
+def draw(path: Path, made: Plan) -> None:
+    """Draw each joint's position, speed and acceleration with their limits, and what is expected to be left."""
+    plt, limits = pyplot(), made.limits
+    t, *parts = made.table()
+    bounds = (
+        (limits.lower, limits.upper),
+        (-limits.speed, limits.speed),
+        (-limits.acceleration, limits.acceleration),
+    )
+    figure, axes = plt.subplots(
+        limits.n_joints, 3, sharex=True, squeeze=False, figsize=(11, 1.3 * limits.n_joints + 0.6)
+    )
+    for j, row in enumerate(axes):
+        for axis, values, (low, high) in zip(row, parts, bounds, strict=True):
+            axis.plot(t, values[:, j], color="tab:blue", lw=0.9)
+            for bound in (low[j], high[j]):
+                axis.axhline(bound, color="tab:red", lw=0.7, ls="--")
+            axis.tick_params(labelsize=7)
+        row[0].set_ylabel(f"{limits.joint_names[j]}\n{made.left[j]:.1%} left", fontsize=7)
+    for axis, heading in zip(axes[0], HEADINGS, strict=True):
+        axis.set_title(heading, fontsize=8)
+    for axis in axes[-1]:
+        axis.set_xlabel("s", fontsize=8)
+    mean = float(np.exp(np.log(made.left).mean()))
+    figure.suptitle(f"planned motion: {mean:.2%} of the torque's variance expected to be left", fontsize=9)
+    figure.tight_layout()
+    figure.savefig(path, dpi=100)
+    plt.close(figure)

@@ -1,0 +1,142 @@
+"""`lipserve excite`: what it writes, prints and draws, and what it says where it cannot go on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import lipcore
+from lipcore.profiles import profile
+from lipcore.robots import load_robot, profile_urdf
+from lipcore.simulation import Stream, inverse_dynamics, simulate
+from service.excite import command
+from service.excite.model import fetch
+from service.excite.model import model as find_model
+from service.excite.robot import find
+from tests.service.data import QUICK, stream, train, upload
+from tests.service.server import free_port
+
+SHORT = ("--seconds", "6", "--rate", "20", "--iterations", "2", "--budget", "1000")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A saved model of a double pendulum, whose joints are called as the robot's."""
+    made = lipcore.train(stream(), ("revolute", "revolute"), options=lipcore.FitOptions(**QUICK, starts=1))
+    path = tmp_path_factory.mktemp("excite") / "model"
+    lipcore.save(made, path)
+    return path
+
+
+def excite(*arguments, ok=True):
+    """Run the command; what it printed, or the error that it ended with."""
+    ended = CliRunner().invoke(command.app, [str(each) for each in arguments])
+    if ok:
+        assert ended.exit_code == 0, (ended.output, ended.exception)
+        return ended.output
+    assert ended.exit_code != 0
+    return ended.exception
+
+
+def read(path):
+    header = path.read_text().split("\n", 1)[0].split(",")
+    values = np.loadtxt(path, delimiter=",", skiprows=1)
+    return header, values[:, 0], *np.split(values[:, 1:], 3, axis=1)
+
+
+def test_a_motion_for_a_saved_model_is_written_drawn_and_told(folder, tmp_path):
+    out, plot = tmp_path / "motion.csv", tmp_path / "motion.png"
+    said = excite("--model", folder, "--robot", "double-pendulum", *SHORT, "--out", out, "--plot", plot)
+    header, t, q, dq, ddq = read(out)
+    assert header == ["t", "q1", "q2", "dq1", "dq2", "ddq1", "ddq2"]
+    assert len(t) == 121
+    np.testing.assert_allclose(np.diff(t), 0.05)
+    np.testing.assert_allclose([dq[0], dq[-1], ddq[0], ddq[-1]], 0, atol=1e-9)
+    # velocity and acceleration are the derivatives of the position
+    np.testing.assert_allclose(np.gradient(q, t, axis=0)[1:-1], dq[1:-1], atol=0.02)
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    for words in ("joint1", "joint2", "geometric mean", "for what the model does not know", "2 iterations", str(out)):
+        assert words in said
+    assert "obstacles" in said
+
+
+def test_without_a_model_a_prior_is_planned_for_within_shares_of_the_limits(tmp_path):
+    out = tmp_path / "motion.csv"
+    said = excite("--robot", "asr-twodof", *SHORT, "--range", "0.5", "--scale", "0.4", "--noise", "0.1", "--out", out)
+    assert "for what a lip-chain prior does not know" in said
+    _, _, q, dq, ddq = read(out)
+    known = profile("asr-twodof")
+    assert (np.abs(q - (known.lower + known.upper) / 2) <= 0.5 * (known.upper - known.lower) / 2 * (1 + 1e-9)).all()
+    assert (np.abs(dq) <= 0.4 * known.speed * (1 + 1e-9)).all()
+    assert (np.abs(ddq) <= 0.4 * known.speed / 0.25 * (1 + 1e-9)).all()
+    assert (np.abs(inverse_dynamics(load_robot("asr-twodof"), q, dq, ddq)) <= 0.4 * known.torque).all()
+
+
+def test_reach_keeps_the_motion_near_the_middle(tmp_path):
+    out = tmp_path / "motion.csv"
+    excite("--robot", "double-pendulum", *SHORT, "--reach", "0.2", "--out", out)
+    assert (np.abs(read(out)[2]) <= 0.2 + 1e-9).all()
+
+
+def test_a_urdf_file_and_another_estimator(tmp_path):
+    path, out = tmp_path / "arm.urdf", tmp_path / "motion.csv"
+    path.write_text(profile_urdf("double-pendulum"))
+    said = excite("--robot", path, *SHORT, "--estimator", "rigid-body", "--out", out)
+    assert "a rigid-body prior" in said
+    assert len(read(out)[0]) == 7
+
+
+def test_a_served_model_is_fetched_as_it_is(server):
+    dataset = upload(server.client, stream())["id"]
+    train(server.client, "to-excite", dataset)
+    found = fetch("to-excite", server.url)
+    query = {name: [0.1, -0.2] for name in ("q", "dq", "ddq")}
+    answer = server.client.post("/v1/models/to-excite/predict", json=query).json()
+    np.testing.assert_allclose(found.predict(**query).tau[0], answer["tau"], rtol=1e-9)
+    np.testing.assert_allclose(found.predict(**query).tau_std[0], answer["tau_std"], rtol=1e-6)
+
+
+def test_the_robot_is_told_by_the_joints_of_the_model():
+    samples = simulate(load_robot("panda"), Stream(n_samples=20), 0)
+    model = lipcore.train(samples, ("revolute",) * 7, options=lipcore.FitOptions(**QUICK, starts=1))
+    found = find(None, model)
+    assert found.name == "panda"
+    np.testing.assert_array_equal(found.limits.acceleration, profile("panda").acceleration)
+    assert found.limits.joint_names == samples.joint_names
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "neither --robot nor --model is given, expected one of them"),
+        (("--robot", "r2d2"), "robot is 'r2d2', expected one of panda"),
+        (("--robot", "nowhere.urdf"), "nowhere.urdf"),
+        (("--robot", "fr3"), "no URDF of robot 'fr3' is installed, so nothing tells how large its torques are"),
+        (("--robot", "double-pendulum", "--scale", "1.5"), "the share of motion is 1.5"),
+        (("--robot", "double-pendulum", "--range", "0"), "the share of position is 0.0"),
+        (("--robot", "double-pendulum", "--seconds", "-1"), "seconds is -1.0, expected a positive number"),
+        (("--robot", "double-pendulum", "--noise", "0"), "noise_std is 0.0, expected positive numbers"),
+        (("--robot", "double-pendulum", "--estimator", "magic"), "estimator is 'magic', expected one of lip"),
+        (("--model", "folder", "--robot", "ur5"), "robot 'ur5' has the joints shoulder_pan_joint"),
+        (("--model", "empty"), "holds no manifest.json, expected the folder of a saved model"),
+        (("--model", "nobody", "--url", f"http://127.0.0.1:{free_port()}"), "start one with `lipserve serve`"),
+    ],
+)
+def test_mistakes_are_explained(folder, tmp_path, monkeypatch, arguments, message):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "folder").symlink_to(folder)
+    monkeypatch.chdir(tmp_path)
+    error = excite(*arguments, "--out", "motion.csv", ok=False)
+    assert isinstance(error, (ValueError, OSError, *command.ERRORS))
+    assert message in str(error)
+    assert not (tmp_path / "motion.csv").exists()
+
+
+def test_a_damaged_model_is_refused(folder, tmp_path):
+    path = tmp_path / "model"
+    path.mkdir()
+    (path / "manifest.json").write_bytes((folder / "manifest.json").read_bytes())
+    (path / "model.safetensors").write_bytes((folder / "model.safetensors").read_bytes()[:-9])
+    with pytest.raises(lipcore.ModelFormatError):
+        find_model(str(path), "http://127.0.0.1:1")
