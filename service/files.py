@@ -11,16 +11,18 @@ import os
 import secrets
 import shutil
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import IO, TypeVar
 
 import numpy as np
-from safetensors.numpy import load as load_arrays
-from safetensors.numpy import save as save_arrays
 
 from lipcore.samples import Samples
+from service import sample_file
 from service.errors import DamagedDataError
+from service.sample_file import ArrayOf, PartOf
 
-ARRAYS = ("t", "episode", "q", "dq", "ddq", "tau")
+Result = TypeVar("Result")
 
 
 class DamagedFileError(ValueError):
@@ -41,19 +43,37 @@ class Files:
         for folder in (self.datasets, self.versions, self.uploads, self.learning):
             folder.mkdir(parents=True, exist_ok=True)
 
-    def write_samples(self, dataset: str, samples: Samples) -> str:
-        """Store samples durably under a new id; return their sha256."""
-        payload = save_arrays({name: np.ascontiguousarray(getattr(samples, name)) for name in ARRAYS})
-        _write(self.datasets / f"{dataset}.safetensors", payload)
-        return hashlib.sha256(payload).hexdigest()
+    def write_samples(self, dataset: str, rows: int, n_joints: int, array: ArrayOf) -> str:
+        """Store samples durably under a new id, asking for one array after the other; return their sha256."""
+        target = self.datasets / f"{dataset}.safetensors"
+        return _store(target, lambda file: sample_file.write(file, rows, n_joints, array))
 
-    def read_samples(self, dataset: str, joint_names: list[str], sha256: str) -> Samples:
-        """Read samples stored under `dataset`; raise DamagedDataError unless they are those that were stored."""
+    def read_samples(
+        self, dataset: str, joint_names: list[str], sha256: str, most: int | None = None, part: PartOf | None = None
+    ) -> Samples:
+        """Read samples stored under `dataset`, or part of them, evenly thinned to `most`.
+
+        Raise DamagedDataError unless they are those that were stored.
+        """
+        path = self.samples_file(dataset, sha256)
+        chosen = None
+        if part is not None:
+            episode, t = (sample_file.read_array(path, name) for name in ("episode", "t"))
+            chosen = np.flatnonzero(part(episode, t))
+        count = sample_file.rows_of(path) if chosen is None else len(chosen)
+        if most is not None and count > most:
+            thinned = np.linspace(0, count - 1, most).round().astype(np.int64)
+            chosen = thinned if chosen is None else chosen[thinned]
+        return Samples(joint_names=tuple(joint_names), **sample_file.read(path, chosen))
+
+    def samples_file(self, dataset: str, sha256: str) -> Path:
+        """Where the samples of a data set lie, see sample_file.py; raise DamagedDataError as `read_samples`."""
+        path = self.datasets / f"{dataset}.safetensors"
         try:
-            payload = _read(self.datasets / f"{dataset}.safetensors", sha256)
+            _check(path, sha256)
         except DamagedFileError as error:
             raise DamagedDataError(f"data set {dataset!r} is damaged: {error}. Upload it again") from error
-        return Samples(joint_names=tuple(joint_names), **load_arrays(payload))
+        return path
 
     def delete_samples(self, dataset: str) -> None:
         """Delete samples; nothing happens where there are none."""
@@ -61,7 +81,8 @@ class Files:
 
     def write_snapshot(self, snapshot: str, payload: bytes) -> str:
         """Store what a version has learnt durably under a new id; return its sha256."""
-        _write(self.learning / f"{snapshot}.safetensors", payload)
+        target = self.learning / f"{snapshot}.safetensors"
+        _store(target, lambda file: file.write(payload))
         return hashlib.sha256(payload).hexdigest()
 
     def read_snapshot(self, snapshot: str, sha256: str | None = None) -> bytes:
@@ -92,25 +113,33 @@ class Files:
 
 def _read(path: Path, sha256: str | None) -> bytes:
     """A stored file; raise DamagedFileError where it is another one than was stored, or none."""
+    if sha256 is not None:
+        _check(path, sha256)
     try:
-        payload = path.read_bytes()
+        return path.read_bytes()
     except FileNotFoundError:
         raise DamagedFileError(f"{path} is missing") from None
-    if sha256 is not None and hashlib.sha256(payload).hexdigest() != sha256:
+
+
+def _check(path: Path, sha256: str) -> None:
+    try:
+        found = sample_file.sha256(path)
+    except FileNotFoundError:
+        raise DamagedFileError(f"{path} is missing") from None
+    if found != sha256:
         raise DamagedFileError(f"{path} does not have the sha256 that was kept of it")
-    return payload
 
 
-def _write(path: Path, payload: bytes) -> None:
-    """Write a file that outlives a power cut, whole or not at all."""
+def _store(path: Path, write: Callable[[IO[bytes]], Result]) -> Result:
+    """Write a file that outlives a power cut, whole or not at all; return what `write` does."""
     draft = path.with_suffix(".draft")
     try:
         with draft.open("wb") as file:
-            file.write(payload)
+            result = write(file)
             file.flush()
             os.fsync(file.fileno())
         draft.rename(path)
-    except OSError:
+    except (OSError, ValueError):
         draft.unlink(missing_ok=True)  # on a full disk, room for what comes next
         raise
     folder = os.open(path.parent, os.O_RDONLY)
@@ -118,3 +147,4 @@ def _write(path: Path, payload: bytes) -> None:
         os.fsync(folder)  # the new name, before a row tells of it
     finally:
         os.close(folder)
+    return result

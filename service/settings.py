@@ -73,6 +73,11 @@ class Settings(BaseSettings):
 
     max_upload_bytes: Count = Field(256 * MiB, description="Largest upload of a data set.")
     max_unpacked_bytes: Count = Field(1024 * MiB, description="Largest data set once unpacked.")
+    max_bag_part_bytes: Count = Field(64 * MiB, description="Largest chunk or message of a bag, once unpacked.")
+    max_columns: Count = Field(2000, description="Most columns of a recording's file, lists taken apart.")
+    max_zip_members: Count = Field(20_000, description="Most files in an archive of recordings.")
+    max_json_bytes: Count = Field(32 * MiB, description="Largest JSON document; one object a line may be longer.")
+    max_json_line_bytes: Count = Field(1 * MiB, description="Longest line of JSON, one object a line.")
     max_urdf_bytes: Count = Field(2 * MiB, description="Largest upload of a URDF.")
     max_archive_bytes: Count = Field(128 * MiB, description="Largest archive of a version that is imported.")
     max_archive_torques: Count = Field(
@@ -84,6 +89,9 @@ class Settings(BaseSettings):
     max_joints: Count = Field(32, description="Most joints of a robot.")
     min_samples: int = Field(30, ge=10, description="Fewest samples of a data set.")
     max_samples: Count = Field(1_000_000, description="Most samples of a data set.")
+    max_report_rows: Count = Field(
+        2000, description="Most rows of a data set that figures on several joints together are taken over."
+    )
     max_position: float = Field(
         12.6, gt=0, description="Largest |q| in rad or m that is taken for SI units: two turns. Beyond it: degrees?"
     )

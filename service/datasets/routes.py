@@ -5,20 +5,25 @@ from __future__ import annotations
 from typing import Annotated
 
 from anyio import to_thread
-from fastapi import APIRouter, Query, Request, Response, status
+from fastapi import APIRouter, Depends, Query, Request, Response, status
 
-from lipcore.model import TorqueConvention
-from lipcore.signals import CUTOFF
 from service.context import ServiceDep
 from service.datasets import store
-from service.datasets.schema import UPLOAD_BODY, Dataset, DatasetPage
+from service.datasets.media import MEDIA_TYPES, SUFFIXES, UPLOAD_BODY
+from service.datasets.options import UploadOptions
+from service.datasets.preview import MOST_POINTS, Preview
+from service.datasets.query import upload_options
+from service.datasets.schema import Dataset, DatasetPage
+from service.datasets.staging import QUANTITIES
 from service.errors import (
     ConflictError,
+    DamagedDataError,
     InvalidDataError,
     InvalidRequestError,
     NotFoundError,
     TooLargeError,
     UnsupportedMediaTypeError,
+    invalid_request,
     responses,
 )
 from service.limits.upload import Kinds, receive_to
@@ -26,7 +31,7 @@ from service.names import NameForPeople
 from service.pages import PageQuery
 from service.route import Route
 
-KINDS = Kinds({"text/csv": "csv", "application/x-npz": "npz"}, {".csv": "csv", ".npz": "npz"})
+KINDS = Kinds(MEDIA_TYPES, SUFFIXES)
 
 router = APIRouter(
     prefix="/v1/datasets", tags=["data sets"], responses=responses(InvalidRequestError), route_class=Route
@@ -44,24 +49,15 @@ async def upload(
     request: Request,
     response: Response,
     service: ServiceDep,
+    options: Annotated[UploadOptions, Depends(upload_options)],
     name: Annotated[NameForPeople | None, Query(description="A name for people; the file's by default")] = None,
-    joint_names: Annotated[
-        str | None, Query(max_length=4000, description="Names of joints 1..n, separated by commas")
-    ] = None,
-    torque_convention: Annotated[
-        TorqueConvention, Query(description="Whether `tau` is the whole joint torque or what is added to gravity")
-    ] = "gravity_included",
-    cutoff: Annotated[
-        float, Query(gt=0, le=1000, allow_inf_nan=False, description="Low-pass for derived quantities, Hz")
-    ] = CUTOFF,
 ) -> Dataset:
-    """Validate a recording and store it as an immutable data set, or say what is wrong and where."""
-    names = None if joint_names is None else tuple(part.strip() for part in joint_names.split(","))
+    """Validate a recording, prepare it and store it as an immutable data set, or say what is wrong and where."""
     path = service.files.upload()
     try:
         kind, file_name = await receive_to(request, path, KINDS, service.disk)
         dataset = await to_thread.run_sync(
-            store.add, service, path, kind, name or file_name or "unnamed", names, torque_convention, cutoff
+            store.add, service, path, kind, name or file_name or "unnamed", options, limiter=service.uploads
         )
     finally:
         path.unlink(missing_ok=True)
@@ -79,6 +75,27 @@ def list_datasets(service: ServiceDep, page: PageQuery) -> DatasetPage:
 def show(service: ServiceDep, dataset: str) -> Dataset:
     """What was found in the recording and what was derived."""
     return store.show(service.database, dataset)
+
+
+@router.get(
+    "/{dataset}/preview",
+    summary="Points of a data set for a plot",
+    responses=responses(NotFoundError, DamagedDataError),
+)
+def preview(
+    service: ServiceDep,
+    dataset: str,
+    quantities: Annotated[
+        str, Query(max_length=100, description="Any of q, dq, ddq, tau, separated by commas")
+    ] = ",".join(QUANTITIES),
+    points: Annotated[int, Query(ge=2, le=MOST_POINTS, description="Most points of one column")] = MOST_POINTS,
+) -> Preview:
+    """Columns thinned so that the largest and smallest values stay."""
+    wanted = [name.strip() for name in quantities.split(",")]
+    for name in wanted:
+        if name not in QUANTITIES or wanted.count(name) > 1:
+            raise invalid_request("quantities", name, f"each of {', '.join(QUANTITIES)} at most once")
+    return store.preview(service, dataset, wanted, points)
 
 
 @router.delete(

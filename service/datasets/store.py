@@ -2,57 +2,64 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy import select
 from sqlalchemy.exc import SQLAlchemyError
 
-from lipcore.model import TorqueConvention
 from lipcore.samples import Samples
+from service import sample_file
 from service.context import Service
 from service.database import Database, DatasetRow, JobRow, now
-from service.datasets.checks import check, check_names
-from service.datasets.columns import Columns
-from service.datasets.csv import read_csv
-from service.datasets.npz import read_npz
-from service.datasets.preparation import prepare
+from service.datasets.mapping.reading import read
+from service.datasets.options import UploadOptions
+from service.datasets.preparing import prepare
+from service.datasets.preview import Preview, preview_file
+from service.datasets.report.making import make_report
 from service.datasets.schema import Dataset, DatasetPage
+from service.datasets.staging import Staged, column, staging
 from service.errors import ConflictError, not_found
-from service.files import ARRAYS, Files, new_id
+from service.files import Files, new_id
 from service.pages import Page, newest
+from service.robots.store import profile_of
+from service.sample_file import PartOf
 from service.training.states import ACTIVE
 
-READERS = {"csv": read_csv, "npz": read_npz}
 
+def add(service: Service, upload: Path, kind: str, name: str, options: UploadOptions) -> Dataset:
+    """Read, check and prepare an upload, then store it: samples first, the row that makes them visible last.
 
-def add(
-    service: Service,
-    upload: Path,
-    kind: str,
-    name: str,
-    joint_names: tuple[str, ...] | None,
-    torque_convention: TorqueConvention,
-    cutoff: float,
-) -> Dataset:
-    """Read, check and prepare an upload, then store it: samples first, the row that makes them visible last."""
-    columns: Columns = READERS[kind](upload, service.settings)
-    check(columns, service.settings)
-    n = columns.q.shape[1]
-    names = joint_names or columns.joint_names or tuple(f"joint{i}" for i in range(1, n + 1))
-    check_names(names, n)
-    prepared = prepare(columns, names, cutoff, service.settings.min_samples)
-    service.disk.take(sum(getattr(prepared.samples, each).nbytes for each in ARRAYS))
-    dataset = new_id("ds")
-    digest = service.files.write_samples(dataset, prepared.samples)
+    Columns lie on disk meanwhile, below the uploads. Raise InvalidDataError, InvalidRequestError, TooLargeError or
+    StorageFullError.
+    """
+    from service.datasets.formats.opening import open_table  # noqa: PLC0415 - pyarrow is 35 MiB, for uploads only
+
+    settings, disk = service.settings, service.disk
+    profile = None if options.robot is None else profile_of(service.database, options.robot)
+    with staging(service.files.uploads) as folder:
+        with open_table(upload, kind, options.read, settings) as table:
+            found = read(table, folder, options, profile, settings, disk)
+        prepared = prepare(found.staged, folder, options.recipe, settings.min_samples, disk)
+        gravity = found.torque_convention == "gravity_included"
+        report = make_report(found.staged, prepared, profile, found.noted, settings, options.recipe, gravity)
+        report["source"] = found.facts
+        staged = prepared.staged
+        disk.take(sample_file.size(staged.rows, staged.n_joints))
+        dataset = new_id("ds")
+        digest = service.files.write_samples(dataset, staged.rows, staged.n_joints, partial(_array, staged))
     row = DatasetRow(
         id=dataset,
         name=name,
         created_at=now(),
         sha256=digest,
-        torque_convention=torque_convention,
-        joint_names=list(names),
-        rows=len(prepared.samples),
-        report=prepared.report,
+        torque_convention=found.torque_convention,
+        joint_names=list(staged.joint_names),
+        rows=staged.rows,
+        report=report,
     )
     try:
         with service.database.transaction() as session:
@@ -77,9 +84,15 @@ def find(database: Database, dataset: str) -> DatasetRow:
     return row
 
 
-def samples(files: Files, row: DatasetRow) -> Samples:
-    """Read the samples of a data set; raise DamagedDataError."""
-    return files.read_samples(row.id, row.joint_names, row.sha256)
+def samples(files: Files, row: DatasetRow, most: int | None = None, part: PartOf | None = None) -> Samples:
+    """Read the samples of a data set, or part of them, evenly thinned to `most`; raise DamagedDataError."""
+    return files.read_samples(row.id, row.joint_names, row.sha256, most, part)
+
+
+def preview(service: Service, dataset: str, quantities: Sequence[str], points: int) -> Preview:
+    """Thin some quantities of a data set for a plot; raise NotFoundError or DamagedDataError."""
+    row = find(service.database, dataset)
+    return preview_file(service.files.samples_file(row.id, row.sha256), row.joint_names, quantities, points)
 
 
 def page(database: Database, part: Page) -> DatasetPage:
@@ -100,6 +113,16 @@ def delete(service: Service, dataset: str) -> None:
                 raise ConflictError(f"data set {dataset!r} is in use by job {job.id!r}: cancel it or wait for its end")
         session.delete(row)
     service.files.delete_samples(dataset)
+
+
+def _array(staged: Staged, name: str) -> NDArray[np.float64] | NDArray[np.int64]:
+    """One array of the samples, filled column by column."""
+    if name in ("t", "episode"):
+        return staged.read(name)
+    found = np.empty((staged.rows, staged.n_joints))
+    for joint in range(staged.n_joints):
+        found[:, joint] = staged.read(column(name, joint))
+    return found
 
 
 def _show(row: DatasetRow) -> Dataset:

@@ -1,0 +1,144 @@
+"""Where in the bytes of a message its fields lie: CDR (ROS 2) and the form of ROS 1."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from struct import Struct
+
+from service.datasets.formats.bags.definitions import SEQUENCE, SIZES, Types
+
+DEEPEST, MOST_FIELDS = 32, 2000
+CDR_HEADER = 4
+_PADDING = 3
+"""Bytes that a CDR message may be longer than its fields: some writers fill it up."""
+
+
+@dataclass
+class Layout:
+    """Of messages of one length that agree in all texts and lengths of sequences.
+
+    numbers: first byte, count and type of numbers by the path of their field, `header.stamp` for example; texts by
+    path; fixed: the bytes in which such messages agree, (first byte, bytes); big_endian: of the numbers; fields: how
+    many there are.
+    """
+
+    length: int
+    big_endian: bool = False
+    numbers: dict[str, tuple[int, int, str]] = field(default_factory=dict)
+    texts: dict[str, list[str]] = field(default_factory=dict)
+    fixed: list[tuple[int, bytes]] = field(default_factory=list)
+    fields: int = 0
+
+    def fits(self, data: bytes) -> bool:
+        """Whether a message has this layout."""
+        return len(data) == self.length and all(data.startswith(known, at) for at, known in self.fixed)
+
+
+def lay_out(data: bytes, types: Types, root: str, last: str, encoding: str) -> Layout:
+    """Layout of a message of type `root` up to its field `last`; raise ValueError where the bytes do not agree."""
+    layout = Layout(len(data))
+    if encoding == "cdr":
+        if len(data) < CDR_HEADER or data[0] != 0 or data[1] > 1:
+            raise ValueError("no plain CDR")
+        layout.big_endian = data[1] == 0
+        layout.fixed.append((0, data[:2]))
+    walk = _Walk(data, types, layout, encoding == "cdr")
+    walk.message(root, "", 0, last)
+    left = len(data) - walk.at
+    if types[root][-1].name == last and left > (_PADDING if encoding == "cdr" else 0):
+        raise ValueError(f"{left} bytes too many")
+    layout.fixed = _merged(layout.fixed)
+    return layout
+
+
+class _Walk:
+    def __init__(self, data: bytes, types: Types, layout: Layout, cdr: bool) -> None:
+        self.data, self.types, self.layout, self.cdr = data, types, layout, cdr
+        self.at = CDR_HEADER if cdr else 0
+        self.length = Struct(">I" if layout.big_endian else "<I")
+
+    def message(self, name: str, path: str, depth: int, last: str | None = None) -> None:
+        if name not in self.types:
+            raise ValueError(f"type {name} without a definition")
+        if depth > DEEPEST:
+            raise ValueError(f"type {name} nested {depth} deep")
+        for each in self.types[name]:
+            self.field(each.type, each.count, f"{path}.{each.name}" if path else each.name, depth)
+            if each.name == last:
+                return
+        if last is not None:
+            raise ValueError(f"type {name} without {last}")
+
+    def count(self) -> None:
+        self.layout.fields += 1
+        if self.layout.fields > MOST_FIELDS:
+            raise ValueError(f"more than {MOST_FIELDS} fields")
+
+    def field(self, kind: str, count: int | None, path: str, depth: int) -> None:
+        self.count()
+        if count == SEQUENCE:
+            count = self.sequence_length()
+            if kind in SIZES and count == 0:
+                self.layout.numbers[path] = (self.at, 0, kind)
+                return
+        if kind in SIZES:
+            many = 1 if count is None else count
+            self.align(SIZES[kind])
+            self.layout.numbers[path] = (self.at, many, kind)
+            self.skip(many * SIZES[kind])
+        elif kind in ("time", "duration"):  # of ROS 1
+            if count is None:
+                self.layout.numbers[path] = (self.at, 1, kind)
+            self.skip(8 * (1 if count is None else count))
+        elif count is None:
+            self.one(kind, path, depth)
+        else:
+            # an element takes a byte at least, but for messages without fields
+            if count > len(self.data):
+                raise ValueError(f"{path} of {count} elements declared in {len(self.data)} bytes")
+            for index in range(count):
+                self.one(kind, path if kind == "string" else f"{path}[{index}]", depth)
+
+    def one(self, kind: str, path: str, depth: int) -> None:
+        self.count()
+        if kind == "string":
+            self.layout.texts.setdefault(path, []).append(self.text())
+        elif kind == "wstring":
+            raise ValueError(f"{path} is a wstring, which is not read")
+        else:
+            self.message(kind, path, depth + 1)
+
+    def text(self) -> str:
+        length = self.sequence_length()
+        start = self.at
+        self.skip(length)
+        self.layout.fixed.append((start, self.data[start : self.at]))
+        raw = self.data[start : self.at]
+        return (raw[:-1] if self.cdr and raw.endswith(b"\x00") else raw).decode()
+
+    def sequence_length(self) -> int:
+        self.align(4)
+        start = self.at
+        self.skip(4)
+        self.layout.fixed.append((start, self.data[start : self.at]))
+        length: int = self.length.unpack_from(self.data, start)[0]
+        return length
+
+    def align(self, size: int) -> None:
+        if self.cdr:
+            self.at += -(self.at - CDR_HEADER) % size
+
+    def skip(self, size: int) -> None:
+        if size > len(self.data) - self.at:
+            raise ValueError(f"{size} bytes declared at byte {self.at}, {max(len(self.data) - self.at, 0)} there")
+        self.at += size
+
+
+def _merged(fixed: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
+    merged: list[tuple[int, bytes]] = []
+    for at, known in fixed:
+        if merged and merged[-1][0] + len(merged[-1][1]) == at:
+            merged[-1] = merged[-1][0], merged[-1][1] + known
+        else:
+            merged.append((at, known))
+    return merged

@@ -1,0 +1,137 @@
+"""Nested columns of Arrow as plain columns of numbers: lists become `name[0]`…, structures `name.part`."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from lipcore.samples import Array
+from service.datasets.formats.cells import since
+from service.datasets.formats.json_shape import SAME
+from service.errors import invalid_data
+
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+
+
+class Node(Protocol):
+    """How a column of some type becomes columns of numbers."""
+
+    names: list[str]
+    units: dict[str, str]
+
+    def read(self, array: pa.Array, first_row: int) -> list[Array]:
+        """Some rows, one (rows,) a name, NaN where a value is missing; raise InvalidDataError naming the row."""
+
+
+def plan(name: str, kind: pa.DataType, sample: pa.Array, widest: int) -> Node | None:
+    """How a column is read; None where it holds no numbers, or lists longer than `widest`.
+
+    sample: some of its first rows, which tell how long its lists are.
+    """
+    if isinstance(kind, pa.BaseExtensionType):
+        return plan(name, kind.storage_type, _storage(sample), widest)
+    if pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_decimal(kind):
+        return _Number(name)
+    if pa.types.is_timestamp(kind) or pa.types.is_duration(kind) or pa.types.is_time(kind):
+        return _Time(name, kind)
+    if pa.types.is_struct(kind):
+        return _struct(name, kind, sample, widest)
+    if pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
+        width = kind.list_size if pa.types.is_fixed_size_list(kind) else _width(sample)
+        items = sample.flatten()
+        child = plan("", kind.value_type, items, widest) if 0 < width <= widest else None
+        if child is not None and width * len(child.names) <= widest:
+            return _List(name, width, child)
+    return None
+
+
+class _Number:
+    """Numbers of any kind."""
+
+    def __init__(self, name: str) -> None:
+        self.names, self.units = [name], dict[str, str]()
+
+    def read(self, array: pa.Array, first_row: int) -> list[Array]:
+        return [pc.cast(_storage(array), pa.float64(), safe=False).to_numpy(zero_copy_only=False)]
+
+
+class _Time:
+    """Times: stamps as s since the first of them, durations and times of day as s."""
+
+    def __init__(self, name: str, kind: pa.DataType) -> None:
+        self.names, self.units = [name], {name: "s"}
+        self.unit = _SECONDS[kind.unit]
+        self.small = pa.types.is_time32(kind)
+        self.origin = None if pa.types.is_timestamp(kind) else 0
+
+    def read(self, array: pa.Array, first_row: int) -> list[Array]:
+        whole = pc.cast(array, pa.int32()) if self.small else array
+        seconds, self.origin = since(whole, self.origin, self.unit)
+        return [seconds]
+
+
+class _Struct:
+    """Parts with names of their own."""
+
+    def __init__(self, parts: dict[int, Node]) -> None:
+        self.parts = parts
+        self.names = [name for part in parts.values() for name in part.names]
+        self.units = {name: unit for part in parts.values() for name, unit in part.units.items()}
+
+    def read(self, array: pa.Array, first_row: int) -> list[Array]:
+        fields = _storage(array).flatten()  # a structure that is missing misses all its parts
+        return [column for index, part in self.parts.items() for column in part.read(fields[index], first_row)]
+
+
+class _List:
+    """Lists of one length."""
+
+    def __init__(self, name: str, width: int, child: Node) -> None:
+        self.name, self.width, self.child = name, width, child
+        self.names = [f"{name}[{i}]{inner}" for i in range(width) for inner in child.names]
+        inner = dict(child.units)
+        self.units = {f"{name}[{i}]{each}": unit for i in range(width) for each, unit in inner.items()}
+
+    def read(self, array: pa.Array, first_row: int) -> list[Array]:
+        array = _storage(array)
+        lengths = pc.fill_null(pc.list_value_length(array), -1).to_numpy(zero_copy_only=False)
+        given = lengths > 0  # an empty list is a missing value
+        wrong = np.flatnonzero(given & (lengths != self.width))
+        if len(wrong):
+            row, count = first_row + int(wrong[0]), int(lengths[wrong[0]])
+            raise invalid_data(
+                f"{self.name}, row {row}", f"{count} values", f"{self.width} values as in the rows before"
+            )
+        inner = self.child.read(array.flatten(), first_row)
+        out = []
+        for position in range(self.width):
+            for column in inner:
+                values = np.full(len(array), np.nan)
+                values[given] = column[position :: self.width]
+                out.append(values)
+        return out
+
+
+def _struct(name: str, kind: pa.DataType, sample: pa.Array, widest: int) -> Node | None:
+    fields, parts, count = sample.flatten(), dict[int, Node](), 0
+    for index in range(kind.num_fields):
+        part = kind.field(index)
+        node = plan(f"{name}.{part.name}", part.type, fields[index], widest)
+        if node is not None:
+            parts[index] = node
+            count += len(node.names)
+    return _Struct(parts) if parts and count <= widest else None
+
+
+def _width(sample: pa.Array) -> int:
+    """The usual length of lists, 0 where there is none."""
+    lengths = pc.drop_null(pc.list_value_length(sample)).to_numpy()
+    found, counts = np.unique(lengths[lengths > 0], return_counts=True)
+    return int(found[counts.argmax()]) if len(found) and counts.max() >= SAME * counts.sum() else 0
+
+
+def _storage(array: pa.Array) -> pa.Array:
+    return array.storage if isinstance(array, pa.ExtensionArray) else array

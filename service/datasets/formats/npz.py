@@ -1,0 +1,259 @@
+"""Reading NPZ: named NumPy arrays, numbers and plain text only. Nothing is unpickled, nothing unpacked unmeasured."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.lib import format as npy
+
+from lipcore.samples import Array
+from service.datasets.formats.blocks import block_rows, checked_names, left_out, said
+from service.datasets.formats.table import Table
+from service.datasets.formats.zips import ERRORS, measure, open_zip
+from service.datasets.options import ReadOptions
+from service.errors import invalid_data
+from service.settings import Settings
+
+ARRAYS = {"q": 2, "dq": 2, "ddq": 2, "tau": 2, "t": 1, "episode": 1, "dt": 0, "joint_names": 1}
+"""Known arrays and their dimensions: q, dq, ddq, tau (N, n); t, episode (N,); dt (); joint_names (n,)."""
+EXPECTED = "a complete NPZ archive"
+MAX_FORTRAN = 64
+"""Most columns of an array stored column after column: each is unpacked by a reader of its own."""
+
+
+@dataclass
+class Stored:
+    """An array in the archive: its member, what its header says, and where its numbers begin."""
+
+    name: str
+    member: zipfile.ZipInfo
+    shape: tuple[int, ...]
+    fortran: bool
+    dtype: np.dtype[Any]
+    offset: int
+
+    @property
+    def width(self) -> int:
+        """Columns of the table that it becomes."""
+        return self.shape[1] if len(self.shape) == 2 else 1
+
+    def columns(self) -> list[str]:
+        """Their names: q1… of what is known, name[0]… of another array."""
+        if len(self.shape) == 1:
+            return [self.name]
+        known = self.name in ARRAYS
+        return [f"{self.name}{i + 1}" if known else f"{self.name}[{i}]" for i in range(self.width)]
+
+
+@contextmanager
+def open_npz(path: Path, options: ReadOptions, settings: Settings) -> Iterator[Table]:
+    """Open an NPZ archive as a table; raise InvalidDataError naming the array, or TooLargeError.
+
+    Known are `ARRAYS`; every other array of one number or one row of numbers a sample becomes columns too, and what
+    else there is is left out, which is a fact of the table.
+    """
+    with open_zip(path, settings, EXPECTED) as archive, ExitStack() as files:
+        members = archive.infolist()
+        for member in members:
+            if "/" in member.filename or not member.filename.endswith(".npy"):
+                raise invalid_data("array", member.filename, "a plain name ending in .npy")
+        if len(members) > settings.max_columns:
+            raise invalid_data("array", f"{len(members)} arrays", f"at most {settings.max_columns}")
+        measure(members, settings)
+        found = {each.name: each for each in (_header(archive, member) for member in members)}
+        rows = _rows(found)
+        used, ignored = _choose(found, rows)
+        joints = found.get("joint_names")
+        step = None if "dt" not in found or "t" in found else _step(archive, found["dt"])
+        names = checked_names((["t"] if step else []) + [name for each in used for name in each.columns()], settings)
+        facts = left_out(ignored, f"they are not {rows} numbers, or rows of numbers")
+        yield Table(
+            names,
+            _blocks(archive, files, used, rows, step),
+            joint_names=None if joints is None else _text(archive, joints),
+            facts=facts,
+        )
+
+
+def _header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Stored:
+    name = member.filename.removesuffix(".npy")
+    try:
+        with archive.open(member) as file:
+            version = npy.read_magic(file)
+            if version not in ((1, 0), (2, 0)):
+                raise ValueError(f"format version {version}")
+            read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+            shape, fortran, dtype = read(file)
+            offset = file.tell()
+    except Exception as error:  # NumPy parses the header as Python text and raises whatever its parser raises
+        raise invalid_data(name, said(error), "a NumPy array") from None
+    kinds = "U" if name == "joint_names" else "fiu"
+    if name in ARRAYS and (dtype.kind not in kinds or not 0 < dtype.itemsize <= 1024 or len(shape) != ARRAYS[name]):
+        raise invalid_data(
+            name,
+            f"of type {dtype} and {len(shape)} dimensions",
+            f"{ARRAYS[name]} dimensions of plain " + ("text" if kinds == "U" else "numbers"),
+        )
+    size = member.file_size - offset
+    if any(not 0 <= length <= size for length in shape):
+        raise invalid_data(name, f"of shape {shape}", "as many values as the file holds")
+    if not dtype.hasobject and math.prod(shape) * dtype.itemsize > size:
+        raise invalid_data(name, "truncated", f"{math.prod(shape)} values, as its header says")
+    return Stored(name, member, tuple(shape), bool(fortran), dtype, offset)
+
+
+def _rows(found: dict[str, Stored]) -> int:
+    """Samples N: as q has rows, or most arrays."""
+    if "q" in found:
+        return found["q"].shape[0]
+    lengths = Counter(each.shape[0] for each in found.values() if each.dtype.kind in "fiu" and each.shape)
+    if not lengths:
+        raise invalid_data("array", ", ".join(found) or "none", "arrays q (N, n) and tau (N, n)")
+    return max(lengths, key=lambda length: (lengths[length], length))
+
+
+def _choose(found: dict[str, Stored], rows: int) -> tuple[list[Stored], list[str]]:
+    """Arrays that become columns, and the names of those that do not."""
+    used, ignored = [], []
+    width = found["q"].shape[1] if "q" in found else None
+    for name, array in found.items():
+        if name in ARRAYS and (len(array.shape) != 2 or width is not None):
+            wanted = {2: (rows, width), 1: (rows,), 0: ()}[ARRAYS[name]] if name != "joint_names" else (width,)
+            if wanted not in (array.shape, (None,)):
+                raise invalid_data(
+                    name, f"of shape {array.shape}", f"shape {wanted}, as q has {rows} rows and {width} joints"
+                )
+        if name in ("dt", "joint_names"):
+            continue
+        if array.dtype.kind in "fiu" and len(array.shape) in (1, 2) and array.shape[0] == rows and array.width:
+            if array.fortran and array.width > MAX_FORTRAN:
+                raise invalid_data(name, f"{array.width} columns in Fortran order", "C order: numpy.ascontiguousarray")
+            used.append(array)
+        else:
+            ignored.append(name)
+    return used, ignored
+
+
+def _blocks(
+    archive: zipfile.ZipFile, files: ExitStack, used: list[Stored], rows: int, step: float | None
+) -> Iterator[Array]:
+    """All arrays side by side, each read on by a reader of its own."""
+    readers = [_Reader(archive, files, each) for each in used]
+    clock = None if step is None else _Clock(step)
+    names = [name for each in used for name in each.columns()]
+    episode = names.index("episode") if "episode" in names else None
+    most = block_rows(len(names) + 1)
+    for start in range(0, rows, most):
+        block = np.concatenate([each.read(min(most, rows - start)) for each in readers], axis=1)
+        if clock is not None:
+            times = clock.read(len(block), None if episode is None else block[:, episode])
+            block = np.column_stack([times, block])
+        yield block
+    for each in readers:
+        each.finish()
+
+
+class _Reader:
+    """Reads an array on, block after block; one column after another is read by one file each."""
+
+    def __init__(self, archive: zipfile.ZipFile, files: ExitStack, array: Stored) -> None:
+        self.array = array
+        by_column = array.fortran and array.width > 1
+        self.parts, self.width = (array.width, 1) if by_column else (1, array.width)
+        self.files: list[IO[bytes]] = []
+        with _named(array.name):
+            for part in range(self.parts):
+                file = files.enter_context(archive.open(array.member))
+                _skip(file, array.offset + part * array.shape[0] * array.dtype.itemsize)
+                self.files.append(file)
+
+    def read(self, rows: int) -> Array:
+        """The next rows, (rows, columns)."""
+        size = rows * self.width * self.array.dtype.itemsize
+        out = np.empty((rows, self.array.width))
+        with _named(self.array.name):
+            for part, file in enumerate(self.files):
+                data = file.read(size)
+                if len(data) != size:
+                    raise invalid_data(
+                        self.array.name, "truncated", f"{math.prod(self.array.shape)} values, as its header says"
+                    )
+                values = np.frombuffer(data, self.array.dtype).reshape(rows, self.width)
+                with np.errstate(over="ignore"):  # what a double cannot hold becomes infinite: it is found as that
+                    out[:, part : part + self.width] = values
+        return out
+
+    def finish(self) -> None:
+        """Read to the end, where the archive's checksum is compared."""
+        with _named(self.array.name):
+            while self.files[-1].read(1024 * 1024):
+                pass
+
+
+def _skip(file: IO[bytes], count: int) -> None:
+    """Read over bytes: zipfile's own `seek` takes 16 MiB of memory for that."""
+    while count > 0:
+        piece = len(file.read(min(count, 1024 * 1024)))
+        if not piece:
+            return
+        count -= piece
+
+
+class _Clock:
+    """Times of even samples, which start anew with every episode."""
+
+    def __init__(self, step: float) -> None:
+        self.step, self.count, self.last = step, 0, np.nan
+
+    def read(self, rows: int, episode: Array | None) -> Array:
+        """Times of the next rows (rows,), s."""
+        index = np.arange(rows) + self.count
+        if episode is not None:
+            new = np.flatnonzero(np.diff(episode, prepend=self.last) != 0)
+            if len(new):
+                starts = np.repeat(np.append(-self.count, new), np.diff(np.append(np.append(0, new), rows)))
+                index = np.arange(rows) - starts
+            self.last = episode[-1]
+        self.count = int(index[-1]) + 1
+        return np.asarray(index * self.step)
+
+
+def _step(archive: zipfile.ZipFile, array: Stored) -> float:
+    step = float(_whole(archive, array))
+    if not 0 < step < np.inf:
+        raise invalid_data("dt", step, "a positive number of seconds")
+    return step
+
+
+def _text(archive: zipfile.ZipFile, array: Stored) -> tuple[str, ...]:
+    try:
+        return tuple(str(name) for name in _whole(archive, array))
+    except (SystemError, ValueError):
+        raise invalid_data("joint_names", "not Unicode", "plain text") from None
+
+
+def _whole(archive: zipfile.ZipFile, array: Stored) -> np.ndarray[Any, Any]:
+    """A small array as it is."""
+    size = math.prod(array.shape) * array.dtype.itemsize
+    if size > 1024 * 1024:
+        raise invalid_data(array.name, f"of {size} bytes", "at most 1 MiB")
+    with _named(array.name), archive.open(array.member) as file:
+        file.seek(array.offset)
+        return np.frombuffer(file.read(size), array.dtype).reshape(array.shape)
+
+
+@contextmanager
+def _named(name: str) -> Iterator[None]:
+    """Errors of the archive become those of an array."""
+    try:
+        yield
+    except ERRORS as error:
+        raise invalid_data(name, said(error), EXPECTED) from None

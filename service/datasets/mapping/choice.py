@@ -1,0 +1,213 @@
+"""Which families of columns are meant, where a file has several of a quantity."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from service.datasets.mapping.effort import prefer
+from service.datasets.mapping.joints import Joint, order_of
+from service.datasets.mapping.recognition import (
+    AIM,
+    CANONICAL,
+    JOINT,
+    Family,
+    Member,
+    columns_hint,
+    families,
+    keys,
+    sightings,
+    unfold,
+)
+from service.datasets.options import UploadOptions
+from service.errors import InvalidDataError, invalid_data, invalid_request
+
+MOTION = ("dq", "ddq")
+MEANT = {"q": "positions", "dq": "velocities", "ddq": "accelerations", "tau": "torques"}
+_MOST_LISTED = 6
+
+
+@dataclass(frozen=True)
+class Found:
+    """Families of columns. positions: those that say which joints there are; given: those that the user named."""
+
+    names: Sequence[str]
+    positions: Family
+    others: tuple[Family, ...]
+    given: dict[str, Family]
+    options: UploadOptions
+
+    def complete(self, joints: Sequence[Joint]) -> dict[str, Family]:
+        """For each quantity the columns to read for these joints; raise InvalidDataError where that is not clear."""
+        out = {"q": self.positions}
+        for quantity in (*MOTION, "tau"):
+            if (family := self._of(quantity, joints)) is not None:
+                out[quantity] = family
+        for family in out.values():
+            if family.doubled:
+                raise invalid_data(
+                    f"column {family.doubled[0] + 1}", self.names[family.doubled[0]], "every column once"
+                )
+        return out
+
+    def notes(self, chosen: dict[str, Family]) -> list[str]:
+        """What else could have been read."""
+        out = []
+        for quantity, family in chosen.items():
+            others = [each.pattern for each in self.others if each.quantity == quantity and each is not family]
+            if len(family.members) > 1 and (
+                others := [each for each in others if JOINT in each and each != family.pattern]
+            ):
+                out.append(
+                    f"{quantity} could also be {', '.join(others[:_MOST_LISTED])}: "
+                    f"{columns_hint({quantity: others[0]})} reads that instead"
+                )
+        return out
+
+    def _of(self, quantity: str, joints: Sequence[Joint]) -> Family | None:
+        if (given := self.given.get(quantity)) is not None:
+            self._check_complete(given, joints)
+            return given
+        rivals = [each for each in self.others if each.quantity == quantity]
+        if quantity in MOTION and self.positions.rank != AIM:
+            # what was aimed at is not how the robot moved
+            rivals = [each for each in rivals if each.rank != AIM]
+        whole = [each for each in rivals if covers(each, joints)]
+        if not whole:
+            return self._none_complete(quantity, rivals, joints)
+        if quantity == "tau":
+            torques, whole = whole, prefer(whole, self.options.read.effort)
+            if not whole:
+                listed = ", ".join(each.pattern for each in torques[:_MOST_LISTED])
+                raise invalid_data("effort", self.options.read.effort, f"what {listed} holds by its name or unit")
+        best = best_of(whole)
+        if quantity != "tau" and best[0].rank == CANONICAL:
+            extra = [member for key, member in best[0].members.items() if key not in self.positions.members]
+            if extra and self.positions.rank == CANONICAL:
+                n, name = len(self.positions.members), self.names[extra[0].index]
+                raise invalid_data(f"column {name}", "present", f"at most {quantity}{n}, as there are q1..q{n}")
+        if len(best) > 1:
+            raise unclear(quantity, best)
+        return best[0]
+
+    def _none_complete(self, quantity: str, rivals: list[Family], joints: Sequence[Joint]) -> Family | None:
+        parts = [each for each in rivals if 2 * sum(source_or_none(each, j) is not None for j in joints) >= len(joints)]
+        if parts:
+            self._check_complete(max(parts, key=lambda each: (-each.rank, len(each.members))), joints)
+        if quantity in MOTION:
+            return None
+        said = f"tau1..tau{len(joints)}, as there are q1..q{len(joints)}"
+        raise invalid_data(
+            "column tau1", "missing", f"{said}; or {columns_hint({'tau': '…{joint}…'})} if called otherwise"
+        )
+
+    def _check_complete(self, family: Family, joints: Sequence[Joint]) -> None:
+        for joint in joints:
+            if source_or_none(family, joint) is not None:
+                continue
+            n, quantity = len(self.positions.members), family.quantity
+            if family.rank == CANONICAL:
+                name, expected = f"{quantity}{joint.key}", f"{quantity}1..{quantity}{n}, as there are q1..q{n}"
+            else:
+                name = family.pattern.replace(JOINT, joint.label)
+                expected = f"{MEANT[quantity]} of every joint, as there is {self.names[joint.index]}"
+            raise invalid_data(
+                f"column {name}", "missing", f"{expected}; or leave the joint out, drop_joints={joint.name}"
+            )
+
+
+def choose(names: Sequence[str], options: UploadOptions) -> Found:
+    """Sort a file's columns; raise InvalidDataError without positions, or where several could be them."""
+    given = {
+        quantity: _given(quantity, said, names)
+        for quantity, said in options.read.columns.items()
+        if quantity not in ("t", "episode")
+    }
+    others = tuple(families(names))
+    if "q" in given:
+        return Found(names, given["q"], others, given, options)
+    rivals = [each for each in others if each.quantity == "q"]
+    if not rivals:
+        hint = columns_hint({"q": "…{joint}…"})
+        raise invalid_data("columns", ", ".join(names[:200]), f"positions q1..qn; or {hint} if called otherwise")
+    best = best_of(rivals)
+    if len(best) > 1:
+        # positions without torques are those of something else
+        torques = [each for each in (*others, *given.values()) if each.quantity == "tau"]
+        with_torque = [each for each in best if any(covers(tau, order_of(each)) for tau in torques)]
+        best = with_torque or best
+    if len(best) > 1:
+        raise unclear("q", best)
+    return Found(names, best[0], others, given, options)
+
+
+def best_of(rivals: Sequence[Family]) -> list[Family]:
+    """Those of the best rank; an angle only where nothing is called a position."""
+    order: Callable[[Family], tuple[int, bool]] = lambda each: (each.rank, each.kind == "angle")  # noqa: E731
+    first = min(map(order, rivals))
+    return [each for each in rivals if order(each) == first]
+
+
+def unclear(quantity: str, rivals: Sequence[Family]) -> InvalidDataError:
+    """The error where several families could be a quantity."""
+    listed = ", ".join(each.pattern for each in rivals[:_MOST_LISTED])
+    hint = columns_hint({quantity: rivals[0].pattern})
+    return invalid_data(f"columns of {quantity}", listed, f"one of them: say which, such as {hint}")
+
+
+def source_or_none(family: Family, joint: Joint) -> Member | None:
+    """A joint's column of a family: by its name or number; by its place where only one of both has names."""
+    if not family.listed and joint.key in family.members:
+        return family.members[joint.key]
+    by_place = family.listed or (family.numbered and isinstance(joint.key, str))
+    if by_place and len(family.members) == joint.of:
+        row = (
+            list(family.members.values())
+            if family.listed
+            else [family.members[key] for key in sorted(family.members, key=int)]
+        )
+        return row[joint.place]
+    return None
+
+
+def source(family: Family, joint: Joint) -> Member:
+    """A joint's column of a family that has one; raise KeyError otherwise."""
+    found = source_or_none(family, joint)
+    if found is None:
+        raise KeyError(joint.name)
+    return found
+
+
+def covers(family: Family, joints: Sequence[Joint]) -> bool:
+    """Whether a family has a column for each of the joints."""
+    return all(source_or_none(family, joint) is not None for joint in joints)
+
+
+def _given(quantity: str, said: str | tuple[str, ...], names: Sequence[str]) -> Family:
+    """The columns that a user names: by a pattern, or one by one."""
+    field = f"columns.{quantity}"
+    if quantity not in MEANT:
+        raise invalid_request(field, said, f"one of t, episode, {', '.join(MEANT)}")
+    if isinstance(said, str):
+        if said.count(JOINT) > 1:
+            raise invalid_request(field, said, f"{JOINT} once")
+        family = unfold(said, names, quantity)
+        if not family.members:
+            raise invalid_data(field, said, f"a pattern of the file's columns: {', '.join(names[:_MOST_LISTED])}…")
+        return family
+    out = Family(quantity, quantity, ", ".join(said), 1, listed=True)
+    labels = [next((s.joint for s in sightings(each) if s.quantity == quantity), "") for each in said]
+    found = keys(labels)
+    distinct = len(set(found)) == len(found) and all(labels)
+    for place, name in enumerate(said):
+        if name not in names:
+            raise invalid_data(
+                f"{field}[{place}]", name, f"one of the file's columns: {', '.join(names[:_MOST_LISTED])}…"
+            )
+        seen = next((s for s in sightings(name) if s.quantity == quantity), None)
+        label = labels[place] if distinct else str(place + 1)
+        out.members[found[place] if distinct else place + 1] = Member(
+            names.index(name), label, seen.unit if seen else None
+        )
+        out.kind = seen.kind if seen else out.kind
+    return out

@@ -1,0 +1,208 @@
+"""The joints of a recording: what they are called, which are kept, in which order."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from service.datasets.mapping.recognition import JOINT, Family, Key
+from service.datasets.mapping.robot import Robot
+from service.datasets.options import UploadOptions
+from service.errors import InvalidDataError, invalid_data, invalid_request
+
+MAX_NAME = 100
+_NUMBER = re.compile(r"\d{1,9}")
+_SHOWN = 12
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint of the file.
+
+    label: what the file calls it; index: of its position's column; place: among all `of` joints.
+    """
+
+    key: Key
+    label: str
+    name: str
+    index: int
+    place: int
+    of: int
+
+
+@dataclass(frozen=True)
+class Order:
+    """Joints kept, in order, and left out; constants: N·m/A of those kept, where the robot says them."""
+
+    kept: tuple[Joint, ...]
+    dropped: tuple[Joint, ...]
+    constants: tuple[float, ...] | None
+    notes: tuple[str, ...]
+
+
+def order_of(positions: Family) -> tuple[Joint, ...]:
+    """All joints of a file, by number where it numbers them, else in the file's order."""
+    items = list(positions.members.items())
+    if not positions.listed:
+        items.sort(key=_by_number(positions))
+    return tuple(
+        Joint(
+            key,
+            member.label,
+            member.label.strip() if any(map(str.isalpha, member.label)) else f"joint{key}",
+            member.index,
+            place,
+            len(items),
+        )
+        for place, (key, member) in enumerate(items)
+    )
+
+
+def arrange(
+    positions: Family,
+    joint_names: tuple[str, ...] | None,
+    options: UploadOptions,
+    robot: Robot | None,
+    max_joints: int,
+) -> Order:
+    """Name and order the joints, leave out what the user or the robot leaves out; raise InvalidDataError."""
+    _check_numbers(positions)
+    joints = _named(order_of(positions), joint_names, options)
+    wanted, left_out = _wanted(joints, options)
+    notes: list[str] = []
+    constants = None
+    kept: tuple[Joint, ...] = wanted
+    if robot is not None:
+        kept, constants, notes = _as_robot(joints, wanted, options, robot)
+        left_out += tuple(joint for joint in wanted if joint.index not in {each.index for each in kept})
+    if not 1 <= len(kept) <= max_joints:
+        raise invalid_data("joints", len(kept), f"1 to {max_joints}")
+    if robot is None and _alphabetical(kept):
+        notes.append(
+            "joints come in the order of the alphabet, as some drivers list them: if that is not from base to tip, "
+            "say it with joints, or the robot"
+        )
+    if [joint.index for joint in kept] != sorted(joint.index for joint in kept):
+        notes.append(f"joints are put in the order {', '.join(joint.name for joint in kept)}")
+    names = options.read.joint_names
+    if names is not None and len(names) == len(kept) != len(joints):
+        kept = tuple(replace(joint, name=name) for joint, name in zip(kept, names, strict=True))
+    check_names(tuple(joint.name for joint in kept))
+    return Order(kept, left_out, constants, tuple(notes))
+
+
+def check_names(names: tuple[str, ...]) -> None:
+    """Raise InvalidDataError unless the names of joints are distinct and printable."""
+    for index, name in enumerate(names):
+        if not name or len(name) > MAX_NAME or not name.isprintable():
+            raise invalid_data(f"joint_names[{index}]", name, f"1 to {MAX_NAME} printable characters")
+        if name in names[:index]:
+            raise invalid_data(f"joint_names[{index}]", name, "names that differ")
+
+
+def _check_numbers(positions: Family) -> None:
+    """Where joints only have numbers, none may be missing."""
+    labels = [member.label for member in positions.members.values()]
+    if positions.listed or not all(label.isdecimal() for label in labels):
+        return
+    found = sorted(key for key in positions.members if isinstance(key, int))
+    first = min(map(int, labels))
+    # from 0 or from 1 on; `missing` is the number as the file would write it
+    missing = next((place for place, key in enumerate(found, start=1) if key != place), None)
+    if missing is not None:
+        name = positions.pattern.replace(JOINT, str(missing - (first == 0)))
+        raise invalid_data(f"column {name}", "missing", f"positions of joints {first or 1} to {max(map(int, labels))}")
+
+
+def _by_number(positions: Family) -> Callable[[tuple[Key, object]], tuple[int, ...]]:
+    labels = {key: member.label for key, member in positions.members.items()}
+    alike = len({_NUMBER.sub("#", label) for label in labels.values()}) == 1
+    if not alike and not positions.numbered:
+        return lambda item: ()
+    return lambda item: tuple(int(each) for each in _NUMBER.findall(labels[item[0]])) or (0,)
+
+
+def _named(joints: tuple[Joint, ...], joint_names: tuple[str, ...] | None, options: UploadOptions) -> tuple[Joint, ...]:
+    names = options.read.joint_names
+    least = len(joints) - len(options.drop_joints) if options.joints is None else len(options.joints)
+    if names is not None and len(names) == len(joints):
+        return tuple(replace(joint, name=name) for joint, name in zip(joints, names, strict=True))
+    if names is not None and len(names) != least:
+        raise invalid_data("joint_names", f"{len(names)} names", f"{len(joints)} names, one a joint")
+    # a file names joints apart from its columns where these only have numbers
+    if joint_names is not None and len(joint_names) == len(joints) and all(isinstance(j.key, int) for j in joints):
+        return tuple(replace(joint, name=name) for joint, name in zip(joints, joint_names, strict=True))
+    return joints
+
+
+def _wanted(joints: tuple[Joint, ...], options: UploadOptions) -> tuple[tuple[Joint, ...], tuple[Joint, ...]]:
+    dropped = [_find(joints, name, "drop_joints") for name in options.drop_joints]
+    chosen = list(joints) if options.joints is None else [_find(joints, name, "joints") for name in options.joints]
+    if len({joint.index for joint in chosen}) < len(chosen):
+        raise invalid_request("joints", ", ".join(options.joints or ()), "every joint once")
+    kept = tuple(joint for joint in chosen if joint not in dropped)
+    return kept, tuple(joint for joint in joints if joint not in kept)
+
+
+def _find(joints: tuple[Joint, ...], name: str, option: str) -> Joint:
+    for joint in joints:
+        if name.lower() in (joint.name.lower(), joint.label.lower()):
+            return joint
+    raise invalid_data(option, name, f"joints of the file: {_shown([joint.name for joint in joints])}")
+
+
+def _as_robot(
+    joints: tuple[Joint, ...], wanted: tuple[Joint, ...], options: UploadOptions, robot: Robot
+) -> tuple[tuple[Joint, ...], tuple[float, ...] | None, list[str]]:
+    """Those of the wanted joints that the robot has, from base to tip and with its names."""
+    notes, names = [], robot.joint_names
+    constants = None if robot.torque_constants is None else list(robot.torque_constants)
+    places = robot.order_of([joint.name for joint in joints])
+    if places is None and options.read.joint_names is not None:
+        places = robot.order_of([joint.label for joint in joints])
+    if places is None:
+        if len(wanted) != len(names) or not (options.read.joint_names or all(isinstance(j.key, int) for j in wanted)):
+            raise _mismatch(robot, wanted)
+        ordered = list(wanted)
+        notes.append(f"joints are taken as those of {robot.name} in order")
+    else:
+        ordered = [joints[place] for place in places]
+    called = {joint.index: place for place, joint in enumerate(ordered)} if len(ordered) == len(names) else {}
+    kept = [joint for joint in ordered if joint in wanted]
+    others = [joint for joint in wanted if joint not in ordered]
+    if options.joints is not None:
+        if [joint for joint in wanted if joint in kept] != kept:
+            expected = f"the order of {robot.name}: {_shown([joint.name for joint in kept])}"
+            raise invalid_request("joints", ", ".join(options.joints), expected)
+        kept, others = list(wanted), []
+    if others:
+        notes.append(f"left out, as {robot.name} has no such joints: {_shown([joint.name for joint in others])}")
+    if options.read.joint_names is None:
+        renamed = [replace(j, name=names[called[j.index]]) if j.index in called else j for j in kept]
+        if any(a.name != b.name for a, b in zip(kept, renamed, strict=True)):
+            pairs = [f"{a.name} is {b.name}" for a, b in zip(kept, renamed, strict=True) if a.name != b.name]
+            notes.append(f"joints get the names that {robot.name} has: {_shown(pairs)}")
+        kept = renamed
+    known = constants is not None and all(joint.index in called for joint in kept)
+    values = tuple(float(constants[called[joint.index]]) for joint in kept) if known and constants else None
+    return tuple(kept), values, notes
+
+
+def _mismatch(robot: Robot, wanted: Sequence[Joint]) -> InvalidDataError:
+    return invalid_data(
+        "joints",
+        _shown([joint.name for joint in wanted]),
+        f"those of {robot.name}, {_shown(robot.joint_names)}: say joint_names as the robot has them, in the file's "
+        "order, or leave other joints out with drop_joints",
+    )
+
+
+def _alphabetical(joints: Sequence[Joint]) -> bool:
+    names = [joint.name for joint in joints]
+    numbered = len({_NUMBER.sub("#", name) for name in names}) < len(names)
+    return len(names) > 2 and not numbered and names == sorted(names)
+
+
+def _shown(names: Sequence[str]) -> str:
+    return ", ".join(names[:_SHOWN]) + (" …" if len(names) > _SHOWN else "")

@@ -1,0 +1,220 @@
+"""Reading a file's table into columns in SI units on disk, once from its beginning to its end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lipcore.model import TorqueConvention
+from lipcore.samples import Array
+from service.datasets.formats.table import Table
+from service.datasets.mapping import checks
+from service.datasets.mapping.checks import Clockwork, Rows, Seen
+from service.datasets.mapping.choice import MOTION
+from service.datasets.mapping.mapping import ColumnMap, Source, resolve
+from service.datasets.mapping.robot import Robot
+from service.datasets.options import Effort, UploadOptions
+from service.datasets.staging import EPISODE, TIME, Staged, column
+from service.errors import invalid_data
+from service.limits.disk import Disk
+from service.settings import Settings
+
+
+@dataclass(frozen=True)
+class Read:
+    """A recording as it was read.
+
+    staged: its columns; missing: (rows,) where any of them is; facts: figures for the report, JSON; noted: sentences
+    that tell what was understood and what was left out.
+    """
+
+    staged: Staged
+    effort: Effort
+    torque_convention: TorqueConvention
+    missing: NDArray[np.bool_]
+    facts: dict[str, Any]
+    noted: list[str]
+
+
+def read(
+    table: Table, folder: Path, options: UploadOptions, robot: Robot | None, settings: Settings, disk: Disk
+) -> Read:
+    """Read a table's columns to files in a folder; raise InvalidDataError, StorageFullError.
+
+    Every row of the file becomes one: values that are missing or infinite become NaN, and such rows are left out when
+    the recording is prepared, as are those whose time was there in the row before.
+    """
+    found = resolve(table.names, table.units, table.joint_names, options, robot, settings.max_joints)
+    reader = _Reader(found, Staged(folder, found.joints, disk), settings)
+    for block in table.blocks:
+        reader.add(block)
+    missing = reader.finish()
+    noted = [*table.facts, *found.notes, *reader.notes()]
+    facts = {
+        "effort": found.torque.effort,
+        "columns": _columns(found, reader.staged),
+        "units": {each.name: each.said for row in found.quantities.values() for each in row if each.said},
+        "unused_columns": list(found.unused),
+        "dropped_joints": list(found.dropped),
+        "torque_constants": None if found.torque.constants is None else list(found.torque.constants),
+        "rows_read": reader.rows,
+        "repeated_stamps": reader.clockwork.repeated,
+        "first_repeated_row": reader.clockwork.first_repeated or None,
+        "missing_rows": int(missing.sum()),
+        "first_missing_row": reader.first_missing,
+    }
+    return Read(reader.staged, found.torque.effort, found.torque.convention, missing, facts, noted)
+
+
+class _Reader:
+    """Takes block after block; keeps of them what the checks at the end need."""
+
+    def __init__(self, found: ColumnMap, staged: Staged, settings: Settings) -> None:
+        self.found, self.staged, self.settings, self.rows = found, staged, settings, 0
+        self.time = Seen(found.t[0].name) if found.t else None
+        self.time_said = any(each.said is not None for each in found.t)
+        self.clockwork = Clockwork(found.t[0].name if found.t else TIME)
+        self.seen = {quantity: [Seen(each.name) for each in row] for quantity, row in found.quantities.items()}
+        self.left_out = {name: Seen(each.name) for name, each in found.dropped.items()}
+        self.absent = {quantity for quantity in MOTION if quantity in found.quantities}
+        """Those of which there was no value yet: perhaps there is none at all."""
+        self._missing: list[NDArray[np.bool_]] = []
+
+    def add(self, block: Array) -> None:
+        """Take a block (M, columns); raise InvalidDataError."""
+        rows = np.arange(self.rows + 1, self.rows + len(block) + 1)
+        self.rows += len(block)
+        if self.rows > self.settings.max_samples:
+            raise invalid_data("rows", self.rows, f"at most {self.settings.max_samples} samples")
+        episode = None
+        if self.found.episode is not None:
+            episode = np.ascontiguousarray(block[:, self.found.episode.index])
+            checks.whole(episode, rows, self.found.episode.name)
+        t = self._time(block, rows)
+        if t is not None:
+            self.clockwork.look(t, episode, rows)
+        self._stage(block, rows, t, episode)
+
+    def finish(self) -> NDArray[np.bool_]:
+        """Check the whole; return which rows lack something, (rows,). Raise InvalidDataError."""
+        for quantity in self.absent:
+            del self.seen[quantity]
+        missing = np.concatenate([*self._missing, np.zeros(0, dtype=np.bool_)])
+        seen = [each for row in self.seen.values() for each in row] + ([self.time] if self.time else [])
+        checks.check_rows(len(missing), int(missing.sum()), self.clockwork.repeated, self.settings.min_samples, seen)
+        if self.found.t:
+            checks.check_time_unit(self.staged.read(TIME), self.time_said, self.found.t[0].name)
+        joints = list(zip(self.found.joints, self.seen["q"], strict=True))
+        said = all(each.said is not None for each in self.found.quantities["q"])
+        checks.check_positions(joints, self.settings.max_position, said)
+        self._check_slopes(missing)
+        return missing
+
+    def notes(self) -> list[str]:
+        """What of the file is not used after all."""
+        out = [f"{quantity} has no values and is taken as not given" for quantity in MOTION if quantity in self.absent]
+        for name, each in self.left_out.items():
+            if each.span > checks.MOVED:
+                out.append(
+                    f"warning: {name} is left out though it moved by {each.span:.3g}, which acts on the torques of "
+                    "the others"
+                )
+            else:
+                out.append(f"{name} is left out; it did not move")
+        return out
+
+    @property
+    def first_missing(self) -> int | None:
+        """Row of the file that is the first to lack a value, counted from 1; None where none does."""
+        seen = [each for row in self.seen.values() for each in row] + ([self.time] if self.time else [])
+        return min((each.first_missing for each in seen if each.missing), default=None)
+
+    def _time(self, block: Array, rows: Rows) -> Array | None:
+        if self.time is None:
+            return None
+        parts = [_scaled(block, each) for each in self.found.t]
+        t = parts[0] if len(parts) == 1 else np.sum(parts, axis=0)
+        if not self.time_said:
+            checks.epoch_unit(t, rows, self.time.name)
+        self.time.add(t, rows)
+        return t
+
+    def _stage(self, block: Array, rows: Rows, t: Array | None, episode: Array | None) -> None:
+        columns: dict[str, Array] = {}
+        missing = np.zeros(len(block), dtype=np.bool_)
+        before = sum(map(len, self._missing))
+        if t is not None:
+            columns[TIME] = t
+            missing |= np.isnan(t)
+        if episode is not None:
+            columns[EPISODE] = episode
+        for quantity, row in self.found.quantities.items():
+            values = [_scaled(block, each) for each in row]
+            for each, seen in zip(values, self.seen[quantity], strict=True):
+                seen.add(each, rows)
+            if quantity in self.absent:
+                if all(np.isnan(each).all() for each in values):
+                    continue
+                self._begin(quantity, before)
+            for joint, each in enumerate(values):
+                columns[column(quantity, joint)] = each
+                missing |= np.isnan(each)
+        for name, source in self.found.dropped.items():
+            self.left_out[name].add(_scaled(block, source), rows)
+        self.staged.append(columns)
+        self._missing.append(missing)
+
+    def _begin(self, quantity: str, rows: int) -> None:
+        """The first values of a quantity come late: all rows before lack it."""
+        self.absent.discard(quantity)
+        if rows:
+            for joint in range(self.staged.n_joints):
+                self.staged.append({column(quantity, joint): np.full(rows, np.nan)})
+            self._missing = [np.ones(rows, dtype=np.bool_)]
+
+    def _check_slopes(self, missing: NDArray[np.bool_]) -> None:
+        """Velocities have to be the slopes of positions, accelerations those of velocities: else units are wrong."""
+        if not self.found.t or "dq" not in self.seen:
+            return
+        t = self.staged.read(TIME)
+        episode = self.staged.read(EPISODE) if EPISODE in self.staged else None
+        part = checks.first_stretch(t, episode, missing)
+        for of, derivative in (("q", "dq"), ("dq", "ddq")):
+            if derivative in self.seen:
+                ratios = [
+                    checks.slope_ratio(
+                        t[part],
+                        self.staged.read(column(of, joint))[part],
+                        self.staged.read(column(derivative, joint))[part],
+                    )
+                    for joint in range(self.staged.n_joints)
+                ]
+                if (error := checks.wrong_unit(ratios, derivative)) is not None:
+                    raise error
+
+
+def _scaled(block: Array, source: Source) -> Array:
+    """A column in SI units, NaN where it is not finite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        values: Array = block[:, source.index] * source.factor
+    values[~np.isfinite(values)] = np.nan
+    return values
+
+
+def _columns(found: ColumnMap, staged: Staged) -> dict[str, list[str]]:
+    """Names of the file's columns by what they were read as."""
+    rows: dict[str, Sequence[Source]] = {
+        TIME: found.t,
+        EPISODE: [found.episode] if found.episode else [],
+        **found.quantities,
+    }
+    return {
+        name: [each.name for each in row]
+        for name, row in rows.items()
+        if row and (name in staged or name in staged.quantities)
+    }

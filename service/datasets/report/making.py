@@ -1,0 +1,219 @@
+"""The report of a data set, made column by column: of what spans several joints only few rows are taken."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lipcore.preparation.recipe import Recipe
+from lipcore.samples import Array
+from service.datasets.preparing import Prepared
+from service.datasets.report.advice import advice, in_words, warnings
+from service.datasets.report.excitation import SELDOM, joint_excitation, weights
+from service.datasets.report.fit import make_fit
+from service.datasets.report.lag import Lags, no_lags, shifts
+from service.datasets.report.limits import against_limits, saturation
+from service.datasets.report.noise import noise_or_share, white_noise
+from service.datasets.report.parts import bounds, number_parts, spread, thin
+from service.datasets.report.rigid_body import Found, judge_rigid_bodies
+from service.datasets.report.robot import Limits, Profile, limits_of
+from service.datasets.report.schema import (
+    DatasetReport,
+    Excitation,
+    JointExcitation,
+    JointLimits,
+    JointNoise,
+    JointSaturation,
+    Lag,
+)
+from service.datasets.report.timing import Clock, look_at_clock
+from service.datasets.staging import EPISODE, QUANTITIES, Staged, column
+from service.settings import Settings
+
+WARNING = "warning: "
+"""What a sentence of the reading begins with that belongs to the warnings."""
+
+
+def make_report(
+    raw: Staged,
+    prepared: Prepared,
+    profile: Profile | None,
+    noted: list[str],
+    settings: Settings,
+    recipe: Recipe | None = None,
+    gravity: bool = True,
+) -> dict[str, Any]:
+    """The report as JSON, see DatasetReport.
+
+    noted: what was found while the file was read; recipe: that of the preparation, the defaults where None; gravity:
+    whether torques contain it.
+    """
+    recipe = recipe or Recipe()
+    names, facts = raw.joint_names, prepared.facts
+    limits = limits_of(profile, names)
+    clock = look_at_clock(raw, recipe.gap_steps, facts.repeated)
+    recorded = _look_at_raw(raw, clock, limits)
+    found = _look_at_samples(prepared, limits, settings.max_report_rows)
+    rigid = _rigid_bodies(profile, limits, prepared, found, gravity)
+    excitation = _excitation(found, rigid)
+    constant = [
+        f"tau{joint + 1} is constant: nothing can be learnt about this joint's torque"
+        for joint, (low, high) in enumerate(found.ranges["tau"])
+        if low == high
+    ]
+    reading = [said for said in noted if not said.startswith(WARNING)]
+    warned = [said.removeprefix(WARNING) for said in noted if said.startswith(WARNING)]
+    if profile is not None and limits is None:
+        reading.append(f"the joints of robot {profile.name} are not those of the data: limits were not compared")
+    if profile is not None and limits is not None and limits.by_order:
+        reading.append(f"joints were taken for those of robot {profile.name} by their order")
+    if isinstance(rigid, str):
+        reading.append(rigid)
+    report = DatasetReport(
+        rows_uploaded=facts.rows,
+        rows=facts.samples,
+        episodes=facts.episodes,
+        rate_hz=facts.rate_hz,
+        gaps=facts.gaps,
+        derived=list(facts.derived),
+        preparation=[str(step["text"]) for step in prepared.steps],
+        ranges={
+            quantity: {"min": [low for low, _ in pairs], "max": [high for _, high in pairs]}
+            for quantity, pairs in found.ranges.items()
+        },
+        torque_noise_estimate=found.noise,
+        warnings=warned + constant + warnings(clock.timing, recorded.saturation, recorded.limits, found.lags, raw.rows),
+        reading=reading,
+        recipe=recipe.to_json(),
+        steps=prepared.steps,
+        robot=None if profile is None or limits is None else profile.name,
+        timing=clock.timing,
+        saturation=recorded.saturation,
+        limits=recorded.limits,
+        lag=found.lags,
+        noise=recorded.noise,
+        excitation=excitation,
+        advice=advice(clock.timing, excitation, recorded.limits, recorded.noise),
+    )
+    return report.model_dump(mode="json")
+
+
+@dataclass(frozen=True)
+class _Recorded:
+    """What the signals as recorded show, joint by joint."""
+
+    saturation: list[JointSaturation]
+    limits: list[JointLimits]
+    noise: list[JointNoise]
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """What the samples show. ranges: smallest and largest by quantity and joint; noise: white, of the torque; left: std
+    of the torque that no motion explains, both N·m; motion: q, dq, ddq at few rows, (R, n) each; speeds, torques: root
+    mean square and standard deviation, (n,).
+    """
+
+    ranges: dict[str, list[tuple[float, float]]]
+    noise: list[float]
+    left: Array
+    speeds: Array
+    torques: Array
+    lags: list[Lag]
+    excitation: list[JointExcitation]
+    motion: tuple[Array, Array, Array]
+
+
+def _look_at_raw(raw: Staged, clock: Clock, limits: Limits | None) -> _Recorded:
+    out = _Recorded([], [], [])
+    some_missing = bool(clock.missing.any())
+    for joint, name in enumerate(raw.joint_names):
+        columns = raw.joint(joint)
+        noise = {each: white_noise(columns[each], clock.part, robust=True) for each in ("tau", "dq") if each in columns}
+        if some_missing:
+            columns = {each: values[~clock.missing] for each, values in columns.items()}
+        out.limits.append(against_limits(joint, name, columns, limits))
+        out.saturation.append(saturation(joint, name, columns["q"], columns["tau"], limits))
+        torque, velocity = noise["tau"], noise.get("dq")
+        out.noise.append(
+            JointNoise(
+                joint=name,
+                torque=torque,
+                torque_share=_share(torque, columns["tau"]),
+                velocity=velocity,
+                velocity_share=None if velocity is None else _share(velocity, columns["dq"]),
+            )
+        )
+    return out
+
+
+def _share(level: float | None, values: Array) -> float | None:
+    wide = spread(values)
+    return None if level is None or wide == 0 else level / wide
+
+
+def _look_at_samples(prepared: Prepared, limits: Limits | None, most: int) -> _Samples:
+    staged, facts = prepared.staged, prepared.facts
+    part = number_parts(staged.rows, [np.diff(staged.read(EPISODE)) != 0])
+    starts, ends = bounds(part)
+    steps = None if facts.rate_hz is None else shifts(facts.rate_hz, int((ends - starts).max()))
+    rows = thin(part, most, 0 if steps is None else int(steps[-1]))
+    motion = (staged.table("q", rows), staged.table("dq", rows), staged.table("ddq", rows))
+    fit = make_fit(rows, *motion, tau=staged.table("tau", rows), independent=_independent(prepared))
+    lags = None if steps is None or facts.rate_hz is None else Lags(fit, steps, facts.rate_hz)
+    ranges: dict[str, list[tuple[float, float]]] = {quantity: [] for quantity in QUANTITIES}
+    levels, left, speeds, torques = np.empty((4, staged.n_joints))
+    found, excitation = [], []
+    for joint, name in enumerate(staged.joint_names):
+        columns = {quantity: staged.read(column(quantity, joint)) for quantity in QUANTITIES}
+        for quantity, values in columns.items():
+            ranges[quantity].append((float(values.min()), float(values.max())))
+        levels[joint] = noise_or_share(columns["tau"], part)
+        speeds[joint], torques[joint] = np.sqrt(np.mean(columns["dq"] ** 2)), columns["tau"].std()
+        if lags is None:
+            left[joint] = np.sqrt(np.mean(fit.residuals(columns["tau"][rows, None]) ** 2))
+        else:
+            lag, left[joint] = lags.of_joint(name, columns["tau"])
+            found.append(lag)
+        excitation.append(joint_excitation(joint, name, columns, part, fit, float(left[joint]), limits))
+    if lags is None:
+        why = "no times were given" if facts.rate_hz is None else "the contiguous parts are too short"
+        found = no_lags(staged.joint_names, why)
+    else:
+        found.insert(0, lags.of_all())
+    return _Samples(ranges, levels.tolist(), left, speeds, torques, found, excitation, motion)
+
+
+def _independent(prepared: Prepared) -> float:
+    """Samples that count as independent: after a low-pass two a period of its cut-off, else all."""
+    facts = prepared.facts
+    if facts.cutoff_hz is None or facts.rate_hz is None:
+        return float(facts.samples)
+    return facts.samples * min(1.0, 2 * facts.cutoff_hz / facts.rate_hz)
+
+
+def _rigid_bodies(
+    profile: Profile | None, limits: Limits | None, prepared: Prepared, found: _Samples, gravity: bool
+) -> Found | str | None:
+    if profile is None or limits is None or profile.urdf is None:
+        return None
+    names, independent = prepared.staged.joint_names, _independent(prepared)
+    return judge_rigid_bodies(profile.urdf, profile.name, names, limits, found.motion, found.left, independent, gravity)
+
+
+def _excitation(found: _Samples, rigid: Found | str | None) -> Excitation:
+    """What motion alone says, and instead of its judgement of friction that beside rigid bodies where there are any."""
+    if not isinstance(rigid, Found):
+        out = Excitation(friction_beside="any motion", joints=found.excitation, whole=None, text="")
+    else:
+        joints = [
+            each.model_copy(update=weights(stds, speed, torque, min(each.forwards, each.backwards) < SELDOM))
+            for each, stds, speed, torque in zip(
+                found.excitation, rigid.friction.tolist(), found.speeds, found.torques, strict=True
+            )
+        ]
+        out = Excitation(friction_beside="rigid bodies", joints=joints, whole=rigid.whole, text="")
+    out.text = in_words(out)
+    return out

@@ -1,0 +1,169 @@
+"""Bags written by others' programs: the `rosbags` package, and the `mcap` packages of Foxglove."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import zipfile
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.datasets.formats.bags.opening import BagKind, open_bag
+from service.datasets.options import ReadOptions
+from service.settings import Settings
+
+typesys = pytest.importorskip("rosbags.typesys", reason="bags are written by `rosbags`, of the extra `dev`")
+rosbag1 = pytest.importorskip("rosbags.rosbag1", reason="bags are written by `rosbags`, of the extra `dev`")
+rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="bags are written by `rosbags`, of the extra `dev`")
+
+ROS1 = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
+ROS2 = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+JOINT_STATE = "sensor_msgs/msg/JointState"
+START = 1_700_000_000_123_456_789
+SETTINGS = Settings()
+
+
+@dataclass
+class State:
+    """A joint state as it is to be recorded. stamp, received: ns, received None as the stamp."""
+
+    stamp: int
+    names: Sequence[str]
+    position: Sequence[float]
+    velocity: Sequence[float] = ()
+    effort: Sequence[float] = ()
+    received: int | None = None
+    topic: str = "/joint_states"
+    frame: str = ""
+
+    @property
+    def time(self) -> int:
+        """Time of reception, ns."""
+        return self.stamp if self.received is None else self.received
+
+
+def states(count: int, names: Sequence[str] = ("a", "b", "c"), seed: int = 0, step: int = 10_000_000) -> list[State]:
+    """States of random numbers, 100 Hz."""
+    numbers = np.random.default_rng(seed).normal(size=(count, 3, len(names)))
+    return [State(START + k * step, names, *row.tolist()) for k, row in enumerate(numbers)]
+
+
+def table_of(said: Iterable[State]) -> np.ndarray:
+    """What is to be read of them: s from the first stamp on, positions, velocities, efforts."""
+    said = list(said)
+    times = [(each.stamp - said[0].stamp) / 1e9 for each in said]
+    return np.column_stack([times, *([getattr(s, key) for s in said] for key in ("position", "velocity", "effort"))])
+
+
+def message(store: Any, state: State) -> Any:
+    """Of rosbags' classes."""
+    types = store.types
+    stamp = types["builtin_interfaces/msg/Time"](sec=state.stamp // 10**9, nanosec=state.stamp % 10**9)
+    extra = {"seq": 7} if store is ROS1 else {}
+    header = types["std_msgs/msg/Header"](stamp=stamp, frame_id=state.frame, **extra)
+    numbers = {key: np.array(getattr(state, key), float) for key in ("position", "velocity", "effort")}
+    return types[JOINT_STATE](header=header, name=list(state.names), **numbers)
+
+
+def write_rosbag1(path: Path, said: Iterable[State], compression: str | None = None) -> Path:
+    """A bag of ROS 1, by rosbags."""
+    writer = rosbag1.Writer(path)
+    if compression:
+        writer.set_compression(getattr(rosbag1.Writer.CompressionFormat, compression.upper()))
+    with writer:
+        connections: dict[str, Any] = {}
+        for each in said:
+            if each.topic not in connections:
+                connections[each.topic] = writer.add_connection(each.topic, JOINT_STATE, typestore=ROS1)
+            data = ROS1.serialize_ros1(message(ROS1, each), JOINT_STATE)
+            writer.write(connections[each.topic], each.time, data)
+    return path
+
+
+def write_rosbag2(
+    folder: Path, said: Iterable[State], storage: str = "SQLITE3", compression: str = "NONE", big_endian: bool = False
+) -> Path:
+    """A folder of rosbag2, by rosbags."""
+    writer = rosbag2.Writer(folder, version=9, storage_plugin=getattr(rosbag2.StoragePlugin, storage))
+    writer.set_compression(getattr(rosbag2.CompressionMode, compression), rosbag2.CompressionFormat.ZSTD)
+    with writer:
+        connections: dict[str, Any] = {}
+        for each in said:
+            if each.topic not in connections:
+                connections[each.topic] = writer.add_connection(each.topic, JOINT_STATE, typestore=ROS2)
+            data = ROS2.serialize_cdr(message(ROS2, each), JOINT_STATE, little_endian=not big_endian)
+            writer.write(connections[each.topic], each.time, data)
+    return folder
+
+
+def write_mcap(path: Path, said: Iterable[State], compression: str = "ZSTD", chunk_size: int = 4096) -> Path:
+    """An MCAP file by Foxglove's writers, which know nothing of rosbags; message times are those of reception."""
+    mcap = pytest.importorskip("mcap.writer", reason="MCAP files are written by `mcap`, of the extra `dev`")
+    ros2 = pytest.importorskip("mcap_ros2.writer", reason="written by `mcap-ros2-support`, of the extra `dev`")
+    with path.open("wb") as file:
+        writer = ros2.Writer(file, chunk_size=chunk_size, compression=getattr(mcap.CompressionType, compression))
+        text, _ = ROS2.generate_msgdef(JOINT_STATE, ros_version=2)
+        schema = writer.register_msgdef(JOINT_STATE, text)
+        for each in said:
+            stamp = {"sec": each.stamp // 10**9, "nanosec": each.stamp % 10**9}
+            body = {
+                "header": {"stamp": stamp, "frame_id": each.frame},
+                "name": list(each.names),
+                "position": list(each.position),
+                "velocity": list(each.velocity),
+                "effort": list(each.effort),
+            }
+            writer.write_message(each.topic, schema, body, log_time=each.time, publish_time=each.time)
+        writer.finish()
+    return path
+
+
+def zipped(folder: Path, file: Path, inside: str = "recording") -> Path:
+    """The zip of a folder."""
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for each in sorted(folder.iterdir()):
+            archive.write(each, f"{inside}/{each.name}")
+    return file
+
+
+def bare(folder: Path, file: Path) -> Path:
+    """The only data file of a folder of rosbag2, alone."""
+    (found,) = [each for each in folder.iterdir() if each.suffix in (".db3", ".mcap")]
+    shutil.copyfile(found, file)
+    return file
+
+
+@dataclass
+class Read:
+    """A table with its blocks put together."""
+
+    names: tuple[str, ...]
+    rows: np.ndarray
+    joint_names: tuple[str, ...] | None
+    units: dict[str, str]
+    facts: list[str]
+
+    def column(self, name: str) -> np.ndarray:
+        """One column, (rows,)."""
+        return self.rows[:, self.names.index(name)]
+
+
+def read(path: Path, kind: BagKind, options: ReadOptions | None = None, settings: Settings = SETTINGS) -> Read:
+    """The whole table of a bag."""
+    with open_bag(path, kind, options or ReadOptions(), settings) as table:
+        blocks = list(table.blocks)
+        assert all(block.dtype == np.float64 and 0 < len(block) <= 16_384 for block in blocks)
+        return Read(table.names, np.concatenate(blocks), table.joint_names, table.units, table.facts)
+
+
+@contextlib.contextmanager
+def changed(path: Path) -> Iterator[bytearray]:
+    """The bytes of a file, to be changed in place."""
+    data = bytearray(path.read_bytes())
+    yield data
+    path.write_bytes(bytes(data))

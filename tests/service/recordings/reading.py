@@ -1,0 +1,64 @@
+"""Opening uploads in tests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+
+from service.datasets.formats.opening import open_table
+from service.datasets.formats.table import BLOCK_ROWS
+from service.datasets.options import ReadOptions
+from service.errors import ServiceError
+from service.settings import Settings
+
+
+@dataclass
+class Read:
+    """A table after its blocks were read: columns by name, and what was found."""
+
+    columns: dict[str, np.ndarray]
+    units: dict[str, str]
+    facts: list[str]
+    joint_names: tuple[str, ...] | None
+
+    def __getitem__(self, name):
+        return self.columns[name]
+
+    @property
+    def names(self):
+        return tuple(self.columns)
+
+
+@cache
+def settings_of(folder, **changed):
+    return Settings(home=folder, **changed)
+
+
+def read(folder, body, kind, options=None, **settings):
+    """Read the bytes of an upload, and check what holds of every table."""
+    path = folder / "upload"
+    path.write_bytes(body)
+    before = set(folder.iterdir())
+    with open_table(path, kind, options or ReadOptions(), settings_of(folder, **settings)) as table:
+        blocks = list(table.blocks)
+        for block in blocks:
+            assert block.dtype == np.float64
+            assert 1 <= len(block) <= BLOCK_ROWS
+            assert block.shape == (len(block), len(table.names))
+    assert set(folder.iterdir()) == before, "leftovers"
+    assert len(set(table.names)) == len(table.names)
+    whole = np.concatenate(blocks) if blocks else np.empty((0, len(table.names)))
+    return Read(dict(zip(table.names, whole.T, strict=True)), table.units, table.facts, table.joint_names)
+
+
+def refused(folder, body, kind, options=None, error=ServiceError, **settings):
+    """Read an upload that is refused; return field, value and expectation of what is wrong, or the whole message."""
+    before = set(folder.iterdir())
+    with pytest.raises(error) as caught:
+        read(folder, body, kind, options, **settings)
+    assert set(folder.iterdir()) <= before | {folder / "upload"}, "leftovers"
+    detail = caught.value.detail
+    return (detail[0].field, detail[0].value, detail[0].expected) if detail else caught.value.message
