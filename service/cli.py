@@ -27,7 +27,7 @@ from service.limits.connections import guarded
 from service.observability import logs
 from service.settings import DEFAULT_URL, Settings
 from service.stream.protocol import StreamProtocol
-from service.tables import prediction_tables
+from service.tables import evaluation_table, figures_table, prediction_tables
 from service.training.states import SUCCEEDED
 
 if TYPE_CHECKING:
@@ -149,6 +149,13 @@ def train(
         str | None,
         typer.Option(help="Of rigid bodies: around the parameters of the `urdf` (default) or around `zero`."),
     ] = None,
+    hold_out: Annotated[
+        float | None, typer.Option(help="Share of the samples to hold out and evaluate the model on, such as 0.3.")
+    ] = None,
+    hold_out_by: Annotated[
+        str | None,
+        typer.Option(help="What is held out: whole `episodes`, the `last` part (default), or some of ten `blocks`."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Upload recordings and train a model on them. Ctrl-C cancels the job."""
@@ -160,14 +167,40 @@ def train(
         if robot is not None and robot.endswith(".urdf"):
             robot = client.upload_robot(Path(robot)).id
         options = None if prior is None else {"prior": prior}
-        job = client.train(model, datasets, estimator, types, options, robot=robot)
+        asked = {name: value for name, value in (("share", hold_out), ("kind", hold_out_by)) if value is not None}
+        job = client.train(model, datasets, estimator, types, options, robot=robot, holdout=asked or None)
         job = follow(client, job, err)
+        made = client.version(model, job.version) if asked and job.version is not None else None
     if as_json:
         out.print_json(job.model_dump_json())
     if job.state != SUCCEEDED:
         _fail(f"job {job.id} has {job.state}" + (f": {job.error.message}" if job.error else ""))
     if not as_json:
         out.print(f"{model} version {job.version} is trained and answers")
+        if made is not None:
+            held = made.lineage["holdout"]
+            out.print(figures_table(f"on {held['samples']} samples held out", made.joint_names, held))
+
+
+@app.command()
+def evaluate(
+    model: Annotated[str, typer.Argument(help="Name of the model.")],
+    dataset: Annotated[str, typer.Argument(help="Id of a data set.")],
+    url: Url = DEFAULT_URL,
+    version: Annotated[int | None, typer.Option(help="A version; the one that serves by default.")] = None,
+    alias: Annotated[str | None, typer.Option(help="A version by its alias.")] = None,
+    held_out: Annotated[
+        bool, typer.Option("--held-out", help="Only on what the training of the version held out of it.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Compare a model with a data set, joint by joint."""
+    with _client(url) as client:
+        answer = client.evaluate(model, dataset, version, alias, "held_out" if held_out else "all")
+    if as_json:
+        out.print_json(answer.model_dump_json())
+    else:
+        out.print(evaluation_table(answer))
 
 
 @app.command()
@@ -238,6 +271,31 @@ def bench(context: typer.Context) -> None:
 
     try:
         command.app(context.args, prog_name="lipserve bench")
+    except command.ERRORS as error:
+        _fail(str(error))
+
+
+@app.command(add_help_option=False, context_settings=_PASS_ON)
+def data(context: typer.Context) -> None:
+    """Upload recordings, list them, read their reports: `lipserve data --help`."""
+    from service.client import ApiError  # noqa: PLC0415 - serving does without httpx
+    from service.datasets import command  # noqa: PLC0415
+
+    try:
+        command.app(context.args, prog_name="lipserve data")
+    except ApiError as error:
+        _fail(_said(error))
+    except command.ERRORS as error:
+        _fail(str(error))
+
+
+@app.command(add_help_option=False, context_settings=_PASS_ON)
+def excite(context: typer.Context) -> None:
+    """Plan a motion within a robot's limits that tells most of what is not known: `lipserve excite --help`."""
+    from service.excite import command  # noqa: PLC0415 - serving does without it
+
+    try:
+        command.app(context.args, prog_name="lipserve excite")
     except command.ERRORS as error:
         _fail(str(error))
 

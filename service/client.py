@@ -7,13 +7,16 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, Unpack
+from urllib.parse import quote
 
 import httpx
 import numpy as np
 from numpy.typing import ArrayLike
 
 from service.access.credentials import headers_of
+from service.datasets.asking import Reading, query_of
+from service.datasets.media import MEDIA_TYPE_OF, SUFFIXES
 from service.datasets.schema import Dataset
 from service.inference.schema import EvaluateResponse, PredictResponse
 from service.models.alias_schema import Alias, AliasList
@@ -34,7 +37,8 @@ from service.updates.control.schema import (
 )
 from service.updates.schema import ObservationResponse
 
-MEDIA_TYPES = {".csv": "text/csv", ".npz": "application/x-npz"}
+UPLOAD_TIMEOUT = 600.0
+"""Longest wait for a recording to be read and prepared, s."""
 POLL_SECONDS = 0.3
 UNIX = "unix://"
 NO_HOST = "http://localhost"
@@ -89,28 +93,36 @@ class Client:
         except httpx.TransportError:
             return False
 
-    def upload(
-        self,
-        path: Path,
-        name: str | None = None,
-        joint_names: list[str] | None = None,
-        torque_convention: str = "gravity_included",
-    ) -> Dataset:
-        """Upload a .csv or .npz file; raise ValueError for another ending, ApiError where the data are refused."""
-        if path.suffix not in MEDIA_TYPES:
-            raise ValueError(f"file is {path.name!r}, expected the ending {' or '.join(MEDIA_TYPES)}")
-        params = {"name": name or path.name, "torque_convention": torque_convention}
-        if joint_names is not None:
-            params["joint_names"] = ",".join(joint_names)
+    def upload(self, path: Path, name: str | None = None, **reading: Unpack[Reading]) -> Dataset:
+        """Upload a recording; raise ValueError for an ending that says no format, ApiError where it is refused.
+
+        reading: how it is to be read and prepared, such as `robot="panda"` or `units={"q": "deg"}`.
+        """
+        media_type = MEDIA_TYPE_OF.get(path.suffix.lower())
+        if media_type is None:
+            raise ValueError(f"file is {path.name!r}, expected the ending {', '.join(SUFFIXES)}")
+        params = {"name": name or path.name, **query_of(reading)}
+        headers = {"content-type": media_type}
         with path.open("rb") as file:
             answer = self._send(
-                "POST",
-                "/v1/datasets",
-                params=params,
-                content=_chunks(file),
-                headers={"content-type": MEDIA_TYPES[path.suffix]},
+                "POST", "/v1/datasets", params=params, content=_chunks(file), headers=headers, timeout=UPLOAD_TIMEOUT
             )
         return Dataset.model_validate(answer)
+
+    def datasets(self) -> list[Dataset]:
+        """All data sets, newest first."""
+        found: list[Dataset] = []
+        cursor: dict[str, str] = {}
+        while True:
+            page = self._send("GET", "/v1/datasets", params=cursor)
+            found += [Dataset.model_validate(item) for item in page["items"]]
+            if page["next_cursor"] is None:
+                return found
+            cursor = {"cursor": page["next_cursor"]}
+
+    def dataset(self, dataset: str) -> Dataset:
+        """One data set with its report; raise ApiError where there is none."""
+        return Dataset.model_validate(self._send("GET", f"/v1/datasets/{quote(dataset, safe='')}"))
 
     def upload_robot(self, path: Path, name: str | None = None) -> Robot:
         """Upload a URDF; raise ApiError where it is refused."""
@@ -127,8 +139,13 @@ class Client:
         joint_types: list[str] | None = None,
         options: dict[str, Any] | None = None,
         robot: str | None = None,
+        holdout: dict[str, Any] | None = None,
     ) -> Job:
-        """Queue a training job. robot: for rigid bodies, a profile such as panda or the id of an uploaded URDF."""
+        """Queue a training job.
+
+        robot: for rigid bodies, a profile such as panda or the id of an uploaded URDF; holdout: what to hold out of the
+        data sets and evaluate the version on, such as {"kind": "last", "share": 0.3}.
+        """
         body: dict[str, Any] = {"model": model, "datasets": datasets, "options": options or {}}
         if estimator is not None:
             body["estimator"] = estimator
@@ -136,6 +153,8 @@ class Client:
             body["joint_types"] = joint_types
         if robot is not None:
             body["robot"] = robot
+        if holdout is not None:
+            body["holdout"] = holdout
         return Job.model_validate(self._send("POST", "/v1/jobs", json=body))
 
     def job(self, job: str) -> Job:
@@ -202,10 +221,13 @@ class Client:
         return PredictResponse.model_validate(self._send("POST", f"/v1/models/{model}/predict", json=body))
 
     def evaluate(
-        self, model: str, dataset: str, version: int | None = None, alias: str | None = None
+        self, model: str, dataset: str, version: int | None = None, alias: str | None = None, part: str = "all"
     ) -> EvaluateResponse:
-        """Compare a model with a data set: the version that serves, unless one is named by its number or an alias."""
-        body = {"dataset": dataset} | _named(version, alias)
+        """Compare a model with a data set: the version that serves, unless one is named by its number or an alias.
+
+        part: `held_out` compares with what the version's training has held out of the data set.
+        """
+        body = {"dataset": dataset, "part": part} | _named(version, alias)
         return EvaluateResponse.model_validate(self._send("POST", f"/v1/models/{model}/evaluate", json=body))
 
     def compare(self, model: str, dataset: str, first: int | str, second: int | str) -> CompareResponse:

@@ -35,6 +35,7 @@ class Service:
     stopping: Stopping
     meters: Meters = field(default_factory=Meters)
     readiness: Readiness = field(default_factory=Readiness)
+    uploads: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(2))
     archives: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))
 
 

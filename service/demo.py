@@ -21,6 +21,7 @@ from lipcore.samples import Samples
 from lipcore.simulation import FAST, Stream, simulate
 from service import recordings
 from service.client import Client
+from service.datasets.asking import Reading
 from service.inference.schema import EvaluateResponse, PredictResponse
 from service.plot import draw
 from service.progress import follow
@@ -131,8 +132,8 @@ def run(port: int, once: bool, plot: Path | None, console: Console) -> None:
 def _upload(client: Client, robot: Robot, stream: Stream, seed: int, path: Path) -> tuple[str, Samples]:
     samples = simulate(robot, stream, seed)
     recordings.write(path, samples)
-    names = list(samples.joint_names) if path.suffix == ".csv" else None
-    return client.upload(path, joint_names=names).id, samples
+    reading = Reading(joint_names=samples.joint_names) if path.suffix == ".csv" else Reading()
+    return client.upload(path, **reading).id, samples
 
 
 def _table(name: str, result: EvaluateResponse, samples: Samples) -> Table:

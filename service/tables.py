@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 from rich.table import Table
 
-from service.inference.schema import Nested, PredictResponse
+from service.inference.schema import EvaluateResponse, Nested, PredictResponse
 
 
 def prediction_tables(answer: PredictResponse) -> list[Table]:
@@ -26,6 +28,33 @@ def prediction_tables(answer: PredictResponse) -> list[Table]:
         Table("joint", *columns, title=f"{answer.model} version {answer.version}"), answer.joint_names, rows
     )
     return [joints, *matrices, *([numbers] if numbers.row_count else [])]
+
+
+def evaluation_table(result: EvaluateResponse) -> Table:
+    """Figures of an evaluation, joint by joint."""
+    what = "held-out samples" if result.part == "held_out" else "samples"
+    unseen = "" if not result.in_training else ", which it was trained on"
+    title = f"{result.model} version {result.version} on {result.samples_used} {what} of {result.dataset}{unseen}"
+    figures: dict[str, Sequence[float | None]] = {
+        "nmse": result.nmse,
+        "rmse": result.rmse,
+        "coverage": result.coverage,
+        "nlpd": result.nlpd,
+    }
+    return figures_table(title, result.joint_names, figures)
+
+
+def figures_table(title: str, joint_names: Sequence[str], figures: Mapping[str, Sequence[float | None]]) -> Table:
+    """nmse, rmse, coverage and nlpd per joint, as an evaluation or a version's lineage tells them."""
+    table = Table("joint", "nMSE", "RMSE N·m", "coverage of 95%", "NLPD nats", title=title)
+    columns = [figures[name] for name in ("nmse", "rmse", "coverage", "nlpd")]
+    for joint, nmse, rmse, coverage, nlpd in zip(joint_names, *columns, strict=True):
+        table.add_row(joint, _figure(nmse, ".2e"), _figure(rmse, ".4f"), _figure(coverage, ".1%"), _figure(nlpd, ".3f"))
+    return table
+
+
+def _figure(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
 
 
 def _by_joint(table: Table, joint_names: list[str], rows: list[list[str]]) -> Table:

@@ -17,6 +17,8 @@ from rich.console import Console
 from lipcore.robots import ROBOTS
 from service.bench import table
 from service.bench.clients import BadAnswerError
+from service.bench.ingest import running as ingest_running
+from service.bench.ingest.recording import FORMATS
 from service.bench.online import durability as durable
 from service.bench.online import running as online_running
 from service.bench.online import table as online_table
@@ -181,6 +183,29 @@ def load(
     if json_file is not None:
         results.write(json_file, [{**asdict(each), "met": each.met} for each in found])
     _tell(soak_table.grids(results), [], found, console, markdown, strict)
+
+
+@app.command()
+def ingest(
+    rows: Annotated[int, typer.Option(min=1000, help="Of the recording, at 1 kHz.")] = 1_000_000,
+    joints: Annotated[int, typer.Option(min=1, max=32)] = 7,
+    formats: Annotated[str, typer.Option(help="Names separated by commas.")] = ",".join(FORMATS),
+    seed: Annotated[int, typer.Option(min=0, help="Of all that is random.")] = 0,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", dir_okay=False, help="Also write all figures here.")
+    ] = None,
+    markdown: Annotated[Path | None, typer.Option(dir_okay=False, help="Also write the tables here.")] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where something promised was missed.")] = False,
+) -> None:
+    """Upload a long recording; time and memory until its report is there."""
+    options = ingest_running.Options(rows, joints, tuple(name.strip() for name in formats.split(",")), seed=seed)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    console = _console()
+    results = ingest_running.run(options, console)
+    found = ingest_running.targets(results)
+    if json_file is not None:
+        results.write(json_file, [{**asdict(each), "met": each.met} for each in found])
+    _tell(ingest_running.grids(results), [], found, console, markdown, strict)
 
 
 def _console() -> Console:

@@ -13,12 +13,16 @@ from lipcore.metrics import LEVELS, RELIABILITY_LEVELS
 from lipcore.metrics import evaluate as compare
 from lipcore.samples import Samples
 from service.context import Service
+from service.database import DatasetRow
 from service.datasets import store
-from service.errors import invalid_request
+from service.errors import InvalidRequestError, invalid_request
 from service.inference import checks, components
 from service.inference.loaded import Served
 from service.inference.schema import EvaluateRequest, EvaluateResponse, Interval, PredictRequest, Reliability
 from service.inference.wire import Prediction
+from service.models import registry
+from service.training import holding_out
+from service.training.holding_out import CannotHoldOutError
 
 Array = NDArray[np.float64]
 
@@ -87,7 +91,8 @@ def _prediction(served: Served, tau: list[Any], tau_std: list[Any], covariance: 
 
 @dataclass(frozen=True)
 class Measured:
-    """A data set to compare models with. samples: how many it has; used: those that are compared, evenly thinned."""
+    """A data set, or part of it, to compare models with. samples: how many it has; used: those that are compared,
+    evenly thinned."""
 
     id: str
     sha256: str
@@ -95,12 +100,38 @@ class Measured:
     used: Samples
 
     def in_training_of(self, served: Served) -> bool:
-        """Whether a version was trained on it, or on the same samples uploaded another time."""
+        """Whether a version has learnt from it or from part of it, or from the same samples uploaded another time."""
         return not served.datasets.isdisjoint((self.id, self.sha256))
 
 
 def measured(service: Service, dataset: str, *versions: Served) -> Measured:
     """Read a data set for these versions; raise NotFoundError, or InvalidRequestError where it is of other joints."""
+    row = _fitting(service, dataset, *versions)
+    used = store.samples(service.files, row, service.settings.max_evaluation_samples)
+    return Measured(row.id, row.sha256, row.rows, used)
+
+
+def held_out(service: Service, dataset: str, served: Served) -> Measured:
+    """Read what the training of a version has held out of a data set; as `measured`, and where it was nothing raise
+    InvalidRequestError."""
+    row = _fitting(service, dataset, served)
+    version = registry.find(service.database, served.name, served.version)
+    split = holding_out.remembered(row, version.manifest["lineage"])
+    if split is None:
+        raise _not_held_out(f"version {served.version} has held nothing out of data set {row.id}")
+    try:
+        used = store.samples(service.files, row, service.settings.max_evaluation_samples, split.held_out)
+    except CannotHoldOutError as error:
+        raise _not_held_out(str(error)) from None
+    return Measured(row.id, row.sha256, split.rows, used)
+
+
+def _not_held_out(why: str) -> InvalidRequestError:
+    return invalid_request("part", "held_out", f"all, as {why}")
+
+
+def _fitting(service: Service, dataset: str, *versions: Served) -> DatasetRow:
+    """The row of a data set that has the joints of these versions and their torque convention."""
     row = store.find(service.database, dataset)
     for served in versions:
         loaded = served.model
@@ -110,17 +141,15 @@ def measured(service: Service, dataset: str, *versions: Served) -> Measured:
         if row.torque_convention != loaded.torque_convention:
             expected = f"that of the model, {loaded.torque_convention}"
             raise invalid_request("dataset", f"a data set whose torque is {row.torque_convention}", expected)
-    samples = store.samples(service.files, row)
-    count = min(len(samples), service.settings.max_evaluation_samples)
-    used = samples.rows(np.linspace(0, len(samples) - 1, count).round().astype(np.int64))
-    return Measured(row.id, row.sha256, len(samples), used)
+    return row
 
 
 def evaluate(service: Service, model: str, request: EvaluateRequest) -> EvaluateResponse:
-    """Compare a model with a data set; raise InvalidRequestError or NotFoundError."""
+    """Compare a model with a data set or what it has held out of it; raise InvalidRequestError or NotFoundError."""
     served = service.loaded.get(model, request.version, request.alias)
     loaded = served.model
-    recorded = measured(service, request.dataset, served)
+    whole = request.part == "all"
+    recorded = (measured if whole else held_out)(service, request.dataset, served)
     used = recorded.used
     answer = loaded.predict(used.q, used.dq, used.ddq)
     metrics = compare(used.tau, answer.tau, answer.tau_std, answer.noise_std)
@@ -129,6 +158,7 @@ def evaluate(service: Service, model: str, request: EvaluateRequest) -> Evaluate
         version=served.version,
         revision=served.revision,
         dataset=recorded.id,
+        part=request.part,
         joint_names=list(loaded.joint_names),
         samples=recorded.samples,
         samples_used=len(used),
@@ -143,5 +173,5 @@ def evaluate(service: Service, model: str, request: EvaluateRequest) -> Evaluate
             for each, coverage, width in zip(LEVELS, metrics.coverages, metrics.widths, strict=True)
         ],
         reliability=Reliability(nominal=list(RELIABILITY_LEVELS), observed=metrics.reliability.T.tolist()),
-        in_training=recorded.in_training_of(served),
+        in_training=whole and recorded.in_training_of(served),
     )

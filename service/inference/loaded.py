@@ -20,6 +20,7 @@ from service.errors import NotFoundError, UnreadableVersionError, not_found
 from service.files import Files
 from service.inference.served import Key, Served, Snapshot
 from service.models import moves, registry
+from service.models.lineage import learnt_from
 from service.models.registry import Serving
 from service.updates.learner import learnt as learning
 
@@ -226,9 +227,7 @@ class LoadedModels:
     def _make(self, row: VersionRow) -> Served:
         base = self._read(row)
         base.warm_up()
-        named = row.manifest["lineage"].get("datasets", [])
-        datasets = frozenset(item[field] for item in named for field in ("id", "sha256") if field in item)
-        served = Served(row.model, row.version, base, base, datasets)
+        served = Served(row.model, row.version, base, base, learnt_from(row.manifest["lineage"]))
         if (published := self._revisions.get((row.model, row.version))) is not None:
             revision, learnt = published
             return replace(served, model=_warm(learnt.apply(base)), revision=revision)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import isfinite
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +63,8 @@ ComponentNames = Annotated[
     AfterValidator(_each_once),
     Field(max_length=len(COMPONENTS), json_schema_extra={"uniqueItems": True}),
 ]
+Part = Literal["all", "held_out"]
+"""Of a data set that a model is compared with."""
 Nested = float | list[float] | list[list[float]] | list[list[list[float]]]
 
 
@@ -146,6 +148,11 @@ class EvaluateRequest(VersionChoice):
     )
 
     dataset: str = Field(max_length=40)
+    part: Part = Field(
+        "all",
+        description="`held_out`: only what the training of the version has held out of the data set, see `holdout` of "
+        "a job",
+    )
 
 
 class Interval(BaseModel):
@@ -172,8 +179,9 @@ class EvaluateResponse(BaseModel):
     version: int
     revision: int
     dataset: str
+    part: Part
     joint_names: list[str]
-    samples: int = Field(description="Samples of the data set")
+    samples: int = Field(description="Samples of the data set, or of the part")
     samples_used: int = Field(description="Samples compared: evenly thinned where there are more than the limit")
     level: float = Field(description="Probability that the interval promises")
     nmse: list[float | None] = Field(description="Mean squared error / variance of the measured torque")
@@ -183,4 +191,6 @@ class EvaluateResponse(BaseModel):
     interval_width: list[float] = Field(description="Mean width of the interval, N·m")
     coverages: list[Interval] = Field(description="Coverage and width of the 50, 80, 95 and 99 % intervals")
     reliability: Reliability
-    in_training: bool = Field(description="Whether the model was trained on this data set: then the figures flatter")
+    in_training: bool = Field(
+        description="Whether the model was trained on these samples: then the figures flatter. Not on what it held out"
+    )

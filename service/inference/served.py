@@ -20,8 +20,8 @@ Alias = tuple[str, str]
 class Served:
     """One version in memory, immutable: whoever holds it answers from it whatever is learnt or dropped meanwhile.
 
-    model: what answers; base: the version as trained; datasets: ids and hashes of the data sets it was trained on;
-    revision: online updates applied to it.
+    model: what answers; base: the version as trained; datasets: ids and hashes of the data sets it has learnt
+    from; revision: online updates applied to it.
     """
 
     name: str

@@ -22,6 +22,7 @@ from service.models import archive, registry
 from service.models.archive import CHECKSUMS, EXPORT, ArchiveError
 from service.models.schema import ModelName, Version
 from service.settings import Settings
+from service.training.holdout_schema import HoldoutLineage
 
 logger = logging.getLogger(__name__)
 
@@ -71,6 +72,7 @@ class Lineage(BaseModel):
     datasets: list[LineageDataset] = Field([], max_length=10_000)
     imported: list[dict[str, Any]] = Field([], max_length=1000)
     learnt: dict[str, Any] | None = None
+    holdout: HoldoutLineage | None = None
 
 
 def add(service: Service, upload: Path, name: str | None) -> Version:

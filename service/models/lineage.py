@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 import subprocess
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from lipcore.manifest import FORMAT_VERSION
 from lipcore.model import TorqueModel
 from lipcore.samples import Samples
 from service import __version__
+from service.database import DatasetRow
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 MOST_SAMPLES = 500
@@ -41,19 +43,48 @@ def software() -> dict[str, str | int]:
     return found if commit is None else {**found, "git_commit": commit}
 
 
-def training_metrics(model: TorqueModel, samples: Samples) -> dict[str, Any]:
-    """How well a model answers for the samples it was trained on, thinned evenly to MOST_SAMPLES of them.
+def named(rows: Sequence[DatasetRow]) -> list[dict[str, Any]]:
+    """Data sets that were trained on as a lineage names them, with how they were prepared where that is known."""
+    prepared = ("source", "recipe", "steps")
+    return [
+        {
+            "id": row.id,
+            "name": row.name,
+            "sha256": row.sha256,
+            "rows": row.rows,
+            **{name: row.report[name] for name in prepared if row.report.get(name) is not None},
+        }
+        for row in rows
+    ]
 
-    Per joint: nmse (None where the torque did not vary), rmse in N·m, coverage of the 95 % interval, nlpd in nats. It
-    says how well the fit went; of motion that the model has not seen only other data can tell.
+
+def learnt_from(lineage: dict[str, Any]) -> frozenset[str]:
+    """Ids and hashes of the data sets that a version has learnt from, be it from part of them."""
+    whole = {each["id"] for each in (lineage.get("holdout") or {}).get("datasets", []) if each["whole"]}
+    learnt = [each for each in lineage.get("datasets", []) if each["id"] not in whole]
+    return frozenset(each[field] for each in learnt for field in ("id", "sha256") if field in each)
+
+
+def training_metrics(model: TorqueModel, samples: Samples) -> dict[str, Any]:
+    """How well a model answers for the samples it was trained on: how well the fit went.
+
+    Of motion that the model has not seen only other data can tell, see `figures`.
     """
-    count = min(len(samples), MOST_SAMPLES)
-    used = samples.rows(np.linspace(0, len(samples) - 1, count).astype(np.int64))
+    return figures(model, samples, MOST_SAMPLES)
+
+
+def figures(model: TorqueModel, samples: Samples, most: int) -> dict[str, Any]:
+    """How well a model answers for samples, thinned evenly to at most so many of them.
+
+    Per joint: nmse (None where the torque did not vary), rmse in N·m, coverage of the 95 % interval, nlpd in nats.
+    """
+    count = min(len(samples), most)
+    used = samples.rows(np.linspace(0, len(samples) - 1, count).round().astype(np.int64))
     # not by the compiled form of the model: a process that trains and never serves would wait for it
     answer = model.posterior.predict(used.motion())
     found = metrics.evaluate(used.tau, answer.mean.numpy(), answer.std.numpy(), model.noise_std)
-    figures = {name: getattr(found, name) for name in ("nmse", "rmse", "coverage", "nlpd")}
-    shown = {name: [float(each) if np.isfinite(each) else None for each in values] for name, values in figures.items()}
+    values = {name: getattr(found, name) for name in ("nmse", "rmse", "coverage", "nlpd")}
+    shown = {name: [float(each) if np.isfinite(each) else None for each in values[name]] for name in values}
     return {"samples": len(used), "of": len(samples), **shown}
 
 

@@ -18,7 +18,7 @@ from service.observability.context import request_id
 from service.pages import Page, newest
 from service.robots import store as robots
 from service.settings import Settings
-from service.training import history
+from service.training import history, holding_out
 from service.training.schema import Job, JobPage, JobRequest, Options
 from service.training.states import ACTIVE, CANCELLED, QUEUED, RUNNING
 
@@ -36,6 +36,8 @@ def create(service: Service, request: JobRequest, retry_of: str | None = None) -
         raise invalid_request("datasets", len(request.datasets), f"at most {service.settings.max_job_datasets}")
     rows = [store.find(service.database, dataset) for dataset in request.datasets]
     joint_types = _check_joints(request, rows)
+    if request.holdout is not None:
+        holding_out.check(rows, request.holdout, service.settings.min_samples)
     service.disk.require()  # for the version that will be made
     _check_estimator(service.database, request, rows[0].joint_names, joint_types)
     with service.database.transaction() as session:
@@ -176,6 +178,7 @@ def shown(row: JobRow) -> Job:
             "estimator": row.request["estimator"],
             "robot": row.request.get("robot"),
             "datasets": row.request["datasets"],
+            "holdout": row.request.get("holdout"),
             "refresh": row.request.get("refresh"),
             **{
                 name: getattr(row, name)

@@ -29,7 +29,9 @@ def retry(service: Service, job: str) -> Job:
             return refresh.ask(
                 service.settings, service.database, service.jobs, row.model, again["trigger"], retry_of=row.id
             )
-        request = JobRequest.model_validate({name: row.request[name] for name in JobRequest.model_fields})
+        request = JobRequest.model_validate(
+            {name: row.request[name] for name in JobRequest.model_fields if name in row.request}  # older ones lack some
+        )
         return jobs.create(service, request, retry_of=row.id)
     except NotFoundError as error:
         raise ConflictError(f"job {job!r} cannot be repeated: {error.message}") from None

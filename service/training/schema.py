@@ -10,6 +10,7 @@ from lipcore.estimators import DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS
 from lipcore.fitting import FitOptions
 from lipcore.motion import JointType
 from service.models.schema import ModelName
+from service.training.holdout_schema import Holdout
 from service.training.states import JobState
 
 _DEFAULTS = FitOptions()
@@ -68,12 +69,16 @@ class JobRequest(BaseModel):
         description=f"For {' and '.join(ROBOT_ESTIMATORS)}: a profile such as panda, or the id of an uploaded URDF",
     )
     options: Options = Field(default_factory=Options)
+    holdout: Holdout | None = Field(
+        None,
+        description="What to hold out of the data sets, to evaluate the version on: its lineage keeps the figures",
+    )
 
 
 class JobProgress(BaseModel):
     """How far a job is."""
 
-    stage: str = Field(description="waiting, loading, hyperparameters, posterior, saving or done")
+    stage: str = Field(description="waiting, loading, hyperparameters, posterior, evaluating, saving or done")
     iteration: int = 0
     max_iterations: int = 0
     objective: float | None = Field(None, description="Penalised negative log evidence, nats: falls during the fit")
@@ -120,6 +125,9 @@ class Job(BaseModel):
     estimator: str
     robot: str | None = Field(description="Profile or id of an uploaded URDF, of estimators with rigid bodies")
     datasets: list[str]
+    holdout: Holdout | None = Field(
+        None, description="What it holds out of the data sets; a refresh holds out what its version held out"
+    )
     refresh: Refresh | None = Field(None, description="What it refreshes; null for a job with data sets alone")
     progress: JobProgress
     attempts: int = Field(description="Times it was started; more than one after an interruption")

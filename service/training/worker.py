@@ -20,10 +20,11 @@ from service.errors import ServiceError, StorageFullError, StorageUnavailableErr
 from service.files import Files
 from service.limits.disk import Disk
 from service.models import registry
-from service.models.lineage import software, training_metrics
+from service.models.lineage import figures, software, training_metrics
 from service.observability.context import job_id
 from service.settings import Settings
 from service.training import history, leftovers
+from service.training.holding_out import CannotHoldOutError
 from service.training.material import Material, observed, recorded
 from service.training.pulse import Pulse, SupersededError
 from service.training.remaining import Remaining
@@ -92,6 +93,10 @@ def _train(settings: Settings, database: Database, files: Files, claim: Claim) -
                 "software": software(),
                 "training_metrics": training_metrics(trained, material.samples),
             }
+            if material.held_out is not None:
+                pulse.stage("evaluating")
+                found = figures(trained, material.held_out, settings.max_evaluation_samples)
+                lineage["holdout"] = {**lineage["holdout"], **found}
             pulse.stage("saving")
             folder = leftovers.new_folder(claim.job)
             Disk(settings).require()
@@ -157,6 +162,8 @@ def _code(error: Exception) -> str:
     """Stable word for why a job failed."""
     if isinstance(error, TakenBackError):
         return "observations_taken_back"
+    if isinstance(error, CannotHoldOutError):
+        return "cannot_hold_out"
     if isinstance(storage_errors.translated(error), StorageFullError):
         return StorageFullError.code
     if isinstance(error, ServiceError):  # as of a data set that is damaged

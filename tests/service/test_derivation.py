@@ -84,14 +84,14 @@ def test_jitter_of_the_clock_is_tolerated(api):
     assert created(post(api, npz(**arrays(true, "q", "tau"), t=t)))["report"]["derived"] == ["dq", "ddq"]
 
 
-def test_uneven_steps_are_refused_where_something_is_derived(api):
+def test_uneven_steps_are_put_on_an_even_clock_where_something_is_derived(api):
     true = fine(50.0)
     t = true.t.copy()
     t[41:] += 0.4 / 50
-    said = error(post(api, npz(**arrays(true, "q", "tau"), t=t)), 422, "invalid_data")
-    assert said["detail"][0]["field"] == "t, row 42"
-    assert "accelerations must be derived" in said["message"]
-    assert created(post(api, npz(**arrays(true, "q", "dq", "ddq", "tau"), t=t)))["report"]["derived"] == []
+    report = created(post(api, npz(**arrays(true, "q", "tau"), t=t)))["report"]
+    assert report["preparation"][0].startswith("put on an even clock")
+    untouched = created(post(api, npz(**arrays(true, "q", "dq", "ddq", "tau"), t=t)))["report"]
+    assert (untouched["derived"], untouched["preparation"]) == ([], [])
 
 
 def test_missing_times_are_refused_where_something_is_derived(api):

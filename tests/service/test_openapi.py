@@ -8,6 +8,8 @@ import re
 import numpy as np
 import pytest
 
+from service.datasets.media import MEDIA_TYPES
+
 METHODS = ("get", "post", "put", "patch", "delete")
 ERROR = {"$ref": "#/components/schemas/ErrorResponse"}
 FAILURE = {"$ref": "#/components/schemas/Failure"}
@@ -55,10 +57,12 @@ def test_every_route_of_the_design_is_there(operations):
         "POST /v1/datasets",
         "GET /v1/datasets",
         "GET /v1/datasets/{dataset}",
+        "GET /v1/datasets/{dataset}/preview",
         "DELETE /v1/datasets/{dataset}",
         "POST /v1/robots",
         "GET /v1/robots",
         "GET /v1/robots/profiles",
+        "GET /v1/robots/profiles/{name}",
         "GET /v1/robots/{robot}",
         "DELETE /v1/robots/{robot}",
         "POST /v1/jobs",
@@ -164,6 +168,7 @@ def test_every_documented_error_has_the_one_shape(operations):
         ("POST /v1/datasets", {413, 415, 422}),
         ("GET /v1/datasets", {422}),
         ("GET /v1/datasets/{dataset}", {404}),
+        ("GET /v1/datasets/{dataset}/preview", {404, 500}),
         ("DELETE /v1/datasets/{dataset}", {404, 409}),
         ("POST /v1/robots", {413, 415, 422}),
         ("GET /v1/robots/{robot}", {404}),
@@ -280,7 +285,7 @@ def test_the_example_of_an_inference_is_answered_as_documented(api, operations, 
 
 def test_media_types_of_an_upload(operations):
     content = operations["POST /v1/datasets"]["requestBody"]["content"]
-    assert set(content) == {"text/csv", "application/x-npz", "multipart/form-data"}
+    assert set(content) == {*MEDIA_TYPES, "multipart/form-data"}
 
 
 def test_the_document_is_plain_json(document):

@@ -59,9 +59,11 @@ def test_lineage_names_the_data_with_their_hashes(api, two_versions):
     jobs, (pendulum, more) = two_versions
     for version, expected in ((1, [pendulum]), (2, [more, pendulum])):
         shown = api.get(f"/v1/models/twice/versions/{version}").json()
-        assert shown["lineage"]["datasets"] == [
+        told = ("id", "name", "sha256", "rows")
+        assert [{name: each[name] for name in told} for each in shown["lineage"]["datasets"]] == [
             {"id": d["id"], "name": d["name"], "sha256": d["sha256"], "rows": d["report"]["rows"]} for d in expected
         ]
+        assert [each["recipe"]["cutoff_hz"] for each in shown["lineage"]["datasets"]] == [4.0] * len(expected)
         assert shown["job"] == shown["lineage"]["job"] == jobs[version - 1]["id"]
         assert shown["fit"]["samples_given"] == 80 * len(expected)
 

@@ -87,6 +87,7 @@ PATHS = [
     *(get(f"{MODELS}/{name}", "model", 404, "not_found") for name in NOBODY),
     *(get(f"{DATASETS}/{name}", "dataset", 404, "not_found") for name in ("ds_0", "%00", "%2e%2e", "x" * 500)),
     *(get(f"{ROBOTS}/{name}", "robot", 404, "not_found") for name in ("urdf_0", "panda", "%F0%9F%A4%96")),
+    *(get(f"{ROBOTS}/profiles/{name}", "robot", 404, "not_found") for name in ("urdf_0", "%2e%2e", "%00", "x" * 500)),
     *(get(f"{JOBS}/{name}", "job", 404, "not_found") for name in ("job_0", "%E2%80%AE")),
     *(
         get(f"{MODELS}/panda-sim/versions/{v}", "version")

@@ -20,6 +20,37 @@ NO_NAMES = (
     "a" * 201,
 )
 """What is no name for people."""
+_NUMBERS = ("-1", "nan", "inf", "1e400", "x", "")
+CHOICES: dict[str, dict[str, str]] = {
+    "rate": dict.fromkeys(("0", *_NUMBERS), "rate"),
+    "gap": dict.fromkeys(("1", *_NUMBERS), "gap"),
+    "trim": dict.fromkeys(_NUMBERS, "trim"),
+    "filtering": dict.fromkeys(("", "sometimes", "ALWAYS"), "filtering"),
+    "form": dict.fromkeys(("", "anticausal"), "form"),
+    "effort": dict.fromkeys(("", "unknown", "volts"), "effort"),
+    "torque_constants": dict.fromkeys(("", "1,,2", "0", "nan", "1e9"), "torque_constants"),
+    "delimiter": dict.fromkeys(("", ",,"), "delimiter"),
+    "robot": {"r2d2": "robot", "urdf_0123456789abcdef": "robot", "a" * 201: "robot"},
+    "columns": {
+        "": "body",
+        "{": "body",
+        "[]": "columns",
+        "1": "columns",
+        '{"q":1}': "columns.q",
+        '{"q":[]}': "columns.q",
+        '{"q":""}': "columns.q",
+        '{"force":"f"}': "columns.force",
+        '{"q":"a","q":"b"}': "q",
+    },
+    "units": {
+        "{}x": "body",
+        "[]": "units",
+        '{"q":1}': "units.q",
+        '{"q":""}': "units.q",
+        '{"speed":"deg"}': "units.speed",
+    },
+}
+"""How an upload may not be read: a query parameter's values, and what the error names."""
 
 
 def upload(
@@ -48,7 +79,7 @@ BAD: list[Bad] = [
         parameter(DATASETS, f"torque_convention={value}", "torque_convention")
         for value in ("", "gravity", "GRAVITY_INCLUDED")
     ),
-    parameter(DATASETS, f"joint_names={'a' * 4001}", "joint_names"),
+    parameter(DATASETS, f"joint_names={'a' * 8001}", "joint_names"),
     parameter(DATASETS, "joint_name=a", "joint_name"),
     parameter(DATASETS, "name=a&name=b", "name"),
     parameter(ROBOTS, "joint_names=a", "joint_names", XML),
@@ -56,6 +87,12 @@ BAD: list[Bad] = [
         upload(path, b"{}", "content-type", kind, "unsupported_media_type", 415)
         for path in (DATASETS, ROBOTS, IMPORT)
         for kind in ("", "application/json", "text/plain", "application/octet-stream", "text/csvx", "*/*", "a" * 500)
+        if (path, kind) != (DATASETS, "application/json")
+    ),
+    *(
+        parameter(DATASETS, f"{name}={value}", named)
+        for name, values in CHOICES.items()
+        for value, named in values.items()
     ),
     *(
         upload(path, form(name), "file name", FORM, "unsupported_media_type", 415)

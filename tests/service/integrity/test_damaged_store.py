@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 
 import pytest
 from sqlalchemy import select
@@ -115,7 +116,7 @@ def store(arm):
     arm.batch(0)
     snapshot(arm, 1)
     samples = stream(samples=40, seed=32)
-    digest = arm.files.write_samples("ds_one", samples)
+    digest = arm.files.write_samples("ds_one", len(samples), samples.n_joints, partial(getattr, samples))
     with arm.database.transaction() as session:
         dataset = {"torque_convention": "gravity_included", "joint_names": list(samples.joint_names), "report": {}}
         session.add(DatasetRow(id="ds_one", name="one", created_at="", sha256=digest, rows=len(samples), **dataset))

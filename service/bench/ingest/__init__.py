@@ -1,0 +1,1 @@
+"""How long a long recording takes from upload to report, and how much memory."""

@@ -1,0 +1,180 @@
+"""Holding part of the data sets out of training, and finding the same samples again from a version's lineage.
+
+A refresh leaves out what its version left out, where it still learns from that data set: the figures of both then speak
+of the same samples, which neither has seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from lipcore.samples import Array, Samples
+from lipcore.splits import GUARD_S, Mask, Numbers, Parts, Split, SplitError, choose, split, taken
+from service.database import DatasetRow
+from service.errors import invalid_request
+from service.training.holdout_schema import HeldOutSet, Holdout, HoldoutLineage
+
+UNTIMED_GUARD = 25.0
+"""Samples left out on both sides in a data set without times, whose rate is not known."""
+
+
+class CannotHoldOutError(ValueError):
+    """A data set cannot be split as asked for."""
+
+
+@dataclass(frozen=True)
+class SetSplit:
+    """How one data set is split.
+
+    whole: nothing of it is learnt from; guard: in `unit`; known: rows held out and guarded where it was split before.
+    """
+
+    dataset: str
+    asked: Holdout
+    whole: bool
+    guard: float
+    unit: Literal["s", "rows"]
+    known: tuple[int, int] | None = None
+
+    @property
+    def rows(self) -> int:
+        """Rows held out; of a data set that was split before."""
+        assert self.known is not None
+        return self.known[0]
+
+    def parts(self, episode: Numbers, t: Array) -> Parts:
+        """Split rows by their episodes and times, (N,) each; raise CannotHoldOutError, also where another split comes
+        out than before."""
+        if self.whole:
+            found = Parts(np.zeros(len(t), dtype=bool), np.ones(len(t), dtype=bool))
+        else:
+            how = Split(self.asked.kind, self.asked.share, self.asked.blocks, self.guard, self.asked.seed)
+            try:
+                found = split(episode, t if self.unit == "s" else np.arange(len(t), dtype=np.float64), how)
+            except SplitError as error:
+                raise CannotHoldOutError(f"data set {self.dataset!r}: {error}") from error
+        counts = (int(np.count_nonzero(found.held_out)), found.guarded)
+        if self.known is not None and counts != self.known:
+            raise CannotHoldOutError(f"data set {self.dataset!r} does not split as it did before")
+        return found
+
+    def held_out(self, episode: Numbers, t: Array) -> Mask:
+        """Rows that are held out, see `parts`."""
+        return self.parts(episode, t).held_out
+
+
+@dataclass(frozen=True)
+class Divided:
+    """Data sets in two. train: of each what is learnt from, None where that is nothing; held_out: of all together;
+    lineage: how to find it again. Both are None where nothing is held out."""
+
+    train: list[Samples | None]
+    held_out: Samples | None
+    lineage: HoldoutLineage | None
+
+
+def check(rows: Sequence[DatasetRow], asked: Holdout, min_samples: int) -> None:
+    """Raise InvalidRequestError where reports tell already that the data sets cannot be split as asked for."""
+    for index, row in enumerate(rows):
+        if row.sha256 in [each.sha256 for each in rows[:index]]:
+            raise invalid_request(f"datasets[{index}]", row.id, "other samples than those of the data sets before it")
+        if asked.guard_s is not None and not _is_timed(row):
+            raise invalid_request("holdout.guard_s", asked.guard_s, f"none, as data set {row.id} has no times")
+    if asked.kind == "episodes" and len(rows) == 1 and rows[0].report["episodes"] < 2:
+        raise invalid_request("holdout.kind", asked.kind, "last or blocks, as the data set is one episode")
+    left = round((1 - asked.share) * sum(row.rows for row in rows))
+    if left < min_samples:
+        expected = f"less: it leaves {left} samples to train on, at least {min_samples} are needed"
+        raise invalid_request("holdout.share", asked.share, expected)
+
+
+def hold_out(rows: Sequence[DatasetRow], tables: Sequence[Samples], asked: Holdout) -> Divided:
+    """Divide data sets for the first time; raise CannotHoldOutError.
+
+    Each is split on its own, but those of one episode stand for an episode where whole ones are held out. What it does
+    to a data set does not depend on the order of the others.
+    """
+    single = {row.id for row, table in zip(rows, tables, strict=True) if len(np.unique(table.episode)) < 2}
+    if asked.kind != "episodes" or len(rows) == 1:
+        single = set()
+    whole = _whole([row for row in rows if row.id in single], asked) if len(single) > 1 else set()
+    splits = {}
+    for row in rows:
+        if row.id in whole or row.id not in single:  # else the one episode that it has is learnt from
+            splits[row.id] = _first(row, asked, row.id in whole)
+    return _divide(rows, tables, splits)
+
+
+def hold_out_again(rows: Sequence[DatasetRow], tables: Sequence[Samples], lineage: dict[str, Any]) -> Divided:
+    """Divide data sets of a version as they were for it, by its lineage; raise CannotHoldOutError."""
+    found = {row.id: remembered(row, lineage) for row in rows}
+    return _divide(rows, tables, {name: each for name, each in found.items() if each is not None})
+
+
+def remembered(row: DatasetRow, lineage: dict[str, Any]) -> SetSplit | None:
+    """How a version's data set was split, or the same samples uploaded another time; None where nothing of it was held
+    out."""
+    if (found := lineage.get("holdout")) is None:
+        return None
+    said = HoldoutLineage.model_validate(found)
+    for each in sorted(said.datasets, key=lambda one: one.id != row.id):  # itself first
+        if row.id == each.id or row.sha256 == each.sha256:
+            counts = (each.rows, each.guarded)
+            return SetSplit(row.id, said.split, each.whole, each.guard, each.guard_unit, counts)
+    return None
+
+
+def _divide(rows: Sequence[DatasetRow], tables: Sequence[Samples], splits: dict[str, SetSplit]) -> Divided:
+    train: list[Samples | None] = []
+    held: list[Samples] = []
+    said: list[HeldOutSet] = []
+    for row, table in zip(rows, tables, strict=True):
+        how = splits.get(row.id)
+        if how is None:
+            train.append(table)
+            continue
+        parts = how.parts(table.episode, table.t)
+        train.append(None if how.whole else taken(table, parts.train))
+        held.append(taken(table, parts.held_out))
+        said.append(
+            HeldOutSet(
+                id=row.id,
+                sha256=row.sha256,
+                whole=how.whole,
+                guard=how.guard,
+                guard_unit=how.unit,
+                rows=len(held[-1]),
+                guarded=parts.guarded,
+            )
+        )
+    if not said:
+        return Divided(train, None, None)
+    asked = next(iter(splits.values())).asked
+    total = {name: sum(getattr(each, name) for each in said) for name in ("rows", "guarded")}
+    return Divided(train, Samples.concatenate(held), HoldoutLineage(split=asked, datasets=said, **total))
+
+
+def _first(row: DatasetRow, asked: Holdout, whole: bool) -> SetSplit:
+    """How a data set is split that was not split before."""
+    if not _is_timed(row):
+        return SetSplit(row.id, asked, whole, UNTIMED_GUARD, "rows")
+    guard = asked.guard_s
+    if guard is None:  # one period of the low-pass that it was prepared with, where it says so
+        cutoff = (row.report.get("recipe") or {}).get("cutoff_hz")
+        guard = GUARD_S if cutoff is None else 1.0 / float(cutoff)
+    return SetSplit(row.id, asked, whole, guard, "s")
+
+
+def _whole(rows: Sequence[DatasetRow], asked: Holdout) -> set[str]:
+    """Ids of those data sets of one episode that are held out as a whole."""
+    ordered = sorted(rows, key=lambda row: row.sha256)
+    chosen = choose(np.array([row.rows for row in ordered]), asked.share, asked.seed)
+    return {row.id for row, held in zip(ordered, chosen, strict=True) if held}
+
+
+def _is_timed(row: DatasetRow) -> bool:
+    return row.report.get("rate_hz") is not None
