@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from sqlalchemy import select
 from sqlalchemy.exc import SQLAlchemyError
 
+from lipcore.motion import JointType
+from lipcore.profiles import Profile
 from lipcore.samples import Samples
 from service import sample_file
 from service.context import Service
@@ -47,6 +49,7 @@ def add(service: Service, upload: Path, kind: str, name: str, options: UploadOpt
         gravity = found.torque_convention == "gravity_included"
         report = make_report(found.staged, prepared, profile, found.noted, settings, options.recipe, gravity)
         report["source"] = found.facts
+        report["joint_types"] = None if profile is None else _joint_types(profile, found.staged.joint_names)
         staged = prepared.staged
         disk.take(sample_file.size(staged.rows, staged.n_joints))
         dataset = new_id("ds")
@@ -113,6 +116,13 @@ def delete(service: Service, dataset: str) -> None:
                 raise ConflictError(f"data set {dataset!r} is in use by job {job.id!r}: cancel it or wait for its end")
         session.delete(row)
     service.files.delete_samples(dataset)
+
+
+def _joint_types(profile: Profile, joint_names: Sequence[str]) -> list[JointType] | None:
+    """Types of the joints by the robot; None where it does not have them all."""
+    places = profile.match(joint_names)
+    types = [profile.joint_types[place] for place in places if place is not None]
+    return types if len(types) == len(joint_names) else None
 
 
 def _array(staged: Staged, name: str) -> NDArray[np.float64] | NDArray[np.int64]:

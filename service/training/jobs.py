@@ -143,7 +143,8 @@ def _check_joints(request: JobRequest, rows: list[DatasetRow]) -> list[str]:
                 expected = f"the {what} of datasets[0], {getattr(first, what)}"
                 raise invalid_request(f"datasets[{index}]", f"a data set with {getattr(row, what)}", expected)
     n = len(first.joint_names)
-    types: list[str] = list(request.joint_types) if request.joint_types is not None else ["revolute"] * n
+    known = next((found for row in rows if (found := row.report.get("joint_types")) is not None), ["revolute"] * n)
+    types: list[str] = list(known if request.joint_types is None else request.joint_types)
     if len(types) != n:
         raise invalid_request("joint_types", f"{len(types)} types", f"{n}, one a joint: {', '.join(first.joint_names)}")
     return types

@@ -62,7 +62,9 @@ class JobRequest(BaseModel):
     model: ModelName = Field(description="Name of the model; a new version of it is made")
     datasets: list[Annotated[str, Field(max_length=40)]] = Field(min_length=1, description="Ids of data sets")
     estimator: str = Field(DEFAULT_ESTIMATOR, max_length=40)
-    joint_types: list[JointType] | None = Field(None, description="One a joint; all revolute by default")
+    joint_types: list[JointType] | None = Field(
+        None, description="One a joint; by default those of the robot that a data set was uploaded with, else revolute"
+    )
     robot: str | None = Field(
         None,
         max_length=40,

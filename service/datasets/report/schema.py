@@ -6,6 +6,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
+from lipcore.motion import JointType
+
 Verdict = Literal["well", "poorly", "not determined"]
 """How well the data tell a weight, see `DETERMINED` in excitation.py for the thresholds."""
 
@@ -144,6 +146,9 @@ class DatasetReport(BaseModel):
     source: dict[str, Any] | None = Field(None, description="What the file's columns were taken as, in figures")
     recipe: dict[str, Any] | None = Field(None, description="The choices that the preparation was made with")
     steps: list[dict[str, Any]] = Field([], description="The steps of `preparation` with their parameters")
+    joint_types: list[JointType] | None = Field(
+        None, description="Of the robot's joints: what a training job takes where it says nothing else"
+    )
     robot: str | None = Field(None, description="Robot whose limits the data were compared with")
     timing: Timing | None = None
     saturation: list[JointSaturation] | None = None

@@ -10,11 +10,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from safetensors.numpy import load_file
+from sqlalchemy import select
 
+from lipcore.robots import load_robot
 from service import sample_file
 from service.bench.ingest import recording
 from service.bench.ingest import running as ingest
-from tests.service.data import arrays, error, npz, post, service_of, stream
+from service.database import JobRow
+from tests.service.data import arrays, error, npz, post, queue, service_of, stream
 
 SAMPLES = stream(samples=600, rate=100.0, seed=71)
 
@@ -86,6 +89,20 @@ def test_recipe_and_source_of_an_upload_are_kept(api):
     assert [step["text"] for step in report["steps"]] == report["preparation"]
     motion = SAMPLES.q[25:-25]  # what the edges leave, in radians
     assert np.array(report["ranges"]["q"]["max"]) == pytest.approx(motion.max(axis=0), abs=0.05)
+
+
+def test_the_types_of_joints_are_those_of_the_robot_unless_the_job_says_otherwise(api):
+    tiago = stream("tiago", samples=80, seed=73)
+    dataset = created(post(api, npz(**arrays(tiago), joint_names=np.array(tiago.joint_names)), robot="tiago"))
+    types = load_robot("tiago").joint_types
+    assert types.count("prismatic") == 1
+    assert dataset["report"]["joint_types"] == list(types)
+    job = queue(api, "types-of-tiago", dataset["id"])
+    with service_of(api).database.session() as session:
+        assert session.scalar(select(JobRow).where(JobRow.id == job["id"])).request["joint_types"] == list(types)
+    api.post(f"/v1/jobs/{job['id']}/cancel")
+    unknown = created(post(api, npz(**arrays(SAMPLES))))
+    assert unknown["report"]["joint_types"] is None
 
 
 def test_preview_keeps_the_extremes(api):
