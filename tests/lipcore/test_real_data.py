@@ -58,7 +58,10 @@ def read_panda() -> tuple[tuple[str, ...], np.ndarray]:
 
 
 @pytest.mark.skipif(not PANDA.exists(), reason=f"no recording at {PANDA}")
-@pytest.mark.parametrize(("options", "lowest_coverage"), [(QUICK, 0.4), (DEFAULT, 0.3)], ids=["quick", "default"])
+@pytest.mark.parametrize(
+    ("options", "lowest_coverage"),
+    [pytest.param(QUICK, 0.4, id="quick"), pytest.param(DEFAULT, 0.3, id="default", marks=pytest.mark.slow)],
+)
 def test_panda_predicts_the_rest_of_its_trajectory(options: FitOptions, lowest_coverage: float) -> None:
     names, signals = read_panda()
     assert signals.shape == (3, 727, 7)
@@ -75,7 +78,9 @@ def test_panda_predicts_the_rest_of_its_trajectory(options: FitOptions, lowest_c
 
 
 @pytest.mark.skipif(not SCHUNK.exists(), reason=f"no recording at {SCHUNK}")
-@pytest.mark.parametrize("options", [QUICK, DEFAULT], ids=["quick", "default"])
+@pytest.mark.parametrize(
+    "options", [pytest.param(QUICK, id="quick"), pytest.param(DEFAULT, id="default", marks=pytest.mark.slow)]
+)
 def test_schunk_predicts_episodes_held_out(options: FitOptions) -> None:
     """Every fourth episode is held out: trajectories of the same kinds, driven at other speeds or again."""
     with np.load(SCHUNK) as file:
