@@ -161,8 +161,8 @@ _GEN3 = Sheet(
     "Kinova Gen3, 7 joints",
     tuple(f"joint_{joint}" for joint in range(1, 8)),
     "measured",
-    "Torque sensors in every joint, gravity included: not checked against a document. Kinova's examples of torque control "
-    "call the measured torque reversed against the actuator's direction: check the sign.",
+    "Torque sensors in every joint, gravity included: not checked against a document. Kinova's examples of torque "
+    "control call the measured torque reversed against the actuator's direction: check the sign.",
     "github Kinovarobotics/ros_kortex, kortex_description/arms/gen3/7dof",
     Numbers(
         (FREE, (-2.41, 2.41), FREE, (-2.66, 2.66), FREE, (-2.23, 2.23), FREE),
@@ -178,7 +178,7 @@ _IIWA7 = Sheet(
     "measured",
     "The fast robot interface's measured torque comes from joint torque sensors, gravity included; torque commanded "
     "on top of the controller's gravity compensation is `commanded`.",
-    "KUKA, specification LBR iiwa: motion ranges, speeds at rated load, maximum torques; written down from memory and not "
+    "KUKA, specification LBR iiwa: motion ranges, speeds at rated load, maximum torques; written down from memory, not "
     "checked against the document: compare with yours",
     Numbers(
         symmetric(170, 120, 170, 120, 170, 120, 175),
