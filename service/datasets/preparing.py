@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lipcore.preparation.errors import PreparationError
 from lipcore.preparation.plan import Plan, plan
 from lipcore.preparation.recipe import Recipe
 from lipcore.samples import Array
-from service.datasets.staging import EPISODE, QUANTITIES, TIME, Staged, column
+from service.datasets.staging import EPISODE, TIME, Staged, column
 from service.errors import invalid_data
 from service.limits.disk import Disk
 
@@ -70,7 +69,7 @@ def prepare(raw: Staged, folder: Path, recipe: Recipe, min_samples: int, disk: D
     asks for, or where fewer than min_samples come out; StorageFullError.
     """
     try:
-        made = plan(_or_none(raw, TIME), _or_none(raw, EPISODE), _missing(raw), raw.quantities, recipe)
+        made = plan(_or_none(raw, TIME), _or_none(raw, EPISODE), raw.missing(), raw.quantities, recipe)
     except PreparationError as error:
         raise invalid_data(error.field, error.value, error.expected) from None
     if len(made) < min_samples:
@@ -104,16 +103,6 @@ class _Joint(Mapping[str, Array]):
 
 def _or_none(raw: Staged, name: str) -> Array | None:
     return raw.read(name) if name in raw else None
-
-
-def _missing(raw: Staged) -> NDArray[np.bool_]:
-    """Rows in which any value is missing, (rows,)."""
-    found = np.zeros(raw.rows, dtype=np.bool_)
-    joints = [column(name, joint) for name in QUANTITIES for joint in range(raw.n_joints)]
-    for name in (TIME, EPISODE, *joints):
-        if name in raw:
-            found |= ~np.isfinite(raw.read(name))
-    return found
 
 
 def _facts(rows: int, made: Plan) -> Facts:

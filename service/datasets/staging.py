@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lipcore.samples import Array
 from service.limits.disk import Disk
@@ -31,6 +32,7 @@ class Staged:
     def __init__(self, folder: Path, joint_names: tuple[str, ...], disk: Disk) -> None:
         self.folder, self.joint_names, self.disk = folder, joint_names, disk
         self._rows: dict[str, int] = {}
+        self._missing: NDArray[np.bool_] | None = None
 
     @property
     def n_joints(self) -> int:
@@ -57,6 +59,7 @@ class Staged:
             with (self.folder / f"{name}.f64").open("ab") as file:
                 file.write(np.ascontiguousarray(values, np.float64).data)
             self._rows[name] = self._rows.get(name, 0) + len(values)
+        self._missing = None
 
     def read(self, name: str) -> Array:
         """One column, (rows,); raise KeyError where there is none."""
@@ -65,6 +68,14 @@ class Staged:
         if len(found) != count:
             raise OSError(f"column {name} has {len(found)} rows on disk, expected {count}")
         return found
+
+    def missing(self) -> NDArray[np.bool_]:
+        """Rows in which any value is missing, (rows,); looked up once, as that reads all columns."""
+        if self._missing is None:
+            self._missing = np.zeros(self.rows, dtype=np.bool_)
+            for name in self._rows:
+                self._missing |= ~np.isfinite(self.read(name))
+        return self._missing
 
     def joint(self, index: int) -> dict[str, Array]:
         """Columns of one joint by quantity."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lipcore.samples import Array
 from service.datasets.report.parts import Rows, finite, number_parts
 from service.datasets.report.schema import Gap, Timing
-from service.datasets.staging import EPISODE, TIME, Staged, column
+from service.datasets.staging import EPISODE, TIME, Staged
 
 MOST_GAPS = 20
 """Gaps that a report lists."""
@@ -33,7 +33,7 @@ def look_at_clock(raw: Staged, gap_steps: float, repeated: int) -> Clock:
 
     gap_steps: a step of time longer than so many usual ones is a gap; repeated: stamps left out while it was read.
     """
-    missing = _missing(raw)
+    missing = raw.missing()
     breaks = [missing[1:] | missing[:-1]]
     if EPISODE in raw:
         breaks.append(np.diff(raw.read(EPISODE)) != 0)
@@ -61,15 +61,6 @@ def look_at_clock(raw: Staged, gap_steps: float, repeated: int) -> Clock:
         missing_rows=int(missing.sum()),
     )
     return Clock(timing, number_parts(raw.rows, [*breaks, gap]), missing)
-
-
-def _missing(raw: Staged) -> NDArray[np.bool_]:
-    """Rows that lack a value."""
-    missing = np.zeros(raw.rows, np.bool_)
-    names = [column(quantity, joint) for joint in range(raw.n_joints) for quantity in raw.quantities]
-    for name in [*names, *(each for each in (TIME, EPISODE) if each in raw)]:
-        missing |= ~np.isfinite(raw.read(name))
-    return missing
 
 
 def _longest(t: Array, steps: Array, gaps: NDArray[np.intp]) -> list[Gap]:

@@ -7,6 +7,7 @@ nothing is unpacked beyond a limit; and no code is generated out of message defi
 from __future__ import annotations
 
 import bz2
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from typing import NamedTuple, Protocol
 
@@ -47,16 +48,16 @@ class Bag(Protocol):
         ...
 
 
-class ScannedBag:
+class ScannedBag(ABC):
     """A bag that is read from front to back; `scan` says how."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.facts: list[str] = []
 
+    @abstractmethod
     def scan(self) -> Iterator[tuple[Channel, int, Data]]:
         """Channel, time of reception in ns and data of every message."""
-        raise NotImplementedError
 
     def tell(self, fact: str) -> None:
         """Note a fact, once: a bag is read several times."""
