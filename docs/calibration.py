@@ -14,10 +14,10 @@ import numpy as np
 import torch
 
 import lipcore
-from lipcore.estimators import ROBOT_ESTIMATORS
 from lipcore.robots import Robot, load_robot, pinocchio
 from lipcore.simulation import FAST, Stream, simulate
 from lipcore.urdf import RigidBody
+from lipcore.vocabulary import ROBOT_ESTIMATORS
 
 SEEDS, TESTS, SPEEDS, SIZES = (301, 302), 2, (1.0, FAST), (60, 200, 500)
 STRIDE = 5

@@ -16,11 +16,12 @@ import torch
 from rosbags.typesys import Stores, get_typestore
 
 import lipcore
-from lipcore.estimators import ESTIMATORS, ROBOT_ESTIMATORS
+from lipcore.estimators import ESTIMATORS
 from lipcore.metrics import evaluate
 from lipcore.samples import Array, Samples
 from lipcore.signals import differentiate, low_pass
 from lipcore.urdf import RigidBody
+from lipcore.vocabulary import ROBOT_ESTIMATORS
 
 PANDA_RATE, PANDA_SHARE = 30.0, 0.7
 SCHUNK_LAST, SCHUNK_FOURTH = 70, 4

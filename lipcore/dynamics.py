@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -20,18 +19,8 @@ from lipcore.kernels.base import SumKernel, TorqueKernel
 from lipcore.model import TorqueModel
 from lipcore.motion import Motion
 from lipcore.posterior import Posterior
+from lipcore.vocabulary import COMPONENTS, ComponentName
 
-ComponentName = Literal[
-    "inertia_matrix",
-    "coriolis",
-    "gravity",
-    "inertial",
-    "friction",
-    "kinetic_energy",
-    "potential_energy",
-    "forward_dynamics",
-]
-COMPONENTS: tuple[ComponentName, ...] = get_args(ComponentName)
 _ALWAYS: tuple[ComponentName, ...] = ("friction",)
 _TORQUES: dict[ComponentName, dict[str, float]] = {
     "gravity": {"rest": 1.0},

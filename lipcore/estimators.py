@@ -15,10 +15,9 @@ from lipcore.kernels.lip import LipKernel
 from lipcore.kernels.lse import LagrangianSEKernel
 from lipcore.kernels.rigid_body import RigidBodyKernel
 from lipcore.kernels.se import SquaredExponentialKernel
-from lipcore.motion import JointType, Motion, check_joint_types
+from lipcore.motion import Motion, check_joint_types
 from lipcore.urdf import JointMismatchError, RigidBody
-
-DEFAULT_ESTIMATOR = "lip-chain"
+from lipcore.vocabulary import ROBOT_ESTIMATORS, JointType
 
 
 class UnknownEstimatorError(ValueError):
@@ -51,9 +50,6 @@ class _ResidualChainKernel(ChainKernel):
 
 
 RESIDUAL_SHARE = 0.1
-ROBOT_ESTIMATORS = ("rigid-body", "rigid-body+lip-chain")
-"""Estimators with the term `rigid_body`, which needs a robot."""
-
 Maker = Callable[[tuple[JointType, ...], bool], dict[str, TorqueKernel]]
 
 ESTIMATORS: dict[str, Maker] = {

@@ -9,12 +9,10 @@ from typing import Any
 
 from lipcore import strict_json
 from lipcore.calibration import Calibration
-from lipcore.fitting import FitOptions
+from lipcore.fit_options import FitOptions
 from lipcore.kernels.friction import FRICTION_TERMS
-from lipcore.kernels.rigid_body import PRIORS
-from lipcore.model import TORQUE_CONVENTIONS
-from lipcore.motion import JOINT_TYPES
 from lipcore.strict_json import quote
+from lipcore.vocabulary import JOINT_TYPES, PRIORS, TORQUE_CONVENTIONS
 
 FORMAT = "lipserve-model"
 FORMAT_VERSION = 3

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import Literal, get_args
 
 import torch
 from numpy.typing import ArrayLike
@@ -16,18 +15,17 @@ from lipcore.compact.basis import Basis
 from lipcore.compact.compress import compress
 from lipcore.compact.posterior import CompactPosterior
 from lipcore.compact.statistics import Statistics
-from lipcore.estimators import DEFAULT_ESTIMATOR, Estimator, make_estimator
+from lipcore.estimators import Estimator, make_estimator
 from lipcore.evaluator import Evaluator
-from lipcore.fitting import Cancelled, FitOptions, Progress, fit
-from lipcore.motion import JointType, Motion, check_finite, check_joint_types, motion_arrays
+from lipcore.fit_options import FitOptions
+from lipcore.fitting import Cancelled, Progress, fit
+from lipcore.motion import Motion, check_finite, check_joint_types, motion_arrays
 from lipcore.posterior import ExactPosterior
 from lipcore.samples import Array, Samples
 from lipcore.urdf import JointMismatchError, RigidBody
+from lipcore.vocabulary import DEFAULT_ESTIMATOR, TORQUE_CONVENTIONS, JointType, TorqueConvention
 
-TorqueConvention = Literal["gravity_included", "gravity_compensated"]
-"""What a torque means: all of it (Franka's `tau_J`), or what is added to gravity compensation (its commands)."""
 MIN_SAMPLES = 10
-TORQUE_CONVENTIONS: tuple[TorqueConvention, ...] = get_args(TorqueConvention)
 
 
 @dataclass(frozen=True)

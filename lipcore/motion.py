@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, cast, get_args
+from typing import cast
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from lipcore.vocabulary import JOINT_TYPES, JointType
+
 Array = NDArray[np.float64]
-JointType = Literal["revolute", "prismatic"]
-JOINT_TYPES: tuple[JointType, ...] = get_args(JointType)
 
 
 def check_joint_types(joint_types: Sequence[str]) -> tuple[JointType, ...]:

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from lipcore.motion import JointType
 from lipcore.samples import Array
+from lipcore.vocabulary import JointType
 
 
 class SimulationUnavailableError(RuntimeError):

@@ -6,10 +6,12 @@ The paper's choices: 4 Hz cut-off, both without delay, so they suit recordings a
 from __future__ import annotations
 
 from math import comb
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lipcore.samples import Array
+if TYPE_CHECKING:
+    from lipcore.samples import Array
 
 CUTOFF = 4.0
 """Default cut-off in Hz."""

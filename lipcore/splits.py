@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from hashlib import sha256
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.samples import Array, Samples
+if TYPE_CHECKING:
+    from lipcore.samples import Array, Samples
 from lipcore.signals import CUTOFF
 
 Kind = Literal["episodes", "last", "blocks"]

@@ -14,9 +14,10 @@ from xml.parsers import expat
 
 import numpy as np
 
-from lipcore.motion import JointType, check_joint_types
+from lipcore.motion import check_joint_types
 from lipcore.robots import ROBOTS, UnknownRobotError, pinocchio, profile_urdf
 from lipcore.samples import Array
+from lipcore.vocabulary import JointType
 
 Matching = Literal["name", "order", "list"]
 """How the data's joints were found in the URDF: by their names, by their order (profiles only), by an explicit list."""

@@ -2,39 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from fastapi import APIRouter
-from pydantic import BaseModel, Field
 
 from service import __version__
 from service.context import ServiceDep
 from service.errors import NotReadyError, problem, responses
+from service.health_schema import Live, Part, Ready
 from service.route import Route
 
 router = APIRouter(prefix="/health", tags=["health"], route_class=Route)
-
-
-class Live(BaseModel):
-    """The process answers."""
-
-    status: Literal["alive"] = "alive"
-
-
-class Part(BaseModel):
-    """One part of the service."""
-
-    name: str = Field(examples=["database"])
-    state: Literal["ok", "warning"] = Field(description="warning: some clients may notice something")
-    message: str = Field(examples=["can be read and written"])
-
-
-class Ready(BaseModel):
-    """The service can do what it is for."""
-
-    status: Literal["ready"] = "ready"
-    version: str
-    checks: list[Part]
 
 
 @router.get("/live", summary="Is the process alive?")

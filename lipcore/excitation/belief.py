@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from lipcore.compact.posterior import CompactPosterior
-from lipcore.estimators import DEFAULT_ESTIMATOR, make_estimator
+from lipcore.estimators import make_estimator
 from lipcore.excitation.limits import Limits
 from lipcore.excitation.reference import draw
-from lipcore.fitting import FitOptions, fit
+from lipcore.fit_options import FitOptions
+from lipcore.fitting import fit
 from lipcore.kernels.base import Params, TorqueKernel
 from lipcore.model import TorqueModel
 from lipcore.motion import Motion
@@ -20,6 +21,7 @@ from lipcore.robots import Robot
 from lipcore.samples import Array, Samples
 from lipcore.simulation import inverse_dynamics
 from lipcore.urdf import RigidBody
+from lipcore.vocabulary import DEFAULT_ESTIMATOR
 
 PRIOR_MOTIONS = 80
 """Motions whose torques, as the URDF has them, tell a prior's hyperparameters."""

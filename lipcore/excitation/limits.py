@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.motion import JointType
 from lipcore.profiles import Profile
 from lipcore.robots import Robot
 from lipcore.samples import Array
+from lipcore.vocabulary import JointType
 
 USUAL_SPEED: dict[str, float] = {"revolute": 1.0, "prismatic": 0.2}
 """Speed limit of a joint of which none is known, rad/s (m/s)."""

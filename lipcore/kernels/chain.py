@@ -29,7 +29,8 @@ from lipcore.kernels.energy import potential_blocks, potential_energy_torque
 from lipcore.kernels.polynomial import BaseKernels, Derivatives, base_kernels, chain_sum
 from lipcore.kernels.weights import PRIOR_STD as WEIGHTS_PRIOR_STD
 from lipcore.kernels.weights import initial_weights, velocity_weights
-from lipcore.motion import JointType, Motion, check_joint_types
+from lipcore.motion import Motion, check_joint_types
+from lipcore.vocabulary import JointType
 
 SHARE = 2 / 3
 """α of a rotation about an axis that is as likely along as across: E[R c · R'c] = (1 + 2 cos(q − q')) / 3 · |c|²."""

@@ -17,7 +17,8 @@ from lipcore.kernels.base import PairKernel, Params, State
 from lipcore.kernels.compiled.cross import Cross
 from lipcore.kernels.compiled.gip_cross import GeometricallyInspiredCross
 from lipcore.kernels.se import independent_blocks, largest_behind, per_joint, power
-from lipcore.motion import JointType, Motion, check_joint_types
+from lipcore.motion import Motion, check_joint_types
+from lipcore.vocabulary import JointType
 
 FACTOR_LOGITS = (0.0, -4.0)
 """Starting logits of a joint's two position factors: gravity is of degree one, so the second is nearly constant. Were

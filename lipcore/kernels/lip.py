@@ -22,7 +22,8 @@ from lipcore.kernels.energy import (
 )
 from lipcore.kernels.polynomial import Derivatives, base_kernels, product
 from lipcore.kernels.weights import PRIOR_STD, initial_weights, velocity_weights
-from lipcore.motion import JointType, Motion, check_joint_types
+from lipcore.motion import Motion, check_joint_types
+from lipcore.vocabulary import JointType
 
 
 class LipKernel(CompiledKernel):

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lipcore.motion import JointType
+from lipcore.vocabulary import JointType
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -15,10 +13,8 @@ from lipcore.motion import Motion
 from lipcore.robots import pinocchio
 from lipcore.samples import Array
 from lipcore.urdf import PARAMETERS, RigidBody
+from lipcore.vocabulary import PRIORS
 
-Prior = Literal["urdf", "zero"]
-PRIORS: tuple[Prior, ...] = get_args(Prior)
-"""What inertial parameters are expected to be before the data speak: those of the URDF, or none."""
 START = {"urdf": 0.1, "zero": 1.0}
 """Relative deviation from the prior mean that a fit starts from."""
 MASS_FLOOR = 0.02

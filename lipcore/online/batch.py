@@ -10,13 +10,7 @@ from numpy.typing import NDArray
 
 from lipcore.motion import Motion
 from lipcore.samples import Array
-
-CODES = ("learnt", "non_finite", "limit", "time_jump", "saturation", "stationary", "contact", "change", "edge")
-"""What may become of a row. All but the first keep it out of learning: a number that is not finite; a position,
-velocity, acceleration or torque beyond its limit; time that goes backwards or leaps; torque at its actuator's limit; a
-robot at rest, whose stiction hides its torque; a contact; a changed robot whose owner has not decided yet; the edge of
-a recording, where an acceleration cannot be derived."""
-LEARNT = 0
+from lipcore.vocabulary import CODES, LEARNT
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.online.batch import CODES, LEARNT
 from lipcore.samples import Array
+from lipcore.vocabulary import CODES, LEARNT
 
 Codes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]

@@ -109,10 +109,7 @@ class OnlineModel:
 
     def novel(self, rows: Rows) -> NDArray[np.bool_]:
         """Which rows the basis does not cover: it leaves more variance of a torque open than its noise has, (N,)."""
-        basis, motion = self.base.posterior.basis, rows.motion()
-        found = basis.uncovered(motion, basis.features(motion)) > self.base.posterior.noise_variance
-        novel: NDArray[np.bool_] = found.any(1).numpy()
-        return novel
+        return uncovered(self.base, rows)
 
     def model(self, floor: Array | None = None) -> TorqueModel:
         """Solve for the model that answers. floor: (n,) (N·m)², which its variances are never below."""
@@ -162,6 +159,14 @@ class OnlineModel:
         now = replace(self.now, statistics=decay(self.now.statistics, factor))
         before = self.before and replace(self.before, statistics=decay(self.before.statistics, factor))
         return replace(self, reference=reference, since=since, now=now, before=before)
+
+
+def uncovered(base: TorqueModel, rows: Rows) -> NDArray[np.bool_]:
+    """Which rows the basis of a version as trained leaves more variance open of than a torque has noise, (N,)."""
+    basis, motion = base.posterior.basis, rows.motion()
+    found = basis.uncovered(motion, basis.features(motion)) > base.posterior.noise_variance
+    novel: NDArray[np.bool_] = found.any(1).numpy()
+    return novel
 
 
 def _check(forgetting_s: float | None) -> None:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from statistics import NormalDist
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lipcore.samples import Array
+if TYPE_CHECKING:
+    from lipcore.samples import Array
 
 LEVEL = 0.95
 """Probability of the interval that `inside` counts."""

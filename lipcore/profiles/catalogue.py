@@ -8,7 +8,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from lipcore.motion import JointType
 from lipcore.profiles.arms import ARMS
 from lipcore.profiles.names import is_number, makes
 from lipcore.profiles.others import OTHERS
@@ -16,6 +15,7 @@ from lipcore.profiles.profile import Profile
 from lipcore.profiles.reading import Limits, read_limits
 from lipcore.profiles.sheet import Sheet, array
 from lipcore.robots import ROBOTS, UnknownRobotError, installed_profiles, profile_urdf
+from lipcore.vocabulary import JointType
 
 SHEETS: dict[str, Sheet] = ARMS | OTHERS
 REVOLUTE: tuple[JointType, ...] = ("revolute",)

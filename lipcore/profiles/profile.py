@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 
-from lipcore.motion import Array, JointType
+from lipcore.motion import Array
 from lipcore.profiles.names import Assignment, assignments, is_number, makes
-
-EffortMeaning = Literal["measured", "commanded", "current", "unknown"]
-"""Measured torque, gravity included; commanded torque, what is added to gravity compensation; motor current, A."""
+from lipcore.vocabulary import EffortMeaning, JointType
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lipcore.motion import Array
-from lipcore.profiles.profile import EffortMeaning
+from lipcore.vocabulary import EffortMeaning
 
 FREE = (-np.inf, np.inf)
 """Range of a joint that turns without end."""

@@ -14,10 +14,11 @@ import torch
 from lipcore.compact.statistics import collect, merge
 from lipcore.model import TorqueModel
 from lipcore.online import state
-from lipcore.online.batch import CODES, Rows
+from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.online.revision import Revision
 from lipcore.samples import Samples
+from lipcore.vocabulary import CODES
 
 Check = Callable[[TorqueModel, Rows], None]
 EXACT = 1e-8

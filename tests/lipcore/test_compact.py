@@ -14,7 +14,7 @@ from lipcore.compact.basis import Basis
 from lipcore.compact.compress import Deviation, compress
 from lipcore.compact.posterior import CompactPosterior
 from lipcore.compact.statistics import collect
-from lipcore.estimators import ESTIMATORS, ROBOT_ESTIMATORS
+from lipcore.estimators import ESTIMATORS
 from lipcore.linalg import NotPositiveDefiniteError
 from lipcore.motion import Motion
 from lipcore.parameters import weight_posterior
@@ -22,6 +22,7 @@ from lipcore.posterior import ExactPosterior
 from lipcore.robots import load_robot
 from lipcore.simulation import Stream, simulate
 from lipcore.urdf import RigidBody
+from lipcore.vocabulary import ROBOT_ESTIMATORS
 
 ROBOT = "double-pendulum"
 OPTIONS = FitOptions(hyperparameter_samples=40, max_iterations=40, starts=1, device="cpu")

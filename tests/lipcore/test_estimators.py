@@ -10,12 +10,13 @@ import pytest
 import torch
 
 from lipcore import FitOptions, Samples, TorqueModel, train
-from lipcore.estimators import DEFAULT_ESTIMATOR, ESTIMATORS, ROBOT_ESTIMATORS, UnknownEstimatorError, make_estimator
+from lipcore.estimators import ESTIMATORS, UnknownEstimatorError, make_estimator
 from lipcore.evidence import negative_log_evidence
 from lipcore.metrics import evaluate
 from lipcore.robots import load_robot
 from lipcore.simulation import Stream, simulate
 from lipcore.urdf import RigidBody
+from lipcore.vocabulary import DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS
 
 ROBOT = "double-pendulum"
 TYPES = ("revolute", "revolute")

@@ -10,7 +10,8 @@ import torch
 
 from lipcore import evidence, fitting
 from lipcore.estimators import make_estimator
-from lipcore.fitting import Fit, FitCancelledError, FitOptions, FitProgress, fit
+from lipcore.fit_options import FitOptions
+from lipcore.fitting import Fit, FitCancelledError, FitProgress, fit
 from lipcore.linalg import NotPositiveDefiniteError
 from lipcore.metrics import evaluate
 from lipcore.model import train

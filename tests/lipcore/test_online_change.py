@@ -19,6 +19,8 @@ from lipcore.simulation import Payload, Stream, inverse_dynamics, simulate
 
 Scale = Callable[[np.ndarray], np.ndarray]
 NAMES = tuple(f"j{k + 1}" for k in range(7))
+SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
+"""Seconds each: others than the first are for when there is time."""
 
 
 class Alarm(NamedTuple):
@@ -63,7 +65,7 @@ def constant(value: float) -> Scale:
     return lambda t: np.full_like(t, value)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("deviation", [1.0, 3.0])
 def test_ten_minutes_of_constant_innovations_raise_no_alarm(deviation: float, seed: int) -> None:
     assert watch(*standard(constant(deviation), seed), rows=50)[1] == []
@@ -76,12 +78,12 @@ def test_no_false_alarm_at_other_rates(rate: float) -> None:
 
 
 @pytest.mark.parametrize("deviation", [1.0, 3.0])
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", SEEDS[:2])
 def test_errors_that_persist_for_half_a_second_are_no_change(deviation: float, seed: int) -> None:
     assert watch(*standard(constant(deviation), seed, persist_s=0.5), rows=50)[1] == []
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", SEEDS[:2])
 @pytest.mark.parametrize("size", [2.5, 4.0, 30.0])
 def test_step_is_found_within_two_seconds_and_dated_to_half_a_second(size: float, seed: int) -> None:
     data = standard(lambda t: np.where(t >= 60.3, size, 1.0), seed, seconds=75.0)
@@ -110,7 +112,7 @@ def test_step_that_is_too_small_for_seconds_is_found_as_drift(deviation: float) 
     assert abs(change.at - 60) < 3
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_errors_that_grow_to_twice_in_five_minutes_are_a_drift(seed: int) -> None:
     data = standard(lambda t: np.sqrt(1 + 3 * np.maximum(t - 60, 0) / 300), seed, seconds=300.0)
     [(change, found)] = watch(*data, rows=50)[1]
@@ -202,7 +204,7 @@ def judged(robot: Robot, stream: Stream, seed: int = 0) -> tuple[np.ndarray, ...
     return samples.t, samples.dq, samples.tau, mean, std
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", SEEDS[:2])
 def test_constant_ignorance_of_a_panda_raises_no_alarm(panda: Robot, seed: int) -> None:
     t, _, tau, mean, std = judged(panda, replace(PLAIN, n_samples=15_000), seed)
     assert watch(t, tau, mean, std, NOISE)[1] == []

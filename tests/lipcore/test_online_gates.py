@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lipcore.online.batch import CODES
 from lipcore.online.gates import LARGEST_TORQUE, Limits, Patience, check_rows, is_contact, time_span
 from lipcore.robots import Robot, load_robot
 from lipcore.samples import Samples
 from lipcore.simulation import Payload, Stream, inverse_dynamics, simulate
+from lipcore.vocabulary import CODES
 
 LIMITS = Limits(12.6, 50.0, 2000.0, None, 1.0, 1e-3)
 PANDA_TORQUE = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0])

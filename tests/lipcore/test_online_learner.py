@@ -12,13 +12,14 @@ from lipcore import FitOptions, TorqueModel, save, train
 from lipcore.compact.posterior import CompactPosterior
 from lipcore.motion import Motion
 from lipcore.online import state
-from lipcore.online.batch import LEARNT, Rows
+from lipcore.online.batch import Rows
 from lipcore.online.learner import ForgottenError, OnlineModel
 from lipcore.online.revision import Revision
 from lipcore.posterior import ExactPosterior
 from lipcore.robots import load_robot
 from lipcore.samples import Samples
 from lipcore.simulation import Payload, Stream, simulate
+from lipcore.vocabulary import LEARNT
 from tests.lipcore.online_checks import as_rows, same_answers
 
 ROBOT = "double-pendulum"

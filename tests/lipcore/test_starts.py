@@ -13,7 +13,8 @@ from torch import Tensor
 
 from lipcore import fitting
 from lipcore.estimators import make_estimator
-from lipcore.fitting import FitCancelledError, FitOptions, fit
+from lipcore.fit_options import FitOptions
+from lipcore.fitting import FitCancelledError, fit
 from lipcore.kernels.base import SumKernel
 from lipcore.kernels.chain import ChainKernel
 from lipcore.kernels.friction import FrictionKernel

@@ -1,0 +1,60 @@
+"""What a fit may be told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from lipcore.vocabulary import PRIORS
+
+if TYPE_CHECKING:
+    import torch
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How to fit.
+
+    hyperparameter_samples: samples that hyperparameters are fitted on; posterior_samples: samples the posterior is
+    conditioned on, where there are more the most spread-out ones; starts: points that the search for hyperparameters is
+    tried from, the best of which is followed; tied: links share kernel shapes (see LipKernel);
+    device: "cpu", "cuda" or "auto"; prior: of rigid bodies, "urdf" or "zero" (see RigidBodyKernel);
+    compact_tolerance: largest deviation of the compact posterior from the exact one, in standard deviations;
+    max_inducing_outputs: where that would take more, the compact posterior deviates more, and answers stay fast.
+    """
+
+    hyperparameter_samples: int = 150
+    posterior_samples: int = 500
+    max_iterations: int = 150
+    starts: int = 3
+    tied: bool = True
+    device: str = "auto"
+    prior: str = "urdf"
+    compact_tolerance: float = 0.01
+    max_inducing_outputs: int = 1500
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("hyperparameter_samples", 10, 2000),
+            ("posterior_samples", 10, 5000),
+            ("max_iterations", 1, 10000),
+            ("starts", 1, 100),
+            ("max_inducing_outputs", 1, 20000),
+        ):
+            value = getattr(self, name)
+            if type(value) is not int or not low <= value <= high:
+                raise ValueError(f"{name} is {value!r}, expected a whole number from {low} to {high}")
+        if self.device not in ("auto", "cpu", "cuda"):
+            raise ValueError(f"device is {self.device!r}, expected auto, cpu or cuda")
+        if not (isinstance(self.compact_tolerance, float) and 0 < self.compact_tolerance <= 1):
+            raise ValueError(f"compact_tolerance is {self.compact_tolerance!r}, expected a number above 0, 1 at most")
+        if self.prior not in PRIORS:
+            raise ValueError(f"prior is {self.prior!r}, expected one of {', '.join(PRIORS)}")
+
+    def torch_device(self) -> torch.device:
+        """The device to fit on; raise ValueError for `cuda` where there is none."""
+        import torch  # noqa: PLC0415 - seconds, which who only names options does without
+
+        if self.device == "cuda" and not torch.cuda.is_available():
+            raise ValueError("device is 'cuda', but no CUDA device is available")
+        return torch.device("cuda" if self.device != "cpu" and torch.cuda.is_available() else "cpu")

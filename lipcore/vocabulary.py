@@ -1,0 +1,42 @@
+"""The names that things go by in models, data and answers. It loads no numerics: clients name things too."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+JointType = Literal["revolute", "prismatic"]
+JOINT_TYPES: tuple[JointType, ...] = get_args(JointType)
+
+TorqueConvention = Literal["gravity_included", "gravity_compensated"]
+"""What a torque means: all of it (Franka's `tau_J`), or what is added to gravity compensation (its commands)."""
+TORQUE_CONVENTIONS: tuple[TorqueConvention, ...] = get_args(TorqueConvention)
+
+EffortMeaning = Literal["measured", "commanded", "current", "unknown"]
+"""Measured torque, gravity included; commanded torque, what is added to gravity compensation; motor current, A."""
+
+ComponentName = Literal[
+    "inertia_matrix",
+    "coriolis",
+    "gravity",
+    "inertial",
+    "friction",
+    "kinetic_energy",
+    "potential_energy",
+    "forward_dynamics",
+]
+COMPONENTS: tuple[ComponentName, ...] = get_args(ComponentName)
+
+DEFAULT_ESTIMATOR = "lip-chain"
+ROBOT_ESTIMATORS = ("rigid-body", "rigid-body+lip-chain")
+"""Estimators with the term `rigid_body`, which needs a robot."""
+
+Prior = Literal["urdf", "zero"]
+PRIORS: tuple[Prior, ...] = get_args(Prior)
+"""What inertial parameters are expected to be before the data speak: those of the URDF, or none."""
+
+CODES = ("learnt", "non_finite", "limit", "time_jump", "saturation", "stationary", "contact", "change", "edge")
+"""What may become of a row. All but the first keep it out of learning: a number that is not finite; a position,
+velocity, acceleration or torque beyond its limit; time that goes backwards or leaps; torque at its actuator's limit; a
+robot at rest, whose stiction hides its torque; a contact; a changed robot whose owner has not decided yet; the edge of
+a recording, where an acceleration cannot be derived."""
+LEARNT = 0
