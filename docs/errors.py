@@ -20,6 +20,11 @@ what was `expected`. Below `/v2` the Open Inference Protocol sets the shape, `{"
 | 500 | read the service's log; `damaged_data` and `unreadable_version` name what is damaged |
 | all others | change the request |
 
+Where no answer comes at all, the request may have been done. Whatever is no POST can be sent again, and so can
+`predict`, `evaluate`, `compare`, `trace` and observations. Uploads, jobs and retries of jobs can where they carry the
+header `Idempotency-Key`, a name of the client's choice: they are done once, and what they made is answered each time.
+Another request under the same key is a conflict. The Python client does all of this by itself.
+
 """
 
 

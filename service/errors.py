@@ -255,7 +255,7 @@ async def _validation_error(request: Request, error: Exception) -> JSONResponse:
 
 
 def _explain(item: dict[str, Any]) -> Problem:
-    where = [part for part in item["loc"] if part not in ("body", "query", "path")]
+    where = [part for part in item["loc"] if part not in ("body", "query", "path", "header")]
     field = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in where).lstrip(".") or "body"
     kind, found, said = item["type"], item.get("input"), str(item["msg"])
     if kind == "json_invalid":

@@ -26,9 +26,13 @@ class Base(DeclarativeBase):
 
 
 class DatasetRow(Base):
-    """An uploaded data set; its samples lie in the file store under the same id."""
+    """An uploaded data set; its samples lie in the file store under the same id.
+
+    idempotency_key, request_digest: see `service.idempotency`; None where the client has given none.
+    """
 
     __tablename__ = "datasets"
+    __table_args__ = (Index("datasets_idempotency_key", "idempotency_key", unique=True),)
 
     seq: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
     id: Mapped[str] = mapped_column(String(40), unique=True)
@@ -39,6 +43,8 @@ class DatasetRow(Base):
     joint_names: Mapped[list[str]]
     rows: Mapped[int]
     report: Mapped[dict[str, Any]]
+    idempotency_key: Mapped[str | None] = mapped_column(String(100))
+    request_digest: Mapped[str | None] = mapped_column(String(64))
 
 
 class RobotRow(Base):
@@ -59,10 +65,11 @@ class JobRow(Base):
     """A training job: all of its state, written by the service and by the worker.
 
     history: what happened to it, oldest first, each {at, state, message}; retry_of: id of the job that it repeats;
-    request_id: of the request that queued it.
+    request_id: of the request that queued it; idempotency_key, request_digest: see `service.idempotency`.
     """
 
     __tablename__ = "jobs"
+    __table_args__ = (Index("jobs_idempotency_key", "idempotency_key", unique=True),)
 
     seq: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
     id: Mapped[str] = mapped_column(String(40), unique=True)
@@ -81,6 +88,8 @@ class JobRow(Base):
     history: Mapped[list[dict[str, Any]]] = mapped_column(default=list, server_default="[]")
     retry_of: Mapped[str | None] = mapped_column(String(40))
     request_id: Mapped[str | None] = mapped_column(String(64))
+    idempotency_key: Mapped[str | None] = mapped_column(String(100))
+    request_digest: Mapped[str | None] = mapped_column(String(64))
 
 
 class ModelRow(Base):

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from lipcore.model import TorqueConvention
 from lipcore.preparation.recipe import Recipe
+from lipcore.vocabulary import TorqueConvention
 
 Effort = Literal["measured", "commanded", "current"]
 """What the effort of a recording is: measured torque, gravity included; commanded torque, what is added to gravity

@@ -7,9 +7,9 @@ from typing import Annotated, Any
 
 from fastapi import Query
 
-from lipcore.model import TorqueConvention
 from lipcore.preparation.recipe import Filtering, Form, Recipe
 from lipcore.signals import CUTOFF
+from lipcore.vocabulary import TorqueConvention
 from service.datasets.options import Effort, ReadOptions, UploadOptions
 from service.errors import invalid_request
 from service.route import read_json

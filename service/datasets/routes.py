@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated
 
 from anyio import to_thread
@@ -26,6 +27,7 @@ from service.errors import (
     invalid_request,
     responses,
 )
+from service.idempotency import KeyHeader, identity
 from service.limits.upload import Kinds, receive_to
 from service.names import NameForPeople
 from service.pages import PageQuery
@@ -42,7 +44,7 @@ router = APIRouter(
     "",
     status_code=status.HTTP_201_CREATED,
     summary="Upload a recording",
-    responses=responses(InvalidDataError, InvalidRequestError, TooLargeError, UnsupportedMediaTypeError),
+    responses=responses(InvalidDataError, InvalidRequestError, TooLargeError, UnsupportedMediaTypeError, ConflictError),
     openapi_extra=UPLOAD_BODY,
 )
 async def upload(
@@ -51,13 +53,17 @@ async def upload(
     service: ServiceDep,
     options: Annotated[UploadOptions, Depends(upload_options)],
     name: Annotated[NameForPeople | None, Query(description="A name for people; the file's by default")] = None,
+    idempotency_key: KeyHeader = None,
 ) -> Dataset:
     """Validate a recording, prepare it and store it as an immutable data set, or say what is wrong and where."""
     path = service.files.upload()
     try:
         kind, file_name = await receive_to(request, path, KINDS, service.disk)
+        said = (sorted(request.query_params.multi_items()), kind, file_name)
+        named = await to_thread.run_sync(partial(identity, idempotency_key, *said, file=path))
+        called = name or file_name or "unnamed"
         dataset = await to_thread.run_sync(
-            store.add, service, path, kind, name or file_name or "unnamed", options, limiter=service.uploads
+            store.add, service, path, kind, called, options, named, limiter=service.uploads
         )
     finally:
         path.unlink(missing_ok=True)

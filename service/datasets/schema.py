@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import BaseModel, Field
 
-from lipcore.model import TorqueConvention
+from lipcore.vocabulary import TorqueConvention
 from service.datasets.report.schema import DatasetReport
 
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from sqlalchemy import select
 from sqlalchemy.exc import SQLAlchemyError
 
-from lipcore.motion import JointType
 from lipcore.profiles import Profile
 from lipcore.samples import Samples
+from lipcore.vocabulary import JointType
 from service import sample_file
 from service.context import Service
 from service.database import Database, DatasetRow, JobRow, now
@@ -26,20 +26,26 @@ from service.datasets.schema import Dataset, DatasetPage
 from service.datasets.staging import Staged, column, staging
 from service.errors import ConflictError, not_found
 from service.files import Files, new_id
+from service.idempotency import Identity, done, mark
 from service.pages import Page, newest
 from service.robots.store import profile_of
 from service.sample_file import PartOf
 from service.training.states import ACTIVE
 
 
-def add(service: Service, upload: Path, kind: str, name: str, options: UploadOptions) -> Dataset:
+def add(
+    service: Service, upload: Path, kind: str, name: str, options: UploadOptions, named: Identity | None = None
+) -> Dataset:
     """Read, check and prepare an upload, then store it: samples first, the row that makes them visible last.
 
-    Columns lie on disk meanwhile, below the uploads. Raise InvalidDataError, InvalidRequestError, TooLargeError or
-    StorageFullError.
+    Columns lie on disk meanwhile, below the uploads. named: the request, which is not done again where it was before.
+    Raise InvalidDataError, InvalidRequestError, TooLargeError, StorageFullError or ConflictError.
     """
     from service.datasets.formats.opening import open_table  # noqa: PLC0415 - pyarrow is 35 MiB, for uploads only
 
+    with service.database.session() as session:
+        if (before := done(session, DatasetRow, named)) is not None:
+            return _show(before)
     settings, disk = service.settings, service.disk
     profile = None if options.robot is None else profile_of(service.database, options.robot)
     with staging(service.files.uploads) as folder:
@@ -64,12 +70,17 @@ def add(service: Service, upload: Path, kind: str, name: str, options: UploadOpt
         rows=staged.rows,
         report=report,
     )
+    mark(row, named)
     try:
         with service.database.transaction() as session:
-            session.add(row)
-    except SQLAlchemyError:
+            if (before := done(session, DatasetRow, named)) is None:
+                session.add(row)
+    except (SQLAlchemyError, ConflictError):
         service.files.delete_samples(dataset)
         raise
+    if before is not None:  # the same request was faster on another connection
+        service.files.delete_samples(dataset)
+        return _show(before)
     return _show(row)
 
 

@@ -14,6 +14,7 @@ from service.database import Database, DatasetRow, JobRow, RobotRow, now
 from service.datasets import store
 from service.errors import BusyError, ConflictError, InvalidRequestError, invalid_request, not_found, problem
 from service.files import new_id
+from service.idempotency import Identity, done, mark
 from service.observability.context import request_id
 from service.pages import Page, newest
 from service.robots import store as robots
@@ -29,8 +30,13 @@ USUAL_WAIT_S, LONGEST_WAIT_S = 30, 3600
 """Seconds after which who finds the queue full may try again: where nothing is known of the jobs that run, and most."""
 
 
-def create(service: Service, request: JobRequest, retry_of: str | None = None) -> Job:
-    """Check a request, store it as a queued job and hand it to the queue. retry_of: the job that it repeats."""
+def create(service: Service, request: JobRequest, retry_of: str | None = None, named: Identity | None = None) -> Job:
+    """Check a request, store it as a queued job and hand it to the queue.
+
+    retry_of: the job that it repeats; named: the request, which is not done again where it was before.
+    """
+    if (before := done_before(service.database, named)) is not None:
+        return before
     _check_options(request.options, service.settings)
     if len(request.datasets) > service.settings.max_job_datasets:
         raise invalid_request("datasets", len(request.datasets), f"at most {service.settings.max_job_datasets}")
@@ -41,8 +47,10 @@ def create(service: Service, request: JobRequest, retry_of: str | None = None) -
     service.disk.require()  # for the version that will be made
     _check_estimator(service.database, request, rows[0].joint_names, joint_types)
     with service.database.transaction() as session:
+        if (row := done(session, JobRow, named)) is not None:  # the same request was faster on another connection
+            return shown(row)
         wanted = {**request.model_dump(mode="json"), "joint_types": joint_types}
-        job = add(session, service.settings, request.model, wanted, retry_of)
+        job = add(session, service.settings, request.model, wanted, retry_of, named)
         present = set(session.scalars(select(DatasetRow.id).where(DatasetRow.id.in_(request.datasets))))
         for dataset in request.datasets:
             if dataset not in present:  # deleted since it was checked
@@ -54,8 +62,20 @@ def create(service: Service, request: JobRequest, retry_of: str | None = None) -
     return shown(job)
 
 
+def done_before(database: Database, named: Identity | None) -> Job | None:
+    """The job that a request has made before, as it is now; None where it has not. Raise ConflictError."""
+    with database.session() as session:
+        row = done(session, JobRow, named)
+    return None if row is None else shown(row)
+
+
 def add(
-    session: Session, settings: Settings, model: str, request: dict[str, Any], retry_of: str | None = None
+    session: Session,
+    settings: Settings,
+    model: str,
+    request: dict[str, Any],
+    retry_of: str | None = None,
+    named: Identity | None = None,
 ) -> JobRow:
     """Add a queued job, to be handed to the queue once the session has committed; raise BusyError for a full queue."""
     waiting = session.scalar(select(func.count()).select_from(JobRow).where(JobRow.state == QUEUED)) or 0
@@ -76,6 +96,7 @@ def add(
         retry_of=retry_of,
         request_id=request_id.get(),
     )
+    mark(job, named)
     history.enter(job, QUEUED, "queued" if retry_of is None else f"queued to repeat job {retry_of}")
     session.add(job)
     return job

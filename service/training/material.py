@@ -10,9 +10,9 @@ import numpy as np
 from sqlalchemy import select
 
 import lipcore
-from lipcore.model import TorqueConvention
 from lipcore.samples import Array, Samples
 from lipcore.urdf import RigidBody
+from lipcore.vocabulary import TorqueConvention
 from service.database import Database, DatasetRow, VersionRow
 from service.files import Files
 from service.models.lineage import named

@@ -9,6 +9,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from service.context import ServiceDep
 from service.errors import BusyError, ConflictError, InvalidRequestError, NotFoundError, TooLargeError, responses
+from service.idempotency import KeyHeader, identity
 from service.pages import PageQuery
 from service.route import Route
 from service.training import events, jobs, retrying
@@ -23,11 +24,12 @@ router = APIRouter(
     "",
     status_code=status.HTTP_202_ACCEPTED,
     summary="Train a model",
-    responses=responses(NotFoundError, TooLargeError, BusyError),
+    responses=responses(NotFoundError, TooLargeError, BusyError, ConflictError),
 )
-def create(service: ServiceDep, request: JobRequest, response: Response) -> Job:
+def create(service: ServiceDep, request: JobRequest, response: Response, idempotency_key: KeyHeader = None) -> Job:
     """Queue a training job. It runs in another process and ends in a new version of the model."""
-    job = jobs.create(service, request)
+    named = identity(idempotency_key, "train", request.model_dump(mode="json", exclude_unset=True))
+    job = jobs.create(service, request, named=named)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job
 
@@ -70,8 +72,8 @@ def cancel(service: ServiceDep, job: str) -> Job:
     summary="Repeat a job that failed or was cancelled",
     responses=responses(NotFoundError, ConflictError, BusyError),
 )
-def retry(service: ServiceDep, job: str, response: Response) -> Job:
+def retry(service: ServiceDep, job: str, response: Response, idempotency_key: KeyHeader = None) -> Job:
     """Queue a new job with the same request; `retry_of` names the old one. What it needs must still be there."""
-    again = retrying.retry(service, job)
+    again = retrying.retry(service, job, identity(idempotency_key, "retry", job))
     response.headers["Location"] = f"/v1/jobs/{again.id}"
     return again

@@ -6,9 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from lipcore.estimators import DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS
-from lipcore.fitting import FitOptions
-from lipcore.motion import JointType
+from lipcore.fit_options import FitOptions
+from lipcore.vocabulary import DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS, JointType
 from service.models.schema import ModelName
 from service.training.holdout_schema import Holdout
 from service.training.states import JobState

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from lipcore.model import TorqueConvention
+from lipcore.vocabulary import TorqueConvention
 from service.datasets.mapping.recognition import AIM, CANONICAL, Family
 from service.datasets.mapping.robot import Robot
 from service.datasets.mapping.units import factor, is_current

@@ -8,8 +8,8 @@ from typing import Protocol
 
 import numpy as np
 
-from lipcore.motion import JointType
 from lipcore.samples import Array
+from lipcore.vocabulary import JointType
 
 
 class Profile(Protocol):

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
-from lipcore.motion import JointType
+from lipcore.vocabulary import JointType
 
 Verdict = Literal["well", "poorly", "not determined"]
 """How well the data tell a weight, see `DETERMINED` in excitation.py for the thresholds."""
