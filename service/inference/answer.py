@@ -19,10 +19,11 @@ from service.errors import InvalidRequestError, invalid_request
 from service.inference import checks, components
 from service.inference.loaded import Served
 from service.inference.schema import EvaluateRequest, EvaluateResponse, Interval, PredictRequest, Reliability
+from service.inference.stretches import stretches
 from service.inference.wire import Prediction
 from service.models import registry
 from service.training import holding_out
-from service.training.holding_out import CannotHoldOutError
+from service.training.holding_out import CannotHoldOutError, SetSplit
 
 Array = NDArray[np.float64]
 
@@ -101,12 +102,12 @@ class Measured:
 
     def in_training_of(self, served: Served) -> bool:
         """Whether a version has learnt from it or from part of it, or from the same samples uploaded another time."""
-        return not served.datasets.isdisjoint((self.id, self.sha256))
+        return served.has_learnt_from(self.id, self.sha256)
 
 
 def measured(service: Service, dataset: str, *versions: Served) -> Measured:
     """Read a data set for these versions; raise NotFoundError, or InvalidRequestError where it is of other joints."""
-    row = _fitting(service, dataset, *versions)
+    row = fitting(service, dataset, *versions)
     used = store.samples(service.files, row, service.settings.max_evaluation_samples)
     return Measured(row.id, row.sha256, row.rows, used)
 
@@ -114,24 +115,32 @@ def measured(service: Service, dataset: str, *versions: Served) -> Measured:
 def held_out(service: Service, dataset: str, served: Served) -> Measured:
     """Read what the training of a version has held out of a data set; as `measured`, and where it was nothing raise
     InvalidRequestError."""
-    row = _fitting(service, dataset, served)
-    version = registry.find(service.database, served.name, served.version)
-    split = holding_out.remembered(row, version.manifest["lineage"])
-    if split is None:
-        raise _not_held_out(f"version {served.version} has held nothing out of data set {row.id}")
+    row = fitting(service, dataset, served)
+    split = split_of(service, row, served)
     try:
         used = store.samples(service.files, row, service.settings.max_evaluation_samples, split.held_out)
     except CannotHoldOutError as error:
-        raise _not_held_out(str(error)) from None
+        raise not_held_out(str(error)) from None
     return Measured(row.id, row.sha256, split.rows, used)
 
 
-def _not_held_out(why: str) -> InvalidRequestError:
+def split_of(service: Service, row: DatasetRow, served: Served) -> SetSplit:
+    """How a data set was split for a version; raise InvalidRequestError where nothing of it was held out."""
+    version = registry.find(service.database, served.name, served.version)
+    split = holding_out.remembered(row, version.manifest["lineage"])
+    if split is None:
+        raise not_held_out(f"version {served.version} has held nothing out of data set {row.id}")
+    return split
+
+
+def not_held_out(why: str) -> InvalidRequestError:
+    """The error of a request for a part that there is not."""
     return invalid_request("part", "held_out", f"all, as {why}")
 
 
-def _fitting(service: Service, dataset: str, *versions: Served) -> DatasetRow:
-    """The row of a data set that has the joints of these versions and their torque convention."""
+def fitting(service: Service, dataset: str, *versions: Served) -> DatasetRow:
+    """The row of a data set; raise NotFoundError, or InvalidRequestError where its joints or its torque convention are
+    not those of these versions."""
     row = store.find(service.database, dataset)
     for served in versions:
         loaded = served.model
@@ -173,5 +182,6 @@ def evaluate(service: Service, model: str, request: EvaluateRequest) -> Evaluate
             for each, coverage, width in zip(LEVELS, metrics.coverages, metrics.widths, strict=True)
         ],
         reliability=Reliability(nominal=list(RELIABILITY_LEVELS), observed=metrics.reliability.T.tolist()),
+        stretches=stretches(used, answer.tau),
         in_training=whole and recorded.in_training_of(served),
     )

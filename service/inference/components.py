@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 
 from lipcore import dynamics
-from lipcore.dynamics import ComponentName
 from lipcore.model import TorqueModel
 from lipcore.motion import Motion
+from lipcore.vocabulary import ComponentName
 from service.errors import invalid_request
 from service.inference.schema import PredictRequest
 

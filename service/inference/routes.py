@@ -9,10 +9,11 @@ from fastapi import APIRouter, Response
 from starlette.types import Scope
 
 from service.context import Service, ServiceDep
-from service.errors import InvalidRequestError, NotFoundError, TooLargeError, responses
+from service.errors import DamagedDataError, InvalidRequestError, NotFoundError, TooLargeError, responses
 from service.hot import Reply, hot_route
-from service.inference import answer
+from service.inference import answer, trace
 from service.inference.schema import EvaluateRequest, EvaluateResponse, PredictRequest, PredictResponse
+from service.inference.trace_schema import TraceRequest, TraceResponse
 from service.inference.wire import decode, encode
 from service.route import Route, is_json
 
@@ -68,3 +69,14 @@ hot.add_api_route(
 async def evaluate(service: ServiceDep, model: str, request: EvaluateRequest) -> EvaluateResponse:
     """Error, coverage and density of the model's torques against measured ones, joint by joint."""
     return await to_thread.run_sync(answer.evaluate, service, model, request, limiter=service.predictions)
+
+
+@router.post("/{model}/trace", summary="Follow a model along a data set", responses=responses(DamagedDataError))
+async def trace_model(service: ServiceDep, model: str, request: TraceRequest) -> TraceResponse:
+    """Measured torque beside the model's, row by row, for a plot: mean, both standard deviations and components.
+
+    Where there are more rows than points, rows are chosen evenly. Each is shown as it was measured and predicted, and
+    the share of them outside the interval is fair, but a peak between two of them is missing: ask for fewer rows to
+    see all.
+    """
+    return await to_thread.run_sync(trace.trace, service, model, request, limiter=service.predictions)

@@ -18,8 +18,7 @@ from pydantic import (
     model_validator,
 )
 
-from lipcore.dynamics import COMPONENTS, ComponentName
-from lipcore.model import TorqueConvention
+from lipcore.vocabulary import COMPONENTS, ComponentName, TorqueConvention
 from service.errors import invalid_request
 from service.inference import checks
 from service.matrices import to_array
@@ -172,6 +171,20 @@ class Reliability(BaseModel):
     )
 
 
+class Stretches(BaseModel):
+    """How the error is spread over the recording: nMSE stretch by stretch, for a box plot."""
+
+    kind: Literal["episodes", "equal"] = Field(
+        description="`episodes` where the samples have 5 to 200 of them, else `equal`: ten stretches of as many samples"
+    )
+    samples: list[int] = Field(description="Samples compared of each stretch, in order of rows")
+    nmse: list[list[float | None]] = Field(
+        description="For each joint one list, like samples: mean squared error within the stretch / variance of the "
+        "measured torque over *all* samples compared, so that a stretch in which a joint hardly moves does not stand "
+        "out; weighted by `samples` they average to the joint's `nmse`. null where the torque does not vary"
+    )
+
+
 class EvaluateResponse(BaseModel):
     """Figures per joint. nmse is null for a joint whose measured torque does not vary."""
 
@@ -191,6 +204,7 @@ class EvaluateResponse(BaseModel):
     interval_width: list[float] = Field(description="Mean width of the interval, N·m")
     coverages: list[Interval] = Field(description="Coverage and width of the 50, 80, 95 and 99 % intervals")
     reliability: Reliability
+    stretches: Stretches
     in_training: bool = Field(
         description="Whether the model was trained on these samples: then the figures flatter. Not on what it held out"
     )

@@ -31,6 +31,10 @@ class Served:
     datasets: frozenset[str]
     revision: int = 0
 
+    def has_learnt_from(self, dataset: str, sha256: str) -> bool:
+        """Whether it was trained on a data set or part of it, or on the same samples uploaded another time."""
+        return not self.datasets.isdisjoint((dataset, sha256))
+
     @cached_property
     def noise_std(self) -> list[float]:
         """Standard deviation of the measured torque around the function, (n,) N·m, as answers carry it."""

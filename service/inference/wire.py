@@ -9,8 +9,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from lipcore.dynamics import ComponentName
-from lipcore.model import TorqueConvention
+from lipcore.vocabulary import ComponentName, TorqueConvention
 from service.inference.schema import PredictRequest
 from service.models.schema import ALIAS
 from service.route import each_once
