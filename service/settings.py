@@ -102,6 +102,7 @@ class Settings(BaseSettings):
     stream_idle_s: float = Field(3600.0, gt=0, description="Seconds without a frame after which a stream is closed.")
     stream_write_s: float = Field(10.0, gt=0, description="Longest wait in s for a client to read an answer.")
     max_evaluation_samples: Count = Field(5000, description="Most samples of one evaluation; more are thinned evenly.")
+    max_trace_points: Count = Field(2000, description="Most rows of one trace of a model along a data set.")
     max_page: Count = Field(100, description="Most items of one page of a list.")
     max_job_datasets: Count = Field(100, description="Most data sets of one training job.")
     max_hyperparameter_samples: Count = Field(500, description="Most samples that hyperparameters are fitted on.")
@@ -192,6 +193,10 @@ class Settings(BaseSettings):
         120.0, gt=0, description="Time in s that a training process may take to start; then it is killed."
     )
     max_job_s: float = Field(86400.0, gt=0, description="Longest that one attempt at a job may run, s; then it fails.")
+    max_live_followers: Count = Field(20, description="Most readers that follow models live; more are answered 429.")
+    live_rows_per_s: Count = Field(
+        50, description="Rows a second that those who follow a model are shown; all are counted."
+    )
     max_job_followers: Count = Field(100, description="Most streams of jobs' events at a time; more are answered 429.")
     serving_threads: Count = Field(1, description="Threads of one prediction.")
     max_concurrent_predictions: Count = Field(2, description="Predictions computed at the same time.")

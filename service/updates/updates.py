@@ -20,6 +20,7 @@ from service.updates.ingest.threads import IngestThreads
 from service.updates.learner import publication
 from service.updates.learner.messages import Contested, Failed, Message, Published
 from service.updates.learner.process import LearnerProcess, learner_place
+from service.updates.live.feed import Feed
 from service.updates.quality.monitor import Monitor
 from service.updates.schema import ObservationRequest, ObservationResponse
 
@@ -38,9 +39,9 @@ class Status:
 class Updates:
     """Learning of all models; safe from several threads. Close it before the database.
 
-    learner: the process that learns. threads: which take batches. when_published, when_contested: called
-    with each such message of the learner, in a thread of its own, after a revision answers; to be filled before the
-    first batch comes.
+    learner: the process that learns. threads: which take batches. live: who follows models. when_published,
+    when_contested: called with each such message of the learner, in a thread of its own, after a revision answers; to
+    be filled before the first batch comes.
     """
 
     def __init__(self, settings: Settings, database: Database, files: Files, loaded: LoadedModels, disk: Disk) -> None:
@@ -53,7 +54,8 @@ class Updates:
         self._said: dict[tuple[str, int], Status] = {}
         self.learner = LearnerProcess(settings, self._hear)
         loaded.learn_from(self.learner.wake)
-        self._ingest = Ingest(settings, database, loaded, self._monitor, self.learner.wake, disk)
+        self.live = Feed(settings)
+        self._ingest = Ingest(settings, database, loaded, self._monitor, self.learner.wake, disk, self.live.note)
 
     def close(self) -> None:
         """Finish the batches that have begun, and end the learner process, which stores what it knows."""

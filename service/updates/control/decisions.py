@@ -16,7 +16,7 @@ from service.pages import Page
 from service.updates import learning
 from service.updates.control import replaying, revisions
 from service.updates.control.learning_schema import Alarm, AlarmPage, ChangeRequest, Decided
-from service.updates.learning import LearningOptions
+from service.updates.learning_options import LearningOptions
 from service.updates.storage import alarms, log
 
 CHANGE = "change"

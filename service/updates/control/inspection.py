@@ -10,9 +10,10 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from lipcore.online.batch import CODES, Rows
+from lipcore.online.batch import Rows
 from lipcore.online.record import Record
 from lipcore.samples import Array
+from lipcore.vocabulary import CODES
 from service.context import Service
 from service.database import EventRow
 from service.errors import NotFoundError, not_found

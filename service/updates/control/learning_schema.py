@@ -7,7 +7,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.updates.control.schema import Revised
-from service.updates.learning import LearningOptions
+from service.updates.learning_options import LearningOptions
 
 
 class Stream(BaseModel):

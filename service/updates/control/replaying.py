@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
-from lipcore.online.batch import CODES, LEARNT, Rows
+from lipcore.online.batch import Rows
+from lipcore.vocabulary import CODES, LEARNT
 from service.context import Service
 from service.database import EventRow
 from service.errors import ConflictError, invalid_request

@@ -29,7 +29,7 @@ from service.updates.control.schema import (
     RolledBack,
     Unlearnt,
 )
-from service.updates.learning import LearningOptions
+from service.updates.learning_options import LearningOptions
 from service.updates.quality import summary
 from service.updates.schema import MOST_SEQUENCE, StreamId
 

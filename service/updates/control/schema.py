@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchema
 
-from lipcore.online.batch import CODES, LEARNT
 from lipcore.online.record import LEVEL
+from lipcore.vocabulary import CODES, LEARNT
 from service.errors import invalid_request
 from service.models.schema import VersionNumber
 from service.updates.schema import MOST_SEQUENCE, State

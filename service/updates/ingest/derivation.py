@@ -16,8 +16,9 @@ from sqlalchemy.orm import Session, undefer
 
 from lipcore.online import acceleration
 from lipcore.online.acceleration import JITTER, RateError, derive
-from lipcore.online.batch import CODES, Rows
+from lipcore.online.batch import Rows
 from lipcore.samples import Array
+from lipcore.vocabulary import CODES
 from service.database import EventRow
 from service.errors import invalid_request
 from service.updates.storage import payload

@@ -25,7 +25,8 @@ from service.updates.ingest.clock import Clock
 from service.updates.ingest.judging import Verdict
 from service.updates.ingest.parsing import Measured, measured
 from service.updates.ingest.screening import Screened
-from service.updates.learning import LearningOptions
+from service.updates.learning_options import LearningOptions
+from service.updates.live.thinning import Judged
 from service.updates.quality.monitor import Monitor
 from service.updates.schema import Derivation, ObservationRequest, ObservationResponse
 from service.updates.storage import alarms, log
@@ -66,6 +67,7 @@ class Ingest:
     """Takes batches of observations; safe from several threads, not for the event loop.
 
     monitor: gives the monitor of a model that is served. wake: tells the learner that a model's log has grown.
+    show: tells those who follow a model of a batch that is durable.
     """
 
     def __init__(
@@ -76,9 +78,10 @@ class Ingest:
         monitor: Callable[[Served], Monitor],
         wake: Callable[[str], None],
         disk: Disk,
+        show: Callable[[Judged], None],
     ) -> None:
         self.settings, self.database, self.loaded, self.disk = settings, database, loaded, disk
-        self._monitor, self._wake = monitor, wake
+        self._monitor, self._wake, self._show = monitor, wake, show
 
     def observe(self, model: str, request: ObservationRequest) -> ObservationResponse:
         """Take a batch; once this returns it is durable.
@@ -193,6 +196,7 @@ class Ingest:
             }
             event.report = report
         monitor.note(arrival.stream_id, verdict, report, arrival.received)
+        self._show(Judged(served, arrival.stream_id, verdict.rows, screened))
         return report
 
     def follow_up(self, monitor: Monitor, model: str) -> None:

@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from lipcore.online.batch import CODES, LEARNT, Rows
+from lipcore.online.batch import Rows
 from lipcore.online.change import RATIO, Change, ChangeDetector, friction_share
 from lipcore.online.gates import is_contact
 from lipcore.online.record import Record
 from lipcore.samples import Array
+from lipcore.vocabulary import CODES, LEARNT
 from service.updates.ingest.contacts import ContactGate
 from service.updates.ingest.screening import Screened
-from service.updates.learning import LearningOptions
+from service.updates.learning_options import LearningOptions
 
 CONTACT, CHANGE = CODES.index("contact"), CODES.index("change")
 MOST_INNOVATIONS = 1000

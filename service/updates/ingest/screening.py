@@ -10,15 +10,16 @@ from sqlalchemy.orm import Session
 
 from lipcore.model import TorqueModel
 from lipcore.online import spacing
-from lipcore.online.batch import CODES, LEARNT, Rows
+from lipcore.online.batch import Rows
 from lipcore.online.gates import Limits, check_rows
 from lipcore.samples import Array
+from lipcore.vocabulary import CODES, LEARNT
 from service.settings import Settings
 from service.updates.ingest import derivation
 from service.updates.ingest.clock import Clock, span
 from service.updates.ingest.derivation import EDGE
 from service.updates.ingest.parsing import Measured
-from service.updates.learning import LearningOptions
+from service.updates.learning_options import LearningOptions
 from service.updates.schema import DerivedAcceleration
 
 NON_FINITE, LIMIT, TIME_JUMP = (CODES.index(code) for code in ("non_finite", "limit", "time_jump"))

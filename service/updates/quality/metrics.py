@@ -9,7 +9,7 @@ from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 from sqlalchemy import select
 
-from lipcore.online.batch import CODES
+from lipcore.vocabulary import CODES
 from service.context import Service
 from service.database import StreamRow
 from service.inference.loaded import Served

@@ -12,9 +12,9 @@ import numpy as np
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from lipcore.online.batch import CODES, LEARNT
 from lipcore.online.change import ChangeDetector
 from lipcore.online.record import Record
+from lipcore.vocabulary import CODES, LEARNT
 from service.database import EventRow
 from service.settings import Settings
 from service.updates.ingest.contacts import ContactGate

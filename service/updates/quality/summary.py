@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 
-from lipcore.online.batch import CODES, LEARNT
 from lipcore.online.record import Record
+from lipcore.vocabulary import CODES, LEARNT
 from service.context import Service
 from service.updates.control.schema import Figures, Quality, QualityWindow
 from service.updates.quality.windows import Window

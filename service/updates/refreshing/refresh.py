@@ -12,6 +12,7 @@ from sqlalchemy.orm import Session
 
 from service.database import AlarmRow, Database, JobRow, LearnerRow, ServingRow, VersionRow
 from service.errors import BusyError, ConflictError, not_found
+from service.idempotency import Identity, done
 from service.models import registry
 from service.settings import Settings
 from service.training import jobs
@@ -38,16 +39,19 @@ def ask(
     model: str,
     trigger: Trigger = "asked",
     retry_of: str | None = None,
+    named: Identity | None = None,
 ) -> Job:
     """Queue a refresh of the version that serves; return its job. Not for the event loop.
 
-    retry_of: the job that it repeats.
+    retry_of: the job that it repeats; named: the request, where its client has named it.
     Raise NotFoundError, BusyError for a full queue, ConflictError where a refresh of the model is under way or there is
     nothing to train on.
     """
     version = registry.find(database, model, None)
     with database.transaction() as session:
-        job = _queue(session, settings, version, trigger, retry_of)
+        if (before := done(session, JobRow, named)) is not None:
+            return jobs.shown(before)
+        job = _queue(session, settings, version, trigger, retry_of, named)
     queue.submit(job.id)
     return jobs.shown(job)
 
@@ -89,7 +93,12 @@ def consider(settings: Settings, database: Database, queue: JobQueue, published:
 
 
 def _queue(
-    session: Session, settings: Settings, version: VersionRow, trigger: Trigger, retry_of: str | None = None
+    session: Session,
+    settings: Settings,
+    version: VersionRow,
+    trigger: Trigger,
+    retry_of: str | None = None,
+    named: Identity | None = None,
 ) -> JobRow:
     """Add the job of a refresh; raise ConflictError or BusyError."""
     model, manifest = version.model, version.manifest
@@ -113,7 +122,7 @@ def _queue(
         "options": manifest["options"],
         "refresh": {"version": version.version, "through": through, "trigger": trigger},
     }
-    return jobs.add(session, settings, model, request, retry_of)
+    return jobs.add(session, settings, model, request, retry_of, named)
 
 
 def _nothing(version: VersionRow, rows: int, left_out: list[dict[str, str]], least: int) -> str:

@@ -14,7 +14,8 @@ import numpy as np
 from sqlalchemy import Select, delete, func, select, update
 from sqlalchemy.orm import Session, undefer
 
-from lipcore.online.batch import CODES, LEARNT, Rows
+from lipcore.online.batch import Rows
+from lipcore.vocabulary import CODES, LEARNT
 from service.database import EventRow, LearnerRow, LearningRow, SnapshotRow, StreamRow, now
 from service.errors import BusyError, ConflictError
 from service.pages import Page

@@ -1,0 +1,1 @@
+"""What a model's streams measure and what it predicted, for people who watch."""
