@@ -1,0 +1,20 @@
+"""Python client of the service."""
+
+from service.client.asynchronous import AsyncClient
+from service.client.errors import ApiError, ServiceUnreachableError
+from service.client.results import Comparison, Component, Evaluation, LiveRows, Prediction, Preview, Trace
+from service.client.sync import Client
+
+__all__ = [
+    "ApiError",
+    "AsyncClient",
+    "Client",
+    "Comparison",
+    "Component",
+    "Evaluation",
+    "LiveRows",
+    "Prediction",
+    "Preview",
+    "ServiceUnreachableError",
+    "Trace",
+]

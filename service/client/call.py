@@ -1,0 +1,149 @@
+"""What a client asks and how it reads the answer, without any transport: each route of the API is one function.
+
+`route` makes such a function of one that says what goes into a request; `Client` and `AsyncClient` are made of them.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import wraps
+from pathlib import Path
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
+from urllib.parse import quote
+
+from pydantic import BaseModel
+
+P = ParamSpec("P")
+T = TypeVar("T")
+Record = TypeVar("Record", bound=BaseModel)
+
+ROUTES: dict[tuple[str, str], str] = {}
+"""(method, path as in the OpenAPI document) of every route that there is a call of, and the call's name."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What came back. body: of the whole answer, or the data of one server-sent event, whose kind is `event`; empty
+    where it was written to a file."""
+
+    status: int
+    body: bytes
+    headers: Mapping[str, str] = field(default_factory=dict)
+    event: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Call(Generic[T]):
+    """One request, and `read`, which makes its result of the answer.
+
+    path: filled in and quoted; json: body as JSON, content: as bytes, file: as those of a file; repeatable: whether it
+    may be sent again when its answer is lost; removes: repeated, it has succeeded where nothing is found any more;
+    timeout: longest wait for the answer in s, that of the client where None; save_to: file that the answer is written
+    to, whole or not at all; shown: what a progress bar says, none where None.
+    """
+
+    method: str
+    path: str
+    read: Callable[[Answer], T]
+    params: Mapping[str, Any] = field(default_factory=dict)
+    headers: Mapping[str, str] = field(default_factory=dict)
+    json: Any = None
+    content: bytes | None = None
+    file: Path | None = None
+    repeatable: bool = False
+    removes: bool = False
+    timeout: float | None = None
+    save_to: Path | None = None
+    shown: str | None = None
+
+    def after(self, cursor: str) -> Call[T]:
+        """The same call for the page after another one."""
+        return replace(self, params={**self.params, "cursor": cursor})
+
+
+@dataclass(frozen=True)
+class Page(Generic[T]):
+    """Part of a list. following: cursor of the next part, None on the last."""
+
+    items: list[T]
+    following: str | None
+
+
+@dataclass(frozen=True)
+class Route:
+    """A method and the paths it goes to: of several the one whose names in braces are given."""
+
+    method: str
+    paths: tuple[str, ...]
+    repeatable: bool
+
+    def __call__(self, read: Callable[[Answer], T], *, names: Mapping[str, Any], **asked: Any) -> Call[T]:
+        """Make the call. names: what stands for the names in braces, None where a name is not given; asked: see `Call`,
+        `params` that are None are left out."""
+        given = {name: str(value) for name, value in names.items() if value is not None}
+        path = next(path for path in self.paths if set(_NAMES.findall(path)) == set(given))
+        filled = path.format_map({name: quote(value, safe="") for name, value in given.items()})
+        params = {name: value for name, value in asked.pop("params", {}).items() if value is not None}
+        return Call(
+            method=self.method, path=filled, read=read, params=params, **{"repeatable": self.repeatable, **asked}
+        )
+
+
+_NAMES = re.compile(r"{(\w+)}")
+
+
+def route(
+    method: str, *paths: str, repeatable: bool | None = None
+) -> Callable[[Callable[Concatenate[Route, P], Call[T]]], Callable[P, Call[T]]]:
+    """Make a call of a function that is given its route first.
+
+    repeatable: whether it may be sent again when its answer is lost; where None, what is no POST may.
+    """
+    at = Route(method, paths, method != "POST" if repeatable is None else repeatable)
+
+    def decorate(make: Callable[Concatenate[Route, P], Call[T]]) -> Callable[P, Call[T]]:
+        @wraps(make)
+        def made(*args: P.args, **kwargs: P.kwargs) -> Call[T]:
+            return make(at, *args, **kwargs)
+
+        signature = inspect.signature(make)
+        _, *rest = signature.parameters.values()
+        made.__signature__ = signature.replace(parameters=rest)  # type: ignore[attr-defined]  # what `help` shows
+        for path in paths:
+            ROUTES[method, path] = make.__name__
+        return made
+
+    return decorate
+
+
+def record(kind: type[Record]) -> Callable[[Answer], Record]:
+    """Read a record of the API."""
+    return lambda answer: kind.model_validate_json(answer.body)
+
+
+def page(kind: type[Record]) -> Callable[[Answer], Page[Record]]:
+    """Read one page of a list of records."""
+
+    def read(answer: Answer) -> Page[Record]:
+        found = json.loads(answer.body)
+        return Page([kind.model_validate(item) for item in found["items"]], found.get("next_cursor"))
+
+    return read
+
+
+def document(answer: Answer) -> Any:
+    """Read JSON as it is."""
+    return json.loads(answer.body)
+
+
+def nothing(answer: Answer) -> None:
+    """Read an answer that says nothing."""
+
+
+def given(**values: Any) -> dict[str, Any]:
+    """Those of the values that are not None."""
+    return {name: value for name, value in values.items() if value is not None}

@@ -1,0 +1,101 @@
+"""Calls about models, their versions, aliases and archives."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from service.client.call import Answer, Call, Page, Route, given, nothing, page, record, route
+from service.models.alias_schema import Alias, AliasList
+from service.models.schema import Model, Version
+
+ARCHIVE_TIMEOUT = 600.0
+"""Longest wait for an archive to be packed or checked, s."""
+
+
+@route("GET", "/v1/models")
+def models(at: Route) -> Call[Page[Model]]:
+    """All models with their versions, newest first."""
+    return at(page(Model), names={})
+
+
+@route("GET", "/v1/models/{model}")
+def model(at: Route, model: str) -> Call[Model]:
+    """A model with its versions."""
+    return at(record(Model), names={"model": model})
+
+
+@route("DELETE", "/v1/models/{model}")
+def delete_model(at: Route, model: str) -> Call[None]:
+    """Delete a model with all that it has observed and learnt, for good."""
+    return at(nothing, names={"model": model}, removes=True)
+
+
+@route("GET", "/v1/models/{model}/versions/{version}")
+def version(at: Route, model: str, version: int) -> Call[Version]:
+    """One version of a model."""
+    return at(record(Version), names={"model": model, "version": version})
+
+
+@route("DELETE", "/v1/models/{model}/versions/{version}")
+def delete_version(at: Route, model: str, version: int) -> Call[None]:
+    """Delete a version that nothing needs, for good."""
+    return at(nothing, names={"model": model, "version": version}, removes=True)
+
+
+@route("GET", "/v1/models/{model}/aliases")
+def aliases(at: Route, model: str) -> Call[list[Alias]]:
+    """Every alias of a model, `serving` first."""
+    return at(lambda answer: AliasList.model_validate_json(answer.body).items, names={"model": model})
+
+
+@route("PUT", "/v1/models/{model}/aliases/{alias}")
+def set_alias(at: Route, model: str, alias: str, version: int | str) -> Call[Alias]:
+    """Point an alias to a version, or to where another alias points; `serving` answers where none is named."""
+    body = {"alias": version} if isinstance(version, str) else {"version": version}
+    return at(record(Alias), names={"model": model, "alias": alias}, json=body)
+
+
+@route("DELETE", "/v1/models/{model}/aliases/{alias}")
+def remove_alias(at: Route, model: str, alias: str) -> Call[None]:
+    """Remove an alias; its version stays."""
+    return at(nothing, names={"model": model, "alias": alias}, removes=True)
+
+
+@route("POST", "/v1/models/{model}/aliases/{alias}/rollback")
+def rollback_alias(at: Route, model: str, alias: str) -> Call[Alias]:
+    """Take back the last move of an alias, the next time the one before it."""
+    return at(record(Alias), names={"model": model, "alias": alias})
+
+
+@route("GET", "/v1/models/{model}/export")
+def export(
+    at: Route, model: str, path: Path | str, version: int | None = None, alias: str | None = None, learnt: bool = True
+) -> Call[Path]:
+    """Write a version as an archive to `path`, whole or not at all, and return it; see `import_model`.
+
+    The version that serves, unless one is named. learnt: with what it has learnt online, else as it was trained.
+    """
+    path = Path(path)
+
+    def read(answer: Answer) -> Path:
+        return path
+
+    params = given(version=version, alias=alias) | {"learnt": learnt}
+    return at(read, names={"model": model}, params=params, save_to=path, timeout=ARCHIVE_TIMEOUT)
+
+
+@route("POST", "/v1/models/import")
+def import_model(at: Route, path: Path | str, name: str | None = None) -> Call[Version]:
+    """Make a new version of an archive that a service has exported; raise ApiError where it is refused.
+
+    name: of the model, that of the archive by default. The version answers where the model had none before.
+    """
+    headers = {"content-type": "application/x-tar"}
+    return at(
+        record(Version),
+        names={},
+        params=given(name=name),
+        headers=headers,
+        file=Path(path),
+        timeout=ARCHIVE_TIMEOUT,
+    )

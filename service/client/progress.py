@@ -1,0 +1,84 @@
+"""Progress of uploads and training jobs in a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeElapsedColumn, TransferSpeedColumn
+
+from service.training.schema import Job
+from service.training.states import ACTIVE
+
+if TYPE_CHECKING:  # which shows its progress with this
+    from service.client.sync import Client
+
+PLAIN_EVERY = 5.0
+"""Seconds between two lines where the console is no terminal."""
+
+
+@contextmanager
+def job_bar(console: Console | None = None) -> Iterator[Callable[[Job], None]]:
+    """A bar, to be called with every look at a job; lines every five seconds where the console is no terminal.
+
+    console: that of standard error where None.
+    """
+    console = console or Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+    )
+    printed = -PLAIN_EVERY
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("waiting", total=1.0)
+
+        def show(seen: Job) -> None:
+            nonlocal printed
+            at = seen.progress
+            objective = "" if at.objective is None else f" objective {at.objective:.1f}"
+            text = f"{at.stage} {at.iteration}/{at.max_iterations}{objective}" if at.iteration else at.stage
+            if at.remaining_s:
+                text += f", at most about {at.remaining_s:.0f} s left"
+            bar.update(task, description=text, completed=at.fraction)
+            if not console.is_terminal and (at.elapsed_s - printed >= PLAIN_EVERY or seen.state not in ACTIVE):
+                printed = at.elapsed_s
+                console.print(f"  {at.elapsed_s:5.1f} s  {at.fraction:4.0%}  {text}", highlight=False)
+
+        yield show
+
+
+@contextmanager
+def upload_bar(
+    text: str, size: int, console: Console | None = None
+) -> Iterator[Callable[[Iterator[bytes]], Iterator[bytes]]]:
+    """A bar that shows how much of `size` bytes has passed the iterator that it is wrapped around.
+
+    When all has been sent, the service still has to read and prepare it: the bar says so.
+    """
+    console = console or Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task(text, total=size)
+
+        def passed(content: Iterator[bytes]) -> Iterator[bytes]:
+            for piece in content:
+                yield piece
+                bar.update(task, advance=len(piece))
+            bar.update(task, description=f"{text}: sent, being read")
+
+        yield passed
+
+
+def follow(client: Client, job: Job, console: Console) -> Job:
+    """Show a job's progress until it ends; Ctrl-C cancels it. Return the job as it ended."""
+    try:
+        with job_bar(console) as show:
+            return client.wait(job.id, show)
+    except KeyboardInterrupt:
+        console.print("cancelling…")
+        client.cancel(job.id)
+        return client.wait(job.id)

@@ -1,0 +1,23 @@
+"""Results whose numbers are arrays."""
+
+from service.client.results.evaluation import Comparison, Evaluation, Interval, Reliability, VersionFigures
+from service.client.results.live import Live, LivePart, LiveRows
+from service.client.results.prediction import Component, Prediction
+from service.client.results.preview import Preview, PreviewColumn
+from service.client.results.trace import Trace
+
+__all__ = [
+    "Comparison",
+    "Component",
+    "Evaluation",
+    "Interval",
+    "Live",
+    "LivePart",
+    "LiveRows",
+    "Prediction",
+    "Preview",
+    "PreviewColumn",
+    "Reliability",
+    "Trace",
+    "VersionFigures",
+]

@@ -1,0 +1,213 @@
+"""How well a version predicts a data set, and how two of them differ."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from service.client.call import Answer
+from service.client.results.arrays import Array, Plain, array
+from service.client.results.table import figure, html_table, text_table
+from service.models.comparison_schema import Outcome
+
+
+@dataclass(frozen=True, eq=False)
+class Interval(Plain):
+    """What the central intervals of one probability hold. level: that probability; coverage: (n) share of measurements
+    inside, noise included; interval_width: (n) mean width, N·m."""
+
+    level: float
+    coverage: Array
+    interval_width: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Reliability(Plain):
+    """nominal: (K) probabilities that intervals promise; observed: (n, K) shares of measurements inside."""
+
+    nominal: Array
+    observed: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Stretches(Plain):
+    """How the error is spread over the recording. kind: stretches are `episodes`, or ten `equal` ones; samples: (S)
+    compared of each; nmse: (n, S) mean squared error within the stretch / variance of the torque over all samples."""
+
+    kind: str
+    samples: NDArray[np.int64]
+    nmse: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation(Plain):
+    """Figures per joint, (n) each; `print` shows them as a table, `rows` lists them.
+
+    samples: of the data set or the part; samples_used: that were compared; nmse: mean squared error / variance of the
+    measured torque, NaN where that does not vary; rmse: N·m; coverage: share of measurements inside the interval of
+    probability `level`, noise included; nlpd: mean negative log predictive density, nats; interval_width: N·m;
+    in_training: whether the model was trained on these samples: then the figures flatter.
+    """
+
+    model: str
+    version: int
+    revision: int
+    dataset: str
+    part: str
+    joint_names: tuple[str, ...]
+    samples: int
+    samples_used: int
+    level: float
+    nmse: Array
+    rmse: Array
+    coverage: Array
+    nlpd: Array
+    interval_width: Array
+    coverages: tuple[Interval, ...]
+    reliability: Reliability
+    stretches: Stretches
+    in_training: bool
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One dictionary a joint, as for `pandas.DataFrame(evaluation.rows())`."""
+        figures = {name: getattr(self, name).tolist() for name in _FIGURES}
+        return [
+            {"joint": joint, **{name: values[at] for name, values in figures.items()}}
+            for at, joint in enumerate(self.joint_names)
+        ]
+
+    @property
+    def title(self) -> str:
+        """What was compared with what, and whether that flatters."""
+        what = "held-out samples" if self.part == "held_out" else "samples"
+        unseen = "" if not self.in_training else ", which it was trained on: these figures flatter"
+        return f"{self.model} version {self.version} on {self.samples_used} {what} of {self.dataset}{unseen}"
+
+    def __str__(self) -> str:
+        return text_table(self.title, self._columns())
+
+    def _repr_html_(self) -> str:
+        return html_table(self.title, self._columns())
+
+    def _columns(self) -> dict[str, list[str]]:
+        heads = {
+            "nMSE": (self.nmse, ".2e"),
+            "RMSE N·m": (self.rmse, ".4f"),
+            f"coverage of {self.level:.0%}": (self.coverage, ".1%"),
+            "width N·m": (self.interval_width, ".3f"),
+            "NLPD nats": (self.nlpd, ".3f"),
+        }
+        cells = {head: [figure(each, form) for each in values] for head, (values, form) in heads.items()}
+        return {"joint": list(self.joint_names), **cells}
+
+
+_FIGURES = ("nmse", "rmse", "coverage", "nlpd", "interval_width")
+
+
+def read_evaluation(answer: Answer) -> Evaluation:
+    """Read the answer to `evaluate`."""
+    said = msgspec.json.decode(answer.body)
+    found: dict[str, Any] = {name: said[name] for name in _NAMED} | {name: array(said[name]) for name in _FIGURES}
+    return Evaluation(
+        **found,
+        joint_names=tuple(said["joint_names"]),
+        coverages=tuple(
+            Interval(each["level"], array(each["coverage"]), array(each["interval_width"]))
+            for each in said["coverages"]
+        ),
+        reliability=Reliability(array(said["reliability"]["nominal"]), array(said["reliability"]["observed"])),
+        stretches=Stretches(
+            said["stretches"]["kind"],
+            np.array(said["stretches"]["samples"], np.int64),
+            array(said["stretches"]["nmse"]),
+        ),
+    )
+
+
+_NAMED = ("model", "version", "revision", "dataset", "part", "samples", "samples_used", "level", "in_training")
+
+
+@dataclass(frozen=True, eq=False)
+class VersionFigures(Plain):
+    """Figures of one version, (n) each; see `Evaluation`."""
+
+    version: int
+    revision: int
+    nmse: Array
+    rmse: Array
+    coverage: Array
+    nlpd: Array
+    interval_width: Array
+    in_training: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Difference(Plain):
+    """The second version's figure less the first's: (n), or () over all joints; NaN where it cannot be told.
+
+    standard_error: of the paired difference; half_width: half the width of its 95 % interval.
+    """
+
+    difference: Array
+    standard_error: Array
+    half_width: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison(Plain):
+    """Two versions on one data set.
+
+    blocks: stretches that standard errors stand on; differences: per joint by figure; nlpd, nmse: over all joints;
+    outcome and better: which version is better by its predictive density, None where none is; verdict: in words;
+    warnings: what makes the comparison unfair.
+    """
+
+    model: str
+    dataset: str
+    joint_names: tuple[str, ...]
+    samples: int
+    samples_used: int
+    blocks: int
+    versions: tuple[VersionFigures, VersionFigures]
+    differences: Mapping[str, Difference]
+    nlpd: Difference
+    nmse: Difference
+    outcome: Outcome
+    better: int | None
+    verdict: str
+    warnings: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return "\n".join([self.verdict, *(f"careful: {warning}" for warning in self.warnings)])
+
+
+def read_comparison(answer: Answer) -> Comparison:
+    """Read the answer to `compare`."""
+    said = msgspec.json.decode(answer.body)
+    first, second = (_figures(each) for each in said["versions"])
+    return Comparison(
+        **{name: said[name] for name in ("model", "dataset", "samples", "samples_used", "blocks")},
+        joint_names=tuple(said["joint_names"]),
+        versions=(first, second),
+        differences={name: _difference(each) for name, each in said["differences"].items()},
+        nlpd=_difference(said["nlpd"]),
+        nmse=_difference(said["nmse"]),
+        outcome=said["outcome"],
+        better=said["better"],
+        verdict=said["verdict"],
+        warnings=tuple(said["warnings"]),
+    )
+
+
+def _figures(said: dict[str, Any]) -> VersionFigures:
+    figures = {name: array(said[name]) for name in _FIGURES}
+    return VersionFigures(said["version"], said["revision"], **figures, in_training=said["in_training"])
+
+
+def _difference(said: dict[str, Any]) -> Difference:
+    return Difference(array(said["difference"]), array(said["standard_error"]), array(said["half_width"]))

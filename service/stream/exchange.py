@@ -1,0 +1,143 @@
+"""What a client of torque streams sends and reads, without any transport."""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from contextlib import suppress
+from typing import Any, NamedTuple
+from urllib.parse import quote, urlencode, urlsplit
+
+import numpy as np
+from numpy.typing import ArrayLike
+from websockets.exceptions import ConnectionClosed
+
+from service.stream.frames import ASK_LEARN, ASK_STD, NUMBER, REQUEST
+from service.stream.messages import (
+    StreamAnswer,
+    StreamError,
+    StreamHello,
+    StreamLearnt,
+    StreamRefusal,
+    read_answer,
+    read_hello,
+    read_refusal,
+)
+
+SEQUENCES = 1 << 32
+_REFUSALS = 1000
+"""Refusals kept: a robot that goes on where nothing is learnt must not fill the memory."""
+
+
+class Destination(NamedTuple):
+    """Where a stream goes: its address as a WebSocket's, and host and port of it."""
+
+    address: str
+    host: str
+    port: int
+
+
+def destination(url: str, model: str, **query: int | str | None) -> Destination:
+    """Where the stream of a model is, of a service at http://host:port; query: what of it is not None."""
+    parts = urlsplit(url)
+    secure = parts.scheme in ("https", "wss")
+    asked = urlencode({name: value for name, value in query.items() if value is not None})
+    path = f"/v1/models/{quote(model, safe='')}/stream" + (f"?{asked}" if asked else "")
+    address = f"{'wss' if secure else 'ws'}://{parts.netloc}{path}"
+    return Destination(address, parts.hostname or "127.0.0.1", parts.port or (443 if secure else 80))
+
+
+class Exchange:
+    """One stream's state. stream_id: whether torques may be sent; first_sequence: of the first frame.
+
+    hello: what the service said of the version that answers, None before it has; answers: those that nobody has taken;
+    unsettled: sequences of torques that are neither acknowledged nor refused; learnt, refusals: see `StreamClient`.
+    """
+
+    def __init__(self, stream_id: str | None, first_sequence: int) -> None:
+        if not 0 <= first_sequence < SEQUENCES:
+            raise ValueError(f"first_sequence is {first_sequence}, expected 0 to {SEQUENCES - 1}")
+        self._stream_id, self._sequence = stream_id, first_sequence - 1
+        self.hello: StreamHello | None = None
+        self.answers: deque[StreamAnswer | StreamError] = deque()
+        self.unsettled: deque[int] = deque()
+        self.learnt = StreamLearnt(first_sequence - 1)
+        self.refusals: deque[StreamRefusal] = deque(maxlen=_REFUSALS)
+
+    def frame(
+        self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike, std: bool, deadline: float, tau: ArrayLike | None
+    ) -> tuple[int, bytes]:
+        """Return a query's sequence and the frame to send; raise ValueError."""
+        parts = [np.ascontiguousarray(part, NUMBER) for part in (q, dq, ddq) + (() if tau is None else (tau,))]
+        n = parts[0].size
+        if any(part.shape != (n,) for part in parts):
+            names = "q, dq and ddq" if tau is None else "q, dq, ddq and tau"
+            shapes = ", ".join(str(part.shape) for part in parts)
+            raise ValueError(f"{names} have the shapes {shapes}, expected (n,) each")
+        flags = ASK_STD if std else 0
+        if tau is not None:
+            if self._stream_id is None:
+                raise ValueError("tau is given, expected a client with stream_id, the name of what it was measured on")
+            flags |= ASK_LEARN
+        self._sequence = (self._sequence + 1) % SEQUENCES
+        if tau is not None:
+            self.unsettled.append(self._sequence)
+        header = REQUEST.pack(self._sequence, flags, n, deadline)
+        return self._sequence, b"".join((header, *(part.tobytes() for part in parts)))
+
+    def take(self, data: str | bytes) -> None:
+        """Keep what the service said; raise StreamError where it speaks another layout."""
+        if isinstance(data, bytes):
+            answer = read_answer(data)
+            self.answers.append(answer)
+            if isinstance(answer, StreamError) and answer.sequence is not None:
+                with suppress(ValueError):  # a frame without torque
+                    self.unsettled.remove(answer.sequence)
+            return
+        said = json.loads(data)
+        if "learnt" in said:
+            self.learnt = self.learnt.and_more(said["learnt"])
+            self._settle(said["learnt"]["through"])
+        elif "refused" in said:
+            self.refusals.append(read_refusal(said["refused"]))
+            self._settle(said["refused"]["through"])
+        else:
+            self.hello = read_hello(said)
+
+    def answer(self) -> StreamAnswer:
+        """Take the oldest answer; raise what is in its place where the query was refused."""
+        answer = self.answers.popleft()
+        if isinstance(answer, StreamError):
+            raise answer
+        return answer
+
+    def _settle(self, through: int) -> None:
+        while self.unsettled and self.unsettled[0] <= through:
+            self.unsettled.popleft()
+
+
+def refused(status: int, body: bytes | bytearray | None) -> StreamError:
+    """The error of a connection that could not be had."""
+    try:
+        error: dict[str, Any] = json.loads(body or b"")["error"]
+        return StreamError(error["message"], error["code"], error["detail"])
+    except (ValueError, KeyError, TypeError):
+        return StreamError(f"the service refused the stream with status {status}", "refused")
+
+
+def closed(error: ConnectionClosed) -> StreamError:
+    """The error of a connection that has ended."""
+    if error.rcvd is None:
+        return StreamError("the connection is lost", "closed")
+    return StreamError(f"the service closed the stream: {error.rcvd.reason or error.rcvd.code}", "closed")
+
+
+def unanswered(timeout: float) -> StreamError:
+    """The error of an answer that has not come in time."""
+    return StreamError(f"no answer within {timeout:g} s", "timeout")
+
+
+def unsettled(count: int, timeout: float) -> StreamError:
+    """The error of torques of which nothing was heard in time."""
+    message = f"{count} torques are neither acknowledged nor refused within {timeout:g} s"
+    return StreamError(message, "timeout")
