@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,21 +9,25 @@ from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
 
 from service.access import keys
 from service.access.scopes import SCOPES
+from service.cli.consoles import note, out, print_json
+from service.cli.options import Json
 from service.database import ApiKeyRow, Database
+from service.errors import InvalidRequestError
 from service.settings import Settings
 
-app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, help="API keys of the home LIPSERVE_HOME.")
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="API keys of the home LIPSERVE_HOME.",
+)
+ERRORS = (InvalidRequestError,)
 LONGEST_DAYS = 36_500.0
-PIPE_WIDTH = 160
-"""Columns of a table that no terminal shows."""
-
-Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 @app.command()
@@ -45,14 +47,13 @@ def create(
         scopes = [part.strip() for given in scope for part in given.split(",")]
         row, secret = keys.create(database, name, scopes, expires)
     if as_json:
-        typer.echo(json.dumps({**_shown(row), "key": secret}))
+        print_json({**_shown(row), "key": secret})
         return
     typer.echo(secret)
     until = f"until {row.expires_at}" if row.expires_at else "until it is revoked"
-    note = (
+    note(
         f"{row.id} may {', '.join(row.scopes)} {until}; a running service knows it after {settings.keys_refresh_s:g} s"
     )
-    typer.echo(note, err=True)
 
 
 @app.command("list")
@@ -61,14 +62,14 @@ def list_(as_json: Json = False) -> None:
     with _database() as (database, _):
         rows = keys.stored(database)
     if as_json:
-        typer.echo(json.dumps([_shown(row) for row in rows]))
+        print_json([_shown(row) for row in rows])
         return
     table = Table(Column("id", no_wrap=True), "name", "scopes", "state", "made", "expires", "last used")
     for row in rows:
         shown = _shown(row)
         times = (_minute(shown[field]) for field in ("created_at", "expires_at", "used_at"))
         table.add_row(row.id, escape(row.name), ", ".join(row.scopes), shown["state"], *times)
-    Console(width=None if sys.stdout.isatty() else PIPE_WIDTH).print(table)
+    out.print(table)
 
 
 @app.command()
@@ -80,9 +81,9 @@ def revoke(
     with _database() as (database, settings):
         row = keys.revoke(database, key)
     if as_json:
-        typer.echo(json.dumps(_shown(row)))
+        print_json(_shown(row))
         return
-    typer.echo(f"{row.id} is revoked; a running service refuses it after {settings.keys_refresh_s:g} s", err=True)
+    note(f"{row.id} is revoked; a running service refuses it after {settings.keys_refresh_s:g} s")
 
 
 @contextmanager

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 from rich.table import Table
 
-from service.inference.schema import EvaluateResponse, Nested, PredictResponse
+from service.client.results import Comparison, Evaluation, Prediction
 
 
-def prediction_tables(answer: PredictResponse) -> list[Table]:
+def prediction_tables(answer: Prediction) -> list[Table]:
     """Tables of the answer to one query: joints, then components that are matrices, then those that are numbers."""
     columns = {"tau N·m": _texts(answer.tau), "tau_std": _texts(answer.tau_std), "noise_std": _texts(answer.noise_std)}
     matrices, numbers = [], Table("", "mean", "std")
@@ -30,18 +31,10 @@ def prediction_tables(answer: PredictResponse) -> list[Table]:
     return [joints, *matrices, *([numbers] if numbers.row_count else [])]
 
 
-def evaluation_table(result: EvaluateResponse) -> Table:
+def evaluation_table(result: Evaluation) -> Table:
     """Figures of an evaluation, joint by joint."""
-    what = "held-out samples" if result.part == "held_out" else "samples"
-    unseen = "" if not result.in_training else ", which it was trained on"
-    title = f"{result.model} version {result.version} on {result.samples_used} {what} of {result.dataset}{unseen}"
-    figures: dict[str, Sequence[float | None]] = {
-        "nmse": result.nmse,
-        "rmse": result.rmse,
-        "coverage": result.coverage,
-        "nlpd": result.nlpd,
-    }
-    return figures_table(title, result.joint_names, figures)
+    figures = {name: getattr(result, name).tolist() for name in ("nmse", "rmse", "coverage", "nlpd")}
+    return figures_table(result.title, result.joint_names, figures)
 
 
 def figures_table(title: str, joint_names: Sequence[str], figures: Mapping[str, Sequence[float | None]]) -> Table:
@@ -54,18 +47,34 @@ def figures_table(title: str, joint_names: Sequence[str], figures: Mapping[str, 
 
 
 def _figure(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)
+    return "-" if value is None or np.isnan(value) else format(value, form)
 
 
-def _by_joint(table: Table, joint_names: list[str], rows: list[list[str]]) -> Table:
+def _by_joint(table: Table, joint_names: Sequence[str], rows: list[list[str]]) -> Table:
     for joint, row in zip(joint_names, rows, strict=True):
         table.add_row(joint, *row)
     return table
 
 
-def _texts(values: Nested) -> list[str]:
+def _texts(values: ArrayLike) -> list[str]:
     return [f"{value:.4f}" for value in np.ravel(values)]
 
 
-def _pairs(means: Nested, stds: Nested) -> list[str]:
+def _pairs(means: ArrayLike, stds: ArrayLike) -> list[str]:
     return [f"{mean} ± {std}" for mean, std in zip(_texts(means), _texts(stds), strict=True)]
+
+
+def comparison_table(found: Comparison) -> Table:
+    """Figures of two versions, joint by joint."""
+    title = f"{found.model} on {found.samples_used} samples of {found.dataset}"
+    numbers = [f"version {each.version}" for each in found.versions]
+    heads = [f"{figure}, {number}" for figure in ("nMSE", "RMSE N·m", "coverage of 95%") for number in numbers]
+    table = Table("joint", *heads, title=title)
+    for at, joint in enumerate(found.joint_names):
+        cells = [
+            _figure(getattr(each, name)[at], form)
+            for name, form in (("nmse", ".2e"), ("rmse", ".4f"), ("coverage", ".1%"))
+            for each in found.versions
+        ]
+        table.add_row(joint, *cells)
+    return table

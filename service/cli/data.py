@@ -1,0 +1,170 @@
+"""`lipserve data`: upload recordings, list them, read their reports, and delete them."""
+
+from __future__ import annotations
+
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+
+from service.cli import completion
+from service.cli.connecting import connected
+from service.cli.consoles import out, print_json, say
+from service.cli.options import DatasetId, Json, Url, Yes, confirm, names, pairs
+from service.datasets.asking import Reading
+from service.datasets.media import SUFFIXES
+from service.settings import DEFAULT_URL
+
+if TYPE_CHECKING:
+    from service.datasets.schema import Dataset
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Recordings and their reports: add, list, show and delete them.",
+)
+PREPARATION = "Preparation"
+
+
+@app.command()
+def add(
+    files: Annotated[
+        list[Path], typer.Argument(exists=True, dir_okay=False, help=f"Recordings: {', '.join(SUFFIXES)}.")
+    ],
+    name: Annotated[str | None, typer.Option(help="A name for people; the file's by default.")] = None,
+    robot: Annotated[str | None, typer.Option(help="A profile such as panda, or the id of an uploaded URDF.")] = None,
+    joint_names: Annotated[str | None, typer.Option(help="Of joints 1..n, separated by commas.")] = None,
+    joints: Annotated[str | None, typer.Option(help="Those to keep, in this order.")] = None,
+    drop_joints: Annotated[str | None, typer.Option("--drop", help="Joints to leave out.")] = None,
+    effort: Annotated[str | None, typer.Option(help="What tau is: measured, commanded or current.")] = None,
+    torque_constants: Annotated[str | None, typer.Option(help="N·m/A of each joint, for motor currents.")] = None,
+    torque_convention: Annotated[str | None, typer.Option(help="gravity_included or gravity_compensated.")] = None,
+    column: Annotated[
+        list[str] | None,
+        typer.Option(help="What the file calls a quantity: q={joint}/position, or names separated by commas; repeat."),
+    ] = None,
+    unit: Annotated[list[str] | None, typer.Option(help="Unit of a quantity: q=deg, t=ms; repeat.")] = None,
+    topic: Annotated[str | None, typer.Option(help="Of a bag.")] = None,
+    delimiter: Annotated[str | None, typer.Option(help="Of a CSV.")] = None,
+    cutoff: Annotated[
+        float | None, typer.Option(help="Of the low-pass, Hz; 4 by default.", rich_help_panel=PREPARATION)
+    ] = None,
+    filtering: Annotated[
+        str | None, typer.Option(help="derived (default), always or never.", rich_help_panel=PREPARATION)
+    ] = None,
+    form: Annotated[
+        str | None, typer.Option(help="acausal (default), or causal as on a live stream.", rich_help_panel=PREPARATION)
+    ] = None,
+    rate: Annotated[float | None, typer.Option(help="Of the samples, Hz.", rich_help_panel=PREPARATION)] = None,
+    gap: Annotated[
+        float | None,
+        typer.Option(help="Steps that a gap is longer than; 1.5 by default.", rich_help_panel=PREPARATION),
+    ] = None,
+    trim: Annotated[
+        float | None, typer.Option(help="Cut off at both ends of every part, s.", rich_help_panel=PREPARATION)
+    ] = None,
+    url: Url = DEFAULT_URL,
+    as_json: Json = False,
+) -> None:
+    """Upload recordings, one data set each, and print their reports."""
+    given = {
+        "robot": robot,
+        "joint_names": names(joint_names),
+        "joints": names(joints),
+        "drop_joints": names(drop_joints),
+        "effort": effort,
+        "torque_constants": names(torque_constants),
+        "torque_convention": torque_convention,
+        "columns": {key: _one_or_more(value) for key, value in pairs("--column", column).items()} or None,
+        "units": pairs("--unit", unit) or None,
+        "topic": topic,
+        "delimiter": delimiter,
+        "cutoff": cutoff,
+        "filtering": filtering,
+        "form": form,
+        "rate": rate,
+        "gap": gap,
+        "trim": trim,
+    }
+    reading: Reading = {key: value for key, value in given.items() if value is not None}  # type: ignore[assignment]
+    with connected(url) as client:
+        made = [client.upload(path, name, progress=True, **reading) for path in files]
+    if as_json:
+        print_json(made if len(made) > 1 else made[0])
+        return
+    for dataset in made:
+        _print(dataset)
+
+
+@app.command("list")
+def list_(
+    limit: Annotated[int, typer.Option(min=1, help="Most that are listed.")] = 50,
+    url: Url = DEFAULT_URL,
+    as_json: Json = False,
+) -> None:
+    """List data sets, newest first."""
+    with connected(url) as client:
+        found = list(islice(client.datasets(), limit))
+    if as_json:
+        print_json(found)
+        return
+    if not found:
+        say("no data set yet: `lipserve data add FILE` uploads a recording")
+    for each in found:
+        rate = "" if each.report.rate_hz is None else f" at {each.report.rate_hz:.4g} Hz"
+        joints = f"{len(each.joint_names)} joints"
+        say(f"{each.id}  {each.created_at[:19]}  {each.name}: {each.report.rows:,} samples{rate}, {joints}")
+
+
+@app.command()
+def show(dataset: DatasetId, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
+    """Print the report of a data set."""
+    with connected(url) as client:
+        found = client.dataset(dataset)
+    if as_json:
+        print_json(found)
+    else:
+        _print(found)
+
+
+@app.command()
+def delete(
+    datasets: Annotated[list[str], typer.Argument(help="Ids of data sets.", autocompletion=completion.datasets)],
+    yes: Yes = False,
+    url: Url = DEFAULT_URL,
+    as_json: Json = False,
+) -> None:
+    """Delete data sets for good; versions that were trained on them stay."""
+    confirm(f"delete {', '.join(datasets)} for good?", yes)
+    with connected(url) as client:
+        for each in datasets:
+            client.delete_dataset(each)
+    if as_json:
+        print_json({"deleted": datasets})
+    else:
+        say(f"{', '.join(datasets)} deleted")
+
+
+def _print(dataset: Dataset) -> None:
+    from service.datasets import report_tables  # noqa: PLC0415 - takes long to import; help needs none
+
+    report = dataset.report
+    out.print(f"[bold]{dataset.id}[/bold]  {escape(dataset.name)}  torque: {dataset.torque_convention}")
+    for said in report_tables.overview(report):
+        say(f"  {said}")
+    for table in report_tables.tables(report, dataset.joint_names):
+        out.print(table)
+    if report.excitation is not None:
+        say(f"  {report.excitation.text}")
+    for said in report.warnings:
+        out.print(f"[yellow]warning:[/yellow] {escape(said)}", highlight=False)
+    for said in report.advice:
+        out.print(f"[cyan]next:[/cyan] {escape(said)}", highlight=False)
+
+
+def _one_or_more(text: str) -> str | list[str]:
+    found = [part.strip() for part in text.split(",")]
+    return found[0] if len(found) == 1 else found

@@ -1,0 +1,101 @@
+"""`lipserve jobs`: what is trained, was trained, or failed to be."""
+
+from __future__ import annotations
+
+from itertools import islice
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Column, Table
+
+from service.cli.connecting import connected
+from service.cli.consoles import note, out, print_json, say
+from service.cli.errors import CommandError
+from service.cli.options import JobId, Json, Url
+from service.settings import DEFAULT_URL
+
+if TYPE_CHECKING:
+    from service.training.schema import Job
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Training jobs: list, show, follow, cancel and retry them.",
+)
+INTERRUPTED = 130
+
+
+@app.command("list")
+def list_(
+    limit: Annotated[int, typer.Option(min=1, help="Most that are listed.")] = 50,
+    url: Url = DEFAULT_URL,
+    as_json: Json = False,
+) -> None:
+    """List jobs, newest first."""
+    with connected(url) as client:
+        found = list(islice(client.jobs(), limit))
+    if as_json:
+        print_json(found)
+        return
+    if not found:
+        say("no job yet: `lipserve train FILE --model NAME` queues one")
+        return
+    table = Table(Column("id", no_wrap=True), "model", "estimator", "state", "done", "version", "queued")
+    for job in found:
+        version = "-" if job.version is None else str(job.version)
+        at = job.created_at[:16].replace("T", " ")
+        table.add_row(job.id, escape(job.model), job.estimator, job.state, f"{job.progress.fraction:.0%}", version, at)
+    out.print(table)
+
+
+@app.command()
+def show(job: JobId, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
+    """Print a job: how far it is, and what happened to it."""
+    with connected(url) as client:
+        _print(client.job(job), as_json)
+
+
+@app.command()
+def cancel(job: JobId, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
+    """Cancel a job that waits or runs."""
+    with connected(url) as client:
+        _print(client.cancel(job), as_json)
+
+
+@app.command()
+def retry(job: JobId, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
+    """Queue a new job that repeats one that failed or was cancelled."""
+    with connected(url) as client:
+        _print(client.retry(job), as_json)
+
+
+@app.command()
+def follow(job: JobId, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
+    """Show a job's progress until it ends; Ctrl-C stops watching, and the job goes on."""
+    from service.cli.watching import watch  # noqa: PLC0415 - the client takes long to import; help needs none
+
+    with connected(url) as client:
+        found, interrupted = watch(client, client.job(job), cancels=False)
+    _print(found, as_json)
+    if interrupted:
+        note(f"job {found.id} goes on: `lipserve jobs cancel {found.id}` ends it")
+        raise typer.Exit(INTERRUPTED)
+    if found.state != "succeeded":
+        raise CommandError(f"job {found.id} has {found.state}" + (f": {found.error.message}" if found.error else ""))
+
+
+def _print(job: Job, as_json: bool) -> None:
+    if as_json:
+        print_json(job)
+        return
+    made = "" if job.version is None else f", version {job.version}"
+    say(f"{job.id}  {job.model} ({job.estimator}): {job.state}{made}")
+    at = job.progress
+    left = "" if not at.remaining_s else f", at most about {at.remaining_s:.0f} s left"
+    say(f"  {at.stage}, {at.fraction:.0%} after {at.elapsed_s:.0f} s{left}; data sets {', '.join(job.datasets)}")
+    for change in job.history:
+        say(f"  {change.at[:19].replace('T', ' ')}  {change.state}: {change.message}")
+    if job.error is not None:
+        say(f"  failed: {job.error.message} ({job.error.code})")

@@ -1,0 +1,267 @@
+"""`lipserve models`: what is served, and which of its versions answers."""
+
+from __future__ import annotations
+
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from service.cli import completion
+from service.cli.connecting import connected, dataset_of
+from service.cli.consoles import note, out, print_json, say
+from service.cli.errors import CommandError
+from service.cli.options import Alias, Data, Json, Model, Url, Version, Yes, confirm
+from service.settings import DEFAULT_URL
+
+if TYPE_CHECKING:
+    from service.models.alias_schema import Alias as AliasRecord
+    from service.models.schema import Version as VersionRecord
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Models: list, show, promote, roll back, compare, export, import and delete them.",
+)
+SERVING = "serving"
+Which = Annotated[str, typer.Argument(help="A version, by its number or an alias.", autocompletion=completion.versions)]
+AliasName = Annotated[str, typer.Option("--alias", help="Which alias.", autocompletion=completion.aliases)]
+
+
+@app.command("list")
+def list_(
+    limit: Annotated[int, typer.Option(min=1, help="Most that are listed.")] = 50,
+    url: Url = DEFAULT_URL,
+    as_json: Json = False,
+) -> None:
+    """List models, newest first."""
+    with connected(url) as client:
+        found = list(islice(client.models(), limit))
+    if as_json:
+        print_json(found)
+        return
+    if not found:
+        say("no model yet: `lipserve train FILE --model NAME` makes one")
+        return
+    table = Table("model", "serving", "versions", "estimator", "aliases", "made")
+    for model in found:
+        serving = next((each for each in model.versions if each.version == model.serving_version), None)
+        aliases = ", ".join(f"{name} → {at}" for name, at in model.aliases.items()) or "-"
+        table.add_row(
+            escape(model.name),
+            str(model.serving_version),
+            str(len(model.versions)),
+            "-" if serving is None else serving.estimator,
+            escape(aliases),
+            model.created_at[:16].replace("T", " "),
+        )
+    out.print(table)
+
+
+@app.command()
+def show(model: Model, version: Version = None, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
+    """Print a model with its versions, and what one of them stands on: the one that serves, or one that is named."""
+    with connected(url) as client:
+        found = client.model(model)
+        shown = client.version(model, version or found.serving_version)
+    if as_json:
+        print_json({"model": found.model_dump(mode="json"), "version": shown.model_dump(mode="json")})
+        return
+    say(f"{found.name}: version {found.serving_version} serves, {found.latest_version} is the newest")
+    table = Table("version", "estimator", "made", "named")
+    for each in found.versions:
+        named = [name for name, at in found.aliases.items() if at == each.version]
+        named = [SERVING, *named] if each.version == found.serving_version else named
+        at = each.created_at[:16].replace("T", " ")
+        table.add_row(str(each.version), each.estimator, at, escape(", ".join(named)) or "-")
+    out.print(table)
+    _print_version(shown)
+
+
+@app.command()
+def promote(
+    model: Model,
+    version: Which,
+    alias: AliasName = SERVING,
+    url: Url = DEFAULT_URL,
+    as_json: Json = False,
+) -> None:
+    """Let a version answer where none is named; with --alias, point that alias to it instead."""
+    with connected(url) as client:
+        moved = client.set_alias(model, alias, _which(version))
+    _moved(model, moved, as_json)
+
+
+@app.command()
+def rollback(
+    model: Model,
+    alias: AliasName = SERVING,
+    revision: Annotated[
+        int | None,
+        typer.Option(min=0, help="Instead: forget what the serving version learnt after this revision; 0: all of it."),
+    ] = None,
+    url: Url = DEFAULT_URL,
+    as_json: Json = False,
+) -> None:
+    """Take back the last promotion, the next time the one before it; or what was learnt online since a revision."""
+    with connected(url) as client:
+        if revision is None:
+            _moved(model, client.rollback_alias(model, alias), as_json)
+            return
+        back = client.rollback(model, revision=revision)
+    if as_json:
+        print_json(back)
+    else:
+        say(f"{model} is back at revision {revision}: {back.undone} batches do not teach any more")
+
+
+@app.command()
+def alias(
+    model: Model,
+    name: Annotated[str, typer.Argument(help="The alias.", autocompletion=completion.aliases)],
+    version: Annotated[
+        str | None,
+        typer.Argument(
+            help="The version it is to name, by number or another alias.", autocompletion=completion.versions
+        ),
+    ] = None,
+    remove: Annotated[bool, typer.Option("--remove", help="Remove it; its version stays.")] = False,
+    url: Url = DEFAULT_URL,
+    as_json: Json = False,
+) -> None:
+    """Print where an alias points and pointed, point it to a version, or remove it."""
+    if remove and version is not None:
+        raise CommandError("--remove and a version are given, expected one of them")
+    with connected(url) as client:
+        if remove:
+            client.remove_alias(model, name)
+            print_json({"removed": name}) if as_json else say(f"alias {name} of {model} is removed")
+            return
+        if version is not None:
+            _moved(model, client.set_alias(model, name, _which(version)), as_json)
+            return
+        found = [each for each in client.aliases(model) if each.alias == name]
+    if not found:
+        raise CommandError(f"no alias {name!r} of {model}", f"`lipserve models alias {model} {name} VERSION` makes it")
+    if as_json:
+        print_json(found[0])
+        return
+    say(f"{name} of {model} names version {found[0].version}")
+    for move in found[0].history:
+        back = " (rolled back)" if move.rollback else ""
+        say(f"  {move.at[:19].replace('T', ' ')}  {_or_none(move.before)} → {_or_none(move.version)}{back}")
+
+
+@app.command()
+def compare(
+    model: Model,
+    data: Data,
+    first: Which,
+    second: Which,
+    url: Url = DEFAULT_URL,
+    as_json: Json = False,
+) -> None:
+    """Compare two versions on a recording: which is better, as far as the data can tell."""
+    with connected(url) as client:
+        found = client.compare(model, dataset_of(client, data), _which(first), _which(second))
+    if as_json:
+        print_json(found)
+        return
+    from service.cli.tables import comparison_table  # noqa: PLC0415 - takes long to import; help needs none
+
+    out.print(comparison_table(found))
+    say(found.verdict)
+    for warning in found.warnings:
+        out.print(f"[yellow]careful:[/yellow] {escape(warning)}", highlight=False)
+
+
+@app.command("export")
+def export_(
+    model: Model,
+    path: Annotated[Path, typer.Argument(help="Archive to write, .tar.", dir_okay=False)],
+    version: Version = None,
+    alias: Alias = None,
+    learnt: Annotated[bool, typer.Option(help="With what it has learnt online; else as it was trained.")] = True,
+    url: Url = DEFAULT_URL,
+    as_json: Json = False,
+) -> None:
+    """Write a version as an archive that another service imports."""
+    with connected(url) as client:
+        written = client.export(model, path, version, alias, learnt)
+    if as_json:
+        print_json({"file": written, "bytes": written.stat().st_size})
+    else:
+        say(f"{written}: {written.stat().st_size:,} bytes; `lipserve models import {written}` reads it")
+
+
+@app.command("import")
+def import_(
+    path: Annotated[Path, typer.Argument(help="Archive that was exported.", exists=True, dir_okay=False)],
+    name: Annotated[str | None, typer.Option(help="Of the model; that of the archive by default.")] = None,
+    url: Url = DEFAULT_URL,
+    as_json: Json = False,
+) -> None:
+    """Make a new version of an exported archive. It answers where the model had none before."""
+    with connected(url) as client:
+        made = client.import_model(path, name)
+    if as_json:
+        print_json(made)
+    else:
+        say(f"{made.model} version {made.version} is imported: `lipserve models promote {made.model} {made.version}`")
+
+
+@app.command()
+def delete(
+    model: Model, version: Version = None, yes: Yes = False, url: Url = DEFAULT_URL, as_json: Json = False
+) -> None:
+    """Delete a version that nothing needs, or a model with all that it has observed and learnt: for good."""
+    what = f"model {model} with all its versions and all it has learnt" if version is None else f"{model} {version}"
+    confirm(f"delete {what} for good?", yes)
+    with connected(url) as client:
+        if version is None:
+            client.delete_model(model)
+        else:
+            client.delete_version(model, version)
+    if as_json:
+        print_json({"deleted": {"model": model, "version": version}})
+    else:
+        say(f"{what} is deleted")
+
+
+def _which(text: str) -> int | str:
+    return int(text) if text.isdecimal() else text
+
+
+def _or_none(version: int | None) -> str:
+    return "none" if version is None else str(version)
+
+
+def _moved(model: str, moved: AliasRecord, as_json: bool) -> None:
+    if as_json:
+        print_json(moved)
+        return
+    did = "answers where none is named" if moved.alias == SERVING else f"is what {moved.alias} names"
+    say(f"{model}: version {moved.version} {did}")
+    if moved.previous is not None:
+        note(f"`lipserve models rollback {model} --alias {moved.alias}` goes back to version {moved.previous}")
+
+
+def _print_version(shown: VersionRecord) -> None:
+    say(f"version {shown.version}: {shown.estimator}, {len(shown.joint_names)} joints: {', '.join(shown.joint_names)}")
+    noise = ", ".join(f"{value:.3g}" for value in shown.noise_std)
+    say(f"  torque {shown.torque_convention.replace('_', ' ')}, noise of a measurement {noise} N·m")
+    lineage: dict[str, Any] = shown.lineage
+    sets = [each.get("name") or each.get("id") for each in lineage.get("datasets") or () if isinstance(each, dict)]
+    if sets:
+        say(f"  trained on {', '.join(map(str, sets))}")
+    held = lineage.get("holdout")
+    if held is not None:
+        from service.cli.tables import figures_table  # noqa: PLC0415 - takes long to import; help needs none
+
+        out.print(figures_table(f"on {held['samples']} samples held out", shown.joint_names, held))
+    else:
+        say("  nothing was held out of its data: `lipserve evaluate` on a recording it has not seen tells how good")

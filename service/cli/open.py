@@ -1,0 +1,46 @@
+"""`lipserve open`."""
+
+from __future__ import annotations
+
+import webbrowser
+from http.client import HTTPException
+from typing import Annotated
+from urllib.parse import quote
+
+import typer
+
+from service.cli import completion
+from service.cli.asking import UNIX, ask
+from service.cli.consoles import print_json, say
+from service.cli.errors import START, CommandError
+from service.cli.options import Json, Url
+from service.settings import DEFAULT_URL
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+@app.command("open")
+def open_(
+    model: Annotated[
+        str | None, typer.Argument(help="A model, for its page.", autocompletion=completion.models)
+    ] = None,
+    live: Annotated[bool, typer.Option("--live", help="The page that follows what is streamed.")] = False,
+    browser: Annotated[bool, typer.Option("--browser", help="Also open it in this machine's browser.")] = False,
+    url: Url = DEFAULT_URL,
+    as_json: Json = False,
+) -> None:
+    """Print the address of the dashboard, or of a model's page in it."""
+    if url.startswith(UNIX):
+        raise CommandError(f"url is {url!r}, expected http://…: a browser needs a port", "`lipserve serve --port 8000`")
+    try:
+        ask(url, "/health/live")
+    except (OSError, HTTPException, ValueError) as error:
+        raise CommandError(f"no service answers at {url}: {error}", START) from error
+    page = "live" if live else "models" if model else ""
+    address = f"{url.rstrip('/')}/#/{page}" + (f"/{quote(model, safe='')}" if model else "")
+    if as_json:
+        print_json({"url": address})
+    else:
+        say(address)
+    if browser:
+        webbrowser.open(address)

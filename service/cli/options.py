@@ -1,0 +1,59 @@
+"""Options and arguments that several commands have."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from service.cli import completion
+from service.cli.errors import CommandError
+
+Url = Annotated[
+    str, typer.Option("--url", envvar="LIPSERVE_URL", help="Address of the service: http://… or unix:///path.")
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
+Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask whether that is meant.")]
+Model = Annotated[str, typer.Argument(help="Name of the model.", autocompletion=completion.models)]
+DatasetId = Annotated[str, typer.Argument(help="Id of a data set.", autocompletion=completion.datasets)]
+JobId = Annotated[str, typer.Argument(help="Id of a job.", autocompletion=completion.jobs)]
+Data = Annotated[
+    str,
+    typer.Argument(help="A recording, which is uploaded, or the id of a data set.", autocompletion=completion.datasets),
+]
+Version = Annotated[
+    int | None,
+    typer.Option(help="A version; the one that serves by default.", autocompletion=completion.versions),
+]
+Alias = Annotated[str | None, typer.Option(help="A version by its alias.", autocompletion=completion.aliases)]
+
+
+def numbers(option: str, text: str) -> list[float]:
+    """Numbers separated by commas; raise CommandError."""
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise CommandError(f"{option} is {text!r}, expected numbers separated by commas") from None
+
+
+def names(text: str | None) -> list[str] | None:
+    """Names separated by commas; None where none are given."""
+    return None if text is None else [part.strip() for part in text.split(",")]
+
+
+def pairs(option: str, given: Sequence[str] | None) -> dict[str, str]:
+    """Values by name of an option that is given as name=value, repeatedly; raise ValueError."""
+    found = {}
+    for text in given or ():
+        name, equals, value = text.partition("=")
+        if not equals or not value:
+            raise ValueError(f"{option} is {text!r}, expected a quantity, = and what it is, as q=deg")
+        found[name.strip()] = value.strip()
+    return found
+
+
+def confirm(question: str, yes: bool) -> None:
+    """Ask whether something is meant, unless that is said; end the command where it is not."""
+    if not yes:
+        typer.confirm(question, abort=True, err=True)

@@ -1,0 +1,1 @@
+"""Playing a motion to a model in real time: `lipserve stream`."""

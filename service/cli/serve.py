@@ -1,0 +1,56 @@
+"""`lipserve serve`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+import uvicorn
+from pydantic import ValidationError
+
+from service import sockets
+from service.app import create_app
+from service.cli.errors import CommandError
+from service.home import HomeError, check_home
+from service.limits.connections import guarded
+from service.observability import logs
+from service.settings import Settings
+from service.stream.protocol import StreamProtocol
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+ERRORS = (HomeError,)
+
+
+@app.command()
+def serve(
+    host: Annotated[str | None, typer.Option(help="Address to listen on (LIPSERVE_HOST).")] = None,
+    port: Annotated[int | None, typer.Option(help="Port to listen on (LIPSERVE_PORT).")] = None,
+    uds: Annotated[Path | None, typer.Option(help="Unix-domain socket to listen on too (LIPSERVE_UDS).")] = None,
+) -> None:
+    """Serve models and run training jobs."""
+    given = {name: value for name, value in (("host", host), ("port", port), ("uds", uds)) if value is not None}
+    try:
+        settings = Settings(**given)  # type: ignore[arg-type]  # validated here
+    except ValidationError as error:
+        faults = (f"{'.'.join(map(str, each['loc'])) or 'settings'}: {each['msg']}" for each in error.errors())
+        raise CommandError("; ".join(faults)) from None
+    logs.configure(logs.LogOptions(settings.log_level, settings.log_format))
+    check_home(settings)  # before the app opens it for good: what is wrong is said without a traceback
+    served = create_app(settings)
+    config = uvicorn.Config(
+        served,
+        host=settings.host,
+        port=settings.port,
+        log_config=None,  # as configured above
+        access_log=False,  # the service's own says more
+        loop="uvloop",
+        http=guarded(settings),
+        ws=StreamProtocol,
+        ws_max_size=settings.max_stream_frame_bytes,
+        ws_per_message_deflate=False,
+        timeout_keep_alive=settings.keep_alive_s,
+        timeout_graceful_shutdown=settings.drain_s,
+        forwarded_allow_ips=settings.trusted_proxies,
+    )
+    sockets.serve(config, settings.uds, settings.uds_mode, served.state.stopping, settings.stop_notice_s)

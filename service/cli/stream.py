@@ -1,0 +1,187 @@
+"""`lipserve stream`."""
+
+from __future__ import annotations
+
+import secrets
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.table import Table
+
+from service.cli.connecting import connected
+from service.cli.consoles import note, out, print_json, say
+from service.cli.errors import CommandError
+from service.cli.options import Alias, Json, Model, Url, Version
+from service.cli.words import ROBOTS
+from service.settings import DEFAULT_URL
+
+if TYPE_CHECKING:
+    from service.cli.playing.source import Motion
+    from service.cli.playing.tally import Tally
+    from service.stream.client import StreamClient
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+SECONDS = 60.0
+INTERRUPTED = 130
+SIMULATION = "Simulation"
+
+
+@app.command()
+def stream(
+    model: Model,
+    file: Annotated[
+        Path | None, typer.Argument(help="A recording with times, q, dq, ddq and tau, or from which these are derived.")
+    ] = None,
+    simulate: Annotated[
+        str | None,
+        typer.Option(help="Play a simulated robot instead, such as panda.", autocompletion=lambda: ROBOTS),
+    ] = None,
+    learn: Annotated[
+        bool,
+        typer.Option("--learn", help="Also send the measured torque, for the model to learn from after it answered."),
+    ] = False,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.1, help="How long: all of a recording, 60 of a simulation by default.")
+    ] = None,
+    deadline: Annotated[
+        float | None, typer.Option(min=0, help="ms after which an answer is late; one step of the motion by default.")
+    ] = None,
+    stream_id: Annotated[
+        str | None, typer.Option(help="Name of the source of the torques; a new one by default.")
+    ] = None,
+    version: Version = None,
+    alias: Alias = None,
+    rate: Annotated[float, typer.Option(min=1, max=2000, help="Hz.", rich_help_panel=SIMULATION)] = 100.0,
+    seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal motions.", rich_help_panel=SIMULATION)] = 0,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="The faster-moving variant.", rich_help_panel=SIMULATION)
+    ] = False,
+    payload: Annotated[
+        float, typer.Option(min=0, help="Payload that the robot takes up, kg.", rich_help_panel=SIMULATION)
+    ] = 0.0,
+    payload_at: Annotated[float, typer.Option(min=0, help="When it does, s.", rich_help_panel=SIMULATION)] = 0.0,
+    url: Url = DEFAULT_URL,
+    as_json: Json = False,
+) -> None:
+    """Play a motion to a model over its WebSocket in real time, and compare its answers with the measured torque.
+
+    One line a second, then figures of the whole. Each answer is given before its row is learnt. Ctrl-C ends it.
+    """
+    # takes long to import; help needs none of it
+    from service.cli.playing.player import Stop, play  # noqa: PLC0415
+    from service.cli.playing.source import recorded, simulated  # noqa: PLC0415
+
+    if (file is None) == (simulate is None):
+        raise CommandError(
+            "expected either a recording or --simulate ROBOT", f"`lipserve stream {model} --simulate panda`"
+        )
+    if file is not None:
+        if not file.is_file():
+            raise CommandError(f"file is {str(file)!r}, expected a recording")
+        motion = recorded(file, seconds)
+    else:
+        motion = simulated(simulate or "", seconds or SECONDS, rate, seed, fast, payload, payload_at)
+    source = (stream_id or f"lipserve-{secrets.token_hex(4)}") if learn else None
+    with (
+        Stop().heard() as stop,
+        connected(url) as client,
+        client.stream(model, version=version, alias=alias, stream_id=source) as found,
+    ):
+        motion = _fitting(motion, found)
+        step = motion.step if deadline is None else deadline / 1e3
+        _announce(motion, found, source)
+        whole = play(
+            found, motion, learn, step, stop, lambda second, part: _tell_second(second, part, found, learn, as_json)
+        )
+        if learn:
+            found.flush()
+        _tell_all(whole, found, learn, as_json)
+    if stop.asked:
+        raise typer.Exit(INTERRUPTED)
+
+
+def _fitting(motion: Motion, stream: StreamClient) -> Motion:
+    """The motion as the model takes it; what does not fit is refused or said."""
+    hello = stream.hello
+    if motion.torque_convention != hello.torque_convention:
+        raise CommandError(
+            f"the torque of the motion is {motion.torque_convention}, expected that of the model: "
+            f"{hello.torque_convention}"
+        )
+    fitting, named = motion.ordered(hello.joint_names)
+    if not named:
+        note(
+            f"careful: the motion's joints {', '.join(motion.joint_names)} are taken, in this order, for the model's "
+            f"{', '.join(hello.joint_names)}"
+        )
+    return fitting
+
+
+def _announce(motion: Motion, stream: StreamClient, source: str | None) -> None:
+    hello, taught = stream.hello, "" if source is None else f", which it learns from as stream {source}"
+    length = f"{len(motion)} rows in {motion.t[-1] - motion.t[0]:.3g} s ({1 / motion.step:.4g} Hz)"
+    note(f"{length} to {hello.model} version {hello.version}{taught}")
+
+
+def _tell_second(second: int, part: Tally, stream: StreamClient, learn: bool, as_json: bool) -> None:
+    from service.cli.playing.tally import learnt_shown  # noqa: PLC0415 - as above
+
+    shown = {"second": second, **part.shown(), "version": stream.hello.version}
+    if learn:
+        shown["learnt"] = learnt_shown(stream.learnt)
+    if as_json:
+        print_json(shown, one_line=True)
+    else:
+        say(f"{second:4d} s  {_line(shown)}")
+
+
+def _tell_all(whole: Tally, stream: StreamClient, learn: bool, as_json: bool) -> None:
+    from service.cli.playing.tally import learnt_shown  # noqa: PLC0415 - as above
+
+    shown = {**whole.shown(), "joints": whole.joints(stream.hello.joint_names)}
+    if learn:
+        shown["learnt"] = learnt_shown(stream.learnt)
+        shown["not_logged"] = [
+            {"first": each.first, "through": each.through, "code": each.code, "message": each.message}
+            for each in stream.refusals
+        ]
+    if as_json:
+        print_json({"summary": shown}, one_line=True)
+        return
+    if shown["joints"]:
+        title = "answers against measured torque" + (", each given before its row was learnt" if learn else "")
+        table = Table("joint", "nMSE", "RMSE N·m", "coverage of 95%", title=title)
+        for each in shown["joints"]:
+            nmse = "-" if each["nmse"] is None else f"{each['nmse']:.2e}"
+            table.add_row(each["joint"], nmse, f"{each['rmse']:.4f}", f"{each['coverage']:.1%}")
+        out.print(table)
+    say(f"in all  {_line(shown)}")
+    for each in shown.get("not_logged", ()):
+        note(f"rows {each['first']} to {each['through']} were not logged: {each['message']} ({each['code']})")
+
+
+def _line(shown: dict[str, Any]) -> str:
+    """Figures of a second, or of all, on one line."""
+    parts = [f"{shown['rows']} rows"]
+    if shown["rows"]:
+        trip = shown["round_trip_ms"]
+        parts += [
+            f"round trip p50 {trip['p50']:.2f} ms, p99 {trip['p99']:.2f} ms",
+            f"{shown['late']} late",
+            f"error {shown['rmse']:.4f} N·m, {shown['coverage']:.1%} in the 95 % band",
+        ]
+    if shown["behind_s"] > 0.1:
+        parts.append(f"{shown['behind_s']:.1f} s behind")
+    if shown["refused"]:
+        parts.append("refused " + _counts(shown["refused"]))
+    if "learnt" in shown:
+        learnt = shown["learnt"]
+        parts.append(f"learnt {learnt['accepted']}")
+        if learnt["kept_out"]:
+            parts.append("kept out " + _counts(learnt["kept_out"]))
+    return "; ".join(parts)
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{count} {code}" for code, count in counts.items())
