@@ -1,0 +1,111 @@
+// Which page is shown: the part of the address after #.
+
+import { replace } from "./dom.js";
+import { forgetKey, key } from "./keys.js";
+import { empty, errorBox, link, loading } from "./ui.js";
+
+const ROUTES = [
+  [/^\/?$/, "overview"],
+  [/^\/data$/, "datasets"],
+  [/^\/data\/(?<id>[^/]+)$/, "dataset"],
+  [/^\/jobs$/, "jobs"],
+  [/^\/jobs\/(?<id>[^/]+)$/, "job"],
+  [/^\/train$/, "train"],
+  [/^\/models$/, "models"],
+  [/^\/models\/(?<name>[^/]+)$/, "model"],
+  [/^\/live(?:\/(?<name>[^/]+))?$/, "live"],
+];
+const main = document.getElementById("main");
+let leave = new AbortController();
+
+async function show() {
+  leave.abort();
+  leave = new AbortController();
+  const { signal } = leave;
+  const [where, query = ""] = location.hash.slice(1).split("?");
+  const [page, params] = find(where);
+  mark(where);
+  title("");
+  if (page === null) {
+    replace(main, empty(`There is no page ${where}.`, link("Overview", "#/")));
+    return;
+  }
+  const view = document.createElement("div");
+  replace(main, loading());
+  try {
+    const module = await import(`./pages/${page}.js`);
+    if (signal.aborted) return;
+    replace(main, view);
+    await module.render(view, { ...params, query: new URLSearchParams(query) }, { signal, title });
+  } catch (error) {
+    if (signal.aborted || error.name === "AbortError") return;
+    if (!error.status && error.name !== "ApiError") console.error(error);
+    replace(main, errorBox(error, show));
+  }
+}
+
+function find(where) {
+  for (const [pattern, page] of ROUTES) {
+    const found = pattern.exec(where);
+    if (!found) continue;
+    const params = Object.entries(found.groups ?? {}).map(([name, value]) => [name, value && decodeURIComponent(value)]);
+    return [page, Object.fromEntries(params)];
+  }
+  return [null, {}];
+}
+
+function title(text) {
+  document.title = text ? `${text} · LIPServe` : "LIPServe";
+}
+
+function mark(where) {
+  const section = where.split("/")[1] ?? "";
+  const home = section === "train" ? "jobs" : section;
+  for (const each of document.querySelectorAll("#nav a")) {
+    const here = each.getAttribute("href") === `#/${home}`;
+    if (here) each.setAttribute("aria-current", "page");
+    else each.removeAttribute("aria-current");
+  }
+}
+
+function themeButton() {
+  const themes = ["auto", "light", "dark"];
+  const made = document.getElementById("theme");
+  const say = () => {
+    made.textContent = `Theme: ${document.documentElement.dataset.theme}`;
+  };
+  made.addEventListener("click", () => {
+    const root = document.documentElement;
+    root.dataset.theme = themes[(themes.indexOf(root.dataset.theme) + 1) % themes.length];
+    localStorage.setItem("lipserve-theme", root.dataset.theme);
+    say();
+    document.dispatchEvent(new Event("themechange"));
+  });
+  say();
+}
+
+function keyButton() {
+  const made = document.getElementById("key");
+  const say = () => {
+    made.hidden = !key();
+    made.textContent = "Forget key";
+  };
+  made.addEventListener("click", () => {
+    forgetKey();
+    say();
+    show();
+  });
+  document.addEventListener("keychange", say);
+  say();
+}
+
+document.getElementById("skip").addEventListener("click", () => main.focus());
+window.addEventListener("hashchange", () => {
+  show();
+  main.focus({ preventScroll: true });
+  window.scrollTo(0, 0);
+});
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => document.dispatchEvent(new Event("themechange")));
+themeButton();
+keyButton();
+show();

@@ -1,0 +1,20 @@
+// Sentences of the service, whose `code` stands between backticks.
+
+import { h } from "../../dom.js";
+
+/** The parts of a sentence: texts, and code where it stands between backticks. */
+export function prose(text) {
+  return text.split("`").map((part, index) => (index % 2 ? h("code", {}, part) : part));
+}
+
+/** Sentences as a list. */
+export function sentences(texts) {
+  return h("ul", {}, texts.map((text) => h("li", {}, prose(text))));
+}
+
+/** Put new children in an element without taking the keyboard's place away: a link that is there again is focused. */
+export function refresh(element, ...children) {
+  const at = element.contains(document.activeElement) ? document.activeElement.getAttribute("href") : null;
+  element.replaceChildren(...children.flat());
+  if (at !== null) [...element.querySelectorAll("a")].find((each) => each.getAttribute("href") === at)?.focus();
+}

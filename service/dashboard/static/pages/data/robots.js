@@ -1,0 +1,77 @@
+// Choosing a robot: known by name, or an uploaded URDF. Shared by the upload and the training form.
+
+import { get, pages } from "../../api.js";
+import { h, replace } from "../../dom.js";
+import { prose } from "./prose.js";
+import { urdfButton } from "./urdf.js";
+
+/** What the effort of a robot's recordings may be. */
+export const EFFORTS = {
+  measured: "measured torque, gravity included",
+  commanded: "commanded torque, added to gravity compensation",
+  current: "motor current, which needs torque constants",
+  unknown: "not known for this robot: say what it is",
+};
+
+/** Profiles and uploaded URDFs, as {profiles, uploaded}. */
+export async function robots(signal) {
+  const [known, uploaded] = await Promise.all([
+    get("/v1/robots/profiles", {}, signal),
+    pages("/v1/robots", 200, {}, signal),
+  ]);
+  return { profiles: known.items, uploaded };
+}
+
+/**
+ * A select of robots and a line that says what the chosen one means.
+ * withUrdf: offer only those that a model with rigid bodies can be made of; onchange(profile): undefined for a URDF.
+ * Returns {select, note, add, fill(robots), choose(name)}: `fill` keeps what is chosen, `add` uploads a URDF and chooses it.
+ */
+export function robotSelect({ none, withUrdf = false, onchange = () => {} }) {
+  const select = h("select", { name: "robot" }, h("option", { value: "" }, none));
+  const note = h("p", { class: "hint" });
+  let profiles = new Map();
+  let last = { profiles: [], uploaded: [] };
+
+  const say = () => {
+    const profile = profiles.get(select.value);
+    replace(note, profile ? prose(described(profile, withUrdf)) : "");
+    onchange(profile);
+  };
+  select.addEventListener("change", say);
+
+  const fill = (found) => {
+    last = found;
+    const { profiles: known, uploaded } = found;
+    const chosen = select.value;
+    const usable = known.filter((each) => !withUrdf || each.urdf_available);
+    profiles = new Map(known.map((each) => [each.name, each]));
+    replace(
+      select,
+      h("option", { value: "" }, none),
+      group("Known robots", usable.map((each) => [each.name, `${each.name} – ${each.title}`])),
+      group("Uploaded URDFs", uploaded.map((each) => [each.id, `${each.name} (${each.id})`])),
+    );
+    choose(chosen);
+  };
+  const choose = (name) => {
+    select.value = name;
+    if (select.selectedIndex < 0) select.value = "";
+    say();
+  };
+  const add = urdfButton((robot) => {
+    fill({ ...last, uploaded: [robot, ...last.uploaded.filter((each) => each.id !== robot.id)] });
+    choose(robot.id);
+  });
+  return { select, note, add, fill, choose };
+}
+
+function group(label, options) {
+  if (!options.length) return "";
+  return h("optgroup", { label }, ...options.map(([value, text]) => h("option", { value }, text)));
+}
+
+function described(profile, withUrdf) {
+  const joints = `${profile.joints.length} joints: ${profile.joints.map((each) => each.name).join(", ")}.`;
+  return withUrdf ? joints : `${joints} Its effort: ${EFFORTS[profile.effort]}. ${profile.effort_note}`;
+}

@@ -1,0 +1,63 @@
+// All data sets, and uploading more.
+
+import { get } from "../api.js";
+import { h, replace } from "../dom.js";
+import { ago, count, number, seconds, when } from "../format.js";
+import { badge, button, card, empty, heading, link, notice, table } from "../ui.js";
+import { refresh } from "./data/prose.js";
+import { robots } from "./data/robots.js";
+import { uploader } from "./data/upload.js";
+
+/** The page `#/data`. */
+export async function render(view, params, { signal, title }) {
+  title("Data sets");
+  const list = h("div", {});
+  const found = [];
+  let cursor = null;
+  const more = button("Show older ones", () => load(cursor));
+
+  const load = async (after = null) => {
+    const page = await get("/v1/datasets", { cursor: after }, signal);
+    if (after === null) found.length = 0;
+    found.push(...page.items);
+    cursor = page.next_cursor;
+    refresh(list, found.length ? listed(found) : nothing(), cursor ? more : "");
+  };
+  const { element, fillRobots } = uploader({ onUploaded: () => load(), signal });
+  await load();
+  replace(view, heading("Data sets", found.length ? link("Train a model", "#/train", "primary") : null), element, card("Recordings", list));
+  // uploads work without them
+  robots(signal).then(fillRobots, (error) => error.name === "AbortError" || notice(`robots: ${error.message}`, "bad"));
+}
+
+function listed(datasets) {
+  return table(
+    [
+      { label: "Name", cell: (row) => link(row.name, `#/data/${row.id}`) },
+      { label: "Findings", cell: (row) => findings(row.report) },
+      { label: "Samples", numeric: true, cell: (row) => count(row.report.rows) },
+      { label: "Rate, Hz", numeric: true, cell: (row) => number(row.report.rate_hz, 4) },
+      { label: "Length", numeric: true, cell: (row) => seconds(row.report.timing?.duration_s) },
+      { label: "Joints", numeric: true, cell: (row) => row.joint_names.length },
+      { label: "Robot", cell: (row) => row.report.robot ?? "–" },
+      { label: "Uploaded", cell: (row) => h("time", { datetime: row.created_at, title: when(row.created_at) }, ago(row.created_at)) },
+      { label: "Next", cell: (row) => link("Train", `#/train?datasets=${row.id}`) },
+    ],
+    datasets,
+    { caption: "Newest first" },
+  );
+}
+
+function findings(report) {
+  if (report.warnings.length) return badge(report.warnings.length === 1 ? "1 warning" : `${report.warnings.length} warnings`, "warn");
+  return report.advice.length ? badge(report.advice.length === 1 ? "1 hint" : `${report.advice.length} hints`, "plain") : badge("nothing found", "good");
+}
+
+function nothing() {
+  return empty(
+    [
+      "There are no recordings yet. Upload one above, or make one by simulation: ",
+      h("code", {}, "lipserve simulate panda panda.csv"),
+    ],
+  );
+}

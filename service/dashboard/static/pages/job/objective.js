@@ -1,0 +1,92 @@
+// The objective of a fit against its iterations, as far as this page has seen it.
+
+import { line, plot } from "../../plots.js";
+
+/** Points by job, kept while the page is open: who leaves a job and comes back sees the curve go on. */
+const seen = new Map();
+const MOST_JOBS = 20;
+
+/** Draws as jobs are given to it; an interrupted job that starts again gets a curve of its own. */
+export class Objective {
+  #place;
+  #signal;
+  #drawn = null;
+  #drawing = false;
+  #next = null;
+
+  constructor(place, signal) {
+    this.#place = place;
+    this.#signal = signal;
+  }
+
+  /** Iterations that are in the curve. */
+  static points(id) {
+    return [...(seen.get(id)?.values() ?? [])].reduce((sum, { x }) => sum + x.length, 0);
+  }
+
+  /** The first iteration that is in the curve, null where there is none. */
+  static first(id) {
+    const [curve] = seen.get(id)?.values() ?? [];
+    return curve?.x[0] ?? null;
+  }
+
+  /** Take a job as it is now; true where a point came with it. */
+  take(job) {
+    const { objective, iteration } = job.progress;
+    if (objective === null || objective === undefined || !iteration) return false;
+    const curves = curvesOf(job.id);
+    if (!curves.has(job.attempts)) curves.set(job.attempts, { x: [], y: [] });
+    const curve = curves.get(job.attempts);
+    if (curve.x.at(-1) >= iteration) return false;
+    curve.x.push(iteration);
+    curve.y.push(objective);
+    return true;
+  }
+
+  /** Draw what is known. On a slow machine news come faster than they can be drawn: only the last is drawn then. */
+  async draw(job) {
+    this.#next = job;
+    if (this.#drawing) return;
+    this.#drawing = true;
+    try {
+      while (this.#next) {
+        const now = this.#next;
+        this.#next = null;
+        await this.#draw(now);
+      }
+    } finally {
+      this.#drawing = false;
+    }
+  }
+
+  async #draw(job) {
+    const curves = [...curvesOf(job.id)];
+    if (this.#signal.aborted || !curves.length) return;
+    const markers = { mode: "lines+markers", marker: { size: 5 }, hovertemplate: "%{y:.1f} nats" };
+    const traces = curves.map(([attempt, { x, y }], index) => line([...x], [...y], curves.length > 1 ? `attempt ${attempt}` : "objective", index, markers));
+    const layout = {
+      x: "iteration",
+      y: "objective, nats",
+      height: 300,
+      showlegend: curves.length > 1,
+      xaxis: { rangemode: "tozero", tickformat: "d", nticks: 12 },
+      yaxis: { tickformat: ".1f" },
+    };
+    const last = curves.at(-1)[1];
+    const label = `Objective against iteration: ${last.y.at(-1).toFixed(1)} nats at iteration ${last.x.at(-1)}, ${last.y[0].toFixed(1)} at iteration ${last.x[0]}`;
+    if (this.#drawn) {
+      this.#place.setAttribute("aria-label", label);
+      await this.#drawn.react(traces, layout);
+    } else {
+      this.#drawn = await plot(this.#place, traces, layout, { label, signal: this.#signal });
+    }
+  }
+}
+
+function curvesOf(id) {
+  if (!seen.has(id)) {
+    if (seen.size >= MOST_JOBS) seen.delete(seen.keys().next().value);
+    seen.set(id, new Map());
+  }
+  return seen.get(id);
+}

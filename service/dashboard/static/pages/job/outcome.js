@@ -1,0 +1,83 @@
+// What came of a job: how good the version is, or why there is none.
+
+import { get, path } from "../../api.js";
+import { h, replace } from "../../dom.js";
+import { count, number, percent, scientific, shortNames } from "../../format.js";
+import { card, link, table } from "../../ui.js";
+
+/** Share of samples in the 95 % band below which it is said to be too narrow. */
+const LEAST_COVERAGE = 0.9;
+const ADVICE = {
+  cannot_hold_out: "Hold out less, or in another way, or nothing.",
+  not_positive_definite: "The samples may be nearly the same, or their torque without any noise: look at the data sets' reports.",
+  damaged_data: "A data set's file is damaged: upload the recording again.",
+  storage_full: "Delete data sets or versions that are no longer needed, then try again.",
+  too_long: "Train on fewer samples or with fewer iterations.",
+  interrupted: "The service was stopped while it ran, too often: try again.",
+};
+
+/** Show it in an element. */
+export async function outcome(element, job, signal) {
+  if (job.state === "succeeded") return replace(element, await judged(job, signal));
+  if (job.state !== "failed") return replace(element);
+  const advice = ADVICE[job.error?.code] ?? "The service's log says more. Its report may tell what is wrong with the data.";
+  return replace(
+    element,
+    h("div", { class: "error", role: "alert" }, h("p", {}, h("strong", {}, "The training failed. "), job.error?.message ?? ""), h("p", {}, advice)),
+  );
+}
+
+async function judged(job, signal) {
+  const more = link(`Version ${job.version} of ${job.model}`, `#/models/${job.model}?version=${job.version}`);
+  let version;
+  try {
+    version = await get(path`/v1/models/${job.model}/versions/${String(job.version)}`, {}, signal);
+  } catch (error) {
+    return card("What it made", h("p", {}, more, `: ${error.message}`));
+  }
+  const held = version.lineage.holdout;
+  const seen = version.lineage.training_metrics;
+  return card(
+    "What it made",
+    h("p", {}, more, job.refresh ? ", which has to prove better before it answers." : ", which answers from now on where no other version is chosen."),
+    held?.nmse
+      ? figures(`On ${count(held.samples)} samples that were held out`, held, version)
+      : h("p", { class: "banner" }, "Nothing was held out: how well it predicts is not known. Evaluate it on a recording that it has not seen."),
+    !held?.nmse && seen?.nmse ? figures(`On ${count(seen.samples)} samples it was trained on: these figures flatter`, seen, version) : null,
+  );
+}
+
+function figures(caption, found, version) {
+  const names = shortNames(version.joint_names);
+  return [verdicts(found, names), shownFigures(caption, found, names, version.joint_types)];
+}
+
+/** What the figures say to be careful with. */
+function verdicts(found, names) {
+  const joints = names.map((name, index) => ({ name, nmse: found.nmse[index], coverage: found.coverage[index] }));
+  const narrow = joints.filter((each) => each.coverage !== null && each.coverage < LEAST_COVERAGE);
+  const useless = joints.filter((each) => each.nmse !== null && each.nmse >= 1);
+  const said = [];
+  if (narrow.length) {
+    const which = narrow.map((each) => `${each.name} (${percent(each.coverage, 0)})`).join(", ");
+    said.push(`The 95 % band is too narrow for ${which}: the model is overconfident there.`);
+  }
+  if (useless.length) {
+    said.push(`Predictions of ${useless.map((each) => each.name).join(", ")} are no better than a constant torque: nMSE of 1 and more.`);
+  }
+  return said.length ? h("div", { class: "banner" }, said.map((text) => h("p", {}, text))) : null;
+}
+
+function shownFigures(caption, found, names, types) {
+  const unit = types.includes("prismatic") ? "N·m or N" : "N·m";
+  return table(
+    [
+      { label: "Joint", cell: (row) => row.name },
+      { label: "nMSE", numeric: true, cell: (row) => scientific(row.nmse) },
+      { label: `RMSE, ${unit}`, numeric: true, cell: (row) => number(row.rmse) },
+      { label: "Within the 95 % band", numeric: true, cell: (row) => percent(row.coverage) },
+    ],
+    names.map((name, index) => ({ name, nmse: found.nmse[index], rmse: found.rmse[index], coverage: found.coverage[index] })),
+    { caption },
+  );
+}

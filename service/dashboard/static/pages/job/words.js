@@ -1,0 +1,40 @@
+// What a job is doing, in words.
+
+import { seconds } from "../../format.js";
+
+/** States of jobs that have not ended. */
+export const ACTIVE = new Set(["queued", "running"]);
+
+const STAGES = {
+  waiting: "waiting for its turn",
+  loading: "loading the data",
+  hyperparameters: "fitting hyperparameters",
+  posterior: "conditioning and compressing the posterior",
+  evaluating: "evaluating what was held out",
+  saving: "saving the version",
+  done: "done",
+};
+
+/** The stage of a job's work. */
+export function stage({ progress: at }) {
+  if (at.stage === "hyperparameters" && !at.iteration) return "looking where to start the fit";
+  return STAGES[at.stage] ?? at.stage;
+}
+
+/** What is left of its time, empty where that is not known. */
+export function left({ progress: at }) {
+  return at.remaining_s === null ? "" : `at most about ${seconds(Math.ceil(at.remaining_s))}`;
+}
+
+/** What was held out, in a sentence. */
+export function heldOut(holdout) {
+  if (!holdout) return "nothing";
+  const share = `${Math.round(100 * holdout.share)} %`;
+  const guard = holdout.guard_s === null ? "" : `, ${holdout.guard_s} s of guard`;
+  const what = {
+    last: `the last ${share} of each data set`,
+    episodes: `${share} in whole episodes, by seed ${holdout.seed}`,
+    blocks: `${share} in some of ${holdout.blocks} blocks, by seed ${holdout.seed}`,
+  };
+  return `${what[holdout.kind]}${guard}`;
+}

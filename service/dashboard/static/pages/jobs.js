@@ -1,0 +1,88 @@
+// All training jobs.
+
+import { get } from "../api.js";
+import { h, replace } from "../dom.js";
+import { ago, percent, seconds, when } from "../format.js";
+import { badge, button, card, empty, every, heading, link, progress, table } from "../ui.js";
+import { refresh } from "./data/prose.js";
+import { ACTIVE, left, stage } from "./job/words.js";
+
+/** The page `#/jobs`. */
+export async function render(view, params, { signal, title }) {
+  title("Training");
+  const list = h("div", {});
+  const stale = h("p", { class: "banner", role: "status", hidden: true });
+  let older = [];
+  let cursor = null;
+  let seen = "";
+
+  const draw = (newest) => {
+    const ids = new Set(newest.map((job) => job.id));
+    const jobs = [...newest, ...older.filter((job) => !ids.has(job.id))];
+    refresh(list, jobs.length ? listed(jobs) : nothing(), cursor ? more : "");
+  };
+  let newest = [];
+  const more = button("Show older ones", async () => {
+    const page = await get("/v1/jobs", { cursor }, signal);
+    older = [...older, ...page.items];
+    cursor = page.next_cursor;
+    draw(newest);
+  });
+  const load = async () => {
+    const page = await get("/v1/jobs", {}, signal);
+    if (!older.length) cursor = page.next_cursor;
+    newest = page.items;
+    const now = JSON.stringify([newest, Math.floor(Date.now() / 30_000)]); // “2 min ago” grows old too
+    if (now !== seen) draw(newest);
+    seen = now;
+  };
+
+  await load();
+  let read = Date.now();
+  replace(view, heading("Training", link("Train a model", "#/train", "primary")), stale, card("Jobs", list));
+  every(
+    2,
+    async () => {
+      try {
+        await load();
+        read = Date.now();
+        stale.hidden = true;
+      } catch (error) {
+        if (error.name === "AbortError") return;
+        stale.hidden = false;
+        stale.textContent = `What is shown is as of ${when(read / 1000)}: ${error.message} Trying again.`;
+      }
+    },
+    signal,
+  );
+}
+
+function listed(jobs) {
+  return table(
+    [
+      { label: "Model", cell: (job) => link(job.model, `#/jobs/${job.id}`) },
+      { label: "State", cell: (job) => badge(job.state) },
+      { label: "How far", cell: far },
+      { label: "Estimator", cell: (job) => job.estimator },
+      { label: "Data sets", numeric: true, cell: (job) => job.datasets.length },
+      { label: "Asked for", cell: (job) => h("time", { datetime: job.created_at, title: when(job.created_at) }, ago(job.created_at)) },
+      { label: "Made", cell: (job) => (job.version === null ? "–" : link(`version ${job.version}`, `#/models/${job.model}?version=${job.version}`)) },
+    ],
+    jobs,
+    { caption: "Newest first" },
+  );
+}
+
+function far(job) {
+  if (job.state === "failed") return job.error?.message ?? "failed";
+  if (!ACTIVE.has(job.state)) {
+    const took = job.progress.elapsed_s ? `took ${seconds(job.progress.elapsed_s)}` : "";
+    return [took, job.refresh ? "refresh of a model that learns" : ""].filter(Boolean).join(", ");
+  }
+  const done = job.progress.fraction;
+  return [`${percent(done, 0)}, ${stage(job)}`, left(job) ? `, ${left(job)} left` : "", progress(done, `Progress of ${job.model}`)];
+}
+
+function nothing() {
+  return empty("Nothing has been trained yet. Upload a recording, then train a model on it.", link("Upload data", "#/data"), link("Train a model", "#/train", "primary"));
+}

@@ -1,0 +1,49 @@
+// What the model's owner should know, and the decision that learning waits for.
+
+import { path, post } from "../../api.js";
+import { h, replace } from "../../dom.js";
+import { when } from "../../format.js";
+import { badge, button, confirm, field, notice } from "../../ui.js";
+import { refresh } from "./refresh.js";
+
+const WORDS = {
+  adapt: "The robot is a different one from now on, with a payload or a new tool: what was learnt before counts less, and it is learnt anew. Adapt?",
+  ignore: "Learning goes on as if nothing had been. If the robot has changed, that ruins what the model knows. Go on?",
+};
+
+/** Show alarms, and buttons where learning is held; the buttons stay while they are needed. */
+export function alarms(page, status, name, signal) {
+  const key = status.held ? String(status.held.at) : "";
+  if ((page.held.dataset.key ?? "") !== key) {
+    page.held.dataset.key = key;
+    replace(page.held, status.held ? decision(status, name, signal) : null);
+  }
+  refresh(page.alarms, status.alarms.length ? list(status.alarms) : null);
+}
+
+function decision({ held, alarms }, name, signal) {
+  const replay = h("input", { type: "checkbox" });
+  const decide = (choice) => async () => {
+    if (!(await confirm(WORDS[choice], choice === "adapt" ? "Adapt" : "Go on as before", choice === "adapt" ? "primary" : "danger"))) return;
+    const done = await post(path`/v1/models/${name}/learning/change`, { decision: choice, replay: replay.checked }, signal);
+    notice(`Learning goes on${done.rows ? `, with ${done.rows} rows that had been kept out` : ""}.`);
+  };
+  const said = alarms.find((alarm) => alarm.kind === "change")?.message;
+  return h(
+    "section",
+    { class: "banner", "aria-label": "Decision" },
+    h("h2", {}, "Learning waits for you"),
+    h("p", {}, said ? `${said[0].toUpperCase()}${said.slice(1)}. ` : "The robot seems to have changed. ", held.at === null ? null : `It began on ${when(held.at)}. `, "The model goes on answering with what it knew before: its torque may be wrong."),
+    field("Also learn the rows kept out since", replay),
+    h("div", { class: "actions" }, button("Adapt to the changed robot", decide("adapt"), { kind: "primary" }), button("Nothing has changed, go on", decide("ignore"))),
+  );
+}
+
+function list(items) {
+  return h(
+    "section",
+    { class: "card", "aria-label": "Alarms" },
+    h("h2", {}, "Newest alarms"),
+    h("ul", {}, items.map((alarm) => h("li", {}, badge(alarm.kind, alarm.kind === "promotion" ? "good" : "warn"), ` ${when(alarm.at)}: ${alarm.message}`))),
+  );
+}

@@ -1,0 +1,19 @@
+// What became of a row: in words, and as a symbol that does not need its colour.
+
+export const CODES = {
+  learnt: { words: "learnt" },
+  contact: { words: "contact", why: "torque far outside the interval, as in a collision", symbol: "x", colour: "contact" },
+  change: { words: "waits for a decision", why: "the robot seems to have changed", symbol: "star", colour: "contact" },
+  saturation: { words: "saturated", why: "torque at its actuator’s limit", symbol: "square-open", colour: "novel" },
+  stationary: { words: "at rest", why: "stiction hides the torque", symbol: "circle-open", colour: "muted" },
+  limit: { words: "beyond a limit", why: "position, speed, acceleration or torque", symbol: "triangle-up-open", colour: "contact" },
+  non_finite: { words: "not a number", why: "a value is missing or not finite", symbol: "cross-open", colour: "contact" },
+  time_jump: { words: "time jumped", why: "time goes backwards or leaps", symbol: "triangle-left-open", colour: "novel" },
+  edge: { words: "acceleration not known yet", why: "comes again with the next batch", symbol: "line-ew-open", colour: "muted" },
+};
+export const NOVEL = { words: "beyond what was trained on", symbol: "diamond-open", colour: "novel" };
+
+/** A code in words. */
+export function words(code) {
+  return CODES[code]?.words ?? code;
+}

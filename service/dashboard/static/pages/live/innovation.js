@@ -1,0 +1,88 @@
+// How far every row was from its prediction, in standard deviations, with marks of what was kept out and what is novel.
+
+import { h, replace } from "../../dom.js";
+import { shortNames } from "../../format.js";
+import { css, line, plot } from "../../plots.js";
+import { card } from "../../ui.js";
+import { CODES, NOVEL } from "./codes.js";
+import { WINDOW_S } from "./rows.js";
+import { broken, HALF_WIDTH, thin } from "./torque.js";
+
+const LEAST = 4;
+const MOST = 12;
+const MOST_MARKS = 150; // of a kind
+
+/** The plot in a place; draw(rows, status). */
+export function innovation(place, joints, signal) {
+  const short = shortNames(joints);
+  const element = h("div", { style: "min-height: 340px" });
+  const hint = `Measured minus predicted, in standard deviations of a measurement. 95 % should lie between the dotted lines at ± ${HALF_WIDTH}. Symbols mark rows that were kept out of learning, and motion that lies beyond what this version was trained on; they stand at the joint that was farthest off. What is beyond ± ${MOST} is drawn there.`;
+  replace(place, card("Innovation", element, h("p", { class: "hint" }, hint)));
+  let made = null;
+  return {
+    async draw(rows, status) {
+      if (signal.aborted) return;
+      const worst = rows.map(farthest);
+      const top = Math.min(MOST, Math.max(LEAST, 1.1 * worst.reduce((most, z) => Math.max(most, Math.abs(z)), 0)));
+      const clip = (z) => (z === null ? null : Math.max(-top, Math.min(top, z)));
+      const thinned = thin(rows);
+      const x = broken(thinned, (row) => row.x);
+      const curves = joints.map((_name, joint) =>
+        line(x, broken(thinned, (row) => clip(score(row, joint))), short[joint], joint, { line: { width: 1 }, hovertemplate: "%{y:.2f} σ" }),
+      );
+      const traces = [...curves, ...marks(rows, worst, clip)];
+      const layout = {
+        y: "σ", height: 340, margin: { l: 48, r: 8, t: 10, b: 40 }, hovermode: "closest", uirevision: "live",
+        xaxis: { range: [-WINDOW_S, 0], ticksuffix: " s" },
+        yaxis: { range: [-1.05 * top, 1.05 * top] },
+        shapes: limits(status.contact_threshold, top),
+      };
+      const label = `Innovation of all joints over the last ${WINDOW_S} seconds, with marks of rows that were kept out of learning`;
+      if (made) await made.react(traces, layout);
+      else made = await plot(element, traces, layout, { label, signal });
+    },
+  };
+}
+
+function score(row, joint) {
+  const { tau, mean, std } = row;
+  return tau[joint] === null || mean[joint] === null ? null : (tau[joint] - mean[joint]) / std[joint];
+}
+
+/** The innovation of the joint that was farthest off; 0 where nothing was predicted. */
+function farthest(row) {
+  return row.tau.reduce((most, _tau, joint) => {
+    const z = score(row, joint);
+    return z !== null && Math.abs(z) > Math.abs(most) ? z : most;
+  }, 0);
+}
+
+function marks(rows, worst, clip) {
+  const kinds = new Map();
+  const add = (kind, row, z) => {
+    if (!kinds.has(kind)) kinds.set(kind, { x: [], y: [], text: [] });
+    const found = kinds.get(kind);
+    found.x.push(row.x);
+    found.y.push(clip(z));
+    found.text.push(`${kind.words}${kind.why ? `: ${kind.why}` : ""}, ${z.toFixed(1)} σ`);
+  };
+  rows.forEach((row, index) => {
+    if (row.code !== "learnt") add(CODES[row.code] ?? { words: row.code, symbol: "cross", colour: "contact" }, row, worst[index]);
+    if (row.novel) add(NOVEL, row, worst[index]);
+  });
+  return [...kinds].map(([kind, data]) => ({
+    ...few(data), mode: "markers", type: "scatter", name: kind.words, colour: kind.colour,
+    marker: { symbol: kind.symbol, size: 8 }, hoverinfo: "text",
+  }));
+}
+
+function few(data) {
+  const step = Math.ceil(data.x.length / MOST_MARKS);
+  return Object.fromEntries(Object.entries(data).map(([name, values]) => [name, values.filter((_value, index) => index % step === 0)]));
+}
+
+function limits(contact, top) {
+  const across = (y, colour, dash) => ({ type: "line", xref: "paper", x0: 0, x1: 1, y0: y, y1: y, line: { color: css(colour), width: 1, dash } });
+  const found = [-HALF_WIDTH, HALF_WIDTH].map((y) => across(y, "muted", "dot"));
+  return contact > top ? found : [...found, ...[-contact, contact].map((y) => across(y, "contact", "dash"))];
+}

@@ -1,0 +1,80 @@
+// Where learning, quality and answers stand, once a second.
+
+import { h } from "../../dom.js";
+import { count, number, percent, scientific, seconds, shortNames } from "../../format.js";
+import { badge, facts, table } from "../../ui.js";
+import { words } from "./codes.js";
+
+/** Version, how far answers lag behind, and what became of rows. */
+export function learningCard(status) {
+  const [latest] = status.windows;
+  const lately = { learnt: latest.accepted, ...latest.rejected };
+  const codes = Object.keys(status.counts).filter((code) => !["batches", "duplicates"].includes(code) && (status.counts[code] || lately[code]));
+  const state = status.held ? badge("held", "warn") : status.learns ? badge("learns", "good") : badge("does not learn", "plain");
+  return panel(
+    "Learning",
+    facts([
+      ["Answers contain", `version ${status.version}, revision ${count(status.revision)}`],
+      ["Behind what came", status.lag_events ? `${count(status.lag_events)} batches` : "nothing"],
+      ["Learning", state],
+      ["Beyond the version", status.novel_share === null ? "not known yet" : `${percent(status.novel_share, 0)} of rows`],
+    ]),
+    status.failure ? h("div", { class: "banner bad" }, `It cannot learn: ${status.failure}. It is tried again.`) : null,
+    codes.length
+      ? table(
+          [
+            { label: "Rows", cell: words },
+            { label: `last ${span(latest.seconds)}`, numeric: true, cell: (code) => count(lately[code] ?? 0) },
+            { label: "since service start", numeric: true, cell: (code) => count(status.counts[code]) },
+          ],
+          codes,
+          { caption: "What became of rows" },
+        )
+      : h("p", { class: "muted" }, "No row has come since the service has started."),
+  );
+}
+
+/** How well rows of the last minute were predicted before they were learnt. */
+export function qualityCard({ windows: [latest], joint_names: names, level }) {
+  const short = shortNames(names);
+  if (!latest.rows) return panel("Quality", h("p", { class: "muted" }, `Nothing was predicted and measured in the last ${span(latest.seconds)}.`));
+  return panel(
+    "Quality",
+    table(
+      [
+        { label: "Joint", cell: (joint) => short[joint] },
+        { label: "nMSE", numeric: true, cell: (joint) => scientific(latest.nmse[joint]) },
+        { label: "RMSE, N·m", numeric: true, cell: (joint) => number(latest.rmse[joint], 2) },
+        { label: `in ${percent(level, 0)} band`, numeric: true, cell: (joint) => percent(latest.coverage[joint]) },
+      ],
+      names.map((_name, joint) => joint),
+      { caption: `${count(latest.rows)} rows of the last ${span(latest.seconds)}, each predicted before it was learnt` },
+    ),
+    h("p", { class: "hint" }, "nMSE: mean squared error / variance of the torque, 0 is best. The last column should be near ", percent(level, 0), ". Contacts do not count."),
+  );
+}
+
+/** How fast streams were answered since the last status. */
+export function answersCard({ answers }) {
+  if (answers === null) return panel("Answers of streams", h("p", { class: "muted" }, "Not known yet."));
+  const at_most = (bound) => (bound === null ? (answers.count ? "more than 30 s" : "–") : `at most ${seconds(bound)}`);
+  return panel(
+    "Answers of streams",
+    facts([
+      ["Answers", `${count(answers.count / answers.seconds)} a second`],
+      ["Half within", at_most(answers.p50_at_most_s)],
+      ["99 % within", at_most(answers.p99_at_most_s)],
+      ["Late", answers.late ? badge(`${count(answers.late)} late`, "warn") : "none"],
+      ["Refused", answers.refused ? badge(`${count(answers.refused)} refused`, "bad") : "none"],
+    ]),
+    h("p", { class: "hint" }, "All streams of this model in the last second, from a frame’s arrival until its answer was ready in the service: the network comes on top."),
+  );
+}
+
+function panel(name, ...children) {
+  return h("section", { class: "card", "aria-label": name }, h("h2", {}, name), children);
+}
+
+function span(length) {
+  return length === 60 ? "minute" : seconds(length);
+}

@@ -1,0 +1,84 @@
+// Which version and which recording the page is about.
+
+import { h } from "../../dom.js";
+import { count } from "../../format.js";
+import { empty, field, link, select } from "../../ui.js";
+
+/** Data sets that a version can be compared with: those of its joints and its torque convention. */
+export function fitting(version, datasets) {
+  return datasets.filter(
+    (each) =>
+      each.torque_convention === version.torque_convention &&
+      each.joint_names.length === version.joint_names.length &&
+      each.joint_names.every((joint, index) => joint === version.joint_names[index]),
+  );
+}
+
+/** What a version has to do with a data set: "trained on", "partly held out", "held out" or "". */
+export function relation(version, dataset) {
+  const same = (each) => each.id === dataset.id || each.sha256 === dataset.sha256;
+  const held = version.lineage.holdout?.datasets?.find(same);
+  if (held) return held.whole ? "held out" : "partly held out";
+  return version.lineage.datasets?.some(same) ? "trained on" : "";
+}
+
+/** The data set and part to begin with: what was asked for, else what the version has not seen, the newest first. */
+export function firstChoice(version, datasets, query) {
+  const offered = fitting(version, datasets);
+  const asked = offered.find((each) => each.id === query.get("dataset"));
+  const by = (...kinds) => offered.find((each) => kinds.includes(relation(version, each)));
+  const dataset = asked ?? by("") ?? by("held out", "partly held out") ?? offered[0] ?? null;
+  if (dataset === null) return { dataset: null, part: "all" };
+  const has = relation(version, dataset).endsWith("held out");
+  const part = has && query.get("part") !== "all" ? "held_out" : "all";
+  return { dataset: dataset.id, part };
+}
+
+/** The fields above the tabs. changed(): the data set or part is another one; chosen(number): the version. */
+export function chooser(state, needs, changed, chosen) {
+  const { model, version, datasets } = state;
+  const numbers = [...model.versions].reverse().map((each) => {
+    const role = each.version === model.serving_version ? ", answers now" : "";
+    return [String(each.version), `${each.version} – ${each.estimator}${role}`];
+  });
+  const fields = [field("Version", select(numbers, String(version.version), (value) => chosen(Number(value))))];
+  const offered = fitting(version, datasets);
+  if (needs.data && offered.length) fields.push(...dataFields(state, offered, changed));
+  return h("div", { class: "grid" }, fields);
+}
+
+/** What is shown where no data set fits. */
+export function noData({ version, datasets }) {
+  const joints = version.joint_names.join(", ");
+  const why = datasets.length
+    ? `None of the ${count(datasets.length)} data sets has the joints of this model (${joints}) and its torque convention (${version.torque_convention}).`
+    : `There is no data set yet to compare this model with.`;
+  return empty(
+    `${why} Upload a recording of this robot that the model was not trained on.`,
+    link("Upload a recording", "#/data", "primary"),
+  );
+}
+
+function dataFields(state, offered, changed) {
+  const { version } = state;
+  const options = offered.map((each) => {
+    const known = relation(version, each);
+    return [each.id, `${each.name || each.id} – ${count(each.report.rows)} samples${known ? `, ${known}` : ", not seen in training"}`];
+  });
+  const made = [
+    field("Recording", select(options, state.dataset, (id) => {
+      state.dataset = id;
+      Object.assign(state, firstChoice(version, offered, new URLSearchParams({ dataset: id })));
+      changed();
+    })),
+  ];
+  const dataset = offered.find((each) => each.id === state.dataset);
+  if (dataset && relation(version, dataset).endsWith("held out")) {
+    const held = [["held_out", "what training held out"], ["all", "all of it"]];
+    made.push(field("Part", select(held, state.part, (part) => {
+      state.part = part;
+      changed();
+    })));
+  }
+  return made;
+}

@@ -1,0 +1,137 @@
+// Small plots, one a joint, that zoom together; where not every row is shown, zooming fetches the rows between.
+
+import { h, replace } from "../../dom.js";
+import { count, shortNames } from "../../format.js";
+import { plot, plotly } from "../../plots.js";
+import { button, errorBox, field, select } from "../../ui.js";
+import { axis } from "./curves.js";
+
+const ALL = "all joints";
+
+/**
+ * Draw a trace joint by joint into an element.
+ * fetch(start, stop): a trace of these rows, (0, null) all; views: {label: (trace, joint, x) => traces}, one is shown at
+ * a time; about: {label: a sentence on it}; unit: of the y axis.
+ */
+export async function joints(element, { first, fetch, views, about, signal }) {
+  const names = shortNames(first.joint_names);
+  const labels = Object.keys(views);
+  const shown = { trace: first, joint: ALL, view: labels[0] };
+  const plots = new Map();
+  let asked = 0, painting = false;
+  const places = first.joint_names.map(() => h("div", {}));
+  const grid = h("div", { class: "grid wide" }, places), said = h("p", { class: "hint" }), note = h("p", { class: "hint" }), key = h("p", { class: "actions" });
+  const problem = h("div", {});
+  const start = h("input", { type: "number", min: "0", step: "1" }), stop = h("input", { type: "number", min: "1", step: "1" });
+
+  const draw = async () => {
+    const { trace } = shown;
+    const { x, label } = axis(trace);
+    painting = true;
+    for (const [joint, place] of places.entries()) {
+      place.hidden = shown.joint !== ALL && shown.joint !== first.joint_names[joint];
+      if (place.hidden) continue;
+      const layout = {
+        title: names[joint],
+        x: label,
+        y: unit(trace, joint),
+        height: shown.joint === ALL ? 270 : 420,
+        showlegend: false, // one key above all plots takes less room than a legend in each
+        xaxis: { autorange: true },
+        hovermode: "x unified",
+      };
+      const text = `${shown.view} of ${first.joint_names[joint]} along the recording, ${trace.shown} of ${trace.in_range} rows`;
+      place.setAttribute("aria-label", text);
+      const traces = views[shown.view](trace, joint, x);
+      replace(key, legend(traces));
+      if (plots.has(joint)) await plots.get(joint).react(traces, layout);
+      else {
+        plots.set(joint, await plot(place, traces, layout, { label: text, signal }));
+        place.on("plotly_relayout", zoomed);
+      }
+      if (signal.aborted) return;
+    }
+    painting = false;
+    start.value = String(trace.rows[0]);
+    stop.value = String(trace.rows.at(-1));
+    replace(said, sentence(trace), " ", whole() ? null : button("Show all rows", () => go(0, null)));
+    replace(note, about[shown.view]);
+  };
+  const whole = () => shown.trace.in_range === first.in_range;
+  const go = async (from, to) => {
+    const mine = (asked += 1);
+    try {
+      const trace = from === 0 && to === null ? first : await fetch(from, to);
+      if (mine !== asked || signal.aborted) return;
+      shown.trace = trace;
+      replace(problem);
+      await draw();
+    } catch (error) {
+      if (error.name !== "AbortError") replace(problem, errorBox(error));
+    }
+  };
+  const zoomed = (change) => {
+    if (painting) return;
+    if (change["xaxis.autorange"]) {
+      if (!whole()) go(0, null);
+      return;
+    }
+    if (!("xaxis.range[0]" in change)) return;
+    const { x } = axis(shown.trace);
+    const [low, high] = [change["xaxis.range[0]"], change["xaxis.range[1]"]];
+    const within = shown.trace.rows.filter((_row, index) => x[index] >= low && x[index] <= high);
+    if (within.length > 1) go(within[0], within.at(-1) + 1);
+  };
+
+  const form = h(
+    "form",
+    {
+      class: "actions",
+      onsubmit: (event) => {
+        event.preventDefault();
+        go(Math.max(0, Number(start.value)), Number(stop.value) + 1);
+      },
+    },
+    field("From row", start),
+    field("to row", stop),
+    h("button", { type: "submit" }, "Show these rows"),
+  );
+  replace(
+    element,
+    h(
+      "div",
+      { class: "grid" },
+      field("Joint", select([ALL, ...first.joint_names], ALL, (joint) => { shown.joint = joint; draw(); })),
+      labels.length > 1 ? field("Show", select(labels, shown.view, (view) => { shown.view = view; draw(); })) : null,
+    ),
+    note,
+    said,
+    key,
+    problem,
+    grid,
+    h("details", {}, h("summary", {}, "Show certain rows"), h("p", { class: "hint" }, "Dragging over a plot does the same."), form),
+  );
+  await plotly();
+  await draw();
+}
+
+/** N·m, or N of a joint that slides. */
+function unit(trace, joint) {
+  return trace.joint_types?.[joint] === "prismatic" ? "N" : "N·m";
+}
+
+/** What each line and band of a plot is, in its colour and form. */
+function legend(traces) {
+  const named = traces.filter((trace) => trace.showlegend !== false);
+  return named.map(({ name, colour, filled, opacity = 1 }) => {
+    const paint = `var(--${typeof colour === "number" ? `joint-${(colour % 8) + 1}` : colour})`;
+    const form = filled ? `height: 0.8rem; opacity: 0.3; background: ${paint}` : `border-top: 3px solid ${paint}; opacity: ${opacity}`;
+    return h("span", {}, h("span", { "aria-hidden": "true", style: `display: inline-block; width: 1.6rem; vertical-align: middle; margin-right: 0.4rem; ${form}` }), name);
+  });
+}
+
+function sentence(trace) {
+  const part = trace.in_range === trace.samples ? "" : ` (rows ${count(trace.rows[0])} to ${count(trace.rows.at(-1))})`;
+  if (trace.shown === trace.in_range) return `All ${count(trace.in_range)} samples${part} are drawn.`;
+  return `${count(trace.shown)} of ${count(trace.in_range)} samples${part} are drawn, evenly chosen: a peak between two of them is missing. Drag over a part of a plot to see every sample of it.`;
+}

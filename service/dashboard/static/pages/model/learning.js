@@ -1,0 +1,88 @@
+// How a model learns while it serves: where it stands, how well it predicted lately, what it reports.
+
+import { get } from "../../api.js";
+import { h, replace } from "../../dom.js";
+import { ago, count, number, percent, scientific, when } from "../../format.js";
+import { badge, card, empty, every, facts, link, loading, table } from "../../ui.js";
+
+/** The tab of learning; it looks again every five seconds. */
+export async function learning(view, { where, name }, { signal }) {
+  const stale = h("div", {}), place = h("div", {}, loading());
+  replace(view, stale, place);
+  let seen = "";
+  const look = async () => {
+    const [said, quality, alarms] = await Promise.all([
+      get(`${where}/learning`, {}, signal),
+      get(`${where}/quality`, {}, signal),
+      get(`${where}/alarms`, { limit: 5 }, signal),
+    ]);
+    if (signal.aborted) return;
+    replace(stale);
+    const now = JSON.stringify([said, quality, alarms]);
+    // what has not changed stays, and with it the keyboard's focus
+    if (now !== seen) replace(place, status(said, name), qualityCard(quality), alarmsCard(alarms.items), options(said.options));
+    seen = now;
+  };
+  await look(); // what goes wrong the first time is shown in the page's place
+  every(5, () => look().catch((error) => {
+    if (!signal.aborted) replace(stale, h("div", { class: "banner bad", role: "alert" }, `What is shown here is no longer up to date: ${error.message}. It is tried again.`));
+  }), signal);
+}
+
+function status({ options, status: at }, name) {
+  const live = link("Follow it live", `#/live/${encodeURIComponent(name)}`, "primary");
+  if (!at.events) {
+    const said = options.enabled
+      ? "It has learnt nothing while serving so far. Send what the robot measured, with the answers’ stream or in batches; "
+      : "It does not learn while it serves: that is switched off. ";
+    return empty([said, h("code", {}, `lipserve stream ${name} --simulate panda --learn`), " shows how with a simulated Panda."], live);
+  }
+  const behind = at.lag_events ? badge(`${count(at.lag_events)} events behind`, "busy") : badge("up to date", "good");
+  return card(
+    "Where it stands",
+    at.held ? h("div", { class: "banner bad", role: "note" }, h("strong", {}, "Learning stands still. "), `The robot seems to have changed${at.held.at ? ` ${ago(at.held.at)}` : ""}: decide on the live page whether to adapt or to go on.`) : null,
+    at.failure ? h("div", { class: "banner bad", role: "note" }, `It cannot learn now: ${at.failure}`) : null,
+    facts([
+      ["Version that learns", String(at.version)],
+      ["Answers contain", [`revision ${count(at.published)} `, behind]],
+      ["Batches logged", count(at.events)],
+      ["Beyond what the version can hold", percent(at.novel_share)],
+      ["Sources", at.streams.length ? at.streams.map((each) => each.stream_id).join(", ") : "none"],
+      ["Candidate", at.candidate ? `version ${at.candidate.version}, has yet to prove better` : "none"],
+    ]),
+    h("p", {}, live),
+  );
+}
+
+function qualityCard({ joint_names: names, windows, level }) {
+  const told = windows.filter((each) => each.rows);
+  if (!told.length) return null;
+  const [latest] = told;
+  const columns = [
+    { label: "Joint", cell: (joint) => names[joint] },
+    { label: "nMSE", numeric: true, cell: (joint) => scientific(latest.nmse[joint]) },
+    { label: "RMSE, N·m", numeric: true, cell: (joint) => number(latest.rmse[joint]) },
+    { label: `in ${percent(level, 0)}`, numeric: true, cell: (joint) => percent(latest.coverage[joint]) },
+  ];
+  const kept = Object.entries(latest.rejected).filter(([, rows]) => rows).map(([code, rows]) => `${code} ${count(rows)}`);
+  return card(
+    "How well it predicted lately",
+    table(columns, names.map((_name, joint) => joint), { caption: `The last ${count(latest.seconds)} s, ${count(latest.rows)} rows: each was predicted before it was learnt` }),
+    h("p", { class: "hint" }, `${count(latest.accepted)} of these rows teach${kept.length ? `; kept out: ${kept.join(", ")}` : ""}.`),
+  );
+}
+
+function alarmsCard(alarms) {
+  if (!alarms.length) return null;
+  const columns = [
+    { label: "When", cell: (each) => when(each.at) },
+    { label: "Kind", cell: (each) => badge(each.kind, each.kind === "change" ? "bad" : "plain") },
+    { label: "What", cell: (each) => each.message },
+  ];
+  return card("Latest alarms", table(columns, alarms));
+}
+
+function options(said) {
+  const text = (value) => (value === null ? "none" : Array.isArray(value) ? value.join(", ") : String(value));
+  return card("How it is set", facts(Object.entries(said).map(([name, value]) => [name.replaceAll("_", " "), text(value)])), h("p", { class: "hint" }, "Changed over the API: ", h("code", {}, "PUT /v1/models/{model}/learning"), "."));
+}

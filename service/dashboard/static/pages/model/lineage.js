@@ -1,0 +1,117 @@
+// Where a version comes from: data, what was held out, options, what the fit said, software.
+
+import { h, replace } from "../../dom.js";
+import { bytes, count, number, percent, scientific, seconds, when } from "../../format.js";
+import { badge, card, facts, link, table } from "../../ui.js";
+
+/** The tab of a version's lineage. */
+export async function lineage(view, { version, datasets }) {
+  const from = version.lineage;
+  replace(
+    view,
+    card(`Version ${version.version}`, facts(origin(version))),
+    dataCard(from, datasets),
+    figuresCard(version, from),
+    card("Fit", facts(fit(version)), version.fit.converged === false ? h("p", { class: "banner" }, "The fit had not converged when it stopped: more iterations may give a better model.") : null),
+    rangeCard(version),
+    card(
+      "Options and software",
+      facts(Object.entries({ ...version.options, ...from.software }).map(([name, value]) => [name.replaceAll("_", " "), String(value)])),
+    ),
+    h("details", {}, h("summary", {}, "All of it as JSON"), h("pre", { tabindex: "0" }, h("code", {}, JSON.stringify({ lineage: from, fit: version.fit, compact: version.compact, calibration: version.calibration, robot: version.robot && { ...version.robot, urdf: undefined } }, null, 2)))),
+  );
+}
+
+function origin(version) {
+  const from = version.lineage;
+  const found = [
+    ["Model", version.model],
+    ["Made", when(version.created_at)],
+    ["By", version.job ? link(version.job, `#/jobs/${version.job}`) : from.imported ? "import" : "came with LIPServe"],
+    ["Estimator", version.estimator],
+    ["Joints", version.joint_names.join(", ")],
+    ["Torque", version.torque_convention.replace("_", " ")],
+    ["Noise of the measurement, N·m", version.noise_std.map((each) => number(each, 2)).join(", ")],
+  ];
+  if (version.robot?.name) found.push(["Robot", version.robot.name]);
+  if (from.refresh) found.push(["Refresh of", `version ${from.refresh.version}`]);
+  if (from.log) found.push(["Rows learnt from the log", `${count(from.log.rows)} of ${count(from.log.found)}`]);
+  if (from.made_by) found.push(["Made by", from.made_by]);
+  return found;
+}
+
+function dataCard(from, datasets) {
+  if (!from.datasets?.length) {
+    const said = from.simulation ? "It was trained on simulated motion, before it came here." : from.imported ? "It was imported; its lineage names no data set." : "Its lineage names no data set.";
+    return card("Trained on", h("p", {}, said));
+  }
+  const known = new Set(datasets.map((each) => each.id));
+  const held = (row) => from.holdout?.datasets.find((each) => each.id === row.id);
+  const columns = [
+    { label: "Data set", cell: (row) => (known.has(row.id) ? link(row.name || row.id, `#/data/${row.id}`) : `${row.name || row.id} (deleted)`) },
+    { label: "Samples", numeric: true, cell: (row) => count(row.rows) },
+    { label: "Held out", numeric: true, cell: (row) => (held(row) ? `${count(held(row).rows)}${held(row).whole ? " (all)" : ""}` : "–") },
+    { label: "Guard, left out of both", numeric: true, cell: (row) => (held(row) ? count(held(row).guarded) : "–") },
+    { label: "Content (sha256)", cell: (row) => h("code", { title: row.sha256 }, row.sha256?.slice(0, 12) ?? "–") },
+  ];
+  return card("Trained on", table(columns, from.datasets));
+}
+
+function figuresCard(version, from) {
+  const sets = [
+    ["Held out", from.holdout?.nmse ? from.holdout : null],
+    ["Trained on (flatters)", from.training_metrics],
+  ].filter(([, figures]) => figures);
+  if (!sets.length) return null;
+  const columns = [
+    { label: "Joint", cell: (joint) => version.joint_names[joint] },
+    ...sets.flatMap(([label, figures]) => [
+      { label: `${label}: nMSE`, numeric: true, cell: (joint) => scientific(figures.nmse[joint]) },
+      { label: "RMSE, N·m", numeric: true, cell: (joint) => number(figures.rmse[joint]) },
+      { label: "in 95 %", numeric: true, cell: (joint) => percent(figures.coverage[joint]) },
+    ]),
+  ];
+  const said = sets.map(([label, figures]) => `${label.toLowerCase()}: ${count(figures.samples)} of ${count(figures.of)} samples`).join("; ");
+  return card(
+    "Figures from the day it was trained",
+    table(columns, version.joint_names.map((_name, joint) => joint), { caption: said }),
+    from.holdout ? h("p", { class: "hint" }, `Held out: ${percent(from.holdout.split.share, 0)} as ${from.holdout.split.kind}.`) : h("p", { class: "hint" }, "Nothing was held out: only a recording that it has not seen tells how good it is."),
+  );
+}
+
+function fit({ fit: said, compact, calibration, lineage: from }) {
+  const found = [
+    ["Converged", badge(said.converged ? "yes" : "no", said.converged ? "good" : "warn")],
+    ["Iterations", count(said.iterations)],
+    ["Took", seconds(said.seconds)],
+    ["Samples given", count(said.samples_given)],
+    ["Hyperparameters fitted on", count(said.samples_hyperparameters)],
+    ["Posterior stands on", count(said.samples_posterior)],
+    ["Stds multiplied by", number(calibration.function_std_factor)],
+  ];
+  if (compact) {
+    found.push(
+      ["Inducing outputs", count(compact.inducing_outputs)],
+      ["Largest deviation of the mean from the exact posterior", `${percent(compact.mean_max)} of its std`],
+      ["Largest deviation of the std", percent(compact.std_max)],
+      ["Tolerance reached", badge(compact.tolerance_reached ? "yes" : "no, answers say they know less than the data told", compact.tolerance_reached ? "good" : "warn")],
+    );
+  }
+  if (from.peak_memory_bytes) found.push(["Memory at most", bytes(from.peak_memory_bytes)]);
+  return found;
+}
+
+function rangeCard({ joint_names: names, training_range: range }) {
+  const span = (quantity) => (joint) => `${number(range[quantity].min[joint])} to ${number(range[quantity].max[joint])}`;
+  const columns = [
+    { label: "Joint", cell: (joint) => names[joint] },
+    { label: "q, rad", numeric: true, cell: span("q") },
+    { label: "dq, rad/s", numeric: true, cell: span("dq") },
+    { label: "ddq, rad/s²", numeric: true, cell: span("ddq") },
+  ];
+  return card(
+    "Where its samples lie",
+    table(columns, names.map((_name, joint) => joint), { caption: "Smallest and largest values (sliding joints: m)" }),
+    h("p", { class: "hint" }, "Outside these ranges it guesses: its bands grow, but not always enough."),
+  );
+}

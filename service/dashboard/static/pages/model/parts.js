@@ -1,0 +1,88 @@
+// What the torque is made of, and the friction that was learnt: known to the model only, as no sensor measures them.
+
+import { post } from "../../api.js";
+import { h, replace } from "../../dom.js";
+import { number } from "../../format.js";
+import { card, loading, table } from "../../ui.js";
+import { noData } from "./choice.js";
+import { around, broken, column } from "./curves.js";
+import { flattery } from "./flattery.js";
+import { joints } from "./joints.js";
+
+const POINTS = 500;
+const SAID = { gravity: "gravity", inertial: "inertial, M(q) ddq", coriolis: "Coriolis and centrifugal", friction: "friction" };
+
+/** The tab of components along the chosen recording, and of parameters. */
+export async function parts(view, state, { signal }) {
+  const cards = [frictionCard(state.version), bodiesCard(state.version)];
+  if (state.dataset === null) {
+    replace(view, noData(state), cards);
+    return;
+  }
+  const request = { dataset: state.dataset, version: state.version.version, part: state.part };
+  replace(view, loading("Taking the torque apart"));
+  const { offered } = await post(`${state.where}/trace`, { ...request, points: 1 }, signal);
+  const fetch = async (start, stop) => {
+    const range = stop === null ? {} : { start, stop };
+    const trace = await post(`${state.where}/trace`, { ...request, ...range, points: POINTS, components: offered }, signal);
+    return { ...trace, joint_types: state.version.joint_types };
+  };
+  const trace = await fetch(0, null);
+  const along = h("div", {});
+  const only = offered.length > 1 ? null : h("p", { class: "hint" }, `A model with the estimator ${state.version.estimator} tells friction apart from the rest, and no more: gravity, inertia and Coriolis are told by estimators that learn energies.`);
+  replace(view, flattery(trace), card("Parts of the torque", only, along), cards);
+  const names = Object.keys(SAID).filter((name) => offered.includes(name));
+  const views = names.length > 1 ? { "all parts": (...given) => names.flatMap((name, index) => part(name, index, ...given)) } : {};
+  for (const [index, name] of names.entries()) views[SAID[name]] = (...given) => part(name, index, ...given);
+  const note = "No sensor measures these: bands hold the learnt function with 95 %, as far as the model itself can tell, and nothing here checks them.";
+  const sum = names.length > 1 ? " They add up to the predicted torque." : "";
+  await joints(along, { first: trace, fetch, views, about: Object.fromEntries(Object.keys(views).map((view_) => [view_, note + sum])), signal });
+}
+
+function part(name, index, trace, joint, x) {
+  const values = trace.components[name];
+  const mean = column(values.mean, joint);
+  return [
+    around(x, mean, column(values.std, joint), trace.breaks, `${SAID[name]}, 95 % of the function`, index, { showlegend: false }),
+    broken(x, mean, trace.breaks, SAID[name], index),
+  ];
+}
+
+function frictionCard({ joint_names: names, joint_types: types, parameters }) {
+  const friction = parameters?.friction;
+  if (!friction) return card("Friction parameters", h("p", { class: "muted" }, "This version does not tell any."));
+  const value = (term) => (joint) => {
+    const { mean, std } = friction[term];
+    const vague = Math.abs(mean[joint]) < 2 * std[joint];
+    return [`${number(mean[joint])} ± ${number(std[joint], 2)}`, vague ? h("span", { class: "muted", title: "within two standard deviations of zero" }, " ≈ 0") : null];
+  };
+  const sliding = types.includes("prismatic") ? " (sliding joints: N·s/m and N)" : "";
+  const columns = [
+    { label: "Joint", cell: (joint) => names[joint] },
+    { label: "Viscous, N·m·s/rad", numeric: true, cell: value("viscous") },
+    { label: "Coulomb, N·m", numeric: true, cell: value("coulomb") },
+    { label: "Offset, N·m", numeric: true, cell: value("offset") },
+  ];
+  return card(
+    "Friction parameters",
+    table(columns, names.map((_name, joint) => joint), { caption: `Mean ± one standard deviation${sliding}, as trained` }),
+    h("p", { class: "hint" }, "Friction is viscous · dq + Coulomb · sign(dq) + a constant offset, which also takes up what else is constant. ≈ 0: zero lies within two standard deviations, so the data do not show that there is any. What was learnt online since is not in this table."),
+  );
+}
+
+function bodiesCard({ parameters }) {
+  const inertia = parameters?.inertia;
+  if (!inertia) return null;
+  const columns = [
+    { label: "Joint that moves the body", cell: (body) => body.joint },
+    { label: "Mass, kg", numeric: true, cell: (body) => `${number(body.mean.mass)} ± ${number(body.std.mass, 2)}` },
+    { label: "Nearest possible mass, kg", numeric: true, cell: (body) => number(body.plausible.mass) },
+  ];
+  return card(
+    "Masses",
+    table(columns, inertia.bodies, { caption: "Mean ± one standard deviation, as trained" }),
+    h("p", { class: "hint" },
+      inertia.mean_is_plausible ? "These are the masses of bodies that can exist. " : "The means alone are not those of bodies that can exist; the nearest possible ones are. ",
+      "Torques tell many inertial parameters only in combinations; the rest comes from the URDF, which is believed the more the better it fits the data, so a small deviation need not mean that the data tell this mass. Moments and inertias: ", h("code", {}, "parameters"), " of the version in the API."),
+  );
+}

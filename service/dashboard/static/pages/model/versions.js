@@ -1,0 +1,110 @@
+// Versions and aliases: which one answers, moving that, taking a move back, deleting, comparing two.
+
+import { del, get, path, post, put } from "../../api.js";
+import { h, replace } from "../../dom.js";
+import { when } from "../../format.js";
+import { badge, button, card, confirm, field, loading, notice, select, table } from "../../ui.js";
+import { compareForm } from "./compare.js";
+import { exportVersion } from "./export.js";
+import { confirmServing } from "./serving.js";
+
+/** The tab of versions. */
+export async function versions(view, state, { signal, reload, select: look }) {
+  replace(view, loading());
+  const { items: aliases } = await get(`${state.where}/aliases`, {}, signal);
+  replace(
+    view,
+    card("Versions", versionTable(state, aliases, reload, look)),
+    card("What versions are called", aliasTable(state, aliases, reload), aliasForm(state, reload)),
+    state.model.versions.length > 1 ? card("Compare two versions", compareForm(state, signal)) : null,
+  );
+}
+
+function versionTable({ name, where, model, version }, aliases, reload, look) {
+  const serving = model.serving_version;
+  const named = (number) => aliases.filter((each) => each.version === number && each.alias !== "serving").map((each) => each.alias);
+  const actions = ({ version: number }) => {
+    const made = [button("Look at it", () => look(number, "accuracy"))];
+    if (number !== serving) made.push(button("Let it answer", async () => {
+      if (!(await confirmServing(name, number, serving))) return;
+      await put(`${where}/aliases/serving`, { version: number });
+      notice(`Version ${number} of ${name} answers from now on.`);
+      await reload();
+    }, { kind: "primary" }));
+    made.push(button("Export", () => exportVersion(name, number)));
+    if (number !== serving && !named(number).length) made.push(button("Delete", async () => {
+      if (!(await confirm(`Delete version ${number} of ${name}? It cannot be brought back.`, `Delete version ${number}`))) return;
+      await del(`${where}/versions/${number}`);
+      notice(`Version ${number} is deleted.`);
+      await reload();
+    }, { kind: "danger" }));
+    for (const each of made) each.setAttribute("aria-label", `${each.textContent}: version ${number}`);
+    return h("div", { class: "actions" }, made);
+  };
+  const columns = [
+    {
+      label: "Version",
+      cell: (each) => [
+        `${each.version} `,
+        each.version === serving ? badge("serving") : null,
+        " ",
+        named(each.version).map((alias) => [badge(alias, "plain"), " "]),
+        each.version === version.version ? h("span", { class: "muted" }, "looked at") : null,
+      ],
+    },
+    { label: "Do", cell: actions },
+    { label: "Estimator", cell: (each) => each.estimator },
+    { label: "Made", cell: (each) => when(each.created_at) },
+  ];
+  return table(columns, [...model.versions].reverse(), { caption: "Newest first" });
+}
+
+function aliasTable({ name, where }, aliases, reload) {
+  const back = (each) => button("Roll back", async () => {
+    const what = each.alias === "serving" ? `Version ${each.previous} of ${name} answers again then, and version ${each.version} no more.` : `${each.alias} means version ${each.previous} again then.`;
+    if (!(await confirm(`Take the last move of “${each.alias}” back? ${what}`, `Back to version ${each.previous}`, "primary"))) return;
+    const now = await post(`${where}/aliases/${encodeURIComponent(each.alias)}/rollback`, {});
+    notice(`${each.alias} is version ${now.version} again.`);
+    await reload();
+  });
+  const remove = (each) => button("Remove", async () => {
+    if (!(await confirm(`Remove the alias “${each.alias}”? Who asks for it is refused then; version ${each.version} stays.`, "Remove it"))) return;
+    await del(path`/v1/models/${name}/aliases/${each.alias}`);
+    notice(`The alias ${each.alias} is removed.`);
+    await reload();
+  }, { kind: "danger" });
+  const named = (made, each) => {
+    made.setAttribute("aria-label", `${made.textContent}: ${each.alias}`);
+    return made;
+  };
+  const columns = [
+    { label: "Alias", cell: (each) => `${each.alias} → ${each.version}` },
+    {
+      label: "Do",
+      cell: (each) => h("div", { class: "actions" }, each.previous === null ? null : named(back(each), each), each.alias === "serving" ? null : named(remove(each), each)),
+    },
+    { label: "Before", cell: (each) => (each.previous === null ? "–" : `version ${each.previous}`) },
+    { label: "Since", cell: (each) => when(each.changed_at) },
+  ];
+  return table(columns, aliases, { caption: "“serving” answers where no version is named; clients may ask for other aliases by name" });
+}
+
+function aliasForm({ where, model, name }, reload) {
+  const alias = h("input", { type: "text", required: true, pattern: "[a-z][a-z0-9._\\-]{0,63}", placeholder: "production", autocomplete: "off", spellcheck: "false" });
+  const version = select([...model.versions].reverse().map((each) => [String(each.version), `version ${each.version}`]), String(model.serving_version));
+  const set = button("Point it there", async () => {
+    if (!alias.reportValidity()) return;
+    const chosen = alias.value.trim(), number = Number(version.value);
+    if (chosen === "serving" && !(await confirmServing(name, number, model.serving_version))) return;
+    await put(`${where}/aliases/${encodeURIComponent(chosen)}`, { version: number });
+    notice(`${chosen} is version ${number} now.`);
+    await reload();
+  });
+  return h(
+    "details",
+    {},
+    h("summary", {}, "Make or move an alias"),
+    h("div", { class: "grid" }, field("Alias", alias, "Lower-case letters, digits, dots and hyphens, after a letter."), field("Points to", version)),
+    set,
+  );
+}

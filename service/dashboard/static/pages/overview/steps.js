@@ -1,0 +1,38 @@
+// What to do first on a service that has not been used yet; gone once all of it is done.
+
+import { h, replace } from "../../dom.js";
+import { badge, card, link } from "../../ui.js";
+import { changed } from "./follow.js";
+
+/** Show the way from nothing to a model, and how far one has come. */
+export function steps(place, { data, models, jobs }) {
+  const trained = jobs.items.find((job) => job.state === "succeeded");
+  const done = { data: data.items.length > 0, trained: trained !== undefined };
+  if (!changed(place, [done, trained?.model, models.items[0]?.name])) return;
+  if (done.data && done.trained) return void place.replaceChildren();
+  const shipped = models.items.find((model) => model.name === "panda-sim");
+  replace(
+    place,
+    card(
+      "First steps",
+      h(
+        "ol",
+        { class: "steps" },
+        step(done.data, link("Upload a recording", "#/data"), " of your robot: positions, velocities and torques. No robot at hand? Simulate one:", command("lipserve simulate panda panda.csv")),
+        step(done.trained, link("Train a model", "#/train"), " on it: the defaults suit most recordings."),
+        step(false, "See how far its torques can be trusted on motion it was not trained on, and stream to it."),
+      ),
+      shipped
+        ? h("p", { class: "hint" }, "Or look around first: ", link("panda-sim", "#/models/panda-sim"), " is a simulated Panda that comes with LIPServe.")
+        : null,
+    ),
+  );
+}
+
+function step(done, ...what) {
+  return h("li", {}, what, " ", done ? badge("done", "good") : null);
+}
+
+function command(text) {
+  return h("pre", {}, h("code", {}, text));
+}

@@ -1,0 +1,119 @@
+// The form that starts a training job.
+
+import { pages, post } from "../api.js";
+import { h, replace } from "../dom.js";
+import { card, errorBox, field, heading, notice } from "../ui.js";
+import { robotSelect, robots } from "./data/robots.js";
+import { advancedOptions } from "./train/advanced.js";
+import { datasetChoice } from "./train/choice.js";
+import { ESTIMATORS, estimatorChoice } from "./train/estimators.js";
+import { holdoutChoice } from "./train/holdout.js";
+
+/** The page `#/train`; `?datasets=ID,ID&model=NAME` chooses beforehand. */
+export async function render(view, { query }, { signal, title }) {
+  title("Train a model");
+  const [datasets, models] = await Promise.all([
+    pages("/v1/datasets", 200, {}, signal),
+    pages("/v1/models", 200, {}, signal),
+  ]);
+  const known = new Map(models.map((each) => [each.name, each]));
+  const robot = robotSelect({ none: "choose one", withUrdf: true });
+  robot.select.required = true;
+  const withRobot = h("div", {}, field("Robot", robot.select, "Its joints are matched with those of the data by name."), robot.note, robot.add);
+  const needRobot = (needed) => {
+    withRobot.hidden = !needed;
+    robot.select.disabled = !needed;
+  };
+  let estimator = ESTIMATORS[0][0];
+  const estimators = estimatorChoice((name, needed) => {
+    estimator = name;
+    needRobot(needed);
+  });
+  needRobot(false);
+
+  const { element: nameField, input: model } = modelName(known, query.get("model"));
+  const preselected = (query.get("datasets") ?? "").split(",");
+  const choice = datasetChoice(datasets, preselected, (picked) => {
+    const said = new Set(picked.map((each) => each.report.robot));
+    if (said.size === 1 && !robot.select.value) robot.choose([...said][0]);
+  });
+  const holdout = holdoutChoice();
+  const advanced = advancedOptions(signal);
+  const problems = h("div", {});
+  const start = h("button", { type: "submit", class: "primary" }, "Start training");
+
+  const submit = async (event) => {
+    event.preventDefault();
+    const picked = choice.chosen();
+    if (!picked.length) {
+      replace(problems, h("div", { class: "error", role: "alert" }, "Choose at least one data set to train on."));
+      form.querySelector("[name=datasets]:not(:disabled)")?.focus();
+      return;
+    }
+    const request = { model: model.value.trim(), datasets: picked.map((each) => each.id), estimator, options: advanced.values() };
+    if (holdout.value()) request.holdout = holdout.value();
+    if (!robot.select.disabled) request.robot = robot.select.value;
+    if (advanced.jointTypes().length) request.joint_types = advanced.jointTypes();
+    start.disabled = true;
+    replace(problems);
+    try {
+      const job = await post("/v1/jobs", request, signal);
+      location.hash = `#/jobs/${job.id}`;
+    } catch (error) {
+      start.disabled = false;
+      if (error.name === "AbortError") return;
+      replace(problems, errorBox(error));
+      const field = error.detail?.[0]?.field?.replace(/\[.*/, "");
+      const wrong = field && form.querySelector(`[name="${CSS.escape(field)}"]`);
+      wrong?.closest("details")?.setAttribute("open", "");
+      wrong?.focus();
+    }
+  };
+  const form = h(
+    "form",
+    { onsubmit: submit },
+    card("What to learn from", choice.element),
+    card("What to make", nameField, estimators, withRobot),
+    card("How to judge it", holdout.element),
+    card("How to fit it", h("p", { class: "hint" }, "The defaults suit most recordings."), advanced.element),
+    problems,
+    h("div", { class: "actions" }, start),
+  );
+  replace(view, heading("Train a model"), form);
+  choice.changed?.();
+  robots(signal).then(
+    (found) => {
+      robot.fill(found);
+      choice.changed?.();
+    },
+    (error) => error.name === "AbortError" || notice(`robots: ${error.message}`, "bad"),
+  );
+}
+
+function modelName(known, given) {
+  const input = h("input", {
+    type: "text",
+    name: "model",
+    value: given ?? "",
+    required: true,
+    pattern: "[a-z0-9][a-z0-9._\\-]{0,63}",
+    title: "Lower-case letters, digits, dots, underscores and hyphens; 64 at most",
+    placeholder: "my-arm",
+    autocomplete: "off",
+    autocapitalize: "none",
+    spellcheck: "false",
+    list: "models-known",
+  });
+  const about = h("p", { class: "hint", role: "status" });
+  const say = () => {
+    const model = known.get(input.value.trim());
+    const has = model?.latest_version === 1 ? "version 1" : `versions up to ${model?.latest_version}`;
+    about.textContent = model
+      ? `${model.name} has ${has}. A new one is made: it answers from then on, unless another was chosen to serve.`
+      : "";
+  };
+  input.addEventListener("input", say);
+  say();
+  const list = h("datalist", { id: "models-known" }, [...known.keys()].map((name) => h("option", { value: name })));
+  return { input, element: [field("Name of the model", input, "Lower-case letters, digits, dots, underscores and hyphens."), about, list] };
+}

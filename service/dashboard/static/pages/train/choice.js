@@ -1,0 +1,59 @@
+// Choosing the data sets to train on: those that fit together.
+
+import { h } from "../../dom.js";
+import { ago, count, seconds, when } from "../../format.js";
+import { empty, link, table } from "../../ui.js";
+
+/** Checkboxes of data sets. Returns {element, chosen()}; onchange(chosen data sets) after every change. */
+export function datasetChoice(datasets, preselected, onchange) {
+  if (!datasets.length) {
+    const none = empty("There is nothing to train on yet.", link("Upload a recording", "#/data", "primary"));
+    return { element: none, chosen: () => [] };
+  }
+  const known = new Set(preselected);
+  const boxes = new Map(
+    datasets.map((each) => [
+      each,
+      h("input", { type: "checkbox", name: "datasets", value: each.id, checked: known.has(each.id), "aria-label": `Train on ${each.name}`, onchange: () => changed() }),
+    ]),
+  );
+  const note = h("p", { class: "hint", role: "status" });
+  const chosen = () => datasets.filter((each) => boxes.get(each).checked);
+  const changed = () => {
+    const picked = chosen();
+    let apart = 0;
+    for (const [each, box] of boxes) {
+      const fits = !picked.length || alike(each, picked[0]);
+      box.disabled = !fits && !box.checked;
+      apart += fits ? 0 : 1;
+    }
+    const rows = picked.reduce((sum, each) => sum + each.report.rows, 0);
+    const others = apart ? ` Data sets with other joints or another torque convention cannot be joined with these: ${apart} left out.` : "";
+    note.textContent = picked.length ? `${picked.length} chosen, ${count(rows)} samples.${others}` : "None chosen yet.";
+    onchange(picked);
+  };
+  const element = h(
+    "div",
+    {},
+    table(
+      [
+        { label: "Use", cell: (row) => boxes.get(row) },
+        { label: "Data set", cell: (row) => link(row.name, `#/data/${row.id}`) },
+        { label: "Samples", numeric: true, cell: (row) => count(row.report.rows) },
+        { label: "Length", numeric: true, cell: (row) => seconds(row.report.timing?.duration_s) },
+        { label: "Episodes", numeric: true, cell: (row) => count(row.report.episodes) },
+        { label: "Joints", numeric: true, cell: (row) => row.joint_names.length },
+        { label: "Robot", cell: (row) => row.report.robot ?? "–" },
+        { label: "Uploaded", cell: (row) => h("time", { datetime: row.created_at, title: when(row.created_at), style: "white-space: nowrap" }, ago(row.created_at)) },
+      ],
+      datasets,
+      { caption: "Data sets, newest first" },
+    ),
+    note,
+  );
+  return { element, chosen, changed };
+}
+
+function alike(one, other) {
+  return one.torque_convention === other.torque_convention && one.joint_names.join("\n") === other.joint_names.join("\n");
+}

@@ -1,0 +1,32 @@
+// The estimators a user chooses from, with a line of explanation each.
+
+import { h } from "../../dom.js";
+
+/** [name, what it knows and when to use it, whether it needs a robot's URDF]. */
+export const ESTIMATORS = [
+  ["lip-chain", "Knows Lagrange's equations of a serial chain, no URDF needed. Take it unless you know better.", false],
+  ["rigid-body", "Knows your URDF's geometry and learns its inertial parameters. For stiff arms whose URDF is right.", true],
+  ["rigid-body+lip-chain", "Both: the chain learns what the rigid bodies miss. For a URDF, much data, and inertia that is not in it.", true],
+  ["lip", "The kernel of the paper, to get the paper's results.", false],
+  ["se", "The paper's baseline: a squared exponential for each joint. To compare with.", false],
+  ["gip", "The paper's baseline: a geometrically inspired polynomial. To compare with.", false],
+  ["lse", "The paper's baseline: one squared exponential Lagrangian. To compare with.", false],
+];
+
+/** Radio buttons of the estimators. onchange(name, needsRobot). */
+export function estimatorChoice(onchange) {
+  return h(
+    "fieldset",
+    {},
+    h("legend", {}, "Estimator"),
+    h("p", { class: "hint" }, "What the model knows of physics before it sees data. All learn friction too: viscous, Coulomb and an offset."),
+    ESTIMATORS.map(([name, said, robot], index) =>
+      h(
+        "div",
+        { class: "field check", style: "flex-wrap: nowrap" },
+        h("input", { type: "radio", name: "estimator", id: `estimator-${index}`, value: name, checked: index === 0, onchange: () => onchange(name, robot) }),
+        h("label", { for: `estimator-${index}` }, h("strong", {}, name), index ? "" : " (default)", h("span", { class: "hint" }, ` ${said}`)),
+      ),
+    ),
+  );
+}

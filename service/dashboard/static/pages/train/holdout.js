@@ -1,0 +1,63 @@
+// What is held out of the data, so that the version can be judged by what it has not seen.
+
+import { h } from "../../dom.js";
+import { field } from "../../ui.js";
+
+const KINDS = [
+  ["last", "the last part of each data set"],
+  ["episodes", "whole episodes"],
+  ["blocks", "some of many equal blocks"],
+  ["", "nothing: learn from all of it"],
+];
+const SAID = {
+  last: "Not a test on motion of another kind: that needs another recording.",
+  episodes: "Of several data sets of one episode each, whole data sets are held out. The seed chooses which.",
+  blocks: "The seed chooses which. Neighbouring blocks resemble each other, so the figures are kinder than on a new recording.",
+  "": "There will be no honest figure of how well the model predicts. Choose this once another recording has told.",
+};
+
+/** The part of the form. Returns {element, value()}: the holdout of a job request, null for nothing. */
+export function holdoutChoice() {
+  const kind = h("select", { name: "holdout.kind" }, KINDS.map(([value, label]) => h("option", { value }, label)));
+  const share = number("holdout.share", 30, { min: 1, max: 90, step: "any", required: true });
+  const blocks = number("holdout.blocks", 10, { min: 2, max: 1000, step: 1 });
+  const seed = number("holdout.seed", 0, { min: 0, max: 2147483647, step: 1 });
+  const guard = h("input", { type: "number", name: "holdout.guard_s", min: "0", max: "3600", step: "any", placeholder: "one period of the low-pass" });
+  const about = h("p", { class: "hint" });
+  const fields = {
+    share: field("Share, %", share),
+    blocks: field("Blocks", blocks),
+    seed: field("Seed of the choice", seed),
+    guard: field("Guard, s", guard, "Samples as near as that to the other side are left out of both."),
+  };
+  const show = () => {
+    about.textContent = SAID[kind.value];
+    fields.share.hidden = fields.guard.hidden = kind.value === "";
+    fields.blocks.hidden = kind.value !== "blocks";
+    fields.seed.hidden = kind.value !== "blocks" && kind.value !== "episodes";
+    share.disabled = kind.value === ""; // a hidden value must not keep the form from being sent
+  };
+  kind.addEventListener("change", show);
+  show();
+  return {
+    element: h(
+      "fieldset",
+      {},
+      h("legend", {}, "Hold out"),
+      h("p", { class: "hint" }, "What is held out is not learnt from: the version is judged by it. Never single rows, as neighbours tell nearly the same."),
+      h("div", { class: "grid" }, field("What", kind), fields.share, fields.blocks, fields.seed, fields.guard),
+      about,
+    ),
+    value: () => {
+      if (!kind.value) return null;
+      const chosen = { kind: kind.value, share: share.valueAsNumber / 100 };
+      if (kind.value === "blocks") chosen.blocks = blocks.valueAsNumber;
+      if (kind.value !== "last") chosen.seed = seed.valueAsNumber;
+      return guard.value ? { ...chosen, guard_s: guard.valueAsNumber } : chosen;
+    },
+  };
+}
+
+function number(name, value, limits) {
+  return h("input", { type: "number", name, value: String(value), required: true, ...limits });
+}

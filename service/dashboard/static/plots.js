@@ -1,0 +1,112 @@
+// Plots by Plotly, whose JavaScript is loaded when the first one is drawn. Colours follow the page's theme.
+
+import { h } from "./dom.js";
+
+let loaded = null;
+
+/** Plotly, once it is there. */
+export function plotly() {
+  loaded ??= new Promise((resolve, reject) => {
+    const script = h("script", { src: "/dashboard/plotly/plotly.min.js" });
+    script.onload = () => resolve(window.Plotly);
+    script.onerror = () => {
+      loaded = null;
+      reject(new Error("Plotly's JavaScript could not be loaded from the service"));
+    };
+    document.head.append(script);
+  });
+  return loaded;
+}
+
+/**
+ * Draw traces into an element and keep them in the page's colours.
+ * layout: Plotly's, and `title`, `x`, `y` (texts of the axes), `height`; label: what it shows, for screen readers.
+ * Returns {element, react(traces, layout), extend(update, indices, most)}.
+ */
+export async function plot(element, traces, layout = {}, { label = "", signal = null } = {}) {
+  const Plotly = await plotly();
+  element.classList.add("plot");
+  element.setAttribute("role", "img");
+  element.setAttribute("aria-label", label || layout.title || "plot");
+  let last = [traces, layout];
+  const draw = () => Plotly.react(element, painted(last[0]), themed(last[1]), CONFIG);
+  await Plotly.newPlot(element, painted(traces), themed(layout), CONFIG);
+  const again = () => (element.isConnected ? draw() : document.removeEventListener("themechange", again));
+  document.addEventListener("themechange", again);
+  signal?.addEventListener("abort", () => {
+    document.removeEventListener("themechange", again);
+    Plotly.purge(element);
+  });
+  return {
+    element,
+    react(newTraces, newLayout = last[1]) {
+      last = [newTraces, newLayout];
+      return draw();
+    },
+    extend: (update, indices, most) => Plotly.extendTraces(element, update, indices, most),
+  };
+}
+
+/** A line. colour: a number of `colours`, or a name of a CSS variable such as "measured". */
+export function line(x, y, name, colour, extra = {}) {
+  return { x, y, name, mode: "lines", type: "scatter", colour, line: { width: 1.5 }, hoverlabel: { namelength: -1 }, ...extra };
+}
+
+/** The area between two curves, one entry of the legend. */
+export function band(x, lower, upper, name, colour) {
+  const edge = { x, mode: "lines", type: "scatter", colour, hoverinfo: "skip", legendgroup: name, line: { width: 0 } };
+  return [
+    { ...edge, y: lower, showlegend: false, name: `${name}, lower` },
+    { ...edge, y: upper, fill: "tonexty", name, filled: true },
+  ];
+}
+
+/** Colours of n joints, in the page's theme. */
+export function colours(n) {
+  return Array.from({ length: n }, (_, index) => css(`--joint-${(index % 8) + 1}`));
+}
+
+/** A colour of the theme by the name of its CSS variable, without --. */
+export function css(name) {
+  const full = name.startsWith("--") ? name : `--${name}`;
+  return getComputedStyle(document.documentElement).getPropertyValue(full).trim();
+}
+
+const CONFIG = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
+
+function painted(traces) {
+  return traces.flat().map(({ colour, filled, ...trace }) => {
+    if (colour === undefined) return trace;
+    const found = typeof colour === "number" ? css(`joint-${(colour % 8) + 1}`) : css(colour) || colour;
+    const made = { ...trace, line: { color: found, ...trace.line } };
+    if (trace.marker || trace.mode?.includes("markers")) made.marker = { color: found, ...trace.marker };
+    if (filled) made.fillcolor = translucent(found);
+    return made;
+  });
+}
+
+function translucent(colour) {
+  const [r, g, b] = [1, 3, 5].map((at) => parseInt(colour.slice(at, at + 2), 16));
+  return `rgba(${r},${g},${b},0.22)`;
+}
+
+function themed({ title = "", x = "", y = "", height = 300, ...rest }) {
+  const axis = { gridcolor: css("line"), zerolinecolor: css("line-strong"), linecolor: css("line-strong"), automargin: true };
+  const own = (name, text) => ({ ...axis, ...rest[name], title: { text, standoff: 8, ...rest[name]?.title } });
+  return {
+    margin: { l: 56, r: 16, t: title ? 40 : 16, b: 44 },
+    legend: { orientation: "h", y: -0.22, yanchor: "top" },
+    hovermode: "x unified",
+    modebar: { bgcolor: "rgba(0,0,0,0)", color: css("muted"), activecolor: css("accent") },
+    ...rest,
+    title: title ? { text: title, x: 0, xanchor: "left", font: { size: 15 } } : undefined,
+    height,
+    autosize: true,
+    paper_bgcolor: "rgba(0,0,0,0)",
+    plot_bgcolor: "rgba(0,0,0,0)",
+    font: { family: "inherit", size: 12.5, color: css("text") },
+    hoverlabel: { bgcolor: css("surface"), bordercolor: css("line-strong"), font: { color: css("text") } },
+    xaxis: own("xaxis", x),
+    yaxis: own("yaxis", y),
+  };
+}
