@@ -1,0 +1,136 @@
+"""Writes docs/reference/api.md from the OpenAPI document: `python docs/api.py`. A test fails while it is not that."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from service.access.scopes import TABLE
+from service.app import create_app
+from service.guide.pages import anchor
+from service.openapi import METHODS
+
+TARGET = Path(__file__).parent / "reference/api.md"
+HEAD = """# API reference
+
+Every route of the HTTP API, generated from its OpenAPI document, which the service answers at `/openapi.json` and
+shows, to be tried out, at `/docs`. Units are SI: rad, rad/s, rad/s², N·m (prismatic joints: m, m/s, m/s², N). "Scope"
+is what an API key has to be allowed, where keys are needed. See also [error codes](../errors.md), and on WebSockets
+[in a control loop](../control-loop.md).
+
+"""
+Document = dict[str, Any]
+
+
+def document() -> str:
+    """The whole file."""
+    api = create_app().openapi()
+    return HEAD + "\n".join([*_contents(api), *_routes(api), *_schemas(api)]).rstrip() + "\n"
+
+
+def _operations(api: Document) -> dict[str, list[tuple[str, str, Document]]]:
+    """Operations by tag, in the order of their paths: (method, path, operation)."""
+    found: dict[str, list[tuple[str, str, Document]]] = {}
+    for path in sorted(api["paths"]):
+        for method in METHODS:
+            if operation := api["paths"][path].get(method):
+                tag = operation.get("tags", ["other"])[0]
+                found.setdefault(tag, []).append((method.upper(), path, operation))
+    return dict(sorted(found.items()))
+
+
+def _contents(api: Document) -> Iterator[str]:
+    yield from ("| route | what it does |", "| --- | --- |")
+    for operations in _operations(api).values():
+        for method, path, operation in operations:
+            yield f"| [`{method} {path}`](#{anchor(f'{method} {path}')}) | {_cell(operation.get('summary', ''))} |"
+    yield ""
+
+
+def _routes(api: Document) -> Iterator[str]:
+    for tag, operations in _operations(api).items():
+        yield f"## {tag[:1].upper()}{tag[1:]}\n"
+        for method, path, operation in operations:
+            yield from _route(method, path, operation)
+
+
+def _route(method: str, path: str, operation: Document) -> Iterator[str]:
+    yield f"### {method} {path}\n"
+    said = re.sub(r"\s*Scope: [^\n]*$", "", operation.get("description", "")).strip()
+    yield f"**{operation.get('summary', '')}.** {_prose(said)}\n".replace("?.**", "?**")
+    if scope := TABLE.get((method, path)):
+        yield f"Scope: `{scope}`.\n"
+    if parameters := operation.get("parameters"):
+        yield from ("| parameter | in | type | meaning |", "| --- | --- | --- | --- |")
+        for each in parameters:
+            needed = ", required" if each.get("required") and each["in"] != "path" else ""
+            yield f"| `{each['name']}` | {each['in']}{needed} | {_type(each['schema'])} | {_said(each)} |"
+        yield ""
+    if body := operation.get("requestBody"):
+        yield f"Body: {_kinds(body['content'])}\n"
+    for status, answer in operation["responses"].items():
+        if int(status) < 400:
+            yield f"Answer: {status} {_kinds(answer.get('content', {})) or '(nothing)'}\n"
+
+
+def _kinds(content: Document) -> str:
+    return "; ".join(f"`{media}` {_type(each.get('schema', {}))}" for media, each in content.items())
+
+
+def _schemas(api: Document) -> Iterator[str]:
+    yield "## Types\n"
+    for name, schema in sorted(api["components"]["schemas"].items()):
+        yield f"### {name}\n"
+        if said := schema.get("description"):
+            yield _prose(said) + "\n"
+        if not (fields := schema.get("properties")):
+            yield f"{_type(schema)}\n"
+            continue
+        required = set(schema.get("required", ()))
+        yield from ("| field | type | meaning |", "| --- | --- | --- |")
+        for field, each in fields.items():
+            default = f" Default: `{_cell(str(each['default']))}`." if each.get("default") not in (None, [], {}) else ""
+            optional = "" if field in required else ", optional"
+            yield f"| `{field}` | {_type(each)}{optional} | {_said(each)}{default} |"
+        yield ""
+
+
+def _type(schema: Document) -> str:
+    """A schema in a few words, with links to the types that it is made of."""
+    if "$ref" in schema:
+        name = schema["$ref"].rpartition("/")[2]
+        return f"[{name}](#{anchor(name)})"
+    for several in ("anyOf", "oneOf", "allOf"):
+        if several in schema:
+            return " or ".join(dict.fromkeys(_type(each) for each in schema[several]))
+    if "enum" in schema:
+        return ", ".join(f"`{value}`" for value in schema["enum"])
+    if "const" in schema:
+        return f"`{schema['const']}`"
+    kind = schema.get("type", "any")
+    if kind == "array":
+        return f"list of {_type(schema.get('items', {}))}"
+    if kind == "object" and isinstance(values := schema.get("additionalProperties"), dict):
+        return f"object of {_type(values)}"
+    return " or ".join(kind) if isinstance(kind, list) else str(kind)
+
+
+def _said(each: Document) -> str:
+    said = each.get("description") or each.get("schema", {}).get("description") or ""
+    return _cell(said)
+
+
+def _prose(text: str) -> str:
+    """Text of the document, in which `<` and `|` mean nothing."""
+    return "\n".join(line.strip() for line in text.strip().splitlines())
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+if __name__ == "__main__":
+    TARGET.parent.mkdir(exist_ok=True)
+    TARGET.write_text(document())
