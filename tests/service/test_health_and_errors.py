@@ -30,7 +30,7 @@ def test_not_ready_while_the_database_does_not_answer(api, monkeypatch, fresh_lo
     assert api.get("/health/live").status_code == 200
 
 
-@pytest.mark.parametrize("path", ["/", "/nowhere", "/v1", "/v1/models/x/y", "/v1/datasets/../../etc"])
+@pytest.mark.parametrize("path", ["/dashboard", "/nowhere", "/v1", "/v1/models/x/y", "/v1/datasets/../../etc"])
 def test_unknown_routes(api, path):
     error(api.get(path), 404, "not_found")
 

@@ -80,6 +80,7 @@ def test_every_route_of_the_design_is_there(operations):
         "PUT /v1/models/{model}/aliases/{alias}",
         "DELETE /v1/models/{model}/aliases/{alias}",
         "POST /v1/models/{model}/aliases/{alias}/rollback",
+        "POST /v1/models/{model}/trace",
         "POST /v1/models/{model}/compare",
         "GET /v1/models/{model}/export",
         "POST /v1/models/import",
@@ -97,6 +98,7 @@ def test_every_route_of_the_design_is_there(operations):
         "PUT /v1/models/{model}/learning",
         "POST /v1/models/{model}/learning/change",
         "GET /v1/models/{model}/alarms",
+        "GET /v1/models/{model}/live",
         "GET /metrics",
         "POST /v1/echo",
         "GET /v2",
@@ -190,6 +192,7 @@ def test_every_documented_error_has_the_one_shape(operations):
         ("POST /v1/models/import", {413, 415, 422}),
         ("POST /v1/models/{model}/predict", {404, 413, 422}),
         ("POST /v1/models/{model}/evaluate", {404, 413, 422}),
+        ("POST /v1/models/{model}/trace", {404, 413, 422, 500}),
         ("POST /v1/models/{model}/observations", {404, 409, 413, 422, 429}),
         ("GET /v1/models/{model}/observations", {404, 422}),
         ("GET /v1/models/{model}/observations/{stream_id}/{sequence}", {404, 422}),
@@ -222,7 +225,7 @@ def test_errors_that_any_route_answers_are_documented_at_each(operations):
         assert ("401" in answered) != name.endswith(("/health/live", "/health/ready")), name
         assert ("requestBody" in operation) == ("408" in answered) == ("413" in answered) == ("415" in answered), name
         stores = not name.startswith("GET") and not name.endswith(
-            ("/predict", "/evaluate", "/compare", "/echo", "/infer")
+            ("/predict", "/evaluate", "/trace", "/compare", "/echo", "/infer")
         )
         assert ("507" in answered) == stores, name
 
@@ -244,6 +247,7 @@ def test_requests_have_examples(document, operations):
         "POST /v1/models/{model}/compare",
         "POST /v1/models/{model}/predict",
         "POST /v1/models/{model}/evaluate",
+        "POST /v1/models/{model}/trace",
         "POST /v1/models/{model}/observations",
         "POST /v1/models/{model}/observations/{stream_id}/{sequence}/replay",
         "POST /v1/models/{model}/rollback",

@@ -14,7 +14,7 @@ import pinocchio
 import pytest
 
 import lipcore
-from lipcore.fitting import FitOptions
+from lipcore.fit_options import FitOptions
 from lipcore.robots import ROBOTS, load_robot
 from lipcore.simulation import Stream, simulate
 from service import cli

@@ -13,9 +13,9 @@ from service.client import ApiError, Client
 from service.errors import InvalidRequestError
 from service.models import registry
 from service.robots import store
+from tests.service.cli.conftest import lipserve  # noqa: F401 - a fixture
 from tests.service.data import QUICK, error, post, queue, service_of, stream, train, upload
 from tests.service.data import csv as csv_file
-from tests.service.test_cli import lipserve  # noqa: F401 - a fixture
 
 LINK = '<link name="{}"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
 LINK += "</inertial></link>"

@@ -132,8 +132,8 @@ def test_the_socket_of_a_successor_is_not_removed(path):
 def test_a_service_listens_on_both(home, path):
     """Then it is killed, started again on what it left, and asked to end."""
     with Server(home, LIPSERVE_UDS=str(path)) as server, Client(f"unix://{path}") as client:
-        answer = client._send("POST", "/v1/models/panda-sim/predict", json=QUERY)
-        assert answer == server.client.post("/v1/models/panda-sim/predict", json=QUERY).json()
+        said = server.client.post("/v1/models/panda-sim/predict", json=QUERY).json()
+        assert client.predict("panda-sim", **QUERY).as_dict() == said
         assert stat.S_IMODE(path.lstat().st_mode) == 0o660
         with unix_connect(str(path), "ws://localhost/v1/echo/stream") as stream:
             stream.send(b"12345678")

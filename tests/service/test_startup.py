@@ -32,10 +32,29 @@ def test_the_serving_application_imports_neither_fitting_nor_robots():
     assert found.isdisjoint((*FITTING, *CLIENTS, "pinocchio"))
 
 
-def test_the_command_line_imports_no_client_and_no_experiment():
-    found = imported("import service.cli")
+def test_the_command_that_serves_imports_no_client_and_no_experiment():
+    found = imported("import service.cli.serve")
     assert "service.app" in found
     assert found.isdisjoint((*FITTING, *CLIENTS, "pinocchio"))
+
+
+def test_listing_commands_imports_none_of_them():
+    found = imported("from service.cli.main import app; import typer; typer.main.get_command(app)")
+    assert found.isdisjoint((*NUMERICS, *CLIENTS, "lipcore", "fastapi", "pydantic"))
+
+
+def test_help_and_completion_of_what_asks_a_service_import_neither_numerics_nor_a_client():
+    names = ("data", "evaluate", "jobs", "models", "open", "predict", "stream", "train")
+    found = imported("\n".join(f"import service.cli.{name}" for name in names))
+    assert found.isdisjoint((*NUMERICS, *CLIENTS, "fastapi"))
+
+
+def test_the_client_loads_no_numerics_but_arrays_and_no_service():
+    found = imported("import service.client")
+    assert "numpy" in found
+    assert found.isdisjoint(
+        (*NUMERICS[1:], *FITTING, "pinocchio", "sqlalchemy", "uvicorn", "service.app", "matplotlib")
+    )
 
 
 def test_a_controller_that_loads_a_model_imports_neither_fitting_nor_service():

@@ -158,11 +158,11 @@ def test_form_is_taken_by_the_ending_of_its_file(api, archive):
 
 def test_client_writes_a_whole_file_or_none(streaming, tmp_path):
     with Client(streaming.server.url) as client:
-        path = client.export_model("pendulum", tmp_path / "arm.tar")
+        path = client.export("pendulum", tmp_path / "arm.tar")
         version = client.import_model(path, name="by-client")
         assert (version.model, version.version) == ("by-client", 1)
         with pytest.raises(ApiError, match="nobody") as refused:
-            client.export_model("nobody", tmp_path / "nobody.tar")
+            client.export("nobody", tmp_path / "nobody.tar")
         assert refused.value.status == 404
         path.write_bytes(path.read_bytes()[:-5000])
         with pytest.raises(ApiError, match=r"model\.safetensors"):

@@ -21,7 +21,8 @@ from tests.service.bad_requests.bad import (
 
 MODELS, EXPORT = "/v1/models", "/v1/models/panda-sim/export"
 NO_ROUTES = (
-    "/",
+    "/dashboard",
+    "/dashboard/%2e%2e/routes.py",
     "/v1",
     "/v1/",
     "//v1/models",
@@ -100,7 +101,10 @@ PATHS = [
     Bad("DELETE", f"{DATASETS}/ds_0", 404, "not_found", "dataset"),
     *(Bad("POST", f"{JOBS}/job_0/{verb}", 404, "not_found", "job") for verb in ("cancel", "retry")),
     get(f"{JOBS}/job_0/events", "job", 404, "not_found"),
-    *(get(f"{MODELS}/nobody/{part}", "model", 404, "not_found") for part in ("aliases", "export", "alarms", "quality")),
+    *(
+        get(f"{MODELS}/nobody/{part}", "model", 404, "not_found")
+        for part in ("aliases", "export", "alarms", "quality", "live")
+    ),
     Bad("DELETE", f"{MODELS}/nobody", 404, "not_found", "model"),
     Bad("DELETE", f"{MODELS}/panda-sim/versions/99", 404, "not_found", "version"),
     Bad("DELETE", f"{MODELS}/panda-sim/versions/0", 422, "invalid_request", "version"),
@@ -132,6 +136,7 @@ PARAMETERS = [
     *(get(f"{JOBS}?cursor={value}", "cursor") for value in ("x", "", "-1", "1.5", "9" * 20, "%D9%A3", "1%00", "1%20")),
     *(get(f"{path}?limt=1", "limt") for path in PAGES),
     *(get(f"{path}?x", "x") for path in ("/health/live", "/health/ready", "/metrics", f"{MODELS}/panda-sim", LEARNING)),
+    get(f"{MODELS}/panda-sim/live?every=1", "every"),
     get(f"{DATASETS}?limit=1&limit=2", "limit"),
     get(f"{DATASETS}?Limit=1", "Limit"),
     get(f"{DATASETS}?limit%00=1", "limit\\x00"),

@@ -19,6 +19,7 @@ from tests.service.bad_requests.bad import (
     QUERY,
     ROLLBACK,
     TENSORS,
+    TRACE,
     ZERO,
     Bad,
     body,
@@ -174,6 +175,16 @@ ASSESSING = [
     *wrong(EVALUATE, {}, "dataset", None, 5, [], "d" * 1000),
     *wrong(EVALUATE, {}, "dataset", "ds_0", "", status=404, code="not_found"),
     *wrong(EVALUATE, {"dataset": "ds_0"}, "version", 0, "x", 10**30),
+    *wrong(TRACE, {}, "dataset", None, 5, [], "d" * 1000),
+    *wrong(TRACE, {}, "dataset", "ds_0", "", "../x", status=404, code="not_found"),
+    *wrong(TRACE, {"dataset": "ds_0"}, "part", "held", None, 5),
+    *wrong(TRACE, {"dataset": "ds_0"}, "start", -1, 1.5, "0", None, True, 2**53, NAN),
+    *wrong(TRACE, {"dataset": "ds_0"}, "stop", -1, "10", True, 2**53, INF),
+    *wrong(TRACE, {"dataset": "ds_0"}, "points", 0, -1, 2001, 2**31, "100", None, 1.0),
+    *wrong(TRACE, {"dataset": "ds_0"}, "components", "gravity", None, {}),
+    *wrong(TRACE, {"dataset": "ds_0"}, "components", ["inertia_matrix"], ["Gravity"], [None], named="components[0]"),
+    *wrong(TRACE, {"dataset": "ds_0"}, "components", ["gravity", "gravity"], named="components[1]"),
+    *wrong(TRACE, {"dataset": "ds_0"}, "version", 0, "x", 10**30),
     *wrong(COMPARE, {"dataset": "ds_0"}, "versions", [], [1], [1, 2, 3], "12", None),
     *wrong(COMPARE, {"dataset": "ds_0"}, "versions", [1, 1], named="versions[1]"),
 ]
@@ -203,4 +214,9 @@ INFERRING = [
         for length in ("x", "-1", "1.5", "", "9" * 40)
     ),
 ]
-BAD: list[Bad] = [*PREDICTING, *TRAINING, *TEACHING, *SETTING, *ASSESSING, *INFERRING]
+NAMING = [
+    body(path, JOB, "Idempotency-Key", headers={"idempotency-key": key})
+    for path in (JOBS, f"{JOBS}/job_0/retry")
+    for key in ("", "k" * 101, "two words", "tab\there")
+]
+BAD: list[Bad] = [*PREDICTING, *TRAINING, *NAMING, *TEACHING, *SETTING, *ASSESSING, *INFERRING]

@@ -15,7 +15,7 @@ from lipcore import FitOptions
 from service.database import Database, LearningRow
 from service.files import Files
 from service.models import registry
-from service.updates.learning import LearningOptions
+from service.updates.learning_options import LearningOptions
 from tests.service.data import DEADLINE, QUICK, eventually, stream
 from tests.service.faults.injection import PATIENCE, Fault, Injector
 from tests.service.faults.ledger import ARM, Ledger

@@ -14,8 +14,9 @@ import numpy as np
 
 import lipcore
 from lipcore.online import spacing
-from lipcore.online.batch import LEARNT, Rows
+from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
+from lipcore.vocabulary import LEARNT
 from service.training.states import ACTIVE
 from tests.service.data import eventually, job, stream
 from tests.service.faults.injection import PATIENCE

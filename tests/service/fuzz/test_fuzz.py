@@ -20,8 +20,8 @@ NAMES = (
     "response_schema_conformance",
     "negative_data_rejection",
 )
-ENDLESS = ("GET /v1/jobs/{job}/events",)
-"""Answers that end with the job: of one that stays queued, never."""
+ENDLESS = ("GET /v1/jobs/{job}/events", "GET /v1/models/{model}/live")
+"""Answers that end with the job, of one that stays queued never, and with the model."""
 ANYTHING = ("POST /v1/echo",)
 """Operations that take any body."""
 WAYS = {

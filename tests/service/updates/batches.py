@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from sqlalchemy import select
 
-from lipcore.online.batch import CODES, Rows
+from lipcore.online.batch import Rows
+from lipcore.vocabulary import CODES
 from service.database import Database, EventRow, ModelRow, StreamRow, VersionRow, now
 from service.updates.storage import log
 from service.updates.storage.log import NewBatch

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lipcore
-from lipcore.online.batch import CODES, Rows
+from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.online.spacing import INDEPENDENT_HZ
 from lipcore.samples import Samples
+from lipcore.vocabulary import CODES
 from service.updates.storage import log, payload
 from tests.service.data import stream
 from tests.service.updates.lessons import QUERIES, RATE, Pupil, School

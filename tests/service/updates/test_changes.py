@@ -14,7 +14,7 @@ from service.updates.ingest import judging
 from service.updates.ingest.contacts import ContactGate
 from service.updates.ingest.judging import Innovations, Watch
 from service.updates.ingest.screening import Screened
-from service.updates.learning import LearningOptions
+from service.updates.learning_options import LearningOptions
 from service.updates.storage import log
 from tests.service.updates import lessons
 from tests.service.updates.lessons import Pupil

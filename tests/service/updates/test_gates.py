@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import lipcore
-from lipcore.online.batch import CODES
 from lipcore.urdf import RigidBody
+from lipcore.vocabulary import CODES
 from service.settings import Settings
 from service.updates.ingest.screening import limits
-from service.updates.learning import LearningOptions
+from service.updates.learning_options import LearningOptions
 from tests.service.updates.lessons import apart
 from tests.service.updates.recordings import codes, learnt_from, logged, part, recording, send
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lipcore.online.batch import CODES, Rows
+from lipcore.online.batch import Rows
+from lipcore.vocabulary import CODES
 from service.updates.storage import log
 from service.updates.storage.log import NewBatch
 from tests.service.data import error

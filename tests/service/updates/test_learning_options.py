@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from service.errors import InvalidRequestError, NotFoundError
 from service.updates import learning
-from service.updates.learning import LearningOptions
+from service.updates.learning_options import LearningOptions
 from tests.service.updates.batches import MODEL, OTHER, batch, everything, opened, roll_back, write
 
 

@@ -7,7 +7,7 @@ from prometheus_client import REGISTRY
 from prometheus_client.openmetrics.parser import text_string_to_metric_families as parse_open
 from prometheus_client.parser import text_string_to_metric_families as parse
 
-from lipcore.online.batch import CODES
+from lipcore.vocabulary import CODES
 from service.updates.storage import log
 from tests.service.updates.lessons import lesson
 

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from lipcore.online.batch import CODES, Rows
+from lipcore.online.batch import Rows
+from lipcore.vocabulary import CODES
 from service.updates.storage.payload import decode, encode
 from tests.service.updates.batches import rows
 

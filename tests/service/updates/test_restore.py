@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from lipcore.online import state
-from lipcore.online.batch import CODES
 from lipcore.online.learner import OnlineModel
+from lipcore.vocabulary import CODES
 from service.updates.learner import learnt, recent
 from service.updates.learner import restore as restoring
 from service.updates.learner.restore import RewoundError, advance

@@ -5,19 +5,18 @@ from __future__ import annotations
 import json
 
 import pytest
-from typer.testing import CliRunner
 
-from service import cli, recordings
+from service import recordings
 from tests.service.data import stream
 
 
 @pytest.fixture
-def data(server):
-    """Run `lipserve data` with arguments against a service; return its exit code and output."""
+def data(server, lipserve):
+    """Run `lipserve data` with arguments against a service; return its exit code and all that it printed."""
 
     def run(command, *arguments):
-        found = CliRunner().invoke(cli.app, ["data", command, *map(str, arguments), "--url", server.url])
-        return found.exit_code, found.output
+        code, said, err = lipserve("data", command, *arguments, "--url", server.url)
+        return code, said or err
 
     return run
 

@@ -3,35 +3,20 @@
 from __future__ import annotations
 
 import json
-import sys
 
 import pytest
 
-from service import cli, recordings
+from service import recordings
 from service.client import ApiError, Client
+from tests.service.cli.conftest import QUICKLY
 from tests.service.data import QUICK, stream
-
-
-@pytest.fixture
-def lipserve(monkeypatch, capsys):
-    """Run the command line; returns its exit code and what it printed."""
-    monkeypatch.setattr(cli.out, "width", 160)
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["lipserve", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        said = capsys.readouterr()
-        return ended.value.code or 0, said.out, said.err
-
-    return run
 
 
 def test_from_a_recording_to_figures_on_what_was_held_out(lipserve, server, tmp_path):
     path = tmp_path / "stream.npz"
     recordings.write(path, stream(samples=120, rate=10.0, seed=11))
     asked = ("--hold-out", 0.25, "--hold-out-by", "blocks")
-    code, said, err = lipserve("train", path, "--model", "cli-held", "--url", server.url, *asked)
+    code, said, err = lipserve("train", path, "--model", "cli-held", "--url", server.url, *asked, *QUICKLY)
     assert code == 0, err
     assert "cli-held version 1 is trained" in said
     held = server.client.get("/v1/models/cli-held/versions/1").json()["lineage"]["holdout"]

@@ -8,26 +8,15 @@ import numpy as np
 import pytest
 
 from lipcore.robots import ROBOTS
-from service import __version__, cli
+from lipcore.simulation import Payload
+from service import __version__
+from service.cli.main import Commands
 from service.datasets.formats.opening import open_table
 from service.datasets.options import ReadOptions
 from service.settings import Settings
+from tests.service.cli.conftest import QUICKLY
 from tests.service.data import arrays, stream
 from tests.service.server import free_port
-
-
-@pytest.fixture
-def lipserve(monkeypatch, capsys):
-    """Run `lipserve` with arguments; return its exit code, output and error output."""
-
-    def run(*arguments):
-        monkeypatch.setattr("sys.argv", ["lipserve", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        said = capsys.readouterr()
-        return ended.value.code or 0, said.out, said.err
-
-    return run
 
 
 def test_version(lipserve):
@@ -37,8 +26,8 @@ def test_version(lipserve):
 def test_help_lists_the_commands(lipserve):
     code, said, _ = lipserve("--help")
     assert code == 0
-    for command in ("serve", "simulate", "data", "train", "evaluate", "predict", "excite", "demo", "reproduce"):
-        assert command in said
+    for command in Commands.entries:
+        assert f"{command} " in said
 
 
 def read(path):
@@ -70,7 +59,7 @@ def test_options_of_the_simulator_matter(lipserve, tmp_path):
         np.column_stack([read(path)[1][f"tau{joint}"] for joint in range(1, 7)]) for path in (other, plain)
     )
     expected = stream(
-        "ur5", 40, 0, speed=10.0, motion="full", noise=0.0, viscous=2.0, coulomb=1.0, payload=cli.Payload(3.0)
+        "ur5", 40, 0, speed=10.0, motion="full", noise=0.0, viscous=2.0, coulomb=1.0, payload=Payload(3.0)
     )
     np.testing.assert_array_equal(found, expected.tau)
     assert not np.array_equal(found, before)
@@ -117,7 +106,7 @@ def test_from_a_recording_to_a_torque(lipserve, server, tmp_path):
     path = tmp_path / "stream.csv"
     lipserve("simulate", "double-pendulum", path, "--samples", 60, "--fast")
     types = ("--joint-types", "revolute, revolute")
-    code, said, err = lipserve("train", path, "--model", "from-cli", "--url", server.url, *types)
+    code, said, err = lipserve("train", path, "--model", "from-cli", "--url", server.url, *types, *QUICKLY)
     assert code == 0, err
     assert "from-cli version 1 is trained and answers" in said
 
@@ -137,7 +126,10 @@ def test_from_a_recording_to_a_torque(lipserve, server, tmp_path):
 def test_refusals_of_the_service_are_passed_on(lipserve, server, tmp_path):
     code, _, err = lipserve("predict", "nobody", "--q", "1", "--url", server.url)
     assert code == 1
-    assert err == "error: no model 'nobody' (not_found, 404)\n"
+    said, hint = err.splitlines()
+    assert said == "error: no model 'nobody' (not_found, 404)"
+    assert hint.startswith("hint: models that exist: ")
+    assert "panda-sim" in hint
 
     path = tmp_path / "bad.csv"
     path.write_text("t,q1,speed1\n0,0,0\n")

@@ -1,0 +1,13 @@
+// What has the keyboard's focus: its name, whether the focus can be seen and is in view; null where nothing has it.
+() => {
+  const node = document.activeElement;
+  if (!node || node === document.body) return null;
+  const style = getComputedStyle(node);
+  const ring = (style.outlineStyle !== 'none' && parseFloat(style.outlineWidth) >= 1) || style.boxShadow !== 'none';
+  const box = node.getBoundingClientRect();
+  return {
+    name: (node.getAttribute('aria-label') || [...(node.labels || [])].map((label) => label.textContent).join(' ')
+      || node.textContent || '').trim().replace(/\s+/g, ' '),
+    tag: node.tagName.toLowerCase(), ring, inView: box.bottom > 0 && box.top < innerHeight,
+  };
+}

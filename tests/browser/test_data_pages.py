@@ -1,0 +1,149 @@
+"""Data sets and jobs in the browser: a refusal that is mended, episodes, deleting, a job stopped and repeated."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from lipcore.estimators import ESTIMATORS
+from lipcore.vocabulary import ROBOT_ESTIMATORS
+from tests.browser.accessibility import audit
+from tests.browser.conftest import Dashboard
+from tests.browser.looking import expect
+from tests.browser.visitor import Visitor
+from tests.service.data import ENDLESS, arrays, columns, csv, ended, job, npz, queue, stream, upload
+
+LONG = {**ENDLESS, "hyperparameter_samples": 120, "starts": 1}
+"""Its first iteration comes soon, its last does not."""
+SET_DEGREES = "Set the unit of q to deg and try again"
+
+
+def file(name: str, body: bytes) -> dict[str, object]:
+    """A file as Playwright takes it."""
+    return {"name": name, "mimeType": "application/octet-stream", "buffer": body}
+
+
+def test_a_refused_recording_says_what_to_do_and_is_taken_then(visitor: Visitor, dashboard: Dashboard) -> None:
+    visitor.expect_refusals(422)
+    table = columns(stream(seed=11))
+    for joint in (1, 2):
+        table[f"q{joint}"] = [f"{np.rad2deg(float(value)) + 180:.12g}" for value in table[f"q{joint}"]]
+    page = visitor.open("#/data")
+    page.locator("input[type=file]").first.set_input_files([file("degrees.csv", csv(table))])
+    page.get_by_label("Name", exact=True).fill("in degrees")
+    page.get_by_role("button", name="Upload", exact=True).click()
+
+    refusal = page.get_by_role("alert")
+    expect(refusal).to_contain_text("degrees.csv was not taken. Nothing was stored.")
+    expect(refusal).to_contain_text("are these degrees?")
+    assert audit(page) == []
+    refusal.get_by_role("button", name=SET_DEGREES).click()
+    expect(page.get_by_text("in degrees: 80 samples of 2 joints")).to_be_visible()
+    expect(page.get_by_text("q is converted from deg").first).to_be_visible()
+    expect(page.get_by_label("Unit of position")).to_have_value("")  # the next file is not read as degrees unasked
+
+    page.get_by_role("link", name="Read its report").click()
+    visitor.settled()
+    page.get_by_role("button", name="Delete").click()
+    page.get_by_role("dialog").get_by_role("button", name="Cancel").click()
+    expect(page.get_by_role("heading", level=1, name="in degrees")).to_be_visible()
+    page.get_by_role("button", name="Delete").click()
+    page.get_by_role("dialog").get_by_role("button", name="Delete").click()
+    expect(page.get_by_role("heading", level=1, name="Data sets")).to_be_visible()
+    visitor.settled()
+    names = {each["name"] for each in dashboard.client.get("/v1/datasets").json()["items"]}
+    assert "in degrees" not in names
+    assert "pendulum.npz" in names
+
+
+def test_options_say_how_a_file_is_read(visitor: Visitor) -> None:
+    samples = stream(seed=12)
+    body = npz(**{**arrays(samples), "tau": samples.tau / np.array([2.0, 4.0])})
+    page = visitor.open("#/data")
+    page.get_by_text("How to read it").click()
+    constants = page.get_by_label("Torque constants, N·m/A")
+    expect(constants).to_be_hidden()
+    page.get_by_label("What the torque column holds").select_option("current")
+    constants.fill("2, 4")
+    page.get_by_label("Names of joints 1 to n").fill("shoulder, elbow")
+    page.locator("input[type=file]").first.set_input_files([file("current.npz", body)])
+    expect(page.get_by_text("It is read as set below")).to_contain_text("torque constants: 2, 4")
+    assert audit(page) == []
+    page.get_by_role("button", name="Upload", exact=True).click()
+    page.get_by_role("link", name="Read its report").click()
+    expect(page.get_by_role("heading", level=1, name="current.npz")).to_be_visible()
+    expect(page.get_by_text("torque is current times 2, 4 N·m/A")).to_be_visible()
+    expect(page.get_by_text("shoulder, elbow").first).to_be_visible()
+
+
+def test_lines_break_between_episodes(visitor: Visitor, dashboard: Dashboard) -> None:
+    samples = stream(seed=13, samples=120)
+    episode = np.repeat([0, 1], 60)
+    body = npz(**{**arrays(samples), "t": np.tile(samples.t[:60], 2)}, episode=episode)
+    answer = dashboard.client.post(
+        "/v1/datasets", content=body, headers={"content-type": "application/x-npz"}, params={"name": "two episodes"}
+    )
+    assert answer.status_code == 201, answer.text
+    page = visitor.open(f"#/data/{answer.json()['id']}")
+    expect(page.locator(".js-plotly-plot .scatterlayer")).to_have_count(4)
+    # their clocks begin anew: against time one would lie on the other
+    expect(page.get_by_label("Against", exact=True)).to_have_value("rows")
+    breaks = "[...document.querySelectorAll('.js-plotly-plot')].map((each) => each.data.map(({y}) => y.indexOf(null)))"
+    assert page.evaluate(breaks) == [[60, 60]] * 4
+    page.get_by_label("Joint", exact=True).select_option(samples.joint_names[0])
+    page.wait_for_function("document.querySelector('.js-plotly-plot').data.length === 1")
+
+
+def test_the_form_offers_the_estimators_there_are(visitor: Visitor) -> None:
+    page = visitor.open("#/train")
+    assert [each.get_attribute("value") for each in page.get_by_role("radio").all()] == list(
+        dict.fromkeys([*("lip-chain", "rigid-body", "rigid-body+lip-chain"), *ESTIMATORS])
+    )
+    for name in ESTIMATORS:
+        page.locator(f'input[type=radio][value="{name}"]').check()
+        robot = page.get_by_label("Robot", exact=True)
+        expect(robot).to_be_visible() if name in ROBOT_ESTIMATORS else expect(robot).to_be_hidden()
+    page.get_by_role("radio", name="lip-chain (default)").check()
+    page.get_by_label("Name of the model").fill("refused")
+    page.get_by_role("button", name="Start training").click()
+    expect(page.get_by_role("alert")).to_contain_text("Choose at least one data set")
+
+
+def test_a_job_is_followed_through_a_lost_connection_stopped_and_repeated(
+    visitor: Visitor, dashboard: Dashboard
+) -> None:
+    client = dashboard.client
+    dataset = upload(client, stream("ur5", samples=200), name="ur5.npz")
+    first = queue(client, "stopped", dataset["id"], options=LONG)["id"]
+    page = visitor.page
+    page.route("**/events", lambda route: route.abort())
+    visitor.open(f"#/jobs/{first}")
+    expect(page.get_by_text("The connection to the service is lost")).to_be_visible()
+    page.unroute("**/events")
+    expect(page.get_by_text("at most about")).to_be_visible()
+    expect(page.get_by_text("The connection to the service is lost")).to_be_hidden()
+    expect(page.get_by_role("progressbar", name="Progress of the training")).to_be_visible()
+
+    page.get_by_role("button", name="Cancel training").click()
+    page.get_by_role("dialog").get_by_role("button", name="Stop training").click()
+    again = page.get_by_role("button", name="Try it again")
+    expect(again).to_be_visible()
+    assert ended(client, first)["state"] == "cancelled"
+    again.click()
+    expect(page).to_have_url(re.compile(rf"#/jobs/(?!{first})"))
+    second = page.url.rpartition("/")[2]
+    expect(page.get_by_role("link", name=first)).to_be_visible()
+    client.post(f"/v1/jobs/{second}/cancel")
+    expect(again).to_be_visible()
+    assert job(client, second)["retry_of"] == first
+    visitor.problems = [problem for problem in visitor.problems if "net::ERR_FAILED" not in problem]  # as was meant
+
+
+@pytest.mark.parametrize("route", ["#/data", "#/jobs", "#/train"])
+def test_lists_name_what_is_there(visitor: Visitor, dashboard: Dashboard, route: str) -> None:
+    page = visitor.open(route)
+    expect(page.get_by_role("link", name="pendulum", exact=route == "#/jobs").first).to_be_visible()
+    assert visitor.overflow() <= 0
+    assert audit(page) == []

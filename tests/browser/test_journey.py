@@ -1,0 +1,223 @@
+"""The whole way in a browser: upload, train, look at the plot, promote, roll back, follow a stream live."""
+
+from __future__ import annotations
+
+import os
+import re
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from lipcore.samples import Samples
+from service.stream.client import StreamClient
+from tests.browser.accessibility import audit
+from tests.browser.conftest import Dashboard
+from tests.browser.looking import expect
+from tests.browser.visitor import DESKTOP, PHONE, Visitor
+from tests.service.data import arrays, npz, stream, train
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Locator, Page
+
+PICTURES = bool(os.environ.get("LIPSERVE_SCREENSHOTS"))
+ROBOT = "panda" if PICTURES else "double-pendulum"
+SAMPLES = 500 if PICTURES else 200
+OPTIONS = {
+    "hyperparameter samples": 200 if PICTURES else 40,
+    "posterior samples": 300 if PICTURES else 60,
+    "max iterations": 60 if PICTURES else 12,
+}
+"""A fit of a second, or for pictures one that is worth a look."""
+NAME = "monday.npz"
+LONG_MS = 180_000
+RATE = 100.0
+CONTACTS = slice(350, 356)
+"""Rows of every stream's cycle at which something is hit."""
+
+
+def drawn(place: Locator, plots: int = 1) -> None:
+    """Wait until at least so many plots have been drawn, each with a text for those who do not see it."""
+    expect(place.locator(".js-plotly-plot:has(.main-svg)").nth(plots - 1)).to_be_attached()
+    for each in place.locator(".js-plotly-plot").all():
+        assert each.get_attribute("aria-label"), each
+
+
+@contextmanager
+def playing(url: str, model: str, samples: Samples) -> Iterator[None]:
+    """Stream samples in real time from a thread, to be learnt from, until the block ends; afterwards nothing failed."""
+    stop, failures = threading.Event(), list[Exception]()
+
+    def play() -> None:
+        try:
+            with StreamClient(model, url, stream_id="cell-3") as client:
+                begin = time.monotonic()
+                for row in range(len(samples.t)):
+                    tau = samples.tau[row] + (40.0 if row in range(CONTACTS.start, CONTACTS.stop) else 0.0)
+                    client.ask(samples.q[row], samples.dq[row], samples.ddq[row], tau=tau)
+                    if stop.wait(max(0.0, begin + row / RATE - time.monotonic())):
+                        return
+        except Exception as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=play)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+    assert failures == []
+
+
+def phone(visitor: Visitor, name: str) -> None:
+    """For pictures: see the page on a phone, in the dark."""
+    if not PICTURES:
+        return
+    visitor.page.set_viewport_size({"width": PHONE[0], "height": PHONE[1]})
+    visitor.page.emulate_media(color_scheme="dark")
+    visitor.shot(name, 1700)
+    visitor.page.emulate_media(color_scheme="light")
+    visitor.page.set_viewport_size({"width": DESKTOP[0], "height": DESKTOP[1]})
+
+
+def uploaded(visitor: Visitor, samples: Samples) -> None:
+    """Upload a recording, and look at its report and plots."""
+    page = visitor.page
+    page.get_by_role("link", name="Upload a recording").first.click()
+    body = npz(**arrays(samples), joint_names=list(samples.joint_names))
+    file = {"name": NAME, "mimeType": "application/octet-stream", "buffer": body}
+    page.get_by_label("Recordings to upload").set_input_files(file)
+    page.get_by_role("button", name="Upload", exact=True).click()
+    page.get_by_role("link", name="Read its report").click()
+
+    expect(page.get_by_role("heading", level=1, name=NAME)).to_be_visible()
+    drawn(page.locator("main"), 4)
+    visitor.settled()
+    assert audit(page) == []
+    visitor.shot("dataset", 1700)
+
+
+def trained(visitor: Visitor) -> None:
+    """Train on what the page shows, and watch the job until it has made a version."""
+    page = visitor.page
+    page.get_by_role("link", name="Train on it").first.click()
+    page.get_by_label("Name of the model").fill("my-arm")
+    expect(page.get_by_label(f"Train on {NAME}")).to_be_checked()
+    assert audit(page) == []
+    visitor.shot("train", 1100)
+    page.get_by_text("Advanced options").click()
+    for label, value in OPTIONS.items():
+        page.get_by_label(label, exact=True).fill(str(value))
+    page.get_by_role("button", name="Start training").click()
+
+    expect(page.get_by_role("heading", level=1, name="Training my-arm")).to_be_visible()
+    drawn(page.get_by_role("region", name="Objective"))
+    if PICTURES:
+        expect(page.locator("main")).to_contain_text(re.compile(r"Iteration[345]\d of"), timeout=LONG_MS)
+        visitor.shot("job", 1000)
+    version = page.get_by_role("link", name="Look at version 1")
+    expect(version).to_be_visible(timeout=LONG_MS)
+    expect(page.get_by_text("samples that were held out")).to_be_visible()
+    visitor.settled()
+    assert audit(page) == []
+    version.click()
+
+
+def judged(visitor: Visitor) -> None:
+    """Look at the model's torque against what was measured, at its parts, and ask it."""
+    page = visitor.settled()
+    expect(page.get_by_role("heading", level=1, name="my-arm")).to_be_visible()
+    recording = page.get_by_label("Recording", exact=True)
+    recording.select_option(label=str(recording.locator("option", has_text=NAME).first.text_content()))
+    expect(page.get_by_label("Part", exact=True)).to_have_value("held_out")
+    drawn(page.locator("main"), 3)
+    expect(page.get_by_text("These samples flatter")).to_have_count(0)
+    assert audit(page) == []
+    visitor.shot("model", 1500)
+    phone(visitor, "model-phone-dark")
+    page.get_by_label("Part", exact=True).select_option("all")
+    expect(page.get_by_text("flatter").first).to_be_visible()
+
+    page.get_by_role("tab", name="Parts and friction").click()
+    drawn(page.locator("main"))
+    assert audit(page) == []
+    visitor.shot("parts", 1500)
+    page.get_by_role("tab", name="Ask").click()
+    page.get_by_role("button", name="Ask", exact=True).click()
+    expect(page.get_by_role("columnheader", name="95 % of measurements")).to_be_visible()
+
+
+def promoted(visitor: Visitor, dashboard: Dashboard, dataset: str) -> None:
+    """Let an earlier version answer, take that back, and compare the two."""
+    page = visitor.page
+    train(dashboard.client, "my-arm", dataset)
+    page = visitor.open("#/models/my-arm?tab=versions")
+
+    def serving() -> int:
+        return dashboard.client.get("/v1/models/my-arm").json()["serving_version"]
+
+    page.get_by_role("button", name="Let it answer: version 1").click()
+    page.get_by_role("dialog").get_by_role("button", name="Cancel").click()
+    assert serving() == 2
+    page.get_by_role("button", name="Let it answer: version 1").click()
+    page.get_by_role("dialog").get_by_role("button", name="Serve version 1").click()
+    expect(page.get_by_text("Version 1 of my-arm answers from now on.")).to_be_visible()
+    assert serving() == 1
+    page.get_by_role("button", name="Roll back: serving").click()
+    page.get_by_role("dialog").get_by_role("button", name="Back to version 2").click()
+    expect(page.get_by_text("serving is version 2 again.")).to_be_visible()
+    assert serving() == 2
+    page.get_by_role("button", name="Compare", exact=True).click()
+    expect(page.get_by_text("blocks; ±")).to_be_visible()
+    assert audit(page) == []
+    visitor.shot("versions", 1300)
+    page.get_by_role("button", name="Let it answer: version 1").click()
+    page.get_by_role("dialog").get_by_role("button", name="Serve version 1").click()
+    visitor.until(lambda: serving() == 1)
+
+
+def followed(visitor: Visitor, dashboard: Dashboard) -> None:
+    """Follow a stream: it is quiet first, then torque and its prediction roll by, and a contact is marked."""
+    page = visitor.page
+    page.get_by_role("link", name="Follow live").click()
+    expect(page.get_by_text("lipserve stream my-arm")).to_be_visible()
+    assert audit(page) == []
+    samples = stream(ROBOT, samples=6000, seed=8, rate=RATE)
+    with playing(dashboard.server.url, "my-arm", samples):
+        state = page.locator("main").get_by_role("status").first
+        expect(state).to_contain_text("live")
+        drawn(page.get_by_role("region", name="Torque"), len(samples.joint_names))
+        drawn(page.get_by_role("region", name="Innovation"))
+        expect(page.get_by_role("region", name="Learning").get_by_role("row", name="learnt")).to_be_visible()
+        expect(page.get_by_role("region", name="Quality").get_by_role("row").nth(1)).to_be_visible()
+        expect(page.get_by_role("region", name="Answers of streams")).to_contain_text("at most")
+        expect(page.get_by_role("region", name="Learning").get_by_role("row", name="contact")).to_be_visible()
+        revision_rises(visitor, page)
+        if PICTURES:
+            page.wait_for_timeout(25_000)
+        assert audit(page) == []
+        visitor.shot("live", 1900)
+        phone(visitor, "live-phone-dark")
+        page.get_by_role("button", name="Pause plots").click()
+        expect(state).to_contain_text("paused")
+    expect(state).to_contain_text("no new rows")
+
+
+def revision_rises(visitor: Visitor, page: Page) -> None:
+    """Wait until answers contain what was streamed."""
+    learning = page.get_by_role("region", name="Learning")
+    visitor.until(lambda: "revision 0" not in learning.inner_text())
+
+
+def test_from_a_recording_to_a_model_that_is_followed_live(visitor: Visitor, dashboard: Dashboard) -> None:
+    visitor.open("#/")
+    uploaded(visitor, stream(ROBOT, samples=SAMPLES, seed=5))
+    dataset = visitor.page.url.rsplit("/", 1)[1]
+    trained(visitor)
+    judged(visitor)
+    promoted(visitor, dashboard, dataset)
+    followed(visitor, dashboard)
+    visitor.open("#/")
+    visitor.shot("overview")

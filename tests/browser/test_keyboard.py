@@ -1,0 +1,65 @@
+"""From a recording to a model with the keyboard alone: every control is reached, named, and seen to have the focus."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tests.browser.accessibility import focused, tab_to
+from tests.browser.looking import expect
+from tests.browser.visitor import Visitor
+from tests.service.data import arrays, npz, stream
+
+if TYPE_CHECKING:
+    from playwright.sync_api import FileChooser
+
+
+def test_a_model_is_made_without_a_mouse(visitor: Visitor) -> None:
+    samples = stream(seed=3)
+    file = {"name": "keys.npz", "mimeType": "application/octet-stream", "buffer": npz(**arrays(samples))}
+    page = visitor.open("#/")
+    choosers: list[FileChooser] = []
+    # long before it opens, as listening later may miss it
+    page.on("filechooser", lambda opened: choosers.append(opened))  # noqa: PLW0108 -- Playwright marks what it is given
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    at = focused(page)
+    assert at is not None
+    assert at["tag"] == "main", "the first stop skips what every page begins with"
+
+    page.reload()
+    tab_to(page, "Data")
+    page.keyboard.press("Enter")
+    visitor.settled()
+    tab_to(page, "Choose files")
+    page.keyboard.press("Enter")
+    visitor.until(lambda: choosers)[0].set_files([file])
+    expect(page.get_by_role("button", name="Upload", exact=True)).to_be_focused()
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("link", name="Train on it")).to_be_visible()
+    tab_to(page, "Train on it")
+    page.keyboard.press("Enter")
+    visitor.settled()
+
+    tab_to(page, "Name of the model")
+    page.keyboard.type("keys")
+    tab_to(page, "lip-chain")
+    page.keyboard.press("ArrowDown")
+    page.keyboard.press("ArrowUp")
+    expect(page.get_by_role("radio", name="lip-chain (default)")).to_be_checked()
+    tab_to(page, "Advanced options")
+    page.keyboard.press("Enter")
+    expect(page.get_by_label("max iterations", exact=True)).to_be_visible()
+    tab_to(page, "hyperparameter samples")
+    page.keyboard.type("20")
+    tab_to(page, "max iterations")
+    page.keyboard.type("4")
+    page.keyboard.press("Enter")  # sends the form, as everywhere
+
+    expect(page.get_by_role("link", name="Look at version 1")).to_be_visible()
+    tab_to(page, "Look at version 1")
+    page.keyboard.press("Enter")
+    visitor.settled()
+    tab_to(page, "Accuracy")
+    page.keyboard.press("ArrowRight")
+    expect(page.get_by_role("tab", selected=True)).to_be_focused()
+    expect(page.get_by_role("tab", selected=True)).not_to_have_text("Accuracy")

@@ -1,0 +1,106 @@
+"""A model's page: what is drawn of a long recording, where there is nothing to draw, aliases, lineage and a query."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from tests.browser.accessibility import audit
+from tests.browser.conftest import Dashboard
+from tests.browser.looking import expect
+from tests.browser.visitor import Visitor
+from tests.service.data import stream, train, upload
+
+ROWS = 1200
+
+
+@pytest.fixture(scope="module")
+def model(dashboard: Dashboard) -> str:
+    """A model that nothing else moves the aliases of."""
+    train(dashboard.client, "looked-at", dashboard.dataset["id"], holdout={"share": 0.3})
+    return "looked-at"
+
+
+@pytest.fixture(scope="module")
+def long(dashboard: Dashboard) -> str:
+    """A recording of more rows than are drawn at once."""
+    return upload(dashboard.client, stream(samples=ROWS, rate=100.0, seed=4), name="long.npz")["id"]
+
+
+def test_a_long_recording_is_thinned_and_said_to_be_and_seen_in_full_where_asked(
+    visitor: Visitor, model: str, long: str
+) -> None:
+    page = visitor.open(f"#/models/{model}?dataset={long}")
+    expect(page.get_by_text("1\u202f000 of 1\u202f200 samples are drawn, evenly chosen")).to_be_visible()
+    page.get_by_label("Joint", exact=True).select_option("joint2")
+    page.get_by_label("Show", exact=True).select_option("residual, measured − predicted")
+    expect(page.get_by_role("img", name=re.compile("residual.* of joint2 along"))).to_be_visible()
+    expect(page.get_by_role("img", name=re.compile("of joint1 along"))).to_have_count(0)
+
+    page.get_by_text("Show certain rows").click()
+    page.get_by_label("From row").fill("100")
+    page.get_by_label("to row").fill("299")
+    page.get_by_role("button", name="Show these rows").click()
+    expect(page.get_by_text("All 200 samples (rows 100 to 299) are drawn.")).to_be_visible()
+    expect(page.get_by_role("img", name="200 of 200 rows")).to_be_visible()
+    page.get_by_label("From row").fill("5000")
+    visitor.expect_refusals(422)
+    page.get_by_role("button", name="Show these rows").click()
+    expect(page.get_by_role("alert")).to_contain_text("a row of the data set, 0 to 1199")
+    page.get_by_role("button", name="Show all rows").click()
+    expect(page.get_by_text("1\u202f000 of 1\u202f200 samples are drawn")).to_be_visible()
+    assert audit(page) == []
+
+
+def test_without_a_recording_of_its_robot_a_page_says_what_to_do(visitor: Visitor) -> None:
+    page = visitor.open("#/models/panda-sim")
+    expect(page.get_by_text("has the joints of this model (panda_joint1")).to_be_visible()
+    expect(page.get_by_role("link", name="Upload a recording")).to_be_visible()
+    page.get_by_role("tab", name="Parts and friction").click()
+    expect(page.get_by_role("table").filter(has_text="Coulomb")).to_contain_text("panda_joint7")
+    assert audit(page) == []
+
+
+def test_an_alias_is_made_moved_by_name_and_removed(visitor: Visitor, dashboard: Dashboard, model: str) -> None:
+    page = visitor.open(f"#/models/{model}?tab=versions")
+    page.get_by_text("Make or move an alias").click()
+    page.get_by_label("Alias", exact=True).fill("production")
+    page.get_by_role("button", name="Point it there").click()
+    expect(page.get_by_role("row").filter(has_text="production → 1")).to_be_visible()
+    assert dashboard.client.get(f"/v1/models/{model}").json()["aliases"] == {"production": 1}
+    expect(page.get_by_role("button", name="Delete")).to_have_count(0)
+    page.get_by_role("button", name="Remove: production").click()
+    page.get_by_role("dialog").get_by_role("button", name="Remove it").click()
+    expect(page.get_by_text("The alias production is removed.")).to_be_visible()
+    assert dashboard.client.get(f"/v1/models/{model}").json()["aliases"] == {}
+
+
+def test_lineage_leads_to_the_data_and_the_job(visitor: Visitor, dashboard: Dashboard, model: str) -> None:
+    page = visitor.open(f"#/models/{model}?tab=lineage")
+    trained = page.get_by_role("region", name="Trained on")
+    expect(trained.get_by_role("link", name="pendulum.npz")).to_have_attribute(
+        "href", f"#/data/{dashboard.dataset['id']}"
+    )
+    expect(page.get_by_role("columnheader", name="Trained on (flatters): nMSE")).to_be_visible()
+    expect(page.get_by_role("link", name=re.compile("^job_"))).to_be_visible()
+    assert audit(page) == []
+
+
+def test_a_motion_outside_the_training_is_said_to_be_a_guess(visitor: Visitor, model: str) -> None:
+    page = visitor.open(f"#/models/{model}?tab=ask")
+    page.get_by_role("button", name="Ask", exact=True).click()
+    expect(page.get_by_text("✓ within")).to_have_count(2)
+    page.get_by_label("dq of joint2", exact=True).fill("40")
+    page.get_by_role("button", name="Ask", exact=True).click()
+    expect(page.get_by_text("dq outside")).to_be_visible()
+    expect(page.get_by_text("Do not command this torque unseen")).to_be_visible()
+    assert audit(page) == []
+
+
+def test_the_tab_in_the_address_is_where_a_link_leads(visitor: Visitor, model: str) -> None:
+    page = visitor.open(f"#/models/{model}?tab=learning")
+    expect(page.get_by_text("It has learnt nothing while serving so far")).to_be_visible()
+    page.get_by_role("tab", name="Learning").press("ArrowLeft")
+    expect(page.get_by_role("tab", name="Ask")).to_be_focused()
+    expect(page).to_have_url(re.compile("tab=ask$"))

@@ -1,0 +1,142 @@
+"""Somebody who looks at the dashboard, and notices what a browser's console and network tell."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Request, Route
+
+PATIENCE_MS = 60_000
+"""Longest wait for anything on a page, ms: the machine may be busy with other tests."""
+DESKTOP = (1280, 800)
+PHONE = (390, 844)
+LARGEST_SHOT = 250_000
+"""Most bytes of a screenshot."""
+_REFUSED = "Failed to load resource: the server responded with a status of "
+
+
+class Visitor:
+    """A browser window on one service; `problems` lists what went wrong in it.
+
+    size: width and height in CSS pixels. scheme: `light` or `dark`.
+    """
+
+    def __init__(
+        self, browser: Browser, url: str, size: tuple[int, int] = DESKTOP, scheme: str = "light", touch: bool = False
+    ) -> None:
+        self.url, self.problems, self._refusals = url.rstrip("/"), list[str](), set[int]()
+        self.context: BrowserContext = browser.new_context(
+            viewport={"width": size[0], "height": size[1]},
+            color_scheme="dark" if scheme == "dark" else "light",
+            reduced_motion="reduce",
+            has_touch=touch,
+            is_mobile=touch,
+            locale="en-GB",
+            timezone_id="UTC",
+        )
+        self.context.set_default_timeout(PATIENCE_MS)
+        # only what is not the service's own goes through Python, which may be busy elsewhere
+        self.context.route(re.compile(f"^(?!{re.escape(self.url)}/)"), self._outside)
+        self.context.on("console", self._said)
+        self.context.on("weberror", lambda raised: self.problems.append(f"uncaught: {raised.error}"))
+        self.context.on("request", self._asked)
+        self.page: Page = self.context.new_page()
+        self.page.on("websocket", lambda socket: self._asked_for(socket.url))
+
+    def expect_refusals(self, *statuses: int) -> None:
+        """Let answers of these statuses be: the browser reports each as an error on its console."""
+        self._refusals.update(statuses)
+
+    def open(self, route: str = "#/") -> Page:
+        """Go to a page of the dashboard and wait until it is there; or of the service, where `route` starts with /."""
+        address = self.url + (route if route.startswith("/") else f"/{route}")
+        if self.page.url == address:
+            self.page.reload()
+        else:
+            self.page.goto(address)
+        if not route.startswith("/"):
+            self.settled()
+        return self.page
+
+    def settled(self) -> Page:
+        """Wait until the page of the address shows what it has to show, and loads nothing more."""
+        from tests.browser.looking import expect
+
+        self.page.evaluate("new Promise((done) => setTimeout(done))")  # a changed hash is told a moment later
+        self.page.locator("main").locator("h1, .error, .empty").first.wait_for()
+        expect(self.page.locator("main .loading")).to_have_count(0)
+        return self.page
+
+    def until(self, look: Callable[[], Any]) -> Any:
+        """Look until the answer is true and return it. Meanwhile the browser is heard, unlike in a plain sleep."""
+        end = time.monotonic() + PATIENCE_MS / 1000
+        while not (seen := look()):
+            assert time.monotonic() < end, "waited in vain"
+            self.page.wait_for_timeout(20)
+        return seen
+
+    def shot(self, name: str, height: int | None = None) -> None:
+        """Keep a picture as LIPSERVE_SCREENSHOTS/name.png; do nothing where that is not set.
+
+        height: show at most so many CSS pixels of the page, from its top; None: what the window shows.
+        """
+        folder = os.environ.get("LIPSERVE_SCREENSHOTS")
+        if not folder:
+            return
+        path = Path(folder) / f"{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        usual = self.page.viewport_size
+        assert usual is not None
+        if height is not None:
+            self.page.set_viewport_size({"width": usual["width"], "height": height})
+            self.page.evaluate("scrollTo(0, 0)")
+            self.page.wait_for_timeout(1000)  # plots that come into view are drawn
+        self.page.screenshot(path=path, animations="disabled", caret="hide")
+        self.page.set_viewport_size(usual)
+        compress(path)
+        assert path.stat().st_size <= LARGEST_SHOT, f"{path} has {path.stat().st_size} bytes"
+
+    def overflow(self) -> float:
+        """Pixels by which the page is wider than the window."""
+        return self.page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
+
+    def close(self) -> None:
+        """Close the window."""
+        self.context.close()
+
+    def _outside(self, route: Route) -> None:
+        if urlsplit(route.request.url).scheme in {"data", "blob"}:
+            route.continue_()
+        else:
+            route.abort()
+
+    def _asked(self, request: Request) -> None:
+        self._asked_for(request.url)
+
+    def _asked_for(self, url: str) -> None:
+        address, ours = urlsplit(url), urlsplit(self.url)
+        if address.scheme not in {"data", "blob"} and address.netloc != ours.netloc:
+            self.problems.append(f"asked for {url}, which is not the service's")
+
+    def _said(self, message: ConsoleMessage) -> None:
+        text = message.text
+        if message.type not in {"error", "warning"}:
+            return
+        if text.startswith(_REFUSED) and int(text.removeprefix(_REFUSED)[:3]) in self._refusals:
+            return
+        self.problems.append(f"console {message.type}: {text} ({message.location.get('url')})")
+
+
+def compress(path: Path) -> None:
+    """Store a picture with at most 256 colours, which plots and text do well with."""
+    from PIL import Image
+
+    with Image.open(path) as picture:
+        picture.convert("RGB").quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)

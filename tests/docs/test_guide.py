@@ -1,0 +1,102 @@
+"""The guide shows every page of the documentation, its links lead on, and nothing else of the disk is served."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+
+from service.guide import pages, routes
+from tests.docs.blocks import ROOT
+
+
+@pytest.fixture(scope="module")
+def guide() -> Iterator[TestClient]:
+    """The guide alone: it needs nothing of a service."""
+    app = FastAPI()
+    routes.install(app)
+    with TestClient(app) as client:
+        yield client
+
+
+def test_every_page_of_the_documentation_is_in_the_guide():
+    there = {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
+    assert there == {page.file for page in pages.pages().values()}
+    assert len(pages.pages()) == len(there)
+
+
+@pytest.mark.parametrize("page", pages.pages().values(), ids=lambda page: page.file)
+def test_a_page_has_a_title_and_links_that_lead_on(guide, page):
+    answer = guide.get(page.address)
+    assert answer.status_code == 200
+    assert answer.text.count("<h1") == 1
+    assert f'href="{page.address}" aria-current="page"' in answer.text
+    assert "default-src 'self'" in answer.headers["content-security-policy"]
+    for link in set(re.findall(r'(?:href|src)="(/guide[^"]*)"', answer.text)):
+        path, _, fragment = link.partition("#")
+        found = guide.get(path)
+        assert found.status_code == 200, f"{page.file}: {link}"
+        assert not fragment or f'id="{fragment}"' in found.text, f"{page.file}: {link}"
+    for link in re.findall(r'(?:href|src)="([^"]*)"', answer.text):
+        assert re.match(r"/|#|https?://", link), f"{page.file}: {link}"
+
+
+def test_marks_of_the_tests_are_not_shown(guide):
+    assert "not run" not in guide.get("/guide/operations").text
+
+
+def test_a_page_that_there_is_not_is_said_so(guide):
+    answer = guide.get("/guide/nothing")
+    assert answer.status_code == 404
+    assert "There is no such page" in answer.text
+    assert 'href="/guide"' in answer.text
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["pages.py", "../pages.py", "..%2fpages.py", "%2e%2e%2fpages.py", "tutorial.md", "demo.png%00", "/etc/passwd", ""],
+)
+def test_no_other_file_is_served(guide, name):
+    assert guide.get(f"/guide/files/{name}").status_code == 404
+
+
+def test_pictures_and_the_style_sheet_are_served(guide):
+    assert guide.get("/guide/files/demo.png").headers["content-type"] == "image/png"
+    assert guide.get("/guide/files/guide.css").headers["content-type"].startswith("text/css")
+
+
+def test_html_in_markdown_is_text(monkeypatch, tmp_path):
+    (tmp_path / "README.md").write_text(
+        "# T\n\n<script>alert(1)</script> [x](javascript:alert(1)) ![y](data:text/html,x)\n"
+    )
+    monkeypatch.setattr(pages, "folder", lambda: tmp_path)
+    for cached in (pages.pages, pages.images, pages.content):
+        cached.cache_clear()
+    try:
+        shown = pages.content("")
+    finally:
+        for cached in (pages.pages, pages.images, pages.content):
+            cached.cache_clear()
+    assert "<script" not in shown
+    assert 'href="javascript' not in shown
+    assert 'src="data:text/html' not in shown
+
+
+@pytest.mark.parametrize(
+    ("href", "leads"),
+    [
+        ("own-robot.md#2-upload", "/guide/own-robot#2-upload"),
+        ("reference/api.md", "/guide/api"),
+        ("README.md", "/guide"),
+        ("demo.png", "/guide/files/demo.png"),
+        ("#here", "#here"),
+        ("https://example.org", "https://example.org"),
+        ("../service/settings.py", None),
+        ("../../etc/passwd", None),
+    ],
+)
+def test_links_are_those_of_the_guide(href, leads):
+    assert pages.target(href, "numbers.md") == leads

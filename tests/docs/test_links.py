@@ -1,0 +1,44 @@
+"""Links, pictures and generated pages of the documentation are there and up to date."""
+
+from __future__ import annotations
+
+import re
+import runpy
+from pathlib import Path
+
+import pytest
+
+from service.guide.pages import anchor
+from tests.docs.blocks import ROOT, all_pages, prose
+
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+BOXES = re.compile(r"^#+ +(.*?)\s*$", re.MULTILINE)
+
+
+def anchors(page: Path) -> set[str]:
+    """What the headings of a page are linked by."""
+    return {
+        anchor(re.sub(r"\[(.*?)\]\(.*?\)", r"\1", heading).replace("`", "")) for heading in BOXES.findall(prose(page))
+    }
+
+
+@pytest.mark.parametrize("page", all_pages(), ids=lambda page: page.stem)
+def test_links_lead_somewhere(page):
+    for link in LINK.findall(prose(page)):
+        if re.match(r"[a-z]+:", link):
+            continue
+        path, _, fragment = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        assert target.is_relative_to(ROOT), f"{page.name}: {link}"
+        assert target.exists(), f"{page.name}: {link}"
+        if fragment:
+            assert fragment in anchors(target), f"{page.name}: {link}"
+
+
+def test_the_api_reference_is_up_to_date():
+    made = runpy.run_path(str(ROOT / "docs/api.py"))
+    assert made["TARGET"].read_text("utf-8") == made["document"](), "run: python docs/api.py"
+
+
+def test_the_readme_stays_short():
+    assert len((ROOT / "README.md").read_text("utf-8").splitlines()) <= 180

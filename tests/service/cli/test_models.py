@@ -1,0 +1,76 @@
+"""`lipserve models`: versions, aliases, archives."""
+
+from __future__ import annotations
+
+import pytest
+
+
+def test_models_are_listed_and_shown(asked, arm):
+    name, _ = arm
+    listed = asked("models", "list", "--json")
+    assert name in [each["name"] for each in listed]
+    assert name in asked("models", "list")
+    assert len(asked("models", "list", "--limit", 1, "--json")) == 1
+    shown = asked("models", "show", name, "--json")
+    assert shown["model"]["latest_version"] >= 2
+    assert shown["version"]["version"] == shown["model"]["serving_version"]
+    said = asked("models", "show", name, "--version", 1)
+    assert "version 1: se, 2 joints: joint1, joint2" in said
+    assert "nothing was held out" in said
+
+
+def test_promoting_is_taken_back(asked, arm):
+    name, _ = arm
+    assert asked("models", "promote", name, 1, "--json")["version"] == 1
+    assert "version 2 answers where none is named" in asked("models", "promote", name, 2)
+    assert asked("models", "rollback", name, "--json")["version"] == 1
+    asked("models", "promote", name, 2)
+    assert "version 1" in asked("models", "promote", name, 1, "--alias", "night")
+    assert asked("models", "promote", name, "night", "--alias", "day", "--json")["version"] == 1
+    assert asked("predict", name, "--q", "0.1,0.2", "--alias", "day", "--json")["version"] == 1
+    assert "names version 1" in asked("models", "alias", name, "day")
+    asked("models", "alias", name, "day", 2)
+    assert asked("models", "alias", name, "day", "--json")["version"] == 2
+    asked("models", "alias", name, "day", "--remove")
+
+
+def test_versions_are_compared(asked, arm):
+    name, dataset = arm
+    found = asked("models", "compare", name, dataset, 1, 2, "--json")
+    assert [each["version"] for each in found["versions"]] == [1, 2]
+    said = asked("models", "compare", name, dataset, 1, 2)
+    assert found["verdict"] in said
+    assert "careful: " in said  # both were trained on it
+
+
+def test_an_archive_is_written_read_and_deleted(asked, arm, lipserve, server, tmp_path):
+    name, _ = arm
+    path = tmp_path / "arm.tar"
+    assert asked("models", "export", name, path, "--version", 1, "--json")["bytes"] == path.stat().st_size
+    made = asked("models", "import", path, "--name", "cli-imported", "--json")
+    assert (made["model"], made["version"]) == ("cli-imported", 1)
+    code, _, err = lipserve("models", "delete", "cli-imported", "--url", server.url)
+    assert code == 1  # nobody has answered the question
+    assert "for good?" in err
+    asked("models", "delete", "cli-imported", "--yes")
+    code, _, err = lipserve("models", "show", "cli-imported", "--url", server.url)
+    assert (code, "no model 'cli-imported'" in err) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "hint"),
+    [
+        (("models", "show", "cli-arm", "--version", 99), "`lipserve models show MODEL` shows the versions"),
+        (("models", "alias", "cli-arm", "noon"), "`lipserve models alias cli-arm noon VERSION` makes it"),
+        (("evaluate", "cli-arm", "ds_none"), "`lipserve data list` shows the data sets"),
+        (("evaluate", "cli-arm", "nowhere.csv"), "`lipserve data list` shows the data sets"),
+        (("jobs", "show", "job_none"), "`lipserve jobs list` shows the jobs"),
+        (("stream", "nobody", "--simulate", "double-pendulum"), "models that exist: "),
+        (("stream", "cli-arm"), "`lipserve stream cli-arm --simulate panda`"),
+    ],
+)
+def test_refusals_say_what_to_do(lipserve, server, arm, arguments, hint):
+    code, said, err = lipserve(*arguments, "--url", server.url)
+    assert (code, said) == (1, "")
+    assert err.startswith("error: ")
+    assert f"hint: {hint}" in err

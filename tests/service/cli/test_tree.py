@@ -1,0 +1,124 @@
+"""The tree of commands: its reference, its lists, completion, exit codes and hints."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import pytest
+
+from lipcore.estimators import ESTIMATORS
+from lipcore.robots import ROBOTS
+from service.cli import errors, words
+from service.cli.consoles import plain
+from service.cli.tree import commands
+from service.client import ApiError
+from tests.service.server import free_port
+
+DOCS = Path(__file__).resolve().parents[3] / "docs"
+PRINTS_NO_RESULT = {"serve", "demo"}
+
+
+def test_reference_is_up_to_date():
+    written = runpy.run_path(str(DOCS / "cli.py"))["page"]()
+    assert (DOCS / "reference/cli.md").read_text() == written, "run: python docs/cli.py"
+
+
+def test_names_that_help_lists_are_those_that_there_are():
+    assert list(ROBOTS) == words.ROBOTS
+    assert list(ESTIMATORS) == words.ESTIMATORS
+
+
+def test_every_command_prints_json_and_has_a_help():
+    for path, command, _ in commands():
+        assert command.help, path
+        for parameter in command.params:
+            assert parameter.help, (path, parameter.name)
+        if not hasattr(command, "list_commands") and path[1] not in PRINTS_NO_RESULT:
+            assert "--json" in [name for each in command.params for name in each.opts], path
+
+
+@pytest.fixture
+def completed(lipserve, monkeypatch):
+    """What a shell is offered for the last word of a command line."""
+
+    def run(line):
+        found = line.split(" ")
+        monkeypatch.setenv("_LIPSERVE_COMPLETE", "complete_bash")
+        monkeypatch.setenv("COMP_WORDS", line)
+        monkeypatch.setenv("COMP_CWORD", str(len(found) - 1))
+        code, said, err = lipserve()
+        monkeypatch.delenv("_LIPSERVE_COMPLETE")
+        assert (code, err) == (0, "")
+        return said.split()
+
+    return run
+
+
+def test_commands_and_options_are_completed(completed):
+    assert completed("lipserve mo") == ["models"]
+    assert completed("lipserve models pro") == ["promote"]
+    assert completed("lipserve predict --comp") == ["--components"]
+    assert completed("lipserve train x.csv --estimator rigid") == ["rigid-body", "rigid-body+lip-chain"]
+    assert "--quick" in completed("lipserve reproduce --qu")
+    assert "latency" in completed("lipserve bench la")
+
+
+def test_names_of_a_running_service_are_completed(completed, server, arm, monkeypatch):
+    name, dataset = arm
+    monkeypatch.setenv("LIPSERVE_URL", server.url)
+    assert completed("lipserve predict cli-ar") == [name]
+    assert completed(f"lipserve models promote {name} ") == ["1", "2"]
+    assert dataset in completed(f"lipserve evaluate {name} ds_")
+    monkeypatch.setenv("LIPSERVE_URL", f"http://127.0.0.1:{free_port()}")
+    assert completed("lipserve predict cli-ar") == []
+
+
+def test_exit_codes(lipserve):
+    assert lipserve("data", "nonsense")[0] == 2
+    assert lipserve("predict", "m", "--nonsense")[0] == 2
+    assert lipserve("models", "promote", "m")[0] == 2
+    assert "Did you mean 'train'" in lipserve("trian")[2]
+    nobody = f"http://127.0.0.1:{free_port()}"
+    for command in (
+        ("models", "list"),
+        ("open",),
+        ("stream", "m", "--simulate", "double-pendulum", "--seconds", "0.1"),
+    ):
+        code, said, err = lipserve(*command, "--url", nobody)
+        assert (code, said) == (1, "")
+        assert "lipserve serve" in err
+
+
+def test_address_of_the_dashboard(asked, server):
+    assert asked("open") == f"{server.url}/#/\n"
+    assert asked("open", "my-arm", "--live", "--json") == {"url": f"{server.url}/#/live/my-arm"}
+
+
+@pytest.mark.parametrize(
+    ("status", "code", "hint"),
+    [
+        (401, "unauthorized", "put yours into LIPSERVE_KEY"),
+        (403, "forbidden", "lipserve keys create"),
+        (429, "busy", "try again in a moment"),
+        (422, "invalid_request", None),
+    ],
+)
+def test_hints(status, code, hint):
+    told = errors.explain(ApiError(status, code, "no", []), (ApiError,))
+    assert told.message == f"no ({code}, {status})"
+    assert (told.hint is None) if hint is None else (hint in told.hint)
+
+
+def test_faults_are_not_explained_away():
+    assert errors.explain(KeyError("x")) is None
+    assert errors.explain(BrokenPipeError()) is None
+    assert errors.explain(ValueError("x is 1, expected 2")) == ("x is 1, expected 2", None)
+
+
+def test_numbers_that_json_does_not_know_are_null():
+    assert plain({"a": float("nan"), "b": (1.0, float("inf")), "c": Path("x")}) == {
+        "a": None,
+        "b": [1.0, None],
+        "c": "x",
+    }

@@ -1,0 +1,66 @@
+"""Clients that talk to a service in the same process, over connections that can be lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import httpx
+import pytest
+from fastapi.testclient import TestClient
+
+from service.client import Client, attempts
+from tests.service.data import ADDRESS
+
+
+class Losing(httpx.BaseTransport):
+    """Hands requests on and loses some answers. lose: says of a request whether its answer is lost, after the service
+    has done what it says; requests: all that were sent."""
+
+    def __init__(self, inner: httpx.BaseTransport, lose: Callable[[httpx.Request, int], bool]) -> None:
+        self.inner, self.lose = inner, lose
+        self.requests: list[httpx.Request] = []
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        self.requests.append(request)
+        response = self.inner.handle_request(request)
+        if self.lose(request, len(self.requests)):
+            response.read()
+            raise httpx.ReadError("the connection is lost")
+        return response
+
+
+def over(transport: httpx.BaseTransport, **options: object) -> Client:
+    """A client whose requests go over a transport."""
+    made = Client(ADDRESS, **options)
+    made._http.close()
+    made._http = httpx.Client(transport=transport, base_url=ADDRESS)
+    return made
+
+
+@pytest.fixture
+def pauses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Nothing waits; what would have been waited for is listed."""
+    found: list[float] = []
+    monkeypatch.setattr("service.client.sync.time.sleep", found.append)
+    return found
+
+
+@pytest.fixture
+def local(api: TestClient) -> Iterator[Client]:
+    """A client of the shared service."""
+    with over(api._transport) as client:
+        yield client
+
+
+@pytest.fixture
+def losing(api: TestClient, pauses: list[float]) -> Callable[..., tuple[Client, Losing]]:
+    """Make a client of the shared service that loses some answers."""
+
+    def make(lose: Callable[[httpx.Request, int], bool] = lambda _, count: count == 1) -> tuple[Client, Losing]:
+        transport = Losing(api._transport, lose)
+        client = over(transport)
+        client._reach.reached = True
+        return client, transport
+
+    assert attempts.RETRIES > 1
+    return make
