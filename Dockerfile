@@ -7,15 +7,17 @@ RUN .ci/install-torch /opt/lipserve/bin/python
 COPY pyproject.toml README.md LICENSE ./
 COPY lipcore lipcore
 COPY service service
+COPY docs docs
 COPY models/panda-sim models/panda-sim
 RUN /opt/lipserve/bin/python -m pip install --no-cache-dir --disable-pip-version-check . \
     && /opt/lipserve/bin/python -m pip uninstall --yes --quiet setuptools pip \
     && site=$(echo /opt/lipserve/lib/python3*/site-packages) \
     && rm -rf "$site"/torch/include "$site"/torch/share "$site"/torch/test \
+    && find "$site"/plotly -mindepth 1 -maxdepth 1 ! -name package_data ! -name __init__.py -exec rm -rf {} + \
     && find /opt/lipserve -name __pycache__ -prune -exec rm -rf {} + \
     && find "$site"/numpy "$site"/scipy "$site"/sympy "$site"/networkx -type d -name tests -prune -exec rm -rf {} + \
     && cd / && NUMBA_CACHE_DIR=/opt/numba /opt/lipserve/bin/python -m lipcore.warm_up \
-    && /opt/lipserve/bin/python -c "import service.cli"
+    && /opt/lipserve/bin/python -c "import service.cli.serve, service.client"
 # the last two also leave the bytecode of what a start imports, 50 MB: the container's user cannot write it, and without
 # it every start takes four seconds longer
 

@@ -12,7 +12,7 @@ demo: install
 
 test: install
 	$(MAKE) -j2 warm-lip warm-chain
-	$(MAKE) -j3 test-service test-updates test-lipcore test-packages test-kills
+	$(MAKE) -j3 test-service test-updates test-lipcore test-packages test-docs test-browser test-kills
 
 # compiles what the parts below would else compile once each, side by side: a minute of one core
 warm-lip: install
@@ -33,12 +33,24 @@ test-packages: install
 test-updates: install
 	$(TEST) -m "not slow" tests/service/updates --ignore tests/service/updates/test_kill_trials.py
 
+# what the documentation says, run
+test-docs: install
+	$(TEST) -m "not slow" tests/docs
+
+# skipped where there is no Chromium
+test-browser: install
+	$(TEST) -m "not slow" tests/browser
+
 # by itself, because a minute of it is waiting for services to start: when one of the others has ended
 test-kills: install
 	$(TEST) tests/service/updates/test_kill_trials.py
 
 test-all: install
 	$(TEST)
+
+# pictures of the dashboard for the README, made by its tests
+screenshots: install
+	LIPSERVE_SCREENSHOTS=docs/screenshots $(TEST) tests/browser/test_journey.py tests/browser/test_states.py
 
 lint: install
 	$(BIN)/ruff check .

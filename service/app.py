@@ -21,9 +21,11 @@ from service.access.keyring import Keyring
 from service.access.local import LocalAccess
 from service.access.middleware import KeyAccess
 from service.context import Service
+from service.dashboard import routes as dashboard
 from service.database import Database, DatasetRow, SnapshotRow, VersionRow
 from service.datasets import routes as datasets
 from service.files import Files
+from service.guide import routes as guide
 from service.home import hold_home
 from service.inference import echo
 from service.inference import routes as inference
@@ -49,6 +51,7 @@ from service.training import routes as training
 from service.training.queue import JobQueue
 from service.updates import routes as observations
 from service.updates.control import routes as control
+from service.updates.live import routes as live
 from service.updates.refreshing import routes as refreshing
 from service.updates.refreshing.wiring import attach
 from service.updates.updates import Updates
@@ -117,9 +120,12 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.include_router(models.router)
     app.include_router(inference.router)
     app.include_router(control.router)
+    app.include_router(live.router)
     app.include_router(refreshing.router)
     app.include_router(oip.router)
     app.include_router(stream.router())
+    dashboard.install(app)
+    guide.install(app)
     return app
 
 

@@ -20,11 +20,10 @@ from lipcore.robots import Robot, load_robot
 from lipcore.samples import Samples
 from lipcore.simulation import FAST, Stream, simulate
 from service import recordings
-from service.client import Client
+from service.client import Client, Evaluation, Prediction
+from service.client.progress import follow
 from service.datasets.asking import Reading
-from service.inference.schema import EvaluateResponse, PredictResponse
 from service.plot import draw
-from service.progress import follow
 from service.training.states import SUCCEEDED
 
 MODEL = "panda-demo"
@@ -81,7 +80,7 @@ def run(port: int, once: bool, plot: Path | None, console: Console) -> None:
     console.print("[bold]1. starting the service[/bold]")
     with ServiceProcess(port) as service, Client(service.url) as client, tempfile.TemporaryDirectory() as folder:
         seconds = service.wait_ready(client)
-        console.print(f"  ready at {service.url} after {seconds:.1f} s; documentation at {service.url}/docs")
+        console.print(f"  ready at {service.url} after {seconds:.1f} s: watch it there")
 
         console.print("[bold]2. simulating a Panda (7 joints, 10 Hz, 50 s a stream) and uploading the streams[/bold]")
         robot = load_robot("panda")
@@ -122,7 +121,8 @@ def run(port: int, once: bool, plot: Path | None, console: Console) -> None:
         if once:
             service.stop()
             return
-    console.print(f"The service stays up at {service.url} (documentation: {service.url}/docs). Ctrl-C ends it.")
+    console.print(f"Look at the model, joint by joint: {service.url}/#/models/{MODEL}")
+    console.print(f"The service stays up (guide: {service.url}/guide, API: {service.url}/docs). Ctrl-C ends it.")
     try:
         service.process.wait()
     except KeyboardInterrupt:
@@ -136,7 +136,7 @@ def _upload(client: Client, robot: Robot, stream: Stream, seed: int, path: Path)
     return client.upload(path, **reading).id, samples
 
 
-def _table(name: str, result: EvaluateResponse, samples: Samples) -> Table:
+def _table(name: str, result: Evaluation, samples: Samples) -> Table:
     table = Table(title=f"{name} trajectory, {result.samples_used} unseen samples, model version {result.version}")
     table.add_column("joint")
     for heading in ("torque std N·m", "nMSE", "RMSE N·m", f"coverage of {result.level:.0%}", "interval N·m"):
@@ -147,7 +147,7 @@ def _table(name: str, result: EvaluateResponse, samples: Samples) -> Table:
         table.add_row(
             joint,
             f"{spread[j]:.3f}",
-            "-" if nmse is None else f"{nmse:.1e}",
+            "-" if np.isnan(nmse) else f"{nmse:.1e}",
             f"{result.rmse[j]:.4f}",
             f"{result.coverage[j]:.1%}",
             f"{result.interval_width[j]:.3f}",
@@ -156,7 +156,7 @@ def _table(name: str, result: EvaluateResponse, samples: Samples) -> Table:
 
 
 def _show_query(
-    query: dict[str, np.ndarray], answer: PredictResponse, measured: np.ndarray, url: str, console: Console
+    query: dict[str, np.ndarray], answer: Prediction, measured: np.ndarray, url: str, console: Console
 ) -> None:
     rounded = {name: [round(float(v), 3) for v in values] for name, values in query.items()}
     console.print(f"  POST {url}/v1/models/{MODEL}/predict", rounded, highlight=False)

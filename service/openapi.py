@@ -19,7 +19,7 @@ GUARDED = (errors.UnauthorizedError, errors.StorageUnavailableError)
 BODY = (errors.RequestTimeoutError, errors.TooLargeError, errors.UnsupportedMediaTypeError)
 """What a route with a body may answer before it has read it."""
 WRITING = (errors.StorageFullError,)
-PURE = ("/predict", "/evaluate", "/compare", "/echo", "/infer")
+PURE = ("/predict", "/evaluate", "/trace", "/compare", "/echo", "/infer")
 """Ends of the paths of POST routes that store nothing."""
 BEFORE_ROUTES = {
     (405, "method_not_allowed"): "The path is there, the method is not: the header `Allow` lists those that are.",

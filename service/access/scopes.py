@@ -12,7 +12,7 @@ from starlette.routing import compile_path
 READ, PREDICT, UPDATE, TRAIN, ADMIN = "read", "predict", "update", "train", "admin"
 SCOPES = {
     READ: "list and look: data sets, robots, jobs, models, quality, metrics; export a model",
-    PREDICT: "ask for torques, over HTTP and streams; evaluate and compare models on data sets",
+    PREDICT: "ask for torques, over HTTP and streams; evaluate, trace and compare models on data sets",
     UPDATE: "teach: send observations and torque in streams, unlearn and replay them",
     TRAIN: "upload and delete data sets and robots; start, cancel and repeat training jobs",
     ADMIN: "everything, also what no other scope allows: move aliases, delete models, set how they learn",
@@ -55,6 +55,7 @@ TABLE: dict[tuple[str, str], str] = {
     ("POST", "/v1/models/{model}/aliases/{alias}/rollback"): ADMIN,
     ("POST", "/v1/models/{model}/predict"): PREDICT,
     ("POST", "/v1/models/{model}/evaluate"): PREDICT,
+    ("POST", "/v1/models/{model}/trace"): PREDICT,
     ("POST", "/v1/models/{model}/compare"): PREDICT,
     (WEBSOCKET, STREAM): PREDICT,
     ("POST", "/v1/models/{model}/observations"): UPDATE,
@@ -69,6 +70,7 @@ TABLE: dict[tuple[str, str], str] = {
     ("PUT", "/v1/models/{model}/learning"): ADMIN,
     ("POST", "/v1/models/{model}/learning/change"): ADMIN,
     ("GET", "/v1/models/{model}/alarms"): READ,
+    ("GET", "/v1/models/{model}/live"): READ,
     ("POST", "/v1/echo"): PREDICT,
     (WEBSOCKET, "/v1/echo/stream"): PREDICT,
     ("GET", "/v2"): READ,
@@ -92,13 +94,25 @@ OPEN: frozenset[tuple[str, str]] = frozenset(
         "/docs/oauth2-redirect",
         "/openapi.json",
         "/static-offline-docs/{file:path}",
+        "/",
+        "/dashboard/{file:path}",
+        "/guide",
+        "/guide/{page}",
+        "/guide/files/{name}",
     )
 )
-"""Routes without a key: health, for what watches over the service, and the documentation."""
+"""Routes without a key: health, for what watches over the service, documentation, guide, and the dashboard's files."""
 
 LONGEST_PATH = 1000
 """Far beyond that of any route: what is longer is not kept for the next request."""
-LASTING = frozenset({("GET", "/v1/jobs/{job}/events"), (WEBSOCKET, STREAM), (WEBSOCKET, "/v1/echo/stream")})
+LASTING = frozenset(
+    {
+        ("GET", "/v1/jobs/{job}/events"),
+        ("GET", "/v1/models/{model}/live"),
+        (WEBSOCKET, STREAM),
+        (WEBSOCKET, "/v1/echo/stream"),
+    }
+)
 """Routes that go on answering for long: they end when the key does."""
 
 

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from lipcore.robots import ROBOTS
+from lipcore.robots import ROBOTS, SimulationUnavailableError
 from service.bench import table
 from service.bench.clients import BadAnswerError
 from service.bench.ingest import running as ingest_running
@@ -35,8 +35,8 @@ from service.demo import DemoError
 from service.errors import ServiceError
 from service.stream.client import StreamError
 
-app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
-ERRORS = (ApiError, BadAnswerError, BenchError, DemoError, ServiceError, StreamError)
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+ERRORS = (ApiError, BadAnswerError, BenchError, DemoError, ServiceError, SimulationUnavailableError, StreamError)
 """What a user is told without a traceback."""
 
 QUICK_RUNS, QUICK_QUERIES, QUICK_SECONDS = 3, 1000, 5.0
@@ -188,7 +188,7 @@ def load(
 @app.command()
 def ingest(
     rows: Annotated[int, typer.Option(min=1000, help="Of the recording, at 1 kHz.")] = 1_000_000,
-    joints: Annotated[int, typer.Option(min=1, max=32)] = 7,
+    joints: Annotated[int, typer.Option(min=1, max=32, help="Of the robot.")] = 7,
     formats: Annotated[str, typer.Option(help="Names separated by commas.")] = ",".join(FORMATS),
     seed: Annotated[int, typer.Option(min=0, help="Of all that is random.")] = 0,
     json_file: Annotated[

@@ -20,11 +20,11 @@ from lipcore.simulation import Stream, simulate
 from service import recordings
 from service.bench.clients import Address
 from service.client import Client
+from service.client.progress import follow
 from service.database import Database
 from service.demo import ServiceProcess
 from service.files import Files, new_id
 from service.models import registry
-from service.progress import follow
 from service.settings import Settings
 from service.training.states import SUCCEEDED
 

@@ -5,29 +5,31 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from lipcore.estimators import DEFAULT_ESTIMATOR, ESTIMATORS
+from lipcore.estimators import ESTIMATORS
 from lipcore.excitation import Belief, Limits, Plan, PlanOptions, plan
 from lipcore.linalg import NotPositiveDefiniteError
-from lipcore.motion import JointType
 from lipcore.profiles import names
-from lipcore.robots import Robot
+from lipcore.robots import Robot, SimulationUnavailableError
 from lipcore.samples import Array
 from lipcore.simulation import FAST, Stream, sinusoids
-from service.client import ApiError, ServiceUnreachableError
+from lipcore.vocabulary import DEFAULT_ESTIMATOR, JointType
+from service.cli.consoles import err, print_json
+from service.cli.options import Json
+from service.client import ApiError
 from service.excite import plotting
 from service.excite.model import model as find_model
 from service.excite.robot import Arm, find
 from service.settings import DEFAULT_URL
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-ERRORS = (ApiError, NotPositiveDefiniteError, ServiceUnreachableError, plotting.PlotUnavailableError)
+ERRORS = (ApiError, NotPositiveDefiniteError, SimulationUnavailableError, plotting.PlotUnavailableError)
 """What a user is told without a traceback, beside ValueError and OSError."""
 COMPARED = 5
 """Random motions whose expected value the planned one is compared with."""
@@ -76,6 +78,7 @@ def excite(
     seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal motions where the budget suffices.")] = 0,
     plot: Annotated[Path | None, typer.Option(dir_okay=False, help="Also draw the motion, .png or .svg.")] = None,
     url: Annotated[str, typer.Option("--url", envvar="LIPSERVE_URL", help="Address of the service.")] = DEFAULT_URL,
+    as_json: Json = False,
 ) -> None:
     """Plan a motion within a robot's limits that tells most of what its model does not know yet."""
     if plot is not None:
@@ -87,7 +90,7 @@ def excite(
     belief = Belief.of_model(known) if known is not None else _prior(found, limits, noise, estimator, seed)
 
     console = Console(width=None if sys.stdout.isatty() else 120)
-    with console.status("planning") as status:
+    with (err if as_json else console).status("planning") as status:
         made = plan(
             belief,
             limits,
@@ -98,7 +101,11 @@ def excite(
     write(out, made)
     if plot is not None:
         plotting.draw(plot, made)
-    console.print(table(made, random_motion(made)), highlight=False)
+    random = random_motion(made)
+    if as_json:
+        print_json(shown(made, random, out, plot))
+        return
+    console.print(table(made, random), highlight=False)
     console.print(said(made, "the model" if known is not None else f"a {estimator} prior"), highlight=False)
     for path in filter(None, (out, plot)):
         console.print(f"written to {path}", highlight=False)
@@ -128,6 +135,26 @@ def random_motion(made: Plan) -> Random:
         return np.asarray(np.mean([made.left_by(*motion, repeats) for motion in draws], axis=0))
 
     return Random(left(1.0), left(FAST))
+
+
+def shown(made: Plan, random: Random, out: Path, plot: Path | None) -> dict[str, Any]:
+    """The plan for JSON: per joint the shares of variance expected to be left, and of the limits that are used."""
+    start = made.series.at(np.zeros(1))[0][0]
+    return {
+        "files": [each for each in (out, plot) if each is not None],
+        "seconds": made.options.seconds,
+        "rate_hz": made.options.rate,
+        "harmonics": made.series.harmonics,
+        "iterations": made.iterations,
+        "out_of_time": made.out_of_time,
+        "joint_names": list(made.limits.joint_names),
+        "start_q": start,
+        "left": made.left,
+        "left_by_random": random.slow,
+        "left_by_random_fast": random.fast,
+        "used": dict(zip(("position", "speed", "acceleration", "torque"), made.used, strict=True)),
+        "warnings": [WARNING],
+    }
 
 
 def table(made: Plan, random: Random) -> Table:

@@ -39,7 +39,7 @@ def model(given: str, url: str, version: int | None = None, alias: str | None = 
 def fetch(name: str, url: str, version: int | None = None, alias: str | None = None) -> TorqueModel:
     """A served model as it is now, with all that it has learnt online."""
     with TemporaryDirectory(prefix="lipserve-excite-") as folder, Client(url) as client:
-        path = client.export_model(name, Path(folder) / "model.tar", version, alias)
+        path = client.export(name, Path(folder) / "model.tar", version, alias)
         try:
             found = archive.members(path, LIMITS)
         except archive.ArchiveError as error:

@@ -6,8 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, Field, StringConstraints
 
-from lipcore.model import TorqueConvention
-from lipcore.motion import JointType
+from lipcore.vocabulary import JointType, TorqueConvention
 
 ModelName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")]
 """Lower-case letters, digits, dots, underscores and hyphens: safe in URLs and never a path."""

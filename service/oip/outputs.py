@@ -9,9 +9,10 @@ import torch
 from numpy.typing import NDArray
 
 from lipcore import dynamics
-from lipcore.dynamics import COMPONENTS, ComponentName, available
+from lipcore.dynamics import available
 from lipcore.model import TorqueModel
 from lipcore.motion import Motion
+from lipcore.vocabulary import COMPONENTS, ComponentName
 from service.errors import invalid_request
 
 Array = NDArray[np.float64]

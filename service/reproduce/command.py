@@ -14,7 +14,9 @@ from rich.console import Console
 
 from lipcore.estimators import ESTIMATORS
 from lipcore.model import MIN_SAMPLES
-from lipcore.robots import ROBOTS
+from lipcore.robots import ROBOTS, SimulationUnavailableError
+from service.cli.consoles import print_json
+from service.cli.options import Json
 from service.reproduce import figures, report, table
 from service.reproduce.experiment import Cell, Experiment
 from service.reproduce.results import FILE, Results
@@ -28,7 +30,7 @@ CURVE_SETS = 5
 
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-ERRORS = (ReproductionError, figures.FiguresUnavailableError)
+ERRORS = (ReproductionError, SimulationUnavailableError, figures.FiguresUnavailableError)
 """What a user is told without a traceback."""
 
 
@@ -54,9 +56,10 @@ def reproduce(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first training set.")] = 1,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes at a time; all cores by default.")] = None,
+    as_json: Json = False,
 ) -> None:
     """Run the paper's experiment: every estimator on training × test sets of a simulated robot; tables and figures."""
-    console, began = Console(soft_wrap=True), time.monotonic()
+    console, began = Console(soft_wrap=True, stderr=as_json), time.monotonic()
     figures.pyplot()
     experiment = Experiment(
         robot=robot,
@@ -104,6 +107,8 @@ def reproduce(
     )
     report.write(reported, out)
     figures.draw(reported, out)
+    if as_json:
+        print_json({"folder": out, "trainings": len(done), "failed": len(failed), "seconds": reported.seconds})
     console.print(f"{out / 'results.md'}: tables and figures of {len(done)} trainings, after {reported.seconds:.0f} s")
     if failed:
         raise ReproductionError(f"{len(failed)} of {len(cells)} trainings failed, the first with {failed[0].error}")

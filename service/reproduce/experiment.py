@@ -15,13 +15,14 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 import lipcore
-from lipcore.estimators import ROBOT_ESTIMATORS, make_estimator
-from lipcore.fitting import FitOptions
+from lipcore.estimators import make_estimator
+from lipcore.fit_options import FitOptions
 from lipcore.metrics import evaluate
 from lipcore.robots import Robot, load_robot
 from lipcore.samples import Array, Samples
 from lipcore.simulation import Stream, inverse_dynamics, simulate
 from lipcore.urdf import RigidBody
+from lipcore.vocabulary import ROBOT_ESTIMATORS
 from service.reproduce.memory import peak_mb, reset_peak
 
 FIRST_TEST_SEED = 1000

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lipcore.estimators import ROBOT_ESTIMATORS
 from lipcore.samples import Array
 from lipcore.simulation import FUNDAMENTAL, MIDDLE_AMPLITUDE
+from lipcore.vocabulary import ROBOT_ESTIMATORS
 from service.reproduce import table
 from service.reproduce.experiment import CellResult, Experiment
 from service.reproduce.table import Row, Summary

@@ -6,8 +6,7 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
-from lipcore.motion import JointType
-from lipcore.profiles import EffortMeaning
+from lipcore.vocabulary import EffortMeaning, JointType
 
 
 class RobotJoint(BaseModel):

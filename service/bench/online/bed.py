@@ -22,7 +22,8 @@ from service.database import Database
 from service.demo import ServiceProcess
 from service.files import Files, new_id
 from service.models import registry
-from service.updates.learning import LearningOptions, set_options
+from service.updates.learning import set_options
+from service.updates.learning_options import LearningOptions
 
 CAUGHT_UP_SECONDS = 300.0
 """Longest wait until all that was acknowledged is learnt."""

@@ -14,7 +14,7 @@ from service.bench.online.bed import install, train
 from service.bench.online.trials import BATCHES, LATE, MODEL, ROWS, TWICE, Tally, Trials, Victim
 from service.bench.table import Grid, promises
 from service.bench.targets import Target
-from service.updates.learning import LearningOptions
+from service.updates.learning_options import LearningOptions
 
 ROBOT, RATE, SPEED = "double-pendulum", 100.0, 5.0
 FIT = {"hyperparameter_samples": 40, "posterior_samples": 100, "max_iterations": 30, "starts": 1}

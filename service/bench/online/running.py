@@ -26,7 +26,7 @@ from service.bench.online.quality import Method, Moment
 from service.bench.online.results import Results
 from service.bench.online.scene import Scene, rows_of
 from service.bench.online.sending import BATCH_ROWS
-from service.updates.learning import LearningOptions
+from service.updates.learning_options import LearningOptions
 
 PARTS = ("flow", "cost", "quality", "fleet")
 """What can be measured, by name."""

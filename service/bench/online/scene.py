@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.online import spacing
-from lipcore.online.batch import LEARNT, Rows
+from lipcore.online.batch import Rows
 from lipcore.robots import Robot, load_robot
 from lipcore.samples import Array, Samples
 from lipcore.simulation import Payload, Stream, simulate
+from lipcore.vocabulary import LEARNT
 
 SINUSOIDS, UNSEEN_SINUSOIDS = 50, 100
 """The unseen trajectory has twice the bandwidth, as in the paper's tests."""

@@ -26,7 +26,7 @@ from service.bench.soak.clients import PROCESSES, Mix, Work
 from service.bench.soak.connections import BATCH_PERIOD, BATCH_ROWS, STEADY, TAUGHT, Expected, Log
 from service.bench.soak.memory import MemoryWatch
 from service.bench.timing import Timing
-from service.updates.learning import LearningOptions
+from service.updates.learning_options import LearningOptions
 
 KINDS = ("predict", "stream", "observe", "upload")
 QUERIES, UPLOADED = 200, 300
