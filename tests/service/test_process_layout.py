@@ -59,12 +59,9 @@ def probe(place):
         return pool.submit(threads_after_linear_algebra).result()
 
 
+@pytest.mark.slow
 @linux
-@pytest.mark.parametrize(
-    "policy",
-    # what is idle hardly gets to run beside other tests
-    ["other", pytest.param("idle", marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize("policy", ["other", "idle"])
 def test_no_library_starts_more_threads_than_the_place_has(monkeypatch, policy):
     """Nor is one left at the usual priority: threads keep what was set before they were started."""
     for name, value in MANY.items():

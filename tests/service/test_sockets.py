@@ -153,6 +153,7 @@ def test_a_service_listens_on_both(home, path):
         assert not path.exists()
 
 
+@pytest.mark.slow
 def test_a_free_port_is_printed_beside_the_socket(home, path, tmp_path):
     log = tmp_path / "log"
     process = start(home, "--port", "0", "--uds", path, stdout=log.open("w"))
@@ -171,6 +172,7 @@ def test_a_free_port_is_printed_beside_the_socket(home, path, tmp_path):
         process.wait(DEADLINE)
 
 
+@pytest.mark.slow
 def test_a_taken_port_leaves_no_socket(home, path, server):
     process = start(home, "--port", server.port, "--uds", path)
     said, _ = process.communicate(timeout=DEADLINE)

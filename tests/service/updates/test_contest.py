@@ -103,7 +103,7 @@ def test_what_is_not_known_is_null():
     assert json.loads(json.dumps(said)) == said
 
 
-@pytest.mark.parametrize("seconds", [0.0, 0.5, 2.0])
+@pytest.mark.parametrize("seconds", [0.5, *(pytest.param(seconds, marks=pytest.mark.slow) for seconds in (0.0, 2.0))])
 def test_standard_error_is_the_spread_of_the_gain_over_repetitions(seconds):
     contests = [compared(correlated(2000, seconds, seed)) for seed in range(60)]
     spread = np.std([contest.gain for contest in contests])
@@ -163,7 +163,7 @@ def test_many_rows_of_a_short_time_decide_nothing(settings):
     assert contest.rows > 10 * settings.promotion_rows
 
 
-@pytest.mark.parametrize("seconds", [0.0, 1.0])
+@pytest.mark.parametrize("seconds", [1.0, pytest.param(0.0, marks=pytest.mark.slow)])
 def test_chance_seldom_promotes_an_equal_candidate(settings, seconds):
     """All looks of a contest together: 2 · 2.3 % is the bound for independent blocks."""
     series = [correlated(12_000, seconds, seed) for seed in range(100)]

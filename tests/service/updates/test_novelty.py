@@ -21,6 +21,7 @@ from tests.service.updates.lessons import Pupil, School, answered
 from tests.service.updates.lessons import school as opened
 from tests.service.updates.motions import OPTIONS, batch, fast, slow
 
+pytestmark = pytest.mark.slow
 PAUSE_S = 0.01
 """Between two questions of the watcher: the learner needs the processor too."""
 SETTINGS = {"novelty_rows": 400, "promotion_rows": 600, "refresh_pause_s": 0.0}

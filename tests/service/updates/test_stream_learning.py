@@ -208,6 +208,7 @@ def test_what_was_gathered_is_logged_when_the_stream_ends(home):
         assert "ERROR" not in server.log.read_text()
 
 
+@pytest.mark.slow
 def test_no_acknowledged_frame_is_lost_or_learnt_twice_when_the_service_is_killed(home):
     measured, known, count = measured_on("panda", 800), 0, 800
     for kill_at in (90, 333, 600, None):  # None: to the end
