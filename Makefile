@@ -5,7 +5,8 @@ BIN := $(VENV)/bin
 # one thread a process: the tests' matrices are small, and three parts run side by side, each in its fixed order
 TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: demo test warm-lip warm-chain test-lipcore test-service test-packages test-updates test-kills test-all lint install serve image clean
+.PHONY: demo test warm-lip warm-chain test-lipcore test-service test-packages test-updates test-docs test-browser test-kills \
+	test-all screenshots lint install serve image clean
 
 demo: install
 	$(BIN)/lipserve demo
@@ -46,7 +47,7 @@ test-kills: install
 	$(TEST) tests/service/updates/test_kill_trials.py
 
 test-all: install
-	$(TEST)
+	$(TEST) --hypothesis-profile thorough
 
 # pictures of the dashboard for the README, made by its tests
 screenshots: install

@@ -78,6 +78,7 @@ def test_options_say_how_a_file_is_read(visitor: Visitor) -> None:
     expect(page.get_by_text("shoulder, elbow").first).to_be_visible()
 
 
+@pytest.mark.slow
 def test_lines_break_between_episodes(visitor: Visitor, dashboard: Dashboard) -> None:
     samples = stream(seed=13, samples=120)
     episode = np.repeat([0, 1], 60)
@@ -111,6 +112,7 @@ def test_the_form_offers_the_estimators_there_are(visitor: Visitor) -> None:
     expect(page.get_by_role("alert")).to_contain_text("Choose at least one data set")
 
 
+@pytest.mark.slow
 def test_a_job_is_followed_through_a_lost_connection_stopped_and_repeated(
     visitor: Visitor, dashboard: Dashboard
 ) -> None:

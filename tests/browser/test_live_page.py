@@ -55,6 +55,7 @@ def arm(dashboard: Dashboard) -> str:
     return "live-arm"
 
 
+@pytest.mark.slow
 def test_a_change_is_decided_and_old_rows_are_said_to_be_old(
     visitor: Visitor, dashboard: Dashboard, windows: Visit, arm: str
 ) -> None:

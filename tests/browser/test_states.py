@@ -63,6 +63,7 @@ def test_a_key_is_asked_for_and_a_wrong_one_asked_for_again(windows: Visit, lock
     expect(page.get_by_role("dialog", name="API key")).to_be_visible()
 
 
+@pytest.mark.slow
 def test_who_gives_no_key_is_told_and_not_asked_for_ever(windows: Visit, locked: Locked) -> None:
     visitor = windows(locked.url)
     visitor.expect_refusals(401)

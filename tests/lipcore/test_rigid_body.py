@@ -70,7 +70,7 @@ def unseen() -> Samples:
     return simulate(load_robot("panda"), Stream(100, speed=10, noise=0.0, n_sinusoids=100), seed=2)
 
 
-@pytest.fixture(scope="module", params=["urdf", "zero"])
+@pytest.fixture(scope="module", params=["urdf", pytest.param("zero", marks=pytest.mark.slow)])
 def model(request: pytest.FixtureRequest, recorded: Samples, wrong_panda: RigidBody) -> TorqueModel:
     options = replace(OPTIONS, prior=request.param)
     return train(recorded, wrong_panda.joint_types, "rigid-body", options, robot=wrong_panda)

@@ -169,6 +169,7 @@ def test_an_upgrade_brings_its_shipped_model(home):
         assert api.get("/v1/models/panda-sim/versions/1").status_code == 200
 
 
+@pytest.mark.slow
 def test_an_upgrade_leaves_a_model_alone_that_the_user_has_trained(home):
     earlier_release(home, job="job_of_the_user")
     with TestClient(create_app(Settings(home=home)), ADDRESS) as api:

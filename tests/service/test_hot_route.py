@@ -259,6 +259,7 @@ asyncio.run(main())
 """
 
 
+@pytest.mark.slow
 def test_serving_has_one_thread_of_linear_algebra(home):
     """In a process of its own: the first thread that sets the number for BLAS is the only one that may."""
     said = subprocess.run(

@@ -26,6 +26,7 @@ def imported(statement):
     return set(json.loads(done.stdout.splitlines()[-1]))
 
 
+@pytest.mark.slow
 def test_the_serving_application_imports_neither_fitting_nor_robots():
     found = imported("import service.app")
     assert {"torch", "fastapi"} <= found
