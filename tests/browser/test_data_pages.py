@@ -15,6 +15,8 @@ from tests.browser.looking import expect
 from tests.browser.visitor import Visitor
 from tests.service.data import ENDLESS, arrays, columns, csv, ended, job, npz, queue, stream, upload
 
+pytestmark = pytest.mark.slow
+
 LONG = {**ENDLESS, "hyperparameter_samples": 120, "starts": 1}
 """Its first iteration comes soon, its last does not."""
 SET_DEGREES = "Set the unit of q to deg and try again"
@@ -78,7 +80,6 @@ def test_options_say_how_a_file_is_read(visitor: Visitor) -> None:
     expect(page.get_by_text("shoulder, elbow").first).to_be_visible()
 
 
-@pytest.mark.slow
 def test_lines_break_between_episodes(visitor: Visitor, dashboard: Dashboard) -> None:
     samples = stream(seed=13, samples=120)
     episode = np.repeat([0, 1], 60)
@@ -112,7 +113,6 @@ def test_the_form_offers_the_estimators_there_are(visitor: Visitor) -> None:
     expect(page.get_by_role("alert")).to_contain_text("Choose at least one data set")
 
 
-@pytest.mark.slow
 def test_a_job_is_followed_through_a_lost_connection_stopped_and_repeated(
     visitor: Visitor, dashboard: Dashboard
 ) -> None:

@@ -12,6 +12,8 @@ from tests.browser.looking import expect
 from tests.browser.visitor import Visitor
 from tests.service.data import stream, train, upload
 
+pytestmark = pytest.mark.slow
+
 ROWS = 1200
 
 

@@ -113,6 +113,7 @@ def test_a_client_that_never_reads_is_slowed_down_and_then_cut_off(bounded, path
     assert "ERROR" not in bounded.log.read_text()
 
 
+@pytest.mark.slow
 def test_a_server_that_stops_says_so_and_waits_for_nobody(home):
     with Server(home, LIPSERVE_STREAM_WRITE_S="3600") as server:
         with dial(server, PANDA) as stream, dial(server, ECHO) as echo:

@@ -114,6 +114,7 @@ def test_a_killed_learner_comes_back_and_catches_up(serving, caplog):
     assert revisions[-1] == 4
 
 
+@pytest.mark.slow
 def test_one_that_is_killed_again_and_again_loses_nothing_and_learns_nothing_twice(serving, monkeypatch):
     monkeypatch.setattr(processes, "LONGEST_PAUSE", 0.0)  # as if it had lived long each time
     for number in range(4):
@@ -148,6 +149,7 @@ def test_ending_while_it_starts_does_not_wait_for_it(alone):
     assert alone.learner.pid is None
 
 
+@pytest.mark.slow
 def test_one_that_does_not_end_is_killed(alone, monkeypatch, caplog):
     alone.teach(0)
     alone.answering(1)

@@ -187,6 +187,7 @@ def test_a_pinned_stream_only_asks(learning, measured):
     assert batches(learning, "pinned") == []
 
 
+@pytest.mark.slow
 def test_what_was_gathered_is_logged_when_the_stream_ends(home):
     measured = measured_on("panda", 10)
     with Server(home, LIPSERVE_STREAM_FLUSH_S="3600", LIPSERVE_STREAM_FLUSH_ROWS="4") as server:
