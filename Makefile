@@ -67,7 +67,7 @@ image:
 install: $(VENV)/.installed
 
 $(VENV)/.installed: pyproject.toml .ci/install-torch
-	@echo "installing into $(VENV): about 2.2 GB, a minute or two from a warm package cache"
+	@echo "installing into $(VENV): about 3 GB, two to four minutes"
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, this is " + sys.version)'
 	$(PYTHON) -m venv $(VENV)
 	.ci/install-torch $(BIN)/python
