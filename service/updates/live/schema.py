@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import BaseModel, Field
 
 from lipcore.online.record import LEVEL
-from lipcore.vocabulary import CODES
+from lipcore.vocabulary import CODES, JointType
 from service.updates.control.learning_schema import Alarm, Held
 from service.updates.control.schema import Nullable, QualityWindow
 
@@ -76,6 +76,7 @@ class LiveStatus(BaseModel):
     revision: int = Field(description="The revision that answers contain now")
     lag_events: int = Field(description="Events of the log that answers do not contain yet")
     joint_names: list[str]
+    joint_types: list[JointType] = Field(description="What the torques' units follow from: N·m, prismatic: N")
     torque_convention: str
     learns: bool = Field(description="Whether observations are taken at all")
     on_change: str = Field(description="What follows a detected change: hold, adapt or learn")

@@ -42,6 +42,7 @@ class Status:
             revision=served.revision,
             lag_events=max(events - served.revision, 0),
             joint_names=list(served.model.joint_names),
+            joint_types=list(served.model.joint_types),
             torque_convention=served.model.torque_convention,
             learns=options.enabled,
             on_change=options.on_change,

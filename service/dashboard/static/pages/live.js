@@ -50,7 +50,7 @@ async function followed(view, name, models, signal) {
     const joints = status.joint_names;
     if (seen.rows?.joints.join() === joints.join()) return;
     seen.rows = new Rows(joints);
-    plots = [torque(page.torque, joints, signal), innovation(page.innovation, joints, signal)];
+    plots = [torque(page.torque, joints, status.joint_types, signal), innovation(page.innovation, joints, signal)];
     seen.drawn = -1;
   };
   const hear = (event, data) => {

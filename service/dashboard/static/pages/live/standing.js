@@ -35,7 +35,7 @@ export function learningCard(status) {
 }
 
 /** How well rows of the last minute were predicted before they were learnt. */
-export function qualityCard({ windows: [latest], joint_names: names, level }) {
+export function qualityCard({ windows: [latest], joint_names: names, joint_types: types, level }) {
   const short = shortNames(names);
   if (!latest.rows) return panel("Quality", h("p", { class: "muted" }, `Nothing was predicted and measured in the last ${span(latest.seconds)}.`));
   return panel(
@@ -44,7 +44,7 @@ export function qualityCard({ windows: [latest], joint_names: names, level }) {
       [
         { label: "Joint", cell: (joint) => short[joint] },
         { label: "nMSE", numeric: true, cell: (joint) => scientific(latest.nmse[joint]) },
-        { label: "RMSE, N·m", numeric: true, cell: (joint) => number(latest.rmse[joint], 2) },
+        { label: "RMSE", numeric: true, cell: (joint) => `${number(latest.rmse[joint], 2)}\u00a0${types[joint] === "prismatic" ? "N" : "N·m"}` },
         { label: `in ${percent(level, 0)} band`, numeric: true, cell: (joint) => percent(latest.coverage[joint]) },
       ],
       names.map((_name, joint) => joint),

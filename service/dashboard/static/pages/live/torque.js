@@ -10,9 +10,9 @@ export const HALF_WIDTH = 1.96;
 const MOST_DRAWN = 300;
 
 /** Plots of all joints in a place; draw(rows) draws those that can be seen. */
-export function torque(place, joints, signal) {
+export function torque(place, joints, types, signal) {
   const short = shortNames(joints);
-  const plots = joints.map((name, joint) => ({ name, joint, title: short[joint], element: h("div", { style: "min-height: 190px" }), seen: false, made: null }));
+  const plots = joints.map((name, joint) => ({ name, joint, title: short[joint], unit: types[joint] === "prismatic" ? "N" : "N·m", element: h("div", { style: "min-height: 190px" }), seen: false, made: null }));
   const watch = new IntersectionObserver((entries) => {
     for (const entry of entries) plots.find((each) => each.element === entry.target).seen = entry.isIntersecting;
   }, { rootMargin: "400px 0px" });
@@ -28,10 +28,10 @@ export function torque(place, joints, signal) {
   );
   const draw = async (each, rows) => {
     const range = reach(rows, each.joint);
-    const traces = [...curves(thin(rows), each.joint), keptOut(rows, each.joint, range)];
+    const traces = [...curves(thin(rows), each.joint, each.unit), keptOut(rows, each.joint, range)];
     const layout = {
       title: each.title,
-      y: "N·m",
+      y: each.unit,
       height: 190,
       showlegend: false,
       margin: { l: 48, r: 8, t: 30, b: 28 },
@@ -61,14 +61,14 @@ export function broken(rows, value) {
   return rows.flatMap((row) => (row.cut ? [null, value(row)] : [value(row)]));
 }
 
-function curves(rows, joint) {
+function curves(rows, joint, unit) {
   const x = broken(rows, (row) => row.x);
   // a torque beyond all limits would leave nothing to see of the others
   const measured = broken(rows, (row) => (row.code === "limit" ? null : row.tau[joint]));
   return [
     ribbon(rows.filter((row) => row.mean[joint] !== null), joint),
-    line(x, broken(rows, (row) => row.mean[joint]), "predicted", "predicted", { hovertemplate: "%{y:.4g} N·m" }),
-    line(x, measured, "measured", "measured", { hovertemplate: "%{y:.4g} N·m", line: { width: 1.2 } }),
+    line(x, broken(rows, (row) => row.mean[joint]), "predicted", "predicted", { hovertemplate: `%{y:.4g} ${unit}` }),
+    line(x, measured, "measured", "measured", { hovertemplate: `%{y:.4g} ${unit}`, line: { width: 1.2 } }),
   ];
 }
 
