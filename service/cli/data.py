@@ -12,7 +12,7 @@ from rich.markup import escape
 from service.cli import completion
 from service.cli.connecting import connected
 from service.cli.consoles import out, print_json, say
-from service.cli.options import DatasetId, Json, Url, Yes, confirm, names, pairs
+from service.cli.options import DatasetId, Json, Limit, Url, Yes, confirm, names, pairs
 from service.datasets.asking import Reading
 from service.datasets.media import SUFFIXES
 from service.settings import DEFAULT_URL
@@ -101,7 +101,7 @@ def add(
 
 @app.command("list")
 def list_(
-    limit: Annotated[int, typer.Option(min=1, help="Most that are listed.")] = 50,
+    limit: Limit = 50,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:

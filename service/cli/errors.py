@@ -9,6 +9,9 @@ from rich.markup import escape
 
 from service.cli.consoles import err
 
+INTERRUPTED = 130
+"""Exit code of what Ctrl-C has ended."""
+
 
 class Told(NamedTuple):
     """An error in words. message: what is wrong; hint: what to do about it, where that can be said."""

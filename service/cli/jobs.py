@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import islice
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 from rich.markup import escape
@@ -11,8 +11,8 @@ from rich.table import Column, Table
 
 from service.cli.connecting import connected
 from service.cli.consoles import note, out, print_json, say
-from service.cli.errors import CommandError
-from service.cli.options import JobId, Json, Url
+from service.cli.errors import INTERRUPTED, CommandError
+from service.cli.options import JobId, Json, Limit, Url
 from service.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
@@ -24,12 +24,11 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Training jobs: list, show, follow, cancel and retry them.",
 )
-INTERRUPTED = 130
 
 
 @app.command("list")
 def list_(
-    limit: Annotated[int, typer.Option(min=1, help="Most that are listed.")] = 50,
+    limit: Limit = 50,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:

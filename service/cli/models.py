@@ -14,7 +14,7 @@ from service.cli import completion
 from service.cli.connecting import connected, dataset_of
 from service.cli.consoles import note, out, print_json, say
 from service.cli.errors import CommandError
-from service.cli.options import Alias, Data, Json, Model, Url, Version, Yes, confirm
+from service.cli.options import Alias, Data, Json, Limit, Model, Url, Version, Yes, confirm
 from service.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ AliasName = Annotated[str, typer.Option("--alias", help="Which alias.", autocomp
 
 @app.command("list")
 def list_(
-    limit: Annotated[int, typer.Option(min=1, help="Most that are listed.")] = 50,
+    limit: Limit = 50,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:

@@ -14,6 +14,7 @@ Url = Annotated[
     str, typer.Option("--url", envvar="LIPSERVE_URL", help="Address of the service: http://… or unix:///path.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
+Limit = Annotated[int, typer.Option(min=1, help="Most that are listed.")]
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask whether that is meant.")]
 Model = Annotated[str, typer.Argument(help="Name of the model.", autocompletion=completion.models)]
 DatasetId = Annotated[str, typer.Argument(help="Id of a data set.", autocompletion=completion.datasets)]

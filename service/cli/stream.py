@@ -11,7 +11,7 @@ from rich.table import Table
 
 from service.cli.connecting import connected
 from service.cli.consoles import note, out, print_json, say
-from service.cli.errors import CommandError
+from service.cli.errors import INTERRUPTED, CommandError
 from service.cli.options import Alias, Json, Model, Url, Version
 from service.cli.words import ROBOTS
 from service.settings import DEFAULT_URL
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 SECONDS = 60.0
-INTERRUPTED = 130
 SIMULATION = "Simulation"
 
 

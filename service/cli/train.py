@@ -12,13 +12,12 @@ from lipcore.vocabulary import DEFAULT_ESTIMATOR
 from service.cli import completion
 from service.cli.connecting import connected, dataset_of
 from service.cli.consoles import note, out, print_json, say
-from service.cli.errors import CommandError
+from service.cli.errors import INTERRUPTED, CommandError
 from service.cli.options import Json, Url, names, pairs
 from service.cli.words import ESTIMATORS, HELD_OUT_BY
 from service.settings import DEFAULT_URL
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-INTERRUPTED = 130
 
 
 @app.command()

@@ -62,6 +62,11 @@ export function bytes(x) {
   return `${number(x / 1000 ** power, 3)}\u00a0${units[power]}`;
 }
 
+/** The unit of a joint's torque: N·m, or N of a joint that slides. */
+export function torqueUnit(type) {
+  return type === "prismatic" ? "N" : "N·m";
+}
+
 /** A joint's name without the prefix that all joints of the robot share: panda_joint1 → joint1. */
 export function shortNames(names) {
   if (names.length < 2) return [...names];

@@ -1,7 +1,7 @@
 // Where learning, quality and answers stand, once a second.
 
 import { h } from "../../dom.js";
-import { count, number, percent, scientific, seconds, shortNames } from "../../format.js";
+import { count, number, percent, scientific, seconds, shortNames, torqueUnit } from "../../format.js";
 import { badge, facts, table } from "../../ui.js";
 import { words } from "./codes.js";
 
@@ -44,7 +44,7 @@ export function qualityCard({ windows: [latest], joint_names: names, joint_types
       [
         { label: "Joint", cell: (joint) => short[joint] },
         { label: "nMSE", numeric: true, cell: (joint) => scientific(latest.nmse[joint]) },
-        { label: "RMSE", numeric: true, cell: (joint) => `${number(latest.rmse[joint], 2)}\u00a0${types[joint] === "prismatic" ? "N" : "N·m"}` },
+        { label: "RMSE", numeric: true, cell: (joint) => `${number(latest.rmse[joint], 2)}\u00a0${torqueUnit(types[joint])}` },
         { label: `in ${percent(level, 0)} band`, numeric: true, cell: (joint) => percent(latest.coverage[joint]) },
       ],
       names.map((_name, joint) => joint),

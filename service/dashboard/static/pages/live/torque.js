@@ -1,7 +1,7 @@
 // Measured and predicted torque of every joint over the last half minute, with the 95 % interval of a measurement.
 
 import { h, replace } from "../../dom.js";
-import { shortNames } from "../../format.js";
+import { shortNames, torqueUnit } from "../../format.js";
 import { line, plot } from "../../plots.js";
 import { card } from "../../ui.js";
 import { WINDOW_S } from "./rows.js";
@@ -12,7 +12,7 @@ const MOST_DRAWN = 300;
 /** Plots of all joints in a place; draw(rows) draws those that can be seen. */
 export function torque(place, joints, types, signal) {
   const short = shortNames(joints);
-  const plots = joints.map((name, joint) => ({ name, joint, title: short[joint], unit: types[joint] === "prismatic" ? "N" : "N·m", element: h("div", { style: "min-height: 190px" }), seen: false, made: null }));
+  const plots = joints.map((name, joint) => ({ name, joint, title: short[joint], unit: torqueUnit(types[joint]), element: h("div", { style: "min-height: 190px" }), seen: false, made: null }));
   const watch = new IntersectionObserver((entries) => {
     for (const entry of entries) plots.find((each) => each.element === entry.target).seen = entry.isIntersecting;
   }, { rootMargin: "400px 0px" });

@@ -1,7 +1,7 @@
 // Small plots, one a joint, that zoom together; where not every row is shown, zooming fetches the rows between.
 
 import { h, replace } from "../../dom.js";
-import { count, shortNames } from "../../format.js";
+import { count, shortNames, torqueUnit } from "../../format.js";
 import { plot, plotly } from "../../plots.js";
 import { button, errorBox, field, select } from "../../ui.js";
 import { axis } from "./curves.js";
@@ -34,7 +34,7 @@ export async function joints(element, { first, fetch, views, about, signal }) {
       const layout = {
         title: names[joint],
         x: label,
-        y: unit(trace, joint),
+        y: torqueUnit(trace.joint_types?.[joint]),
         height: shown.joint === ALL ? 270 : 420,
         showlegend: false, // one key above all plots takes less room than a legend in each
         xaxis: { autorange: true },
@@ -113,11 +113,6 @@ export async function joints(element, { first, fetch, views, about, signal }) {
   );
   await plotly();
   await draw();
-}
-
-/** N·m, or N of a joint that slides. */
-function unit(trace, joint) {
-  return trace.joint_types?.[joint] === "prismatic" ? "N" : "N·m";
 }
 
 /** What each line and band of a plot is, in its colour and form. */
