@@ -71,7 +71,7 @@ $(VENV)/.installed: pyproject.toml .ci/install-torch
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, this is " + sys.version)'
 	$(PYTHON) -m venv $(VENV)
 	.ci/install-torch $(BIN)/python
-	$(BIN)/python -m pip install --disable-pip-version-check -e '.[sim,plot,dev]'
+	$(BIN)/python -m pip install --disable-pip-version-check -e '.[sim,plot,cluster,dev]'
 	@touch $@
 
 clean:

@@ -159,7 +159,7 @@ def _add_middleware(
 def _open(settings: Settings, stopping: Stopping, meters: Meters) -> Service:
     """Open the home, finish what an earlier run left, and load the models that are asked for first."""
     sys.setswitchinterval(SWITCH_INTERVAL)
-    database, files = Database(settings.home, settings.database_timeout_s), Files(settings.home)
+    database, files = Database.of(settings, settings.database_timeout_s), Files.of(settings)
     with database.session() as session:
         datasets_known = set(session.scalars(select(DatasetRow.id)))
         versions_known = set(session.scalars(select(VersionRow.folder)))

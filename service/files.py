@@ -21,6 +21,7 @@ from lipcore.samples import Samples
 from service import sample_file
 from service.errors import DamagedDataError
 from service.sample_file import ArrayOf, PartOf
+from service.settings import Settings
 
 Result = TypeVar("Result")
 
@@ -42,6 +43,11 @@ class Files:
         self.learning = home / "learning"
         for folder in (self.datasets, self.versions, self.uploads, self.learning):
             folder.mkdir(parents=True, exist_ok=True)
+
+    @classmethod
+    def of(cls, settings: Settings) -> Files:
+        """The file store that the settings name."""
+        return cls(settings.home)
 
     def write_samples(self, dataset: str, rows: int, n_joints: int, array: ArrayOf) -> str:
         """Store samples durably under a new id, asking for one array after the other; return their sha256."""

@@ -6,11 +6,11 @@ import fcntl
 from pathlib import Path
 from typing import IO
 
-from sqlalchemy import text
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.database.engine import FILE, Database
+from service.database.engine import Database
 from service.database.migrations import DatabaseVersionError
+from service.database.sqlite import FILE
 from service.files import Files
 from service.settings import Settings
 
@@ -46,11 +46,11 @@ def check_home(settings: Settings) -> None:
     home, path = settings.home, settings.home / FILE
     with hold_home(home):
         try:
-            Files(home).upload().unlink()
+            Files.of(settings).upload().unlink()
         except OSError as error:
             raise HomeError(_unusable(home, error)) from error
         try:
-            found = _damage(home, settings.database_timeout_s)
+            found = _damage(settings)
         except DatabaseVersionError as error:
             raise HomeError(str(error)) from error
         except SQLAlchemyError as error:
@@ -62,13 +62,13 @@ def check_home(settings: Settings) -> None:
         )
 
 
-def _damage(home: Path, timeout_s: float) -> str | None:
-    """What SQLite finds wrong with the database, None where it is whole."""
-    database = Database(home, timeout_s)
+def _damage(settings: Settings) -> str | None:
+    """What is wrong with the database, None where it is whole."""
+    database = Database.of(settings, settings.database_timeout_s)
     try:
-        with database.transaction() as session:  # a database that can only be read is of no use either
-            found: str | None = session.scalar(text("PRAGMA quick_check(1)"))
-        return None if found == "ok" else found
+        with database.transaction():  # a database that can only be read is of no use either
+            pass
+        return next(iter(database.adapter.damage()), None)
     finally:
         database.close()
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 CHECKOUT_MODELS = Path(__file__).resolve().parents[1] / "models"
@@ -167,6 +167,39 @@ class Settings(BaseSettings):
     promotion_rows: Count = Field(2000, description="Samples on which a refreshed version must be better.")
     promotion_patience_s: float = Field(3600.0, gt=0, description="Time after which one that is not is dismissed, s.")
 
+    database_url: str | None = Field(
+        None,
+        pattern="^postgresql://",
+        repr=False,
+        description="PostgreSQL server that several services share, postgresql://user:password@host/name; SQLite below "
+        "the home where not set. Needs LIPSERVE_FILES_URL.",
+    )
+    database_connections: Count = Field(20, description="Most connections to PostgreSQL of one process.")
+    files_url: str | None = Field(
+        None,
+        pattern="^(s3|file)://",
+        description="Where data sets, versions and snapshots lie that several services share: s3://bucket/prefix (with "
+        "the usual AWS_ variables), or file:///folder for one that all hosts mount; the home where not set. Needs "
+        "LIPSERVE_DATABASE_URL.",
+    )
+    files_cache_bytes: Count = Field(4096 * MiB, description="Size of the copies of shared files kept below the home.")
+    cluster: str | None = Field(
+        None,
+        pattern="^(tcp|tls)://",
+        description="Scheduler of the Dask cluster that jobs run on, tcp://host:8786; processes of this host where not "
+        "set. Needs LIPSERVE_DATABASE_URL.",
+    )
+    replica_beat_s: float = Field(1.0, gt=0, description="Seconds between two signs of life of a service to others.")
+    replica_lost_s: float = Field(
+        10.0, gt=0, description="Seconds without one after which others take over the jobs of a service."
+    )
+    min_revision_wait_s: float = Field(
+        2.0, ge=0, description="Longest wait in s of a query for the revision that it asks for at least; then a 503."
+    )
+    statistics_workers: Count = Field(
+        1, description="Processes that a training job sums up statistics in, where there is no cluster."
+    )
+
     database_timeout_s: float = Field(
         10.0, gt=0, description="Longest wait in s of a request for another writer of the database; then it gets a 503."
     )
@@ -213,6 +246,14 @@ class Settings(BaseSettings):
         "127.0.0.1",
         description="Reverse proxies whose X-Forwarded-For names the client: addresses or networks, with commas.",
     )
+
+    @model_validator(mode="after")
+    def _shared_together(self) -> Self:
+        if (self.database_url is None) != (self.files_url is None):
+            raise ValueError("database_url and files_url: expected both, for services that share them, or none of them")
+        if self.cluster is not None and self.database_url is None:
+            raise ValueError("cluster: expected database_url and files_url too, which its workers share")
+        return self
 
     @property
     def keys_needed(self) -> bool:

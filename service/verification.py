@@ -16,7 +16,7 @@ from lipcore import persistence
 from lipcore.online import state
 from lipcore.probing import probe
 from service.database import Database, DatasetRow, EventRow, RobotRow, SnapshotRow, VersionRow
-from service.database.engine import FILE
+from service.database.sqlite import FILE
 from service.errors import DamagedDataError
 from service.files import Files
 from service.settings import Settings
@@ -60,7 +60,7 @@ def verify(settings: Settings) -> Verified:
     if not (settings.home / FILE).is_file():
         raise FileNotFoundError(f"home is {str(settings.home)!r}, expected a folder with the database of a service")
     torch.set_num_threads(settings.serving_threads)
-    database, files = Database(settings.home, settings.database_timeout_s), Files(settings.home)
+    database, files = Database.of(settings, settings.database_timeout_s), Files.of(settings)
     try:
         return _verify(database, files)
     finally:

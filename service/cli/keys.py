@@ -89,7 +89,7 @@ def revoke(
 @contextmanager
 def _database() -> Iterator[tuple[Database, Settings]]:
     settings = Settings()
-    database = Database(settings.home)
+    database = Database.of(settings)
     try:
         yield database, settings
     finally:

@@ -1,63 +1,100 @@
-"""Sessions on the database: SQLite in WAL mode."""
+"""Sessions on the database: SQLite below the home, or a PostgreSQL server that several services share."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
-from sqlalchemy import create_engine, event, text
+from sqlalchemy import Connection, Engine
 from sqlalchemy.orm import Session, sessionmaker
 
 from service.database.migrations import migrate
+from service.database.sqlite import Sqlite
+from service.settings import Settings
 
-FILE = "lipserve.sqlite3"
 PATIENCE_S = 30.0
 """Longest wait for another writer, of processes that nobody waits for."""
-MOST_CONNECTIONS = 64
-"""More than there are threads: who only reads shall not wait for those that wait to write."""
+
+
+class Adapter(Protocol):
+    """What SQLite and PostgreSQL do differently."""
+
+    engine: Engine
+    shared: bool
+    """Whether other services may write to it too."""
+
+    def lock(self, connection: Connection, model: str | None) -> None:
+        """Begin a transaction of a writer: the only one of a model, or the only one of all where None."""
+
+    def turn(self, model: str) -> AbstractContextManager[None]:
+        """Be the only one, of all services, that takes something for a model while the block runs."""
+
+    def check(self, seconds: float) -> None:
+        """Raise an error unless the database can be read and written within so many seconds."""
+
+    def damage(self, most: int = 1) -> list[str]:
+        """What the database finds wrong with itself, at most so many faults; empty where it is whole."""
 
 
 class Database:
-    """Sessions on one database; safe to share between threads. timeout_s: longest wait for another writer."""
+    """Sessions on one database; safe to share between threads. timeout_s: longest wait for another writer.
 
-    def __init__(self, home: Path, timeout_s: float = PATIENCE_S) -> None:
-        home.mkdir(parents=True, exist_ok=True)
-        self.engine = create_engine(
-            f"sqlite:///{home / FILE}",
-            connect_args={"timeout": timeout_s},
-            max_overflow=MOST_CONNECTIONS,
-            pool_timeout=timeout_s,
-        )
-        event.listen(self.engine, "connect", _configure)
-        migrate(self.engine)
+    url: of a PostgreSQL server, None for SQLite below the home. connections: most that are open at a time there.
+    """
+
+    def __init__(
+        self, home: Path, timeout_s: float = PATIENCE_S, url: str | None = None, connections: int | None = None
+    ) -> None:
+        self.adapter = _adapter(home, timeout_s, url, connections)
+        self.engine = self.adapter.engine
+        migrate(self.engine, self.adapter.lock)
         self._sessions = sessionmaker(self.engine, expire_on_commit=False)
+
+    @classmethod
+    def of(cls, settings: Settings, timeout_s: float = PATIENCE_S) -> Database:
+        """The database that the settings name."""
+        return cls(settings.home, timeout_s, settings.database_url, settings.database_connections)
+
+    @property
+    def shared(self) -> bool:
+        """Whether other services may write to it too."""
+        return self.adapter.shared
 
     @contextmanager
     def session(self) -> Iterator[Session]:
-        """Session for reading."""
+        """Session for reading: every statement sees what was committed before it."""
         with self._sessions() as session:
             yield session
 
     @contextmanager
-    def transaction(self) -> Iterator[Session]:
-        """Session whose changes are committed at the end, all or none; one writer at a time."""
+    def transaction(self, model: str | None = None) -> Iterator[Session]:
+        """Session whose changes are committed at the end, all or none; what is read inside cannot change before.
+
+        model: where given, only rows of this model are written, so that those of other models need not wait (which
+        SQLite's writers do all the same); else it is the only writer.
+        """
         with self._sessions() as session:
-            # taking the write lock first: what is read inside cannot change before it is written
-            session.execute(text("BEGIN IMMEDIATE"))
+            self.adapter.lock(session.connection(), model)
             yield session
             session.commit()
+
+    def turn(self, model: str) -> AbstractContextManager[None]:
+        """Be the only one, of all services that share the database, that takes something for a model meanwhile.
+
+        For what is read before the transaction that writes it down. Nothing needs it where there is one service.
+        """
+        return self.adapter.turn(model)
 
     def close(self) -> None:
         """Close all connections."""
         self.engine.dispose()
 
 
-def _configure(connection: Any, _: object) -> None:
-    connection.isolation_level = None  # transactions are begun by `transaction`, not by the driver
-    cursor = connection.cursor()
-    cursor.execute("PRAGMA journal_mode=WAL")
-    cursor.execute("PRAGMA synchronous=FULL")
-    cursor.execute("PRAGMA foreign_keys=ON")
-    cursor.close()
+def _adapter(home: Path, timeout_s: float, url: str | None, connections: int | None) -> Adapter:
+    if url is None:
+        return Sqlite(home, timeout_s)
+    from service.database.postgresql import Postgresql  # noqa: PLC0415 - its driver is an extra
+
+    return Postgresql(url, timeout_s, connections)

@@ -65,7 +65,8 @@ class JobRow(Base):
     """A training job: all of its state, written by the service and by the worker.
 
     history: what happened to it, oldest first, each {at, state, message}; retry_of: id of the job that it repeats;
-    request_id: of the request that queued it; idempotency_key, request_digest: see `service.idempotency`.
+    request_id: of the request that queued it; owner: id of the service that has it run, None where none does yet;
+    idempotency_key, request_digest: see `service.idempotency`.
     """
 
     __tablename__ = "jobs"
@@ -88,8 +89,20 @@ class JobRow(Base):
     history: Mapped[list[dict[str, Any]]] = mapped_column(default=list, server_default="[]")
     retry_of: Mapped[str | None] = mapped_column(String(40))
     request_id: Mapped[str | None] = mapped_column(String(64))
+    owner: Mapped[str | None] = mapped_column(String(40))
     idempotency_key: Mapped[str | None] = mapped_column(String(100))
     request_digest: Mapped[str | None] = mapped_column(String(64))
+
+
+class ReplicaRow(Base):
+    """A service that shares the database with others. seen_at: its last sign of life, by the database's clock, Unix s."""
+
+    __tablename__ = "replicas"
+
+    id: Mapped[str] = mapped_column(String(40), primary_key=True)
+    host: Mapped[str]
+    started_at: Mapped[str]
+    seen_at: Mapped[float]
 
 
 class ModelRow(Base):

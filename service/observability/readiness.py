@@ -5,11 +5,8 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from contextlib import closing
 from dataclasses import dataclass
-from sqlite3 import connect
 from typing import TYPE_CHECKING, Literal
-from urllib.parse import quote
 
 from sqlalchemy import func, select, text
 
@@ -130,11 +127,7 @@ class Readiness:
 def _database(service: Service) -> tuple[State, str]:
     with service.database.session() as session:
         session.execute(text("SELECT 1"))
-    # a connection of its own: requests wait longer for each other than this should
-    address = f"file:{quote(str(service.database.engine.url.database))}?mode=rw"
-    with closing(connect(address, WRITE_S, isolation_level=None, uri=True)) as connection:
-        connection.execute("BEGIN IMMEDIATE")
-        connection.execute("ROLLBACK")
+    service.database.adapter.check(WRITE_S)
     return "ok", "can be read and written"
 
 

@@ -50,7 +50,7 @@ class JobQueue:
         self.feed = Feed(database)
         self.problem: str | None = None
         """Why training processes cannot be started, None while they can as far as is known."""
-        self._settler = Settler(settings, database, Files(settings.home))
+        self._settler = Settler(settings, database, Files.of(settings))
         self._slots = [Slot(training_place(settings)) for _ in range(settings.training_workers)]
         self._hands: list[Hand] = []
         self._waiting: dict[str, float] = {}  # when each may be handed out, monotonic, in the order of coming

@@ -48,7 +48,7 @@ def run(settings: Settings, job: str) -> None:
     Raise StorageError where the outcome could not be written, or what is needed not be read.
     """
     token = job_id.set(job)
-    database, files = Database(settings.home), Files(settings.home)
+    database, files = Database.of(settings), Files.of(settings)
     try:
         claim = _claim(settings, database, job)
         if claim is not None:

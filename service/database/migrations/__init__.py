@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from sqlalchemy import Connection, Engine, inspect, text
 
-HEAD = "0003"
+HEAD = "0004"
 """The revision that this release needs."""
 
 
@@ -14,16 +15,17 @@ class DatabaseVersionError(RuntimeError):
     """The database is of a later release, which this one does not know how to read."""
 
 
-def migrate(engine: Engine) -> None:
+def migrate(engine: Engine, lock: Callable[[Connection, None], None]) -> None:
     """Apply what is missing, all or nothing; a database that is up to date is only looked at.
 
-    One process at a time: the others wait and then find it done. Raise DatabaseVersionError.
+    lock: begins a transaction as the only writer: other processes wait and then find it done. Raise
+    DatabaseVersionError.
     """
     with engine.connect() as connection:
         if revision(connection) == HEAD:
             return
         connection.rollback()
-        connection.execute(text("BEGIN IMMEDIATE"))
+        lock(connection, None)
         found = revision(connection)
         if found != HEAD:
             _upgrade(connection, found)

@@ -31,7 +31,7 @@ FIRST_PAUSE, LONGEST_PAUSE = 1.0, 60.0
 
 def run(settings: Settings, connection: Connection) -> None:
     """Follow the models whose names come over the connection, until it ends or None comes."""
-    database, files = Database(settings.home), Files(settings.home)
+    database, files = Database.of(settings), Files.of(settings)
     publication.clear(files)
     snapshots.sweep(database, files)
     learner = Learner(database, files, settings)
