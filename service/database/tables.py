@@ -95,7 +95,7 @@ class JobRow(Base):
 
 
 class ReplicaRow(Base):
-    """A service that shares the database with others. seen_at: its last sign of life, by the database's clock, Unix s."""
+    """A service that shares the database with others. seen_at: its last sign of life, Unix s (database's clock)."""
 
     __tablename__ = "replicas"
 
