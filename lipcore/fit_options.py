@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, get_args
 
 from lipcore.vocabulary import PRIORS
 
 if TYPE_CHECKING:
     import torch
+
+Standing = Literal["auto", "all", "chosen"]
 
 
 @dataclass(frozen=True)
@@ -20,7 +22,10 @@ class FitOptions:
     tried from, the best of which is followed; tied: links share kernel shapes (see LipKernel);
     device: "cpu", "cuda" or "auto"; prior: of rigid bodies, "urdf" or "zero" (see RigidBodyKernel);
     compact_tolerance: largest deviation of the compact posterior from the exact one, in standard deviations;
-    max_inducing_outputs: where that would take more, the compact posterior deviates more, and answers stay fast.
+    max_inducing_outputs: where that would take more, the compact posterior deviates more, and answers stay fast;
+    statistics: what the posterior of the chosen basis stands on in the end: the samples `chosen` before, or `all`, each
+    counted for the time that it stands for (`lipcore.online.spacing`); `auto`: all where together they are worth more
+    than posterior_samples independent ones, which was measured to answer better (docs/all_rows.py).
     """
 
     hyperparameter_samples: int = 150
@@ -32,6 +37,7 @@ class FitOptions:
     prior: str = "urdf"
     compact_tolerance: float = 0.01
     max_inducing_outputs: int = 1500
+    statistics: Standing = "auto"
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -44,6 +50,8 @@ class FitOptions:
             value = getattr(self, name)
             if type(value) is not int or not low <= value <= high:
                 raise ValueError(f"{name} is {value!r}, expected a whole number from {low} to {high}")
+        if self.statistics not in get_args(Standing):
+            raise ValueError(f"statistics is {self.statistics!r}, expected one of {', '.join(get_args(Standing))}")
         if self.device not in ("auto", "cpu", "cuda"):
             raise ValueError(f"device is {self.device!r}, expected auto, cpu or cuda")
         if not (isinstance(self.compact_tolerance, float) and 0 < self.compact_tolerance <= 1):

@@ -91,9 +91,11 @@ def fit(
     options: FitOptions,
     on_progress: Progress | None = None,
     cancelled: Cancelled | None = None,
+    stretches: Samples | None = None,
 ) -> Fit:
     """Fit hyperparameters to samples; on_progress after every iteration, `cancelled` asked at every evaluation.
 
+    stretches: contiguous samples that tell the white noise, where `samples` are thinned.
     Raise FitCancelledError when `cancelled` answers true, NotPositiveDefiniteError where no hyperparameters give a
     covariance that can be factored.
     """
@@ -101,7 +103,7 @@ def fit(
     motion, tau = samples.motion(device), samples.torque(device)
     floor = torch.from_numpy(np.log(noise.floor(samples))).to(device)
     start = kernel.initial(motion, tau)
-    start["noise.log_std"] = torch.from_numpy(np.log(noise.start(samples))).to(device)
+    start["noise.log_std"] = torch.from_numpy(np.log(noise.start(samples, stretches))).to(device)
     stop = cancelled or (lambda: False)
     rows = spread_out(motion, options.hyperparameter_samples)
     search = _Search(kernel, start, floor, motion[rows], tau[rows], stop)

@@ -133,6 +133,33 @@ def train(
     robot: for estimators of rigid bodies, built for the joints of the samples.
     Raise ValueError for bad arguments, FitCancelledError, or NotPositiveDefiniteError.
     """
+    from lipcore import conditioning  # noqa: PLC0415 - it imports this module
+    from lipcore.online import spacing  # noqa: PLC0415
+
+    options = options or FitOptions()
+    model = fitted(samples, joint_types, estimator, options, torque_convention, on_progress, cancelled, robot)
+    weights = spacing.recorded(samples.t, samples.episode)
+    if not conditioning.wanted(options, len(samples), float(weights.sum())):
+        return model
+    return conditioning.condition(model, samples, weights, cancelled)
+
+
+def fitted(
+    samples: Samples,
+    joint_types: Sequence[str],
+    estimator: str = DEFAULT_ESTIMATOR,
+    options: FitOptions | None = None,
+    torque_convention: TorqueConvention = "gravity_included",
+    on_progress: Progress | None = None,
+    cancelled: Cancelled | None = None,
+    robot: RigidBody | None = None,
+    stretches: Samples | None = None,
+) -> TorqueModel:
+    """Train as `train` does, on the chosen samples alone: where there are too many for memory, on a thinned table.
+
+    stretches: contiguous samples of the same recordings, which tell the white noise of signals; the samples themselves
+    where None.
+    """
     options = options or FitOptions()
     types = check_joint_types(joint_types)
     if len(types) != samples.n_joints:
@@ -149,11 +176,11 @@ def train(
         )
     gravity = torque_convention == "gravity_included"
     chosen = make_estimator(estimator, types, options.tied, robot, options.prior, gravity)
-    fitted = fit(chosen.kernel, samples, options, on_progress, cancelled)
-    used = samples.rows(fitted.rows)
+    found = fit(chosen.kernel, samples, options, on_progress, cancelled, stretches)
+    used = samples.rows(found.rows)
     motion, tau = used.motion(), used.torque()
     calibration = calibrate(estimator)
-    exact = ExactPosterior.fit(chosen.kernel, fitted.params, motion, tau, calibration.function_std_factor)
+    exact = ExactPosterior.fit(chosen.kernel, found.params, motion, tau, calibration.function_std_factor)
     compression = compress(exact, tau, options.compact_tolerance, options.max_inducing_outputs)
     return TorqueModel(
         chosen,
@@ -161,7 +188,7 @@ def train(
         types,
         torque_convention,
         asdict(options),
-        {**asdict(fitted.report), "jitter": exact.factor.jitter},
+        {**asdict(found.report), "jitter": exact.factor.jitter},
         compression.posterior,
         training_range(motion),
         compression.report(),

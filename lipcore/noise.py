@@ -32,9 +32,13 @@ SAMPLES = 250
 """Samples that tell the noise: its estimate is then good to about five per cent."""
 
 
-def start(samples: Samples) -> Array:
-    """Noise std that a fit starts from, (n,) N·m: the white noise of the signals, or a share of their spread."""
-    level = noise_level([samples.tau[part] for part in samples.episodes()])
+def start(samples: Samples, stretches: Samples | None = None) -> Array:
+    """Noise std that a fit starts from, (n,) N·m: the white noise of the signals, or a share of their spread.
+
+    stretches: contiguous samples, where `samples` are thinned: their differences would tell of motion.
+    """
+    signals = samples if stretches is None else stretches
+    level = noise_level([signals.tau[part] for part in signals.episodes()])
     return np.asarray(np.maximum.reduce([level, START_SHARE * samples.tau.std(axis=0), floor(samples)]))
 
 

@@ -11,7 +11,6 @@ import torch
 from anyio import CapacityLimiter, to_thread
 from fastapi import FastAPI
 from fastapi_offline import FastAPIOffline
-from sqlalchemy import select
 from starlette.routing import BaseRoute
 from threadpoolctl import threadpool_limits
 
@@ -22,9 +21,9 @@ from service.access.local import LocalAccess
 from service.access.middleware import KeyAccess
 from service.context import Service
 from service.dashboard import routes as dashboard
-from service.database import Database, DatasetRow, SnapshotRow, VersionRow
+from service.database import Database
 from service.datasets import routes as datasets
-from service.files import Files
+from service.files import Files, sweeping
 from service.guide import routes as guide
 from service.home import hold_home
 from service.inference import echo
@@ -44,11 +43,12 @@ from service.observability.meters import Meters
 from service.observability.request_log import RequestLog
 from service.observability.requests import RequestContext
 from service.oip import routes as oip
+from service.replication.replication import Replication
 from service.robots import routes as robots
 from service.settings import Settings
 from service.stream import routes as stream
 from service.training import routes as training
-from service.training.queue import JobQueue
+from service.training.queue import queue_of
 from service.updates import routes as observations
 from service.updates.control import routes as control
 from service.updates.live import routes as live
@@ -81,6 +81,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         service = await to_thread.run_sync(_open, settings, stopping, meters)
         threadpool_limits(settings.serving_threads)  # of BLAS, whose libraries the models have brought in
         app.state.service = service
+        replication = Replication(service) if service.database.shared else None
         try:
             async with nullcontext() if keyring is None else keyring.watching(service.database):
                 yield
@@ -89,6 +90,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
                 rest.callback(lock.close)
                 rest.callback(service.database.close)
                 rest.push_async_callback(to_thread.run_sync, service.updates.close)
+                if replication is not None:
+                    rest.push_async_callback(to_thread.run_sync, replication.close)
                 await to_thread.run_sync(service.jobs.close)  # first: what learns needs the CPU to store its state
 
     hot = [*inference.hot.routes, *echo.hot.routes, *oip.hot.routes, *observations.hot.routes]
@@ -160,16 +163,11 @@ def _open(settings: Settings, stopping: Stopping, meters: Meters) -> Service:
     """Open the home, finish what an earlier run left, and load the models that are asked for first."""
     sys.setswitchinterval(SWITCH_INTERVAL)
     database, files = Database.of(settings, settings.database_timeout_s), Files.of(settings)
-    with database.session() as session:
-        datasets_known = set(session.scalars(select(DatasetRow.id)))
-        versions_known = set(session.scalars(select(VersionRow.folder)))
-        snapshots_known = set(session.scalars(select(SnapshotRow.id)))
-    if swept := files.sweep(datasets_known, versions_known, snapshots_known):
-        logger.warning("removed %d unfinished files of an earlier run", swept)
+    sweeping.start(database, files)
     registry.install_shipped(database, files)
     loaded = LoadedModels(database, files, settings.max_loaded_models)
     logger.info("loaded %d models", loaded.preload())
-    jobs = JobQueue(settings, database, lambda model, _: loaded.adopt(model))
+    jobs = queue_of(settings)(settings, database, lambda model, _: loaded.adopt(model))
     if recovered := jobs.recover():
         logger.warning("queued again after an interruption: %s", ", ".join(recovered))
     limiter = CapacityLimiter(settings.max_concurrent_predictions)

@@ -42,7 +42,7 @@ class ServiceProcess:
     """A service of its own, running `lipserve serve`."""
 
     def __init__(self, port: int, env: dict[str, str] | None = None) -> None:
-        self.port = port if port and _free(port) else _free_port()
+        self.port = port if port and _free(port) else free_port()
         self.url = f"http://127.0.0.1:{self.port}"
         command = [sys.executable, "-m", "service", "serve", "--host", "127.0.0.1", "--port", str(self.port)]
         quiet = {"LIPSERVE_LOG_LEVEL": "warning"}  # unless the user wants more: its lines would stand among the demo's
@@ -175,7 +175,8 @@ def _free(port: int) -> bool:
         return probe.connect_ex(("127.0.0.1", port)) != 0
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """A port that nobody listens on."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

@@ -135,6 +135,13 @@ class NotReadyError(ServiceError):
     status, code = 503, "not_ready"
 
 
+class RevisionNotReachedError(ServiceError):
+    """The version that answers has not learnt as much yet as the query asks for: the header `Retry-After` says when to
+    ask again. Revisions count for one version: `version` names the one that an acknowledgement spoke of."""
+
+    status, code = 503, "revision_not_reached"
+
+
 class StorageUnavailableError(ServiceError):
     """The database or the disk cannot be written now: nothing was stored, try again."""
 

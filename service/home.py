@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import fcntl
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.database.engine import Database
+from service.database.engine import Database, DriverMissingError
 from service.database.migrations import DatabaseVersionError
 from service.database.sqlite import FILE
-from service.files import Files
+from service.files import Files, FilesUnreachableError
 from service.settings import Settings
 
 
@@ -43,23 +45,32 @@ def check_home(settings: Settings) -> None:
 
     Takes about 0.3 s for each GB of the database. Raise HomeError.
     """
-    home, path = settings.home, settings.home / FILE
-    with hold_home(home):
+    home = settings.home
+    with hold_home(home), usable(settings):
         try:
-            Files.of(settings).upload().unlink()
+            files = Files.of(settings)
+            files.upload().unlink()
+            files.try_out()
+        except FilesUnreachableError:
+            raise
         except OSError as error:
             raise HomeError(_unusable(home, error)) from error
-        try:
-            found = _damage(settings)
-        except DatabaseVersionError as error:
-            raise HomeError(str(error)) from error
-        except SQLAlchemyError as error:
-            found = str(getattr(error, "orig", error))
+        found = _damage(settings)
     if found is not None:
-        raise HomeError(
-            f"the database {path} cannot be used: {found}. Where it is damaged, restore a copy of the home, or what "
-            f'can be read of it with `sqlite3 {path} ".recover"`; or set LIPSERVE_HOME to another folder'
-        )
+        raise HomeError(_unusable_database(settings, found))
+
+
+@contextmanager
+def usable(settings: Settings) -> Iterator[None]:
+    """Raise HomeError, which says what would help, for what keeps a block from using the database or shared files."""
+    try:
+        yield
+    except (DatabaseVersionError, DriverMissingError) as error:
+        raise HomeError(str(error)) from error
+    except FilesUnreachableError as error:
+        raise HomeError(_unusable_files(settings, error)) from error
+    except SQLAlchemyError as error:
+        raise HomeError(_unusable_database(settings, str(getattr(error, "orig", None) or error))) from error
 
 
 def _damage(settings: Settings) -> str | None:
@@ -75,3 +86,20 @@ def _damage(settings: Settings) -> str | None:
 
 def _unusable(home: Path, error: OSError) -> str:
     return f"home is {str(home)!r}, expected a folder that the service may write to: {error.strerror or error}"
+
+
+def _unusable_files(settings: Settings, error: OSError) -> str:
+    expected = "a folder that is mounted and that the service may write to"
+    if (settings.files_url or "").startswith("s3:"):
+        expected = "a bucket that this service may list, read, write and delete in, by the AWS_ variables or a role"
+    return f"files_url is {settings.files_url!r}, expected {expected}: {error.strerror or error}"
+
+
+def _unusable_database(settings: Settings, found: str) -> str:
+    if settings.database_url is not None:
+        return f"the database of LIPSERVE_DATABASE_URL cannot be used: {found}"
+    path = settings.home / FILE
+    return (
+        f"the database {path} cannot be used: {found}. Where it is damaged, restore a copy of the home, or what "
+        f'can be read of it with `sqlite3 {path} ".recover"`; or set LIPSERVE_HOME to another folder'
+    )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
@@ -17,6 +18,8 @@ from safetensors import safe_open
 
 ARRAYS = ("t", "episode", "q", "dq", "ddq", "tau")
 BLOCK = 1 << 20
+ROWS = 1 << 14
+"""Rows that chosen ones are read out of at a time."""
 _HEADER = 8
 """Bytes that say how long the header is; and to whose multiples it is filled up, so that numbers are aligned."""
 
@@ -80,6 +83,52 @@ def rows_of(path: Path) -> int:
     with safe_open(path, framework="numpy") as file:
         count: int = file.get_slice("t").get_shape()[0]
     return count
+
+
+class Reader:
+    """A file that is open for its rows, part by part; it outlives the file's name. Safe from several threads.
+
+    Nothing is mapped into memory: of a file as large as memory is, only what was asked for is there.
+    """
+
+    def __init__(self, path: Path) -> None:
+        with path.open("rb", buffering=0) as file:
+            self._file = os.dup(file.fileno())
+        length = int.from_bytes(os.pread(self._file, _HEADER, 0), "little")
+        header = json.loads(os.pread(self._file, length, _HEADER))
+        self._first = {name: _HEADER + length + int(header[name]["data_offsets"][0]) for name in ARRAYS}
+        self._width = {name: int(np.prod(header[name]["shape"][1:], dtype=np.int64)) for name in ARRAYS}
+        self._shape = {name: header[name]["shape"][1:] for name in ARRAYS}
+        self.rows: int = header["t"]["shape"][0]
+
+    def __del__(self) -> None:
+        if hasattr(self, "_file"):
+            os.close(self._file)
+
+    def array(self, name: str, first: int = 0, last: int | None = None) -> NDArray[Any]:
+        """Rows `first` to `last`, exclusive, of one array; raise ValueError where the file ends before them."""
+        count, size = (self.rows if last is None else last) - first, 8 * self._width[name]
+        out = np.empty((count, *self._shape[name]), "<i8" if name == "episode" else "<f8")
+        view, at = out.data.cast("B") if out.size else memoryview(b""), 0
+        while at < len(view):
+            got = os.preadv(self._file, [view[at:]], self._first[name] + first * size + at)
+            if got == 0:
+                raise ValueError(f"{name} ends before row {last}")
+            at += got
+        return out
+
+    def take(self, index: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+        """Arrays by name of chosen rows, (K,) and rising: never much more than these is in memory."""
+        parts: dict[str, list[NDArray[Any]]] = {name: [] for name in ARRAYS}
+        at = 0
+        while at < len(index):
+            first = int(index[at])
+            to = int(np.searchsorted(index, first + ROWS))
+            last = int(index[to - 1]) + 1
+            for name in ARRAYS:
+                parts[name].append(self.array(name, first, last)[index[at:to] - first])
+            at = to
+        return {name: np.concatenate(found) if found else self.array(name, 0, 0) for name, found in parts.items()}
 
 
 def _shape(name: str, rows: int, n_joints: int) -> list[int]:

@@ -42,7 +42,7 @@ def _default_home() -> Path:
 class Settings(BaseSettings):
     """Validated settings; a wrong value stops the start with its name and what was expected."""
 
-    model_config = SettingsConfigDict(env_prefix="LIPSERVE_", extra="ignore", frozen=True)
+    model_config = SettingsConfigDict(env_prefix="LIPSERVE_", extra="ignore", frozen=True, hide_input_in_errors=True)
 
     home: Path = Field(default_factory=_default_home, description="Folder of the database and all files.")
     host: str = Field("127.0.0.1", description="Address to listen on; anything but loopback asks for API keys.")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import torch
-from sqlalchemy import select, text
+from sqlalchemy import select
 from sqlalchemy.orm import Session, undefer
 
 import lipcore
@@ -18,11 +18,11 @@ from lipcore.probing import probe
 from service.database import Database, DatasetRow, EventRow, RobotRow, SnapshotRow, VersionRow
 from service.database.sqlite import FILE
 from service.errors import DamagedDataError
-from service.files import Files
+from service.files import Files, FilesUnreachableError
 from service.settings import Settings
 from service.updates.storage.payload import decode
 
-ERRORS_OF_SQLITE = 20
+FAULTS = 20
 """Faults of the database that are told, at most."""
 EVENTS = 200
 """Batches that are read together."""
@@ -55,24 +55,24 @@ def verify(settings: Settings) -> Verified:
     """Read a home whole: the database, data sets, robots, versions, what they have learnt and the log of observations.
 
     It may run beside the service: what that deletes meanwhile is not damaged. Nothing is changed but a database of an
-    earlier release, which is brought up to date. Raise FileNotFoundError where the home has no database.
+    earlier release, which is brought up to date. Where services share a database and files, all of these are read, and
+    no copies of them. Raise FileNotFoundError where the home has no database, FilesUnreachableError where the shared
+    files cannot be read now.
     """
-    if not (settings.home / FILE).is_file():
+    if settings.database_url is None and not (settings.home / FILE).is_file():
         raise FileNotFoundError(f"home is {str(settings.home)!r}, expected a folder with the database of a service")
     torch.set_num_threads(settings.serving_threads)
-    database, files = Database.of(settings, settings.database_timeout_s), Files.of(settings)
+    database = Database.of(settings, settings.database_timeout_s)
     try:
-        return _verify(database, files)
+        with Files.fresh(settings) as files:
+            return _verify(database, files)
     finally:
         database.close()
 
 
 def _verify(database: Database, files: Files) -> Verified:
     found = Verified()
-    with database.session() as session:
-        faults = [str(each) for each in session.scalars(text(f"PRAGMA integrity_check({ERRORS_OF_SQLITE})"))]
-        faults += [f"a row of {row[0]} refers to no row of {row[2]}" for row in session.execute(_FOREIGN)]
-    found.damages += [Damage("database", FILE, each) for each in faults if each != "ok"]
+    found.damages += [Damage("database", FILE, each) for each in database.adapter.inconsistencies(FAULTS)]
     for kind, check in _CHECKS.items():
         found.read[kind] = 0
         for name, gone, reason in check(database, files):
@@ -85,7 +85,6 @@ def _verify(database: Database, files: Files) -> Verified:
     return found
 
 
-_FOREIGN = text("PRAGMA foreign_key_check")
 _Finding = tuple[str, Callable[[Session], bool], str | None]
 """Name of what was read, how to tell whether it has been deleted since, and why it is damaged, None where it is not."""
 
@@ -120,9 +119,8 @@ def _versions(database: Database, files: Files) -> Iterator[_Finding]:
 
 
 def _read_version(files: Files, row: VersionRow) -> None:
-    folder = files.versions / row.folder
-    probe(lipcore.load(folder, row.checksums))
-    if persistence.read_manifest(folder) != row.manifest:
+    probe(files.load_version(row.folder, row.checksums))
+    if files.read_version(row.folder, persistence.read_manifest) != row.manifest:
         raise ValueError("manifest.json is not the manifest that the database has")
 
 
@@ -142,7 +140,7 @@ def _snapshots(database: Database, files: Files) -> Iterator[_Finding]:
 def _base(files: Files, row: VersionRow | None) -> lipcore.TorqueModel | None:
     """The version as trained, None where it cannot be read, which is said of the version."""
     try:
-        return None if row is None else lipcore.load(files.versions / row.folder, row.checksums)
+        return None if row is None else files.load_version(row.folder, row.checksums)
     except lipcore.ModelFormatError:
         return None
 
@@ -176,6 +174,8 @@ def _reason(read: Callable[..., None], *arguments: Any) -> str | None:
     """Why something cannot be read, None where it can."""
     try:
         read(*arguments)
+    except FilesUnreachableError:  # which says nothing of the file
+        raise
     except (ValueError, OSError, DamagedDataError) as error:
         return str(error)
     return None

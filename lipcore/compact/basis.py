@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from lipcore.kernels.base import LinearKernel, PairKernel, Params, SumKernel, TorqueKernel
+from lipcore.kernels.compiled.cross import Cross
 from lipcore.linalg import cholesky
 from lipcore.motion import Motion
 
@@ -77,7 +80,27 @@ class Basis:
         """Variance k(x, x) − φᵀφ that the basis leaves open at N queries, (N, n). features: φ(x), (M, N n)."""
         if self.term is None:
             return torch.zeros_like(query.q)
-        prior = self.term.variance(self.params, query).diagonal(dim1=1, dim2=2)
+        return self._open(self.term.variance(self.params, query).diagonal(dim1=1, dim2=2), features)
+
+    def told(self, query: Motion) -> tuple[Tensor, Tensor]:
+        """`features` and `uncovered` of N queries, for few of them at a time: compiled, on the CPU."""
+        if self._cross is None:
+            features = self.features(query)
+            return features, self.uncovered(query, features)
+        n, size = query.n_joints, self._cross.size
+        blocks = torch.empty((len(query), size + 1, n, n), dtype=torch.float64)
+        motions = np.stack([query.q.numpy(), query.dq.numpy(), query.ddq.numpy()], axis=1)
+        self._cross.fill_many(motions, blocks.numpy())
+        gram = blocks[:, :size].permute(1, 2, 0, 3).reshape(size * n, len(query) * n)[self.outputs]
+        parts = [gram, *(each.covariance(self.params) @ _rows(each, query).T for each in self.linear)]
+        features = torch.linalg.solve_triangular(self.root, torch.cat(parts), upper=False)
+        return features, self._open(blocks[:, size].diagonal(dim1=1, dim2=2), features)
+
+    @cached_property
+    def _cross(self) -> Cross | None:
+        return None if self.term is None else self.term.cross(self.params, self.inducing)
+
+    def _open(self, prior: Tensor, features: Tensor) -> Tensor:
         # the linear terms' own features leave nothing open
         explained = features[: len(self.outputs)].square().sum(0).reshape(prior.shape)
         return (prior - explained).clamp_min(0.0)

@@ -82,11 +82,42 @@ def subtract(all_samples: Statistics, some: Statistics) -> Statistics:
     return Statistics(all_samples.a - some.a, all_samples.b - some.b, all_samples.samples - some.samples)
 
 
-def decay(statistics: Statistics, factor: float) -> Statistics:
-    """Statistics whose samples count a `factor` from 0 to 1 as much as before; raise ValueError for another."""
+def add_to(
+    statistics: Statistics, features: Tensor, variance: Tensor, residual: Tensor, weights: Tensor, sign: float = 1.0
+) -> Statistics:
+    """Statistics with N samples more, or fewer where sign is −1, that overwrite these: for few samples, often.
+
+    Of A only the lower triangle is kept up, which is all that `solve` reads; `mirror` follows with the other. The same
+    to rounding as to `merge` what `collect` finds. features: φ, (M, N n), overwritten; variance: R, (N, n); residual:
+    (N, n); weights: (N,).
+    """
+    root = (weights[:, None] / variance).sqrt()
+    features *= root.reshape(-1)
+    b = features @ (residual * root).reshape(-1)
+    _add_square(statistics.a, features, sign)
+    samples = statistics.samples + sign * float(weights.sum())
+    return Statistics(statistics.a, statistics.b + sign * b, samples)
+
+
+def mirror(statistics: Statistics) -> None:
+    """Make the upper triangle of A equal to the lower one, in place."""
+    statistics.a.copy_(statistics.a.tril() + statistics.a.tril(-1).T)
+
+
+def decay(statistics: Statistics, factor: float, own: bool = False) -> Statistics:
+    """Statistics whose samples count a `factor` from 0 to 1 as much as before; raise ValueError for another.
+
+    own: whether these are not needed any more and may be overwritten, to the same bits.
+    """
     if not 0.0 <= factor <= 1.0:
         raise ValueError(f"factor is {factor!r}, expected a number from 0 to 1")
-    return Statistics(factor * statistics.a, factor * statistics.b, factor * statistics.samples)
+    a, b = statistics.a, statistics.b
+    return Statistics(a.mul_(factor) if own else factor * a, factor * b, factor * statistics.samples)
+
+
+def copied(statistics: Statistics) -> Statistics:
+    """The same statistics in memory of their own."""
+    return Statistics(statistics.a.clone(), statistics.b.clone(), statistics.samples)
 
 
 def solve(statistics: Statistics, centre: Tensor | None = None) -> Solution:
@@ -119,3 +150,15 @@ def _square(features: Tensor) -> Tensor:
     out[half:, :half] = lower @ upper.T
     out[:half, half:] = out[half:, :half].T
     return out
+
+
+def _add_square(a: Tensor, features: Tensor, sign: float) -> None:
+    """Add sign F Fᵀ of (M, K) to the lower triangle of A, in place; of the upper one, blocks on the diagonal change."""
+    if len(a) <= BLOCK:
+        a.addmm_(features, features.T, alpha=sign)
+        return
+    half = len(a) // 2
+    upper, lower = features[:half], features[half:]
+    _add_square(a[:half, :half], upper, sign)
+    _add_square(a[half:, half:], lower, sign)
+    a[half:, :half].addmm_(lower, upper.T, alpha=sign)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,12 +11,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lipcore.compact.posterior import CompactPosterior
-from lipcore.compact.statistics import Solution, Statistics, collect, decay, empty, merge, solve, subtract
+from lipcore.compact.statistics import Solution, Statistics, add_to, copied, decay, empty, mirror, solve
 from lipcore.model import TorqueModel
 from lipcore.online.batch import Rows
 from lipcore.samples import Array
 
-_Combine = Callable[[Statistics, Statistics], Statistics]
 CHUNK = 500
 """Rows whose features are computed together: they take 28 MB at a thousand variables."""
 
@@ -82,16 +80,39 @@ class OnlineModel:
         """Sum of the weights of the rows learnt in this regime."""
         return self.now.statistics.samples
 
-    def learn(self, rows: Rows) -> OnlineModel:
-        """Learn the rows of code 0, in any order; those from before the regime before this one teach nothing more."""
-        return self._add(rows.learnt, merge)
+    def begin(self, since: float) -> OnlineModel:
+        """Say from when on, s of event time, the version's own samples are forgotten, where that is not known yet."""
+        if self.since is not None:
+            return self
+        return replace(self, since=since, reference=max(self.reference, since))
 
-    def unlearn(self, rows: Rows) -> OnlineModel:
-        """Take back rows that were learnt; raise ForgottenError for some from before the regime before this one."""
+    def learn(self, rows: Rows, own: bool = False) -> OnlineModel:
+        """Learn the rows of code 0, in any order; those from before the regime before this one teach nothing more.
+
+        own: whether nobody else has these sums (see `detached`), so that they can be added to where they are: the model
+        that this is called of is not to be used again, the last of many is to be made `whole`. The outcome is the same
+        to the last bit.
+        """
+        return self._add(rows.learnt, 1.0, own)
+
+    def unlearn(self, rows: Rows, own: bool = False) -> OnlineModel:
+        """Take back rows that were learnt; raise ForgottenError for some from before the regime before this one.
+
+        own: as in `learn`.
+        """
+        self.check_unlearn(rows)
+        return self._add(rows.learnt, -1.0, own)
+
+    def check_unlearn(self, rows: Rows) -> None:
+        """Raise ForgottenError where rows cannot be taken back, being from before the regime before this one."""
         oldest = self.now.begins if self.before is None else self.before.begins
         if len(rows.learnt) and float(rows.learnt.time.min()) < oldest:
             raise ForgottenError(f"rows from before {oldest:.3f} s cannot be taken back: two changes have come since")
-        return self._add(rows.learnt, subtract)
+
+    def detached(self) -> OnlineModel:
+        """The same model with sums of its own, which can be added to."""
+        before = self.before and replace(self.before, statistics=copied(self.before.statistics))
+        return replace(self, before=before, now=replace(self.now, statistics=copied(self.now.statistics)))
 
     def change(self, at: float) -> OnlineModel:
         """Begin a new regime at an event time: the mean is kept, its uncertainty is opened.
@@ -124,40 +145,51 @@ class OnlineModel:
         )
         return replace(self.base, posterior=found)
 
-    def _add(self, rows: Rows, combine: _Combine) -> OnlineModel:
-        for first in range(0, len(rows), CHUNK):
-            self = self._add_chunk(rows.take(slice(first, first + CHUNK)), combine)  # noqa: PLW0642 - immutable
+    def whole(self) -> OnlineModel:
+        """Return the same model with its sums complete, once it has learnt with `own`."""
+        for regime in (self.now, self.before):
+            if regime is not None:
+                mirror(regime.statistics)
         return self
 
-    def _add_chunk(self, rows: Rows, combine: _Combine) -> OnlineModel:
+    def _add(self, rows: Rows, sign: float, own: bool) -> OnlineModel:
+        if not len(rows):
+            return self
+        model = self if own else self.detached()
+        for first in range(0, len(rows), CHUNK):
+            model = model._add_chunk(rows.take(slice(first, first + CHUNK)), sign)
+        return model if own else model.whole()
+
+    def _add_chunk(self, rows: Rows, sign: float) -> OnlineModel:
         latest = max(self.reference, float(rows.time.max()))
         model = self._aged(latest, float(rows.time.min()) if self.since is None else self.since)
         current = rows.time >= model.now.begins
         now, before = model.now, model.before
         if current.any():
-            told = model._collect(rows.take(current))
-            now = replace(now, statistics=combine(now.statistics, told))
+            now = replace(now, statistics=model._told(now.statistics, rows.take(current), sign))
         if before is not None and (late := ~current & (rows.time >= before.begins)).any():
-            before = replace(before, statistics=combine(before.statistics, model._collect(rows.take(late))))
+            before = replace(before, statistics=model._told(before.statistics, rows.take(late), sign))
             now = replace(now, centre=before.solve().mean)
         return replace(model, now=now, before=before)
 
-    def _collect(self, rows: Rows) -> Statistics:
+    def _told(self, statistics: Statistics, rows: Rows, sign: float) -> Statistics:
+        """These statistics, overwritten, with what rows say, or without it."""
         posterior, motion = self.base.posterior, rows.motion()
         weights = torch.from_numpy(rows.weight)
         if self.forgetting_s is not None:
             weights = weights * torch.from_numpy(np.exp((rows.time - self.reference) / self.forgetting_s))
         residual = torch.from_numpy(rows.tau) - posterior.kernel.mean(motion)
-        return collect(posterior.basis, posterior.noise_variance, motion, residual, weights)
+        features, open_ = posterior.basis.told(motion)
+        return add_to(statistics, features, posterior.noise_variance + open_, residual, weights, sign)
 
     def _aged(self, reference: float, since: float) -> OnlineModel:
-        """The same knowledge as it weighs at a later reference time."""
+        """The same knowledge as it weighs at a later reference time; its sums are overwritten."""
         age = reference - max(self.reference, since)
         if self.forgetting_s is None or age <= 0:
             return replace(self, reference=reference, since=since)
         factor = math.exp(-age / self.forgetting_s)
-        now = replace(self.now, statistics=decay(self.now.statistics, factor))
-        before = self.before and replace(self.before, statistics=decay(self.before.statistics, factor))
+        now = replace(self.now, statistics=decay(self.now.statistics, factor, own=True))
+        before = self.before and replace(self.before, statistics=decay(self.before.statistics, factor, own=True))
         return replace(self, reference=reference, since=since, now=now, before=before)
 
 

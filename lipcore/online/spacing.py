@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lipcore.samples import Array
 
@@ -24,6 +25,23 @@ def evenly(time: Array, rate: float = INDEPENDENT_HZ) -> Array:
     steps = np.diff(time[np.isfinite(time)])
     rising = steps[steps > 0]
     return np.full(len(time), min(1.0, rate * float(np.median(rising))) if len(rising) else 1.0)
+
+
+def recorded(time: Array, episode: NDArray[np.int64], rate: float = INDEPENDENT_HZ) -> Array:
+    """Weight of each row of a recording, (N,), from 0 to 1: `rate` times the seconds since the row before in its
+    episode, 1 at most; the first of an episode counts as the second does, and a row without a neighbour in full.
+
+    time, episode: (N,). A row's weight depends on its neighbours alone: those of a piece are those of the whole, where
+    the piece has one more row at both ends.
+    """
+    if not len(time):
+        return np.empty(0)
+    joined = np.diff(episode) == 0
+    steps = np.where(joined, np.diff(time), np.nan)
+    since = np.concatenate([[np.nan], steps])
+    until = np.concatenate([steps, [np.nan]])
+    found = np.where(np.isfinite(since), since, until)
+    return np.clip(rate * np.where(np.isfinite(found), found, np.inf), 0.0, 1.0)
 
 
 def weights(time: Array, before: float | None = None, rate: float = INDEPENDENT_HZ) -> Array:

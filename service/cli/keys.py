@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any
 
@@ -18,6 +18,7 @@ from service.cli.consoles import note, out, print_json
 from service.cli.options import Json
 from service.database import ApiKeyRow, Database
 from service.errors import InvalidRequestError
+from service.home import HomeError, usable
 from service.settings import Settings
 
 app = typer.Typer(
@@ -26,7 +27,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="API keys of the home LIPSERVE_HOME.",
 )
-ERRORS = (InvalidRequestError,)
+ERRORS = (HomeError, InvalidRequestError)
 LONGEST_DAYS = 36_500.0
 
 
@@ -89,11 +90,8 @@ def revoke(
 @contextmanager
 def _database() -> Iterator[tuple[Database, Settings]]:
     settings = Settings()
-    database = Database.of(settings)
-    try:
+    with usable(settings), closing(Database.of(settings)) as database:
         yield database, settings
-    finally:
-        database.close()
 
 
 def _shown(row: ApiKeyRow) -> dict[str, Any]:

@@ -31,6 +31,9 @@ def predict(
     tau: Annotated[str | None, typer.Option("--tau", help="Torques, N·m, for forward_dynamics.")] = None,
     version: Version = None,
     alias: Alias = None,
+    min_revision: Annotated[
+        int | None, typer.Option(min=0, help="Answer with this revision or a later one: what was taught is in it.")
+    ] = None,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
@@ -54,6 +57,7 @@ def predict(
             alias=alias,
             components=names(components) or [],
             tau=torque,
+            min_revision=min_revision,
         )
     if as_json:
         print_json(answer)

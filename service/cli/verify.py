@@ -8,15 +8,19 @@ from rich.markup import escape
 from service import verification
 from service.cli.consoles import err, print_json, say
 from service.cli.options import Json
+from service.home import HomeError, usable
 from service.settings import Settings
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+ERRORS = (HomeError,)
 
 
 @app.command()
 def verify(as_json: Json = False) -> None:
     """Read everything that the home LIPSERVE_HOME stores and report what is damaged; also while the service runs."""
-    found = verification.verify(Settings())
+    settings = Settings()
+    with usable(settings):
+        found = verification.verify(settings)
     if as_json:
         print_json(found.shown())
     else:

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from secrets import token_hex
 from typing import Protocol
 
-from sqlalchemy import Connection, Engine
+from sqlalchemy import Connection, Engine, event
 from sqlalchemy.orm import Session, sessionmaker
 
+from service.database import notices
 from service.database.migrations import migrate
+from service.database.notices import Notice
 from service.database.sqlite import Sqlite
 from service.settings import Settings
 
 PATIENCE_S = 30.0
 """Longest wait for another writer, of processes that nobody waits for."""
+
+
+class DriverMissingError(RuntimeError):
+    """What PostgreSQL needs is not installed."""
 
 
 class Adapter(Protocol):
@@ -31,17 +38,27 @@ class Adapter(Protocol):
     def turn(self, model: str) -> AbstractContextManager[None]:
         """Be the only one, of all services, that takes something for a model while the block runs."""
 
+    def heard(self, pause_s: float) -> Iterator[str | None]:
+        """What other services tell, see `Database.heard`."""
+
+    def close(self) -> None:
+        """Close all connections."""
+
     def check(self, seconds: float) -> None:
         """Raise an error unless the database can be read and written within so many seconds."""
 
     def damage(self, most: int = 1) -> list[str]:
         """What the database finds wrong with itself, at most so many faults; empty where it is whole."""
 
+    def inconsistencies(self, most: int) -> list[str]:
+        """As `damage`, looked at more closely, and rows that refer to none."""
+
 
 class Database:
     """Sessions on one database; safe to share between threads. timeout_s: longest wait for another writer.
 
     url: of a PostgreSQL server, None for SQLite below the home. connections: most that are open at a time there.
+    origin: by which others know who has changed something.
     """
 
     def __init__(
@@ -51,6 +68,9 @@ class Database:
         self.engine = self.adapter.engine
         migrate(self.engine, self.adapter.lock)
         self._sessions = sessionmaker(self.engine, expire_on_commit=False)
+        self.origin = token_hex(8)
+        if self.shared:
+            event.listen(self._sessions, "after_flush", notices.collect)
 
     @classmethod
     def of(cls, settings: Settings, timeout_s: float = PATIENCE_S) -> Database:
@@ -78,6 +98,8 @@ class Database:
         with self._sessions() as session:
             self.adapter.lock(session.connection(), model)
             yield session
+            if self.shared:
+                notices.send(session, self.origin)
             session.commit()
 
     def turn(self, model: str) -> AbstractContextManager[None]:
@@ -87,14 +109,26 @@ class Database:
         """
         return self.adapter.turn(model)
 
+    def heard(self, pause_s: float) -> Generator[Notice | None, None, None]:
+        """What is changed from the first None on that this yields, as it is committed; and None after each pause, s.
+
+        Ends with an error where the connection does. Where there is one service, nothing is told and this ends at once.
+        """
+        for payload in self.adapter.heard(pause_s):
+            notice = None if payload is None else notices.read(payload)
+            if payload is None or notice is not None:
+                yield notice
+
     def close(self) -> None:
         """Close all connections."""
-        self.engine.dispose()
+        self.adapter.close()
 
 
 def _adapter(home: Path, timeout_s: float, url: str | None, connections: int | None) -> Adapter:
     if url is None:
         return Sqlite(home, timeout_s)
-    from service.database.postgresql import Postgresql  # noqa: PLC0415 - its driver is an extra
-
+    try:
+        from service.database.postgresql import Postgresql  # noqa: PLC0415 - its driver is an extra
+    except ModuleNotFoundError as error:
+        raise DriverMissingError("LIPSERVE_DATABASE_URL needs more: pip install 'lipserve[cluster]'") from error
     return Postgresql(url, timeout_s, connections)

@@ -6,11 +6,19 @@ or of all. They end with the transaction, and so with a process or a host that d
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 from zlib import crc32
 
-from sqlalchemy import Connection, create_engine, make_url, text
+import psycopg
+from psycopg.abc import Buffer
+from psycopg.types.string import StrDumperUnknown
+from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url, text
+from sqlalchemy.exc import ArgumentError
+
+from service.database.notices import CHANNEL
 
 WRITERS, TURNS = 0x4C495053, 0x4C495054
 """Names of the two kinds of locks among those of the database."""
@@ -22,6 +30,15 @@ OPTIONS = {
     "tcp_keepalives_interval": "5",
     "tcp_keepalives_count": "3",
 }
+LISTENING: dict[str, Any] = {
+    "application_name": "lipserve notices",
+    "connect_timeout": 5,
+    # a server that is gone without a word is noticed within half a minute
+    "keepalives_idle": 10,
+    "keepalives_interval": 5,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 25_000,
+}
 
 
 class Postgresql:
@@ -30,20 +47,11 @@ class Postgresql:
     shared = True
 
     def __init__(self, url: str, timeout_s: float, connections: int | None = None) -> None:
-        options = OPTIONS | {"lock_timeout": f"{max(1, round(1000 * timeout_s))}ms"}
         most = CONNECTIONS if connections is None else connections
-        self.engine = create_engine(
-            make_url(url).set(drivername="postgresql+psycopg"),
-            connect_args={
-                "options": " ".join(f"-c {name}={value}" for name, value in options.items()),
-                "connect_timeout": max(2, round(timeout_s)),
-                "application_name": "lipserve",
-            },
-            pool_pre_ping=True,  # connections do not outlive a restart of the server
-            pool_size=min(5, most),
-            max_overflow=max(0, most - 5),
-            pool_timeout=timeout_s,
-        )
+        turns = max(1, most // 4)
+        self.engine = _engine(url, timeout_s, max(1, most - turns))
+        # who has a turn needs another connection, which none of those that wait for a turn may have
+        self._turns = _engine(url, timeout_s, turns)
 
     def lock(self, connection: Connection, model: str | None = None) -> None:
         """Wait until no other writer of the model, or none at all, is left; the lock ends with the transaction."""
@@ -56,9 +64,19 @@ class Postgresql:
     @contextmanager
     def turn(self, model: str) -> Iterator[None]:
         """Wait until no other service has the turn of the model; on a connection of its own."""
-        with self.engine.connect() as connection:
+        with self._turns.connect() as connection:
             _take(connection, "pg_advisory_xact_lock", TURNS, _key(model))
             yield
+
+    def heard(self, pause_s: float) -> Iterator[str | None]:
+        """Payloads of notices, on a connection of its own; None once it listens, and after each pause of so long, s."""
+        url = self.engine.url.set(drivername="postgresql").render_as_string(hide_password=False)
+        with psycopg.connect(url, autocommit=True, **LISTENING) as connection:
+            connection.execute(f"LISTEN {CHANNEL}")
+            while True:
+                yield None
+                for notice in connection.notifies(timeout=pause_s):
+                    yield notice.payload
 
     def check(self, seconds: float) -> None:
         """Raise an error unless the server answers, and takes writes, with every writer done within so many seconds."""
@@ -68,9 +86,66 @@ class Postgresql:
                 raise OSError("the PostgreSQL server is a standby, which cannot be written")
             self.lock(connection)
 
+    def close(self) -> None:
+        """Close all connections."""
+        self.engine.dispose()
+        self._turns.dispose()
+
     def damage(self, most: int = 1) -> list[str]:
         """Nothing: PostgreSQL looks after itself (its checksums, `pg_amcheck`)."""
         return []
+
+    def inconsistencies(self, most: int) -> list[str]:
+        """Nothing either: it holds to its references."""
+        return []
+
+
+def _engine(url: str, timeout_s: float, most: int) -> Engine:
+    options = OPTIONS | {"lock_timeout": f"{max(1, round(1000 * timeout_s))}ms"}
+    made = create_engine(
+        _read(url),
+        connect_args={
+            "options": " ".join(f"-c {name}={value}" for name, value in options.items()),
+            "connect_timeout": max(2, round(timeout_s)),
+            "application_name": "lipserve",
+        },
+        pool_pre_ping=True,  # connections do not outlive a restart of the server
+        pool_size=min(5, most),
+        max_overflow=max(0, most - 5),
+        pool_timeout=timeout_s,
+        json_serializer=_json,
+    )
+    event.listen(made, "connect", _configure)
+    return made
+
+
+class _Text(StrDumperUnknown):
+    """Text without NUL, which PostgreSQL has no way to hold: a name with one is then looked for and not found."""
+
+    def dump(self, obj: str) -> Buffer | None:
+        return super().dump(obj.replace("\0", "\ufffd"))
+
+
+def _configure(connection: psycopg.Connection[Any], _: object) -> None:
+    connection.adapters.register_dumper(str, _Text)
+
+
+def _json(value: Any) -> str:
+    """JSON as PostgreSQL has it, where numbers that are none are null. All others come back as they were."""
+    try:
+        return json.dumps(value, allow_nan=False)
+    except ValueError:
+        return json.dumps(json.loads(json.dumps(value), parse_constant=lambda _: None))
+
+
+def _read(url: str) -> URL:
+    try:
+        return make_url(url).set(drivername="postgresql+psycopg")
+    except (ArgumentError, ValueError):  # without what it says, which may be half of a password
+        raise ArgumentError(
+            "LIPSERVE_DATABASE_URL cannot be read, expected postgresql://user:password@host:port/name, with what is "
+            "neither letter nor digit in the password as %XX"
+        ) from None
 
 
 def _take(connection: Connection, function: str, kind: int, key: int) -> None:

@@ -30,6 +30,7 @@ from service.idempotency import Identity, done, mark
 from service.pages import Page, newest
 from service.robots.store import profile_of
 from service.sample_file import PartOf
+from service.storage_errors import undecided
 from service.training.states import ACTIVE
 
 
@@ -75,8 +76,9 @@ def add(
         with service.database.transaction() as session:
             if (before := done(session, DatasetRow, named)) is None:
                 session.add(row)
-    except (SQLAlchemyError, ConflictError):
-        service.files.delete_samples(dataset)
+    except (SQLAlchemyError, ConflictError) as error:
+        if not undecided(error):
+            service.files.delete_samples(dataset)
         raise
     if before is not None:  # the same request was faster on another connection
         service.files.delete_samples(dataset)

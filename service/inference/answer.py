@@ -40,9 +40,12 @@ def at_once(served: Served, motion: Array, max_position: float) -> Prediction | 
     return _prediction(served, tau, tau_std)
 
 
-def predict(service: Service, model: str, request: PredictRequest) -> Prediction:
-    """Torque with uncertainty at the queries; raise InvalidRequestError or NotFoundError. Not for the event loop."""
-    served = service.loaded.get(model, request.version, request.alias)
+def predict(service: Service, model: str, request: PredictRequest, served: Served | None = None) -> Prediction:
+    """Torque with uncertainty at the queries; raise InvalidRequestError or NotFoundError. Not for the event loop.
+
+    served: what answers, where that is found already.
+    """
+    served = served or service.loaded.get(model, request.version, request.alias)
     loaded = served.model
     single = request.q.ndim == 1
     components.check(loaded, request, service.settings.max_component_batch)
@@ -153,9 +156,12 @@ def fitting(service: Service, dataset: str, *versions: Served) -> DatasetRow:
     return row
 
 
-def evaluate(service: Service, model: str, request: EvaluateRequest) -> EvaluateResponse:
-    """Compare a model with a data set or what it has held out of it; raise InvalidRequestError or NotFoundError."""
-    served = service.loaded.get(model, request.version, request.alias)
+def evaluate(service: Service, model: str, request: EvaluateRequest, served: Served | None = None) -> EvaluateResponse:
+    """Compare a model with a data set or what it has held out of it; raise InvalidRequestError or NotFoundError.
+
+    served: what answers, where that is found already.
+    """
+    served = served or service.loaded.get(model, request.version, request.alias)
     loaded = served.model
     whole = request.part == "all"
     recorded = (measured if whole else held_out)(service, request.dataset, served)

@@ -6,7 +6,7 @@ import gc
 import itertools
 import logging
 import threading
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from weakref import WeakValueDictionary
 
@@ -18,7 +18,8 @@ from lipcore.online.revision import Revision
 from service.database import Database, VersionRow
 from service.errors import NotFoundError, UnreadableVersionError, not_found
 from service.files import Files
-from service.inference.served import Key, Served, Snapshot
+from service.inference.served import Alias, Key, Served, Snapshot
+from service.inference.waiting import Waiting
 from service.models import moves, registry
 from service.models.lineage import learnt_from
 from service.models.registry import Serving
@@ -36,6 +37,7 @@ class LoadedModels:
     theirs, and none waits. So does a revision of it. An alias moves in the same way.
 
     moving: held while an alias is moved or a version deleted, in the database and then here, one at a time.
+    waiting: who waits for a model to answer otherwise.
     """
 
     def __init__(self, database: Database, files: Files, capacity: int) -> None:
@@ -49,6 +51,7 @@ class LoadedModels:
         self._deleted: set[Key] = set()
         self._lock = threading.Lock()
         self.moving = threading.Lock()
+        self.waiting = Waiting()
         self._loading: dict[Key, threading.Lock] = {}
         self._clock = itertools.count()
         self._used: dict[Key, int] = {}
@@ -114,6 +117,19 @@ class LoadedModels:
             if version is not None:
                 aliases[model, alias] = version
             self._snapshot = replace(self._snapshot, aliases=aliases)
+        self.waiting.tell(model)
+
+    def aliases(self) -> Mapping[Alias, int]:
+        """Where every alias points that has been given, but for those that serve."""
+        return self._snapshot.aliases
+
+    def repoint(self, aliases: Mapping[Alias, int], models: Collection[str] | None) -> None:
+        """Let the aliases of these models, of all where None, be these; `moving` is held, and the database says so."""
+        with self._lock:
+            kept = {} if models is None else {k: v for k, v in self._snapshot.aliases.items() if k[0] not in models}
+            self._snapshot = replace(self._snapshot, aliases=kept | dict(aliases))
+        for model in {model for model, _ in aliases}:
+            self.waiting.tell(model)
 
     def forget(self, model: str, versions: Collection[int], whole: bool = False) -> None:
         """Answer no more with these versions, which have been deleted; `moving` is held.
@@ -130,6 +146,7 @@ class LoadedModels:
                 self._held.pop(key, None)
                 self._used.pop(key, None)
                 self._unreadable.pop(key, None)
+        self.waiting.tell(model)
 
     def announce(self, models: Collection[str]) -> None:
         """Answer for these models with the versions that now serve. Not for the event loop."""
@@ -143,10 +160,18 @@ class LoadedModels:
         for serving in registry.serving(self.database, [model]).values():
             try:
                 self._load(registry.find(self.database, model, serving.version), serving)
-            except UnreadableVersionError as error:  # who asks for it is told; the version before goes on answering
+            except (UnreadableVersionError, OSError) as error:  # who asks is told; the version before goes on answering
                 logger.error("%s", error)
             except NotFoundError:  # another one serves by now, and this one has been deleted: who did that adopts it
                 logger.info("version %d of model %s was deleted before it answered", serving.version, model)
+
+    def held(self) -> dict[Key, int | None]:
+        """Versions that anyone here may answer with, and their revisions: those in memory, of streams too, and those
+        that serve, which may have been dropped (None)."""
+        snapshot = self._snapshot
+        found: dict[Key, int | None] = {(model, each.version): None for model, each in snapshot.serving.items()}
+        streamed = [each for ref in self._held.valuerefs() if (each := ref()) is not None]
+        return found | {(each.name, each.version): each.revision for each in (*streamed, *snapshot.served.values())}
 
     def versions(self) -> Collection[Key]:
         """Versions that are in memory; asking does not count as using them."""
@@ -194,7 +219,7 @@ class LoadedModels:
             try:
                 self._load(registry.find(self.database, model, serving.version), serving)
                 loaded += 1
-            except UnreadableVersionError as error:  # the others shall answer all the same
+            except (UnreadableVersionError, OSError) as error:  # the others shall answer all the same
                 logger.error("%s", error)
         return loaded
 
@@ -244,10 +269,12 @@ class LoadedModels:
 
     def _read(self, row: VersionRow) -> TorqueModel:
         try:
-            return lipcore.load(self.files.versions / row.folder, row.checksums)
+            return self.files.load_version(row.folder, row.checksums)
         except lipcore.ModelFormatError as error:
             if self.is_deleted(row.model, row.version):
                 raise not_found("version", row.version) from error
+            if self.database.shared:  # another service may have deleted it
+                registry.find(self.database, row.model, row.version)
             message = f"version {row.version} of model {row.model!r} cannot be loaded: {error}"
             raise UnreadableVersionError(message) from error
 
@@ -271,6 +298,7 @@ class LoadedModels:
                 del entries[oldest]
                 self._used.pop(oldest, None)
             self._snapshot = replace(self._snapshot, served=entries, serving=pointers)
+        self.waiting.tell(served.name)
         return current
 
 

@@ -9,15 +9,25 @@ from fastapi import APIRouter, Response
 from starlette.types import Scope
 
 from service.context import Service, ServiceDep
-from service.errors import DamagedDataError, InvalidRequestError, NotFoundError, TooLargeError, responses
+from service.errors import (
+    DamagedDataError,
+    InvalidRequestError,
+    NotFoundError,
+    RevisionNotReachedError,
+    TooLargeError,
+    responses,
+)
 from service.hot import Reply, hot_route
 from service.inference import answer, trace
 from service.inference.schema import EvaluateRequest, EvaluateResponse, PredictRequest, PredictResponse
+from service.inference.served import Served
 from service.inference.trace_schema import TraceRequest, TraceResponse
+from service.inference.waiting import reached
 from service.inference.wire import decode, encode
 from service.route import Route, is_json
 
 _ERRORS = responses(InvalidRequestError, NotFoundError, TooLargeError)
+_LATE = responses(RevisionNotReachedError)
 
 _TAGS: list[str | Enum] = ["inference"]
 router = APIRouter(prefix="/v1/models", tags=_TAGS, responses=_ERRORS, route_class=Route)
@@ -33,26 +43,36 @@ async def _answer(scope: Scope, body: bytes) -> Reply | None:
     service: Service = scope["app"].state.service
     model: str = scope["path_params"]["model"]
     served, motion = service.loaded.hot(model, query.version, query.alias), query.single()
+    if query.min_revision is not None:
+        served = await reached(service, model, query.version, query.alias, query.min_revision)
     if served is not None and motion is not None:
         at_once = answer.at_once(served, motion, service.settings.max_position)
         if at_once is not None:
             return Reply(encode(at_once))
     request = query.request()
-    return None if request is None else Reply(await _in_thread(service, model, request))
+    return None if request is None else Reply(await _in_thread(service, model, request, served))
 
 
-async def _in_thread(service: Service, model: str, request: PredictRequest) -> bytes:
-    return await to_thread.run_sync(_encoded, service, model, request, limiter=service.predictions)
+async def _in_thread(service: Service, model: str, request: PredictRequest, served: Served | None) -> bytes:
+    return await to_thread.run_sync(_encoded, service, model, request, served, limiter=service.predictions)
 
 
-def _encoded(service: Service, model: str, request: PredictRequest) -> bytes:
-    return encode(answer.predict(service, model, request))
+def _encoded(service: Service, model: str, request: PredictRequest, served: Served | None) -> bytes:
+    return encode(answer.predict(service, model, request, served))
+
+
+async def _wanted(service: Service, model: str, request: PredictRequest | EvaluateRequest) -> Served | None:
+    """The version that answers, where the request waits for a revision of it; None where it does not."""
+    if request.min_revision is None:
+        return None
+    return await reached(service, model, request.version, request.alias, request.min_revision)
 
 
 async def predict(service: ServiceDep, model: str, request: PredictRequest) -> Response:
     """Answer one query or a batch. Nothing is clipped; `tau_std` grows where the model knows little."""
     # a right query has been answered before: this reads the others, to say what is wrong, or in JSON of other dialects
-    return Reply(await _in_thread(service, model, request)).response()
+    served = await _wanted(service, model, request)
+    return Reply(await _in_thread(service, model, request, served)).response()
 
 
 hot.add_api_route(
@@ -61,14 +81,16 @@ hot.add_api_route(
     methods=["POST"],
     summary="Torque at a motion, with its uncertainty",
     response_model=PredictResponse,
+    responses=_LATE,
     route_class_override=hot_route(_answer),
 )
 
 
-@router.post("/{model}/evaluate", summary="Compare a model with a data set")
+@router.post("/{model}/evaluate", summary="Compare a model with a data set", responses=_LATE)
 async def evaluate(service: ServiceDep, model: str, request: EvaluateRequest) -> EvaluateResponse:
     """Error, coverage and density of the model's torques against measured ones, joint by joint."""
-    return await to_thread.run_sync(answer.evaluate, service, model, request, limiter=service.predictions)
+    served = await _wanted(service, model, request)
+    return await to_thread.run_sync(answer.evaluate, service, model, request, served, limiter=service.predictions)
 
 
 @router.post("/{model}/trace", summary="Follow a model along a data set", responses=responses(DamagedDataError))

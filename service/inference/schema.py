@@ -79,6 +79,19 @@ class VersionChoice(BaseModel):
         return self
 
 
+MinRevision = Annotated[
+    int | None,
+    Field(
+        ge=0,
+        lt=2**31,
+        description="Answer with this revision of the version or a later one, as the `revision` of an acknowledgement: "
+        "what was taught is in the answer, whichever service took it. Waits up to LIPSERVE_MIN_REVISION_WAIT_S, then "
+        "503 `revision_not_reached`. Revisions count for one version: where another may have been promoted since, "
+        "name the `version` of the acknowledgement too",
+    ),
+]
+
+
 class PredictRequest(VersionChoice):
     """One query, or a batch of them, in SI units."""
 
@@ -108,6 +121,7 @@ class PredictRequest(VersionChoice):
         "`friction`. They cost several times a torque: the most queries of such a request are fewer",
     )
     tau: Vectors | None = Field(None, description="Torque that `forward_dynamics` is asked for, N·m (prismatic: N)")
+    min_revision: MinRevision = None
 
 
 class ComponentValues(BaseModel):
@@ -152,6 +166,7 @@ class EvaluateRequest(VersionChoice):
         description="`held_out`: only what the training of the version has held out of the data set, see `holdout` of "
         "a job",
     )
+    min_revision: MinRevision = None
 
 
 class Interval(BaseModel):

@@ -31,6 +31,7 @@ class Query(Struct, forbid_unknown_fields=True):
     covariance: bool = False
     components: list[ComponentName] = []
     tau: Numbers | None = None
+    min_revision: Annotated[int, Meta(ge=0, lt=2**31)] | None = None
 
     def single(self) -> Array | None:
         """Return the motion (3, n) where this is one query for a torque and no more."""
@@ -59,6 +60,7 @@ class Query(Struct, forbid_unknown_fields=True):
             alias=self.alias,
             covariance=self.covariance,
             components=self.components,
+            min_revision=self.min_revision,
         )
 
 

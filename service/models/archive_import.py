@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-import shutil
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from service.models import archive, registry
 from service.models.archive import CHECKSUMS, EXPORT, ArchiveError
 from service.models.schema import ModelName, Version
 from service.settings import Settings
+from service.storage_errors import undecided
 from service.training.holdout_schema import HoldoutLineage
 
 logger = logging.getLogger(__name__)
@@ -93,12 +94,14 @@ def add(service: Service, upload: Path, name: str | None) -> Version:
     files[MANIFEST] = persistence.manifest_bytes(manifest)
     service.disk.require(sum(map(len, files.values())))
     folder = new_id("mv")
-    target = service.files.versions / folder
-    persistence.write(target, files)
+    with service.files.new_version(folder) as target:
+        persistence.write(target, files)
     try:
         version, serves = _publish(service, model, folder, manifest)
-    except BaseException:
-        shutil.rmtree(target, ignore_errors=True)
+    except BaseException as error:
+        if not undecided(error):
+            with suppress(OSError):  # what cannot be deleted now is swept
+                service.files.delete_version(folder)
         raise
     if serves:
         service.loaded.adopt(model)

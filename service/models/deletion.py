@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import shutil
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
@@ -122,7 +121,7 @@ def _remove_files(files: Files, folders: Collection[str], snapshots: Collection[
     """Remove files that no row names any more; what cannot be removed now is at the next start."""
     for folder in folders:
         with _forgiven():
-            shutil.rmtree(files.versions / folder)
+            files.delete_version(folder)
     for snapshot in snapshots:
         with _forgiven():
             files.delete_snapshot(snapshot)

@@ -6,6 +6,7 @@ import json
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from lipcore import persistence
@@ -76,9 +77,7 @@ def _find(service: Service, model: str, version: int | None, alias: str | None) 
 
 def _files(service: Service, row: VersionRow, learnt: bool) -> tuple[dict[str, bytes], int]:
     """The files of a version by name, checked, and the revision that they are of: 0 as trained."""
-    files = persistence.read_files(service.files.versions / row.folder)
-    if row.checksums is not None:
-        persistence.check(files, row.checksums)
+    files = service.files.read_version(row.folder, lambda folder: _checked(folder, row))
     if not learnt:
         return files, 0
     served = service.loaded.hot(row.model, row.version)
@@ -89,6 +88,13 @@ def _files(service: Service, row: VersionRow, learnt: bool) -> tuple[dict[str, b
     lineage = {**row.manifest["lineage"], "learnt": _learnt(row, known.revision)}
     _, files = persistence.encode(known.model, lineage)
     return {MANIFEST: files.pop(MANIFEST), **files}, known.revision
+
+
+def _checked(folder: Path, row: VersionRow) -> dict[str, bytes]:
+    files = persistence.read_files(folder)
+    if row.checksums is not None:
+        persistence.check(files, row.checksums)
+    return files
 
 
 def _learnt(row: VersionRow, revision: int) -> dict[str, Any]:

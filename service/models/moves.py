@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
@@ -11,10 +13,13 @@ SERVING = "serving"
 """The alias that every model has: the version that answers where none is named."""
 
 
-def pointers(database: Database) -> dict[tuple[str, str], int]:
-    """The version of every alias of every model by (model, alias), but for those that serve."""
+def pointers(database: Database, models: Collection[str] | None = None) -> dict[tuple[str, str], int]:
+    """The version of every alias of these models, of all where None, by (model, alias), but for those that serve."""
+    query = select(AliasRow.model, AliasRow.alias, AliasRow.version)
+    if models is not None:
+        query = query.where(AliasRow.model.in_(models))
     with database.session() as session:
-        rows = session.execute(select(AliasRow.model, AliasRow.alias, AliasRow.version)).all()
+        rows = session.execute(query).all()
     return {(model, alias): version for model, alias, version in rows}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from sqlalchemy import func, select, update
@@ -156,22 +157,35 @@ def install_shipped(database: Database, files: Files) -> None:
     newest version.
     """
     source = shipped_models() / SHIPPED
-    query = select(VersionRow).where(VersionRow.model == SHIPPED).order_by(VersionRow.version.desc())
     with database.session() as session:
-        known = list(session.scalars(query))
-        row = session.scalar(select(ModelRow).where(ModelRow.name == SHIPPED))
-        if row is None and session.get(DeletedModelRow, SHIPPED) is not None:
+        if not _is_missing(session, source):
             return
-    if known and row is not None:
-        shipped = read_manifest(source)
-        made_by_user = known[0].job is not None or "imported" in known[0].manifest["lineage"]
-        if made_by_user or row.last_version > known[0].version or any(_same(each, shipped) for each in known):
-            return
-    folder = new_id("mv")
-    manifest = lipcore.copy_model(source, files.versions / folder)
+    folder, version = new_id("mv"), None
+    with files.new_version(folder) as target:
+        manifest = lipcore.copy_model(source, target)
     with database.transaction() as session:
-        version = publish(session, SHIPPED, folder, manifest, None)
+        if _is_missing(session, source):  # no other service has started at the same time
+            version = publish(session, SHIPPED, folder, manifest, None)
+    if version is None:
+        files.delete_version(folder)
+        return
     logger.info("registered the shipped model %s as version %d", SHIPPED, version)
+
+
+def _is_missing(session: Session, source: Path) -> bool:
+    """Whether the shipped model is to be registered."""
+    query = select(VersionRow).where(VersionRow.model == SHIPPED).order_by(VersionRow.version.desc())
+    known = list(session.scalars(query))
+    row = session.scalar(select(ModelRow).where(ModelRow.name == SHIPPED))
+    if row is None:
+        return session.get(DeletedModelRow, SHIPPED) is None
+    if not known:
+        return True
+    made_by_user = known[0].job is not None or "imported" in known[0].manifest["lineage"]
+    if made_by_user or row.last_version > known[0].version:
+        return False
+    shipped = read_manifest(source)
+    return not any(_same(each, shipped) for each in known)
 
 
 def _same(version: VersionRow, manifest: dict[str, Any]) -> bool:

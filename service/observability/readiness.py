@@ -81,6 +81,7 @@ class Readiness:
         looks: dict[str, Callable[[Service], tuple[State, str]]] = {
             "database": _database,
             "home": _home,
+            **({"files": _files} if service.files.shared else {}),
             "models": _models,
             "learner": self._learner,
             "training": self._training,
@@ -111,9 +112,15 @@ class Readiness:
             found = session.execute(select(JobRow.state, func.count()).group_by(JobRow.state))
             counts = dict(found.all())
         waiting, running = counts.get(QUEUED, 0), counts.get(RUNNING, 0)
+        said = f"{waiting} jobs wait, {running} run"
+        if (cluster := service.jobs.cluster) is not None:  # what serves can do without
+            if cluster.problem is not None:
+                return "warning", f"{cluster.problem}; {said}"
+            none = waiting > 0 and cluster.jobs == 0
+            return ("warning" if none else "ok"), f"{said}, the cluster takes {cluster.jobs} at a time"
         stuck = self._lasting("training", waiting > 0 and running < service.settings.training_workers)
         if stuck is None or stuck <= START_S:
-            return "ok", f"{waiting} jobs wait, {running} run"
+            return "ok", said
         return "failed", f"{waiting} jobs wait, though no more than {running} have run for {stuck:.0f} s"
 
     def _lasting(self, what: str, wrong: bool) -> float | None:
@@ -141,6 +148,15 @@ def _home(service: Service) -> tuple[State, str]:
     return ("ok", "can be written") if shortage is None else ("failed", shortage)
 
 
+def _files(service: Service) -> tuple[State, str]:
+    """Whether the shared store answers: without it, what is in memory and what has a copy here still does."""
+    try:
+        service.files.check()
+    except OSError as error:
+        return "warning", f"{error.strerror or error}: nothing can be uploaded, trained or loaded"
+    return "ok", "the shared store answers"
+
+
 def _models(service: Service) -> tuple[State, str]:
     """Whether the versions that serve can be read: in memory, or their files are there and were not found damaged."""
     with service.database.session() as session:
@@ -151,8 +167,7 @@ def _models(service: Service) -> tuple[State, str]:
     lost = 0
     for model, serving in registry.serving(service.database, names).items():
         key = model, serving.version
-        manifest = service.files.versions / folders.get(key, "") / "manifest.json"
-        if key not in loaded and (key in unreadable or not manifest.is_file()):
+        if key not in loaded and (key in unreadable or not service.files.has_version(folders.get(key, ""))):
             lost += 1
     if not lost:
         return "ok", f"{len(names)} can be read"

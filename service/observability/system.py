@@ -56,8 +56,7 @@ class System(Collector):
         yield PARTS.of(([part.name], float(part.state != "failed")) for part in parts)
         yield LOADED.of([((), len(service.loaded.versions()))])
         files, usage = service.files, service.disk.usage()
-        folders = {"datasets": files.datasets, "versions": files.versions, "snapshots": files.learning}
-        used = {what: measure(folder) for what, folder in folders.items()}
+        used = {what: measure(folder) for what, folder in files.folders.items()}
         used["other"] = max(usage.used - sum(used.values()), 0)  # the database above all; measured a moment before
         yield USED.of(([what], size) for what, size in used.items())
         yield FREE.of([((), usage.free)])

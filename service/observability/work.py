@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from datetime import datetime
 
 from prometheus_client.core import Metric
 from prometheus_client.registry import Collector
@@ -38,14 +39,15 @@ class Work(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Yield every metric."""
-        seconds = 86_400 * (func.julianday(JobRow.finished_at) - func.julianday(JobRow.started_at))
         with self._database.session() as session:
             counts = session.execute(select(JobRow.state, func.count()).group_by(JobRow.state))
             states = dict(counts.all())
-            ended = select(JobRow.state, seconds).where(JobRow.state.in_(OUTCOMES), seconds.is_not(None))
+            ended = select(JobRow.state, JobRow.started_at, JobRow.finished_at).where(JobRow.state.in_(OUTCOMES))
             durations = {outcome: Durations(BOUNDS) for outcome in OUTCOMES}
-            for outcome, lasted in session.execute(ended):
-                durations[outcome].add(max(lasted, 0.0))  # clocks are set back at times
+            for outcome, started, finished in session.execute(ended):
+                if started is not None and finished is not None:
+                    lasted = datetime.fromisoformat(finished) - datetime.fromisoformat(started)
+                    durations[outcome].add(max(lasted.total_seconds(), 0.0))  # clocks are set back at times
         yield JOBS.of(([state], states.get(state, 0)) for state in ACTIVE)
         yield FINISHED.of(([outcome], states.get(outcome, 0)) for outcome in OUTCOMES)
         yield DURATION.spread(([outcome], durations[outcome]) for outcome in OUTCOMES)

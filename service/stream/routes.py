@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from typing import NamedTuple
 from urllib.parse import parse_qsl
 
-from anyio import to_thread
 from fastapi import APIRouter
 from starlette.types import Receive, Scope, Send
 from uvicorn.protocols.utils import ClientDisconnected
@@ -15,6 +15,7 @@ from uvicorn.protocols.utils import ClientDisconnected
 from service.context import Service
 from service.errors import BusyError, NotFoundError, NotReadyError, invalid_request
 from service.inference import checks
+from service.inference.waiting import reached
 from service.models.schema import ALIAS
 from service.stream.conversation import Conversation, Echo
 from service.stream.protocol import CONNECTION, StreamProtocol
@@ -80,13 +81,14 @@ class StreamRoute(EchoRoute):
     path = PATH
 
     async def conversation(self, service: Service, scope: Scope, receive: Receive, send: Send) -> Conversation:
-        """Return what talks with the client; raise InvalidRequestError, NotFoundError or UnreadableVersionError."""
-        version, alias, std, stream_id = _parameters(scope["query_string"])
-        model = scope["path_params"]["model"]
-        served = service.loaded.hot(model, version, alias)
-        if served is None:
-            served = await to_thread.run_sync(service.loaded.get, model, version, alias)
-        return Session(_connection(scope), receive, send, service, served, version is not None, std, stream_id, alias)
+        """Return what talks with the client; raise InvalidRequestError, NotFoundError, UnreadableVersionError or
+        RevisionNotReachedError."""
+        asked = _parameters(scope["query_string"])
+        model, version, alias = scope["path_params"]["model"], asked.version, asked.alias
+        # with 0 it waits for nothing but the model to be in memory
+        served = await reached(service, model, version, alias, asked.min_revision)
+        pinned = version is not None
+        return Session(_connection(scope), receive, send, service, served, pinned, asked.std, asked.stream_id, alias)
 
 
 class NoRoute:
@@ -97,9 +99,19 @@ class NoRoute:
         raise NotFoundError(f"no stream at {scope['path'][:200]}: streams are at {PATH}")
 
 
-def _parameters(query: bytes) -> tuple[int | None, str | None, bool, str | None]:
-    """Read version, alias, std and stream_id; raise InvalidRequestError."""
-    version, alias, std, stream_id = None, None, False, None
+class Asked(NamedTuple):
+    """What the address of a stream says. min_revision: that its first answer has at least."""
+
+    version: int | None
+    alias: str | None
+    std: bool
+    stream_id: str | None
+    min_revision: int
+
+
+def _parameters(query: bytes) -> Asked:
+    """Read the query of an address; raise InvalidRequestError."""
+    version, alias, std, stream_id, min_revision = None, None, False, None, 0
     for name, value in parse_qsl(query.decode("ascii", "backslashreplace"), keep_blank_values=True):
         if name == "version":
             if not re.fullmatch("[0-9]{1,10}", value) or not 0 < int(value) < 2**31:
@@ -117,10 +129,14 @@ def _parameters(query: bytes) -> tuple[int | None, str | None, bool, str | None]
             if not re.fullmatch(STREAM_ID, value):
                 raise invalid_request("stream_id", value, f"a name that matches {STREAM_ID}")
             stream_id = value
+        elif name == "min_revision":
+            if not re.fullmatch("[0-9]{1,10}", value) or not int(value) < 2**31:
+                raise invalid_request("min_revision", value, "a revision of the version")
+            min_revision = int(value)
         else:
-            raise invalid_request(name, value, "no parameter but version, alias, std and stream_id")
+            raise invalid_request(name, value, "no parameter but version, alias, std, stream_id and min_revision")
     checks.one_choice(version, alias)
-    return version, alias, std, stream_id
+    return Asked(version, alias, std, stream_id, min_revision)
 
 
 def _connection(scope: Scope) -> StreamProtocol:

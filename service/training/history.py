@@ -18,5 +18,6 @@ def enter(row: JobRow, state: JobState, message: str) -> None:
     row.state = state
     if state == QUEUED:
         row.progress = {"stage": "waiting"}
+        row.owner = None  # any service may have it run
     elif state not in ACTIVE:
         row.finished_at = at

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from lipcore.samples import Array, Samples
-from lipcore.splits import GUARD_S, Mask, Numbers, Parts, Split, SplitError, choose, split, taken
+from lipcore.samples import Array
+from lipcore.splits import GUARD_S, Mask, Numbers, Parts, Split, SplitError, choose, split
 from service.database import DatasetRow
 from service.errors import invalid_request
 from service.training.holdout_schema import HeldOutSet, Holdout, HoldoutLineage
@@ -67,13 +67,20 @@ class SetSplit:
         return self.parts(episode, t).held_out
 
 
+class Clock(NamedTuple):
+    """When the rows of a data set are from: their episodes and times, (N,) each."""
+
+    episode: Numbers
+    t: Array
+
+
 @dataclass(frozen=True)
 class Divided:
-    """Data sets in two. train: of each what is learnt from, None where that is nothing; held_out: of all together;
-    lineage: how to find it again. Both are None where nothing is held out."""
+    """Data sets in two, by the rows of each, (N,): which are learnt from and which held out, None for all and for none
+    of them; lineage: how to find them again, None where nothing is held out."""
 
-    train: list[Samples | None]
-    held_out: Samples | None
+    train: list[Mask | None]
+    held_out: list[Mask | None]
     lineage: HoldoutLineage | None
 
 
@@ -92,13 +99,13 @@ def check(rows: Sequence[DatasetRow], asked: Holdout, min_samples: int) -> None:
         raise invalid_request("holdout.share", asked.share, expected)
 
 
-def hold_out(rows: Sequence[DatasetRow], tables: Sequence[Samples], asked: Holdout) -> Divided:
+def hold_out(rows: Sequence[DatasetRow], clocks: Sequence[Clock], asked: Holdout) -> Divided:
     """Divide data sets for the first time; raise CannotHoldOutError.
 
     Each is split on its own, but those of one episode stand for an episode where whole ones are held out. What it does
     to a data set does not depend on the order of the others.
     """
-    single = {row.id for row, table in zip(rows, tables, strict=True) if len(np.unique(table.episode)) < 2}
+    single = {row.id for row, clock in zip(rows, clocks, strict=True) if len(np.unique(clock.episode)) < 2}
     if asked.kind != "episodes" or len(rows) == 1:
         single = set()
     whole = _whole([row for row in rows if row.id in single], asked) if len(single) > 1 else set()
@@ -106,13 +113,13 @@ def hold_out(rows: Sequence[DatasetRow], tables: Sequence[Samples], asked: Holdo
     for row in rows:
         if row.id in whole or row.id not in single:  # else the one episode that it has is learnt from
             splits[row.id] = _first(row, asked, row.id in whole)
-    return _divide(rows, tables, splits)
+    return _divide(rows, clocks, splits)
 
 
-def hold_out_again(rows: Sequence[DatasetRow], tables: Sequence[Samples], lineage: dict[str, Any]) -> Divided:
+def hold_out_again(rows: Sequence[DatasetRow], clocks: Sequence[Clock], lineage: dict[str, Any]) -> Divided:
     """Divide data sets of a version as they were for it, by its lineage; raise CannotHoldOutError."""
     found = {row.id: remembered(row, lineage) for row in rows}
-    return _divide(rows, tables, {name: each for name, each in found.items() if each is not None})
+    return _divide(rows, clocks, {name: each for name, each in found.items() if each is not None})
 
 
 def remembered(row: DatasetRow, lineage: dict[str, Any]) -> SetSplit | None:
@@ -128,18 +135,19 @@ def remembered(row: DatasetRow, lineage: dict[str, Any]) -> SetSplit | None:
     return None
 
 
-def _divide(rows: Sequence[DatasetRow], tables: Sequence[Samples], splits: dict[str, SetSplit]) -> Divided:
-    train: list[Samples | None] = []
-    held: list[Samples] = []
+def _divide(rows: Sequence[DatasetRow], clocks: Sequence[Clock], splits: dict[str, SetSplit]) -> Divided:
+    train: list[Mask | None] = []
+    held: list[Mask | None] = []
     said: list[HeldOutSet] = []
-    for row, table in zip(rows, tables, strict=True):
+    for row, clock in zip(rows, clocks, strict=True):
         how = splits.get(row.id)
         if how is None:
-            train.append(table)
+            train.append(None)
+            held.append(None)
             continue
-        parts = how.parts(table.episode, table.t)
-        train.append(None if how.whole else taken(table, parts.train))
-        held.append(taken(table, parts.held_out))
+        parts = how.parts(clock.episode, clock.t)
+        train.append(parts.train)
+        held.append(parts.held_out)
         said.append(
             HeldOutSet(
                 id=row.id,
@@ -147,15 +155,15 @@ def _divide(rows: Sequence[DatasetRow], tables: Sequence[Samples], splits: dict[
                 whole=how.whole,
                 guard=how.guard,
                 guard_unit=how.unit,
-                rows=len(held[-1]),
+                rows=int(np.count_nonzero(parts.held_out)),
                 guarded=parts.guarded,
             )
         )
     if not said:
-        return Divided(train, None, None)
+        return Divided(train, held, None)
     asked = next(iter(splits.values())).asked
     total = {name: sum(getattr(each, name) for each in said) for name in ("rows", "guarded")}
-    return Divided(train, Samples.concatenate(held), HoldoutLineage(split=asked, datasets=said, **total))
+    return Divided(train, held, HoldoutLineage(split=asked, datasets=said, **total))
 
 
 def _first(row: DatasetRow, asked: Holdout, whole: bool) -> SetSplit:

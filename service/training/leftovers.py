@@ -2,30 +2,42 @@
 
 from __future__ import annotations
 
-import shutil
+import logging
 
 from sqlalchemy import select
 
-from service.database import Database, VersionRow
+from service.database import Database, JobRow, VersionRow
 from service.files import Files, new_id
+from service.training.states import ACTIVE
+
+logger = logging.getLogger(__name__)
 
 
 def new_folder(job: str) -> str:
     """A fresh name for a folder of a version that `job` makes, from which the job can be told."""
-    return f"{new_id('mv')}_{_mark(job)}"
+    return new_id(f"mv_{_mark(job)}")
 
 
 def remove(database: Database, files: Files, job: str) -> int:
-    """Delete what a job that runs nowhere has written and no version names; return how many folders."""
-    left = [path for path in files.versions.glob(f"*{_mark(job)}*") if path.is_dir()]
-    if not left:
+    """Delete what a job that runs nowhere has written and no version names; return how many folders.
+
+    Where several services share the files it is done once the job has ended, else when they are swept.
+    """
+    try:
+        names = files.versions_marked(_mark(job))
+        if not names:
+            return 0
+        with database.session() as session:
+            state = session.scalar(select(JobRow.state).where(JobRow.id == job))
+            if files.shared and state in ACTIVE:  # another service may be about to publish them
+                return 0
+            known = set(session.scalars(select(VersionRow.folder).where(VersionRow.folder.in_(names))))
+        left = [name for name in names if name not in known]
+        for name in left:
+            files.delete_version(name)
+    except OSError as error:
+        logger.warning("files that job %s did not publish are left until they are swept: %s", job, error)
         return 0
-    with database.session() as session:
-        names = [path.name for path in left]
-        known = set(session.scalars(select(VersionRow.folder).where(VersionRow.folder.in_(names))))
-    left = [path for path in left if path.name not in known]
-    for path in left:
-        shutil.rmtree(path, ignore_errors=True)  # what cannot be deleted now is swept at the next start
     return len(left)
 
 

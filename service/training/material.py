@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Any
 
 import numpy as np
 from sqlalchemy import select
 
-import lipcore
+from lipcore.online import spacing
 from lipcore.samples import Array, Samples
 from lipcore.urdf import RigidBody
 from lipcore.vocabulary import TorqueConvention
@@ -19,7 +19,9 @@ from service.models.lineage import named
 from service.robots import store as robots
 from service.settings import Settings
 from service.training import holding_out
+from service.training.holding_out import Divided
 from service.training.holdout_schema import Holdout, HoldoutLineage
+from service.training.rows import CANDIDATES, Part, Table, opened
 from service.updates.refreshing import material, scope
 from service.updates.storage import log
 
@@ -32,36 +34,46 @@ class NothingToLearnError(ValueError):
 class Material:
     """Samples and what is known of their robot.
 
-    weights: (N,), how much each sample counts where the model forgets, else None; lineage: where the samples come from;
-    seen: number of the newest event of the model's log when it was read; held_out: what the version is evaluated on and
-    does not learn from, None where that is nothing.
+    samples: what a fit chooses from; stretches: contiguous samples, where these are thinned, else None; table: the data
+    sets' rows to learn from; logged: what the model has observed, with weights (N,), None where that is nothing; rows:
+    how many both are; lineage: where they come from; seen: number of the newest
+    event of the model's log when it was read; held_out: samples that the version is evaluated on and does not learn
+    from, and how many they stand for; None where that is nothing.
     """
 
     samples: Samples
+    stretches: Samples | None
+    table: Table
     torque_convention: TorqueConvention
     robot: RigidBody | None
     lineage: dict[str, Any]
-    weights: Array | None = None
+    logged: tuple[Samples, Array] | None = None
     seen: int = 0
-    held_out: Samples | None = None
+    held_out: tuple[Samples, int] | None = None
+
+    @property
+    def rows(self) -> int:
+        """Samples that there are to learn from."""
+        return len(self.table) + (0 if self.logged is None else len(self.logged[0]))
 
 
-def recorded(database: Database, files: Files, request: dict[str, Any]) -> Material:
+def recorded(settings: Settings, database: Database, files: Files, request: dict[str, Any]) -> Material:
     """Samples of the data sets that a job names; raise CannotHoldOutError."""
     rows = _datasets(database, request["datasets"])
-    tables = [files.read_samples(row.id, row.joint_names, row.sha256) for row in rows]
+    parts = opened(files, rows)
     asked = request.get("holdout")
-    divided = holding_out.Divided(list(tables), None, None)
+    divided = Divided([None] * len(parts), [None] * len(parts), None)
     if asked is not None:
-        divided = holding_out.hold_out(rows, tables, Holdout.model_validate(asked))
-    samples = Samples.concatenate([table for table in divided.train if table is not None])
+        divided = holding_out.hold_out(rows, [part.clock() for part in parts], Holdout.model_validate(asked))
+    table = _learnt(parts, divided)
     names, robot = rows[0].joint_names, request.get("robot")
     return Material(
-        samples,
+        *_candidates(table, None),
+        table,
         rows[0].torque_convention,  # type: ignore[arg-type]  # checked when it was stored
         None if robot is None else robots.resolve(database, robot, names, request["joint_types"]),
         {"datasets": named(rows), **_holdout(divided.lineage)},
-        held_out=divided.held_out,
+        held_out=_held_out(settings, parts, divided),
     )
 
 
@@ -78,25 +90,26 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
         within = scope.find(session, model, refresh["through"])
         rows, left_out = scope.split(session, within, version.manifest["lineage"])
     rows = [row for row in rows if row.id in request["datasets"]]  # what may be deleted meanwhile was not promised
-    base = lipcore.load(files.versions / version.folder, version.checksums)
+    base = files.load_version(version.folder, version.checksums)
     logged = material.read(
         database, model, base.joint_names, within, settings.max_refresh_samples, settings.max_time_gap_s
     )
-    tables = [files.read_samples(row.id, row.joint_names, row.sha256) for row in rows]
-    divided = holding_out.hold_out_again(rows, tables, version.manifest["lineage"])
-    kept = [(row, part) for row, part in zip(rows, divided.train, strict=True) if part is not None]
-    if not kept and logged.found < settings.min_samples:
+    parts = opened(files, rows)
+    divided = holding_out.hold_out_again(rows, [part.clock() for part in parts], version.manifest["lineage"])
+    table = _learnt([replace(part, factor=_aged(part.row, within)) for part in parts], divided)
+    if not table.parts and logged.found < settings.min_samples:
         raise NothingToLearnError(f"the log has {logged.found} rows to train on, expected {settings.min_samples}")
-    parts = [part for _, part in kept]
-    times = [np.full(len(part), _uploaded(row)) for row, part in kept]
     log_lineage: dict[str, Any] = {"through": within.through, "rows": 0, "found": logged.found}
-    if logged.samples is not None:
-        parts.append(logged.samples)
-        times.append(logged.samples.t)
-        span = {"first": float(logged.samples.t.min()), "last": float(logged.samples.t.max())}
-        log_lineage |= {"rows": len(logged.samples), **span}
+    weighted = None
+    if (found := logged.samples) is not None:
+        span = {"first": float(found.t.min()), "last": float(found.t.max())}
+        log_lineage |= {"rows": len(found), **span}
+        ages = material.weights(found.t, within)
+        counted = spacing.recorded(found.t, found.episode)
+        weighted = found, counted if ages is None else counted * ages
     return Material(
-        Samples.concatenate(parts),
+        *_candidates(table, logged.samples),
+        table,
         base.torque_convention,
         base.robot,
         {
@@ -105,10 +118,44 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
             "refresh": {**refresh, "left_out": left_out},
             "log": log_lineage,
         },
-        material.weights(np.concatenate(times), within),
+        weighted,
         seen,
-        divided.held_out,
+        _held_out(settings, parts, divided),
     )
+
+
+def _learnt(parts: list[Part], divided: Divided) -> Table:
+    """What is learnt from of data sets, those left out that nothing is learnt from."""
+    chosen = [replace(part, chosen=mask) for part, mask in zip(parts, divided.train, strict=True)]
+    return Table([part for part in chosen if len(part)])
+
+
+def _held_out(settings: Settings, parts: list[Part], divided: Divided) -> tuple[Samples, int] | None:
+    """What is evaluated on, thinned to as much as an evaluation takes, and how much there is of it."""
+    both = zip(parts, divided.held_out, strict=True)
+    table = Table([replace(part, chosen=mask) for part, mask in both if mask is not None])
+    return (table.thinned(settings.max_evaluation_samples), len(table)) if table.parts else None
+
+
+def _candidates(table: Table, logged: Samples | None) -> tuple[Samples, Samples | None]:
+    """What a fit chooses from, and contiguous samples where these are thinned."""
+    log_rows = 0 if logged is None else len(logged)
+    total = len(table) + log_rows
+    many = total > CANDIDATES
+    most = max(1, round(CANDIDATES * len(table) / total)) if many else total
+    parts = [table.thinned(most)] if table.parts else []
+    stretches = [table.stretches()] if table.parts else []
+    if logged is not None:
+        count = min(log_rows, max(1, round(CANDIDATES * log_rows / total))) if many else log_rows
+        parts.append(logged.rows(np.linspace(0, log_rows - 1, count).round().astype(np.int64)))
+        stretches.append(logged)
+    return Samples.concatenate(parts), Samples.concatenate(stretches) if many else None
+
+
+def _aged(row: DatasetRow, within: scope.Scope) -> float:
+    """What a data set's samples count where the model forgets: their age counts from their upload."""
+    found = material.weights(np.array([datetime.fromisoformat(row.created_at).timestamp()]), within)
+    return 1.0 if found is None else float(found[0])
 
 
 def _datasets(database: Database, names: list[str]) -> list[DatasetRow]:
@@ -119,7 +166,3 @@ def _datasets(database: Database, names: list[str]) -> list[DatasetRow]:
 
 def _holdout(lineage: HoldoutLineage | None) -> dict[str, Any]:
     return {} if lineage is None else {"holdout": lineage.model_dump(mode="json")}
-
-
-def _uploaded(row: DatasetRow) -> float:
-    return datetime.fromisoformat(row.created_at).timestamp()

@@ -19,6 +19,10 @@ logger = logging.getLogger(__name__)
 
 BEAT_S = 0.5
 """Seconds between two signs of life."""
+STATISTICS = "statistics"
+"""Stage of the pass over all rows."""
+FIT_ROWS = 200_000
+"""Rows whose pass takes about as long as a fit, for the fraction that is shown."""
 
 
 class SupersededError(RuntimeError):
@@ -28,13 +32,16 @@ class SupersededError(RuntimeError):
 class Pulse:
     """Beats while its block runs. The fit asks and tells it without waiting for the database.
 
-    own: reads the job's row in a session; raises SupersededError where it is not this attempt's any more.
+    own: reads the job's row in a session; raises SupersededError where it is not this attempt's any more; model: that
+    the job is of, so that those who write of others need not wait for a beat.
     """
 
-    def __init__(self, database: Database, own: Callable[[Any], JobRow]) -> None:
-        self.database, self.own = database, own
+    def __init__(self, database: Database, own: Callable[[Any], JobRow], model: str) -> None:
+        self.database, self.own, self.model = database, own, model
         self.remaining: Remaining | None = None
         self._began = time.monotonic()
+        self._fit_share, self._pass_began = 1.0, (0.0, 0.0)
+        self._ends: float | None = None
         self._latest: dict[str, Any] = {"stage": "loading"}
         self._stop, self._superseded = False, False
         self._wake, self._ended = threading.Event(), False
@@ -65,10 +72,25 @@ class Pulse:
             "iteration": at.iteration,
             "max_iterations": at.max_iterations,
             "objective": at.objective,
-            "fraction": at.fraction,
+            "fraction": self._fit_share * at.fraction,
         }
         if changed:
             self._wake.set()
+
+    def plan(self, rows: int) -> None:
+        """Say that a pass over so many rows follows the fit, which is then part of the work only."""
+        self._fit_share = FIT_ROWS / (FIT_ROWS + rows)
+
+    def share(self, done: float) -> None:
+        """Take what share of the pass is done; how long the rest takes shows from then on."""
+        clock = time.monotonic()
+        if self._latest["stage"] != STATISTICS or self._pass_began[1] == 0.0:  # not by how long workers take to start
+            self._pass_began = clock, done
+        began, before = self._pass_began
+        if done > before:
+            self._ends = clock + (clock - began) * (1.0 - done) / (done - before)
+        fraction = self._fit_share + (0.98 - self._fit_share) * done
+        self._latest = {**self._latest, "stage": STATISTICS, "fraction": max(fraction, self._latest["fraction"])}
 
     def stage(self, name: str) -> None:
         """Say what is done now."""
@@ -84,6 +106,8 @@ class Pulse:
     def shown(self) -> dict[str, Any]:
         """The progress as it is written now."""
         left = None if self.remaining is None else self.remaining.seconds(time.monotonic())
+        if self._ends is not None:
+            left = max(0.0, self._ends - time.monotonic())
         remaining = None if left is None else round(left, 1)
         return {**self._latest, "elapsed_s": round(self.elapsed, 3), "remaining_s": remaining}
 
@@ -105,7 +129,7 @@ class Pulse:
             self._wake.clear()
 
     def _exchange(self) -> None:
-        with self.database.transaction() as session:
+        with self.database.transaction(self.model) as session:
             row = self.own(session)
             row.progress, row.heartbeat_at = self.shown(), now()
             self._stop = row.cancel_requested

@@ -18,8 +18,10 @@ from functools import partial
 
 from sqlalchemy import select
 
+from service.compute.cluster import Cluster
 from service.database import Database, JobRow
 from service.files import Files
+from service.replicas import Replicas
 from service.settings import Settings
 from service.training import history, worker
 from service.training.feed import Feed
@@ -34,13 +36,16 @@ logger = logging.getLogger(__name__)
 WATCH_S = 0.2
 """Seconds between two looks at the jobs that run."""
 RECONCILE_S = 30.0
-"""Seconds between two searches for jobs that nobody has: there are none, unless something went very wrong."""
+"""Seconds between two searches for jobs that nobody has: there are none, unless something went very wrong, or other
+services share the database: then it is as often as these give signs of life."""
 AGAIN_S = 1.0
 """Seconds after which the clerk tries again to write what the database did not take."""
 
 
 class JobQueue:
     """Hands queued jobs to training processes, watches these, and takes back what an interruption left.
+
+    Where several services share the database, a job that waits is anybody's: who hands it out first owns it.
 
     trained: called with the model and the version that a job has made, in a thread of its own.
     """
@@ -50,8 +55,11 @@ class JobQueue:
         self.feed = Feed(database)
         self.problem: str | None = None
         """Why training processes cannot be started, None while they can as far as is known."""
-        self._settler = Settler(settings, database, Files.of(settings))
-        self._slots = [Slot(training_place(settings)) for _ in range(settings.training_workers)]
+        self.replicas = Replicas(settings, database)
+        self._settler = Settler(settings, database, Files.of(settings), self.replicas.mine)
+        self.cluster: Cluster | None = None
+        self._slots = self._places()
+        self._reconcile_s = settings.replica_beat_s if database.shared else RECONCILE_S
         self._hands: list[Hand] = []
         self._waiting: dict[str, float] = {}  # when each may be handed out, monotonic, in the order of coming
         self._settling: set[str] = set()
@@ -63,6 +71,9 @@ class JobQueue:
         self._clerk = threading.Thread(target=self._settle, daemon=True, name="job-clerk")
         self._watcher.start()
         self._clerk.start()
+
+    def _places(self) -> list[Slot]:
+        return [Slot(training_place(self.settings)) for _ in range(self.settings.training_workers)]
 
     def submit(self, job: str) -> None:
         """Hand a queued job to the next free training process."""
@@ -76,7 +87,8 @@ class JobQueue:
         """Queue again every job that an earlier run of the service left unfinished; return their ids."""
         with self.database.transaction() as session:
             rows = list(session.scalars(select(JobRow).where(JobRow.state.in_(ACTIVE)).order_by(JobRow.seq)))
-            ready = [row.id for row in rows if self._is_ready(row)]
+            ours = (None, self.replicas.id)
+            ready = [row.id for row in rows if row.owner in ours and self._is_ready(row)]
         for job in ready:
             self.submit(job)
         return ready
@@ -94,10 +106,13 @@ class JobQueue:
             self._hand_back()
         except Exception:  # as after a kill: the next start finds them
             logger.exception("running jobs could not be handed back")
+        self.replicas.close()
 
     def _hand_back(self) -> None:
         with self.database.transaction() as session:
             for row in session.scalars(select(JobRow).where(JobRow.state == RUNNING)):
+                if not self.replicas.mine(row.owner):
+                    continue
                 if row.cancel_requested:
                     history.enter(row, CANCELLED, "cancelled: the service was stopped while it ran")
                     continue
@@ -114,7 +129,7 @@ class JobQueue:
     def _watch(self) -> None:
         while not self._closing.is_set():
             try:
-                self._inbox.get(timeout=WATCH_S if self._hands or self._waiting else RECONCILE_S)()
+                self._inbox.get(timeout=WATCH_S if self._hands or self._waiting else self._reconcile_s)()
             except queue.Empty:
                 pass
             except Exception:
@@ -142,7 +157,10 @@ class JobQueue:
         for slot, job in zip(free, ready, strict=False):
             if self._closing.is_set():
                 return
+            owned = self.replicas.take(job, None)
             del self._waiting[job]
+            if not owned:  # another service was faster
+                continue
             try:
                 future = slot.start(worker.run, self.settings, job)
             except Exception as error:  # no memory, too many processes
@@ -165,14 +183,21 @@ class JobQueue:
             for hand in list(self._hands):
                 if ended := hand.judge(self.settings, clock):
                     self._hands.remove(hand)
-                    hand.slot.kill()
+                    self._end(hand)
                     self._pass_on(ended)
 
+    def _end(self, hand: Hand) -> None:
+        hand.slot.kill()
+
     def _read(self, clock: float) -> None:
-        columns = JobRow.id, JobRow.state, JobRow.heartbeat_at, JobRow.cancel_requested
+        columns = JobRow.state, JobRow.heartbeat_at, JobRow.cancel_requested, JobRow.attempts
+        jobs = [hand.job for hand in self._hands]
         with self.database.session() as session:
-            rows = session.execute(select(*columns).where(JobRow.id.in_([hand.job for hand in self._hands])))
-            found = {job: Facts(state, heard, cancel) for job, state, heard, cancel in rows}
+            rows = session.execute(select(JobRow.id, JobRow.owner, *columns).where(JobRow.id.in_(jobs)))
+            found = {
+                job: Facts(state, heard, cancel, attempts, self.replicas.mine(owner))
+                for job, owner, state, heard, cancel, attempts in rows
+            }
         for hand in self._hands:
             if hand.job in found:
                 hand.see(found[hand.job], clock)
@@ -197,19 +222,36 @@ class JobQueue:
 
     def _reconcile(self) -> None:
         clock = time.monotonic()
-        if clock - self._reconciled < RECONCILE_S:
+        if clock - self._reconciled < self._reconcile_s:
             return
         self._reconciled = clock
         known = {hand.job for hand in self._hands} | self._settling | self._waiting.keys()
         with self.database.session() as session:
             rows = list(session.scalars(select(JobRow).where(JobRow.state.in_(ACTIVE)).order_by(JobRow.seq)))
+            free = self.replicas.free(session)
         for row in rows:
             if row.id in known:
                 continue
+            ours = self.replicas.mine(row.owner)
+            if not ours and not (row.owner in free and self._may_have(row)):
+                continue
             if row.state == QUEUED:
                 self.submit(row.id)
-            elif _age(row.heartbeat_at) > self.settings.job_heartbeat_s:
-                self._pass_on(Ended(row.id, "ended", "no process runs it"))
+            else:
+                self._found(row, ours)
+
+    def _may_have(self, row: JobRow) -> bool:
+        """Whether a job that nobody has, or one who is gone, can be this service's."""
+        if row.state == QUEUED and row.owner is None:
+            return True  # it is taken when it is handed out
+        return self.replicas.take(row.id, row.owner)
+
+    def _found(self, row: JobRow, ours: bool) -> None:
+        """See to a job that runs, but not in a process of this service. ours: not taken over just now."""
+        if not ours:
+            self._pass_on(Ended(row.id, "ended", "the service that had it run is gone"))
+        elif _age(row.heartbeat_at) > self.settings.job_heartbeat_s:
+            self._pass_on(Ended(row.id, "ended", "no process runs it"))
 
     def _settled(self, job: str, settled: Settled) -> None:
         self._settling.discard(job)
@@ -245,3 +287,12 @@ def _age(moment: str | None) -> float:
     if moment is None:
         return float("inf")
     return (datetime.now(UTC) - datetime.fromisoformat(moment)).total_seconds()
+
+
+def queue_of(settings: Settings) -> type[JobQueue]:
+    """The kind of queue that the settings ask for."""
+    if settings.cluster is None:
+        return JobQueue
+    from service.training.cluster import ClusterQueue  # noqa: PLC0415 - it is one of these
+
+    return ClusterQueue

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from lipcore.fit_options import FitOptions
+from lipcore.fit_options import FitOptions, Standing
 from lipcore.vocabulary import DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS, JointType
 from service.models.schema import ModelName
 from service.training.holdout_schema import Holdout
@@ -47,6 +47,11 @@ class Options(BaseModel):
         description="Most inducing outputs, which answers take the longer for; with fewer than the tolerance needs, "
         "the version's `compact` says how far it deviates",
     )
+    statistics: Standing = Field(
+        _DEFAULTS.statistics,
+        description="What the posterior stands on in the end: the samples that were `chosen`, or `all`, each for the "
+        "time that it stands for; `auto`: all, where that is worth more than `posterior_samples` independent ones",
+    )
 
 
 class JobRequest(BaseModel):
@@ -79,7 +84,9 @@ class JobRequest(BaseModel):
 class JobProgress(BaseModel):
     """How far a job is."""
 
-    stage: str = Field(description="waiting, loading, hyperparameters, posterior, evaluating, saving or done")
+    stage: str = Field(
+        description="waiting, loading, hyperparameters, posterior, statistics, evaluating, saving or done"
+    )
     iteration: int = 0
     max_iterations: int = 0
     objective: float | None = Field(None, description="Penalised negative log evidence, nats: falls during the fit")

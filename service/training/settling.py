@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from sqlalchemy import select
@@ -32,10 +33,16 @@ class Settled:
 
 
 class Settler:
-    """Settles one job after the other. To be used by one thread."""
+    """Settles one job after the other. To be used by one thread. mine: whether a job with an owner is to be settled."""
 
-    def __init__(self, settings: Settings, database: Database, files: Files) -> None:
-        self.settings, self.database, self.files = settings, database, files
+    def __init__(
+        self,
+        settings: Settings,
+        database: Database,
+        files: Files,
+        mine: Callable[[str | None], bool] = lambda _: True,
+    ) -> None:
+        self.settings, self.database, self.files, self.mine = settings, database, files, mine
         self._starts: dict[str, int] = {}
 
     def settle(self, ended: Ended) -> Settled:
@@ -53,8 +60,10 @@ class Settler:
     def _decide(self, row: JobRow, ended: Ended) -> Settled:
         if row.state == SUCCEEDED and row.version is not None:
             return Settled(made=(row.model, row.version))
-        if row.state not in ACTIVE:
+        if row.state not in ACTIVE or not self.mine(row.owner):
             return Settled()
+        if row.state == RUNNING and (ended.why == "refused" or ended.attempt not in (None, row.attempts)):
+            return Settled()  # another attempt runs
         if ended.why == "cancelled" or row.cancel_requested:
             history.enter(row, CANCELLED, f"cancelled: {ended.message}")
             return Settled()

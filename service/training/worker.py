@@ -5,16 +5,17 @@ from __future__ import annotations
 import logging
 import resource
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
 import lipcore
-from lipcore.model import TorqueModel
-from lipcore.online.conditioning import condition
+from lipcore.conditioning import wanted
+from lipcore.model import TorqueModel, fitted
 from service import storage_errors
+from service.compute.executors import ClusterUnavailableError
 from service.database import Database, JobRow, LearnerRow, now
 from service.errors import ServiceError, StorageFullError, StorageUnavailableError
 from service.files import Files
@@ -28,10 +29,15 @@ from service.training.holding_out import CannotHoldOutError
 from service.training.material import Material, observed, recorded
 from service.training.pulse import Pulse, SupersededError
 from service.training.remaining import Remaining
+from service.training.rows import CANDIDATES
 from service.training.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, JobState
+from service.training.summing import all_rows
 from service.updates.refreshing import scope
 
 logger = logging.getLogger(__name__)
+
+FILES_PATIENCE_S = 60.0
+"""How long shared files are asked for again where they cannot be reached, before an attempt is given up."""
 
 
 class StorageError(RuntimeError):
@@ -48,7 +54,7 @@ def run(settings: Settings, job: str) -> None:
     Raise StorageError where the outcome could not be written, or what is needed not be read.
     """
     token = job_id.set(job)
-    database, files = Database.of(settings), Files.of(settings)
+    database, files = Database.of(settings), Files.of(settings, FILES_PATIENCE_S)
     try:
         claim = _claim(settings, database, job)
         if claim is not None:
@@ -82,25 +88,27 @@ def _claim(settings: Settings, database: Database, job: str) -> Claim | None:
 
 def _train(settings: Settings, database: Database, files: Files, claim: Claim) -> None:
     try:
-        with Pulse(database, lambda session: _own(session, claim)) as pulse:
+        with Pulse(database, lambda session: _own(session, claim), claim.model) as pulse:
             material = _material(settings, database, files, claim)
-            trained = _fit(claim, material, pulse)
+            trained = _fit(settings, claim, material, pulse)
             lineage = {
                 "job": claim.job,
                 **material.lineage,
                 "trained_at": now(),
                 "training_process": {"seconds": round(pulse.elapsed, 1), "peak_memory_mb": _peak_memory_mb()},
                 "software": software(),
-                "training_metrics": training_metrics(trained, material.samples),
+                "training_metrics": training_metrics(trained, material.samples, material.rows),
             }
             if material.held_out is not None:
                 pulse.stage("evaluating")
-                found = figures(trained, material.held_out, settings.max_evaluation_samples)
+                held_out, of = material.held_out
+                found = figures(trained, held_out, settings.max_evaluation_samples, of)
                 lineage["holdout"] = {**lineage["holdout"], **found}
             pulse.stage("saving")
             folder = leftovers.new_folder(claim.job)
             Disk(settings).require()
-            manifest = lipcore.save(trained, files.versions / folder, lineage)
+            with files.new_version(folder) as target:
+                manifest = lipcore.save(trained, target, lineage)
         with database.transaction() as session:
             row = _own(session, claim)
             if row.cancel_requested:
@@ -114,23 +122,30 @@ def _train(settings: Settings, database: Database, files: Files, claim: Claim) -
         logger.warning("job %s was taken over by another attempt", claim.job)
     except Exception as error:
         logger.exception("job %s failed", claim.job)
-        if isinstance(storage_errors.translated(error), StorageUnavailableError):
+        unavailable = isinstance(error, ClusterUnavailableError)
+        if unavailable or isinstance(storage_errors.translated(error), StorageUnavailableError):
             raise StorageError(str(error)) from None  # another time it may work
         _finish(database, files, claim, FAILED, f"{type(error).__name__}: {error}", _code(error))
 
 
 def _material(settings: Settings, database: Database, files: Files, claim: Claim) -> Material:
     if claim.request.get("refresh") is None:
-        return recorded(database, files, claim.request)
+        return recorded(settings, database, files, claim.request)
     return observed(settings, database, files, claim.model, claim.request)
 
 
-def _fit(claim: Claim, material: Material, pulse: Pulse) -> TorqueModel:
+def _fit(settings: Settings, claim: Claim, material: Material, pulse: Pulse) -> TorqueModel:
     request, count = claim.request, len(material.samples)
     options = lipcore.FitOptions(**request["options"])
-    pulse.remaining = Remaining(min(options.hyperparameter_samples, count), min(options.posterior_samples, count))
+    table = material.table.weighed(options.posterior_samples)
+    # the version that serves has learnt all rows of a refresh, not only the few that a fit chooses
+    every = request.get("refresh") is not None or wanted(options, material.rows, table.worth())
+    if every:
+        pulse.plan(material.rows)
+    if not every or material.rows <= CANDIDATES:  # else it is the pass that takes long
+        pulse.remaining = Remaining(min(options.hyperparameter_samples, count), min(options.posterior_samples, count))
     pulse.stage("hyperparameters")
-    trained = lipcore.train(
+    trained = fitted(
         material.samples,
         request["joint_types"],
         request["estimator"],
@@ -139,11 +154,12 @@ def _fit(claim: Claim, material: Material, pulse: Pulse) -> TorqueModel:
         on_progress=pulse.progress,
         cancelled=pulse.cancelled,
         robot=material.robot,
+        stretches=material.stretches,
     )
-    if request.get("refresh") is None:
+    trained = replace(trained, fit={**trained.fit, "samples_given": material.rows})
+    if not every:
         return trained
-    # the version that serves has learnt all of these rows, not only the few that a fit chooses
-    return condition(trained, material.samples, material.weights, pulse.cancelled)
+    return all_rows(settings, trained, material, table, options, pulse.cancelled, pulse.share)
 
 
 def _publish(session: Session, claim: Claim, material: Material, folder: str, manifest: dict[str, Any]) -> int:

@@ -29,7 +29,7 @@ def set_options(database: Database, model: str, wanted: LearningOptions, n_joint
         raise invalid_request(
             "torque_limits", f"a list of {len(limits)}", f"{n_joints} positive numbers, one for each joint in order"
         )
-    with database.transaction() as session:
+    with database.turn(model), database.transaction(model) as session:
         row = _row(session, model)
         row.options = wanted.model_dump()
         if wanted.forgetting_s != log.forgetting(session, model, log.newest(session, model)):

@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -71,8 +72,23 @@ class Updates:
         return observe_frames(self._ingest, self._monitor(frames.served), frames)
 
     def monitor(self, model: str) -> Monitor:
-        """What is kept in memory of a model; raise NotFoundError or UnreadableVersionError. Not for the event loop."""
-        return self._monitor(self.loaded.get(model, None))
+        """What is kept in memory of a model; raise NotFoundError or UnreadableVersionError. Not for the event loop.
+
+        It knows what other services took by now too.
+        """
+        found = self._monitor(self.loaded.get(model, None))
+        self._ingest.follow(found, model)
+        return found
+
+    def turn(self, model: str) -> AbstractContextManager[None]:
+        """Be the only one, of all services, that takes something for a model; raise as `monitor`. Not for the event
+        loop."""
+        return self._ingest.turn(self._monitor(self.loaded.get(model, None)), model)
+
+    def follow(self) -> None:
+        """Take in what other services took for the models that are known here. Not for the event loop."""
+        for model, monitor in self.monitors().items():
+            self._ingest.follow(monitor, model)
 
     def monitors(self) -> dict[str, Monitor]:
         """Those of the models that have learnt or have been looked at since the service started."""

@@ -13,7 +13,9 @@ from lipcore.robots import load_robot
 from lipcore.simulation import Stream, simulate
 
 JOINT_TYPES = ("revolute", "revolute")
-OPTIONS = FitOptions(hyperparameter_samples=20, posterior_samples=50, max_iterations=10, starts=1, device="cpu")
+OPTIONS = FitOptions(
+    hyperparameter_samples=20, posterior_samples=50, max_iterations=10, starts=1, device="cpu", statistics="chosen"
+)
 
 
 @pytest.fixture(scope="module")

@@ -226,7 +226,10 @@ def test_what_has_learnt_is_neither_a_start_nor_a_version(base: TorqueModel, row
 
 def test_state_of_another_version_or_damaged_is_refused(base: TorqueModel, rows: Rows) -> None:
     payload = state.dump(OnlineModel.start(base).learn(rows))
-    other = replace(base, posterior=replace(base.posterior, weights=base.posterior.weights + 1))
+    known = base.posterior.statistics
+    assert known is not None
+    told = replace(known, b=known.b + 1)
+    other = replace(base, posterior=replace(base.posterior, weights=base.posterior.weights + 1, statistics=told))
     with pytest.raises(ValueError, match="another version"):
         state.load(other, payload)
     for broken in (b"", payload[:-10], b"x" * 100, payload[:8] + b"[" + payload[9:]):
@@ -248,3 +251,18 @@ def test_rows_of_differing_shapes_are_refused(rows: Rows) -> None:
     with pytest.raises(ValueError, match="code has shape"):
         replace(rows, code=np.zeros(3, np.uint8))
     assert (rows.code == LEARNT).all()
+
+
+@pytest.mark.parametrize("forgetting", [None, 20.0])
+def test_adding_in_place_gives_the_same_bits(base: TorqueModel, rows: Rows, forgetting: float | None) -> None:
+    parts = [rows.take(slice(0, 40)), rows.take(slice(40, 41)), rows.take(slice(41, None))]
+    usual = OnlineModel.start(base, forgetting, since=float(rows.time.min()))
+    untouched = state.dump(usual)
+    own = usual.detached()
+    for part in parts:
+        usual, own = usual.learn(part), own.learn(part, own=True)
+    usual, own = usual.change(5000.0), own.change(5000.0)
+    usual, own = usual.unlearn(parts[1]), own.unlearn(parts[1], own=True)
+    assert state.dump(own.whole()) == state.dump(usual)
+    assert state.dump(OnlineModel.start(base, forgetting, since=float(rows.time.min()))) == untouched
+    assert torch.equal(usual.now.statistics.a, usual.now.statistics.a.T)

@@ -15,6 +15,7 @@ from lipcore import Samples, TorqueModel
 from service.app import create_app
 from service.models import registry
 from service.settings import Settings
+from tests.service import backend
 from tests.service.data import ADDRESS, service_of, stream, train, upload
 from tests.service.server import Server
 from tests.service.streams import Streaming, saved_model
@@ -40,6 +41,24 @@ LIMITS = {
     "max_posterior_samples": 40,
 }
 """Limits small enough to be exceeded."""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def services_share(request: pytest.FixtureRequest) -> Iterator[bool]:
+    """Whether services share a database and files: where the tests are told so, see `tests.service.backend`."""
+    if request.config.getoption("backend") == backend.OWN:
+        yield False
+        return
+    with backend.shared():
+        yield True
+
+
+@pytest.fixture(autouse=True)
+def _own_files(request: pytest.FixtureRequest, services_share: bool) -> None:
+    """Skip tests of the files of a single service where there are none: `@pytest.mark.own_files("why")`."""
+    marker = request.node.get_closest_marker("own_files")
+    if services_share and marker is not None:
+        pytest.skip(f"of a service alone: {marker.args[0]}")
 
 
 @pytest.fixture(scope="session")
@@ -104,7 +123,7 @@ def trained(api: TestClient, pendulum: dict[str, str]) -> Trained:
     train(api, "pendulum", pendulum["id"])
     service = service_of(api)
     folder = registry.find(service.database, "pendulum", 1).folder
-    return Trained("pendulum", pendulum["id"], stream(), lipcore.load(service.files.versions / folder))
+    return Trained("pendulum", pendulum["id"], stream(), lipcore.load(service.files.version_folder(folder)))
 
 
 @pytest.fixture

@@ -13,6 +13,7 @@ from typing import Self
 
 import httpx
 
+from tests.service import backend
 from tests.service.data import DEADLINE, eventually
 
 
@@ -30,7 +31,7 @@ class Server:
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "service", "serve", "--port", str(self.port)],
-                env={**os.environ, "LIPSERVE_HOME": str(home), **settings},
+                env={**os.environ, "LIPSERVE_HOME": str(home), **backend.environment(home), **settings},
                 stdout=log,
                 stderr=log,
             )

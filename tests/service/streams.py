@@ -14,7 +14,9 @@ from websockets.sync.client import ClientConnection, connect
 import lipcore
 from lipcore import TorqueModel
 from service.database import Database
+from service.files import Files
 from service.models import registry
+from service.settings import Settings
 from tests.service.data import DEADLINE
 from tests.service.server import Server
 
@@ -106,9 +108,10 @@ def ask(connection: ClientConnection, request: bytes | str) -> Answer:
 
 def saved_model(server: Server, name: str, version: int) -> TorqueModel:
     """A version that a server has stored, loaded by lipcore here."""
-    database = Database(server.home)
+    settings = Settings(home=server.home)
+    database = Database.of(settings)
     try:
-        return lipcore.load(server.home / "versions" / registry.find(database, name, version).folder)
+        return lipcore.load(Files.of(settings).version_folder(registry.find(database, name, version).folder))
     finally:
         database.close()
 

@@ -72,6 +72,7 @@ def test_unknown_data_set_is_not_found(strict):
         assert "ds_x" in error(answer, 404, "not_found")["message"]
 
 
+@pytest.mark.own_files("looks for the file below the home")
 def test_deleted_data_set_is_gone_with_its_file(strict, datasets):
     file = service_of(strict).files.datasets / f"{datasets[0]}.safetensors"
     assert file.exists()

@@ -82,7 +82,7 @@ def test_large_data_sets_are_thinned_evenly_and_that_is_said(strict, panda):
     assert (answer["samples"], answer["samples_used"]) == (120, 50)
     assert answer["in_training"] is False
     service = service_of(strict)
-    model = lipcore.load(service.files.versions / registry.find(service.database, "panda-sim", 1).folder)
+    model = lipcore.load(service.files.version_folder(registry.find(service.database, "panda-sim", 1).folder))
     rows = np.round(np.arange(50) * 119 / 49).astype(np.int64)
     compare(answer, expected(model, stream("panda", 120, motion="middle").rows(rows)))
 

@@ -62,7 +62,7 @@ def rows_of(samples, found):
 def material(api, *datasets, **holdout):
     service = service_of(api)
     request = {"datasets": list(datasets), "holdout": holdout}
-    return recorded(service.database, service.files, request)
+    return recorded(service.settings, service.database, service.files, request)
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def test_only_the_rest_is_trained_on(api, held, dataset):
     assert version(api, held[0])["fit"]["samples_given"] == TRAIN.stop
     found = material(api, dataset, share=0.3)
     assert rows_of(recording(), found.samples) == list(range(ROWS))[TRAIN]
-    assert rows_of(recording(), found.held_out) == list(range(ROWS))[HELD_OUT]
+    assert rows_of(recording(), found.held_out[0]) == list(range(ROWS))[HELD_OUT]
 
 
 def test_the_lineage_keeps_the_split_and_the_figures(api, held, dataset):
@@ -97,7 +97,7 @@ def test_the_lineage_keeps_the_split_and_the_figures(api, held, dataset):
     assert (entry["guard"], entry["guard_unit"]) == (0.25, "s")
 
     service, unseen = service_of(api), recording().rows(HELD_OUT)
-    model = lipcore.load(service.files.versions / registry.find(service.database, held[0], 1).folder)
+    model = lipcore.load(service.files.version_folder(registry.find(service.database, held[0], 1).folder))
     answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
     metrics = evaluate(unseen.tau, answer.tau, answer.tau_std, answer.noise_std)
     for name in FIGURES:
@@ -142,14 +142,14 @@ def test_sides_are_apart_in_every_kind(api, kind):
     """Twelve episodes of one recording without pauses, as gaps leave them: rows within 0.25 s are on no two sides."""
     samples, episode = recording(), np.arange(ROWS) // 10
     found = material(api, upload_episodes(api, samples, episode), kind=kind, share=0.4, blocks=6)
-    learnt, held = rows_of(samples, found.samples), rows_of(samples, found.held_out)
+    learnt, held = rows_of(samples, found.samples), rows_of(samples, found.held_out[0])
     assert not set(learnt) & set(held)
     assert min(abs(first - second) for first in learnt for second in held) == 5
     assert 24 <= len(held) <= 48
     if kind == "episodes":
         assert not set(episode[learnt]) & set(episode[held])
     # where rows are missing between, a new episode begins: differences across it would be no noise
-    for part in (found.samples, found.held_out):
+    for part in (found.samples, found.held_out[0]):
         steps = np.diff(rows_of(samples, part))
         np.testing.assert_array_equal(steps[np.diff(part.episode) == 0], 1)
 
@@ -180,7 +180,7 @@ def test_a_data_set_of_one_episode_beside_larger_ones_is_learnt(api, dataset):
     many = upload_episodes(api, recording(seed=3), np.arange(ROWS) // 20)
     found = material(api, dataset, many, kind="episodes", share=0.3)
     assert [each["id"] for each in found.lineage["holdout"]["datasets"]] == [many]
-    assert len(found.samples) + len(found.held_out) + found.lineage["holdout"]["guarded"] == 2 * ROWS
+    assert len(found.samples) + len(found.held_out[0]) + found.lineage["holdout"]["guarded"] == 2 * ROWS
 
 
 def test_a_data_set_without_times_has_a_guard_in_rows(api):
@@ -191,7 +191,7 @@ def test_a_data_set_without_times_has_a_guard_in_rows(api):
     (entry,) = found.lineage["holdout"]["datasets"]
     assert (entry["guard"], entry["guard_unit"]) == (25.0, "rows")
     assert rows_of(recording(seed=4), found.samples) == list(range(35))
-    assert rows_of(recording(seed=4), found.held_out) == list(range(85, ROWS))
+    assert rows_of(recording(seed=4), found.held_out[0]) == list(range(85, ROWS))
     body = {"model": "m", "datasets": [untimed], "holdout": {"guard_s": 0.1}}
     said = error(api.post("/v1/jobs", json=body), 422, "invalid_request")
     assert said["detail"][0]["field"] == "holdout.guard_s"
@@ -290,4 +290,4 @@ def test_the_guard_is_a_period_of_the_low_pass_that_was_used(api):
         row.report = {**row.report, "recipe": {"cutoff_hz": 2.0}}
     found = material(api, name, share=0.3)
     assert found.lineage["holdout"]["datasets"][0]["guard"] == 0.5
-    assert found.held_out.t[0] - found.samples.t[-1] > 1.0
+    assert found.held_out[0].t[0] - found.samples.t[-1] > 1.0

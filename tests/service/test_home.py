@@ -52,7 +52,7 @@ def second_start(tmp_path_factory):
             "datasets": api.get("/v1/datasets").json(),
             "models": api.get("/v1/models").json(),
         }
-    database = Database(home)
+    database = Database.of(Settings(home=home))
     with database.transaction() as session:
         session.add(interrupted("job_again", dataset, attempts=1, cancel_requested=False))
         session.add(interrupted("job_enough", dataset, attempts=3, cancel_requested=False))
@@ -129,7 +129,7 @@ def test_a_second_service_on_the_same_home_is_refused(second_start):
 
 
 def test_a_damaged_version_does_not_keep_the_others_from_answering(home):
-    database, files = Database(home), Files(home)
+    database, files = Database.of(Settings(home=home)), Files(home)
     registry.install_shipped(database, files)
     manifest = lipcore.copy_model(shipped_models() / registry.SHIPPED, files.versions / "mv_damaged")
     with database.transaction() as session:
@@ -148,7 +148,7 @@ def test_a_damaged_version_does_not_keep_the_others_from_answering(home):
 
 def earlier_release(home, job):
     """A home whose newest version of the shipped model is of a format that is no longer read."""
-    database, files = Database(home), Files(home)
+    database, files = Database.of(Settings(home=home)), Files(home)
     registry.install_shipped(database, files)
     with database.transaction() as session:
         row = session.scalar(select(VersionRow))

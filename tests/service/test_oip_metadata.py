@@ -9,6 +9,7 @@ import pytest
 import lipcore
 from lipcore.kernels.se import SquaredExponentialKernel
 from service import __version__
+from service.files import Files
 from service.oip.outputs import shapes
 from tests.service.data import service_of
 from tests.service.oip import refused
@@ -112,7 +113,7 @@ def test_a_version_that_cannot_be_loaded_is_not_ready(api, trained, monkeypatch)
     def broken(*_):
         raise lipcore.ModelFormatError("the manifest is missing")
 
-    monkeypatch.setattr(lipcore, "load", broken)
+    monkeypatch.setattr(Files, "load_version", broken)
     monkeypatch.setattr(service_of(api).loaded, "_snapshot", type(service_of(api).loaded._snapshot)())
     said = refused(api.get(f"/v2/models/{trained.name}/ready"), 503)
     assert said == f"version 1 of model {trained.name!r} cannot be loaded: the manifest is missing"

@@ -264,7 +264,7 @@ def test_an_uploaded_urdf_trains_as_its_profile_does(api, pendulum):
     assert api.get("/v1/models/by-upload/versions/1").json()["robot"]["name"] == "my pendulum"
     assert api.delete(f"/v1/robots/{robot['id']}").status_code == 204
     service = service_of(api)
-    kept = lipcore.load(service.files.versions / registry.find(service.database, "by-upload", 1).folder)
+    kept = lipcore.load(service.files.version_folder(registry.find(service.database, "by-upload", 1).folder))
     assert kept.predict(**query).tau[0].tolist() == answers[0]
 
 

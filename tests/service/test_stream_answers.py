@@ -118,6 +118,8 @@ def test_missed_deadlines_are_flagged_and_counted(streaming):
         (f"{STREAM}?version=", 422, "invalid_request", "expected the number of a version"),
         (f"{STREAM}?std=yes", 422, "invalid_request", "std is yes, expected 0 or 1"),
         (f"{STREAM}?verison=1", 422, "invalid_request", "verison is 1, expected no parameter but version, alias"),
+        (f"{STREAM}?min_revision=x", 422, "invalid_request", "min_revision is x, expected a revision of the version"),
+        (f"{STREAM}?min_revision=2147483648", 422, "invalid_request", "expected a revision of the version"),
         (f"{STREAM}?stream_id=", 422, "invalid_request", "stream_id is , expected a name that matches [A-Za-z0-9]"),
         (f"{STREAM}?stream_id=-arm", 422, "invalid_request", "stream_id is -arm, expected a name that matches"),
         (f"{STREAM}?stream_id=arm%0A", 422, "invalid_request", "expected a name that matches"),

@@ -76,7 +76,7 @@ def test_version_shows_how_it_was_made(api, two_versions):
     assert shown["torque_convention"] == "gravity_included"
     assert {**shown["options"], **QUICK} == shown["options"]
     assert shown["fit"]["iterations"] <= QUICK["max_iterations"]
-    assert shown["fit"]["samples_posterior"] == QUICK["posterior_samples"]
+    assert shown["fit"]["samples_posterior"] == 80  # of a slow recording all are worth learning
     q = stream().q
     assert (shown["training_range"]["q"]["min"] >= q.min(axis=0)).all()
     assert (shown["training_range"]["q"]["max"] <= q.max(axis=0)).all()

@@ -26,16 +26,18 @@ def predict(
     components: Sequence[str] = (),
     tau: ArrayLike | None = None,
     alias: str | None = None,
+    min_revision: int | None = None,
 ) -> Call[Prediction]:
     """Torque for arrays of shape (n,) or (N, n), and components by name; tau is for `forward_dynamics` only.
 
-    The version that serves answers, unless one is named by its number or an alias.
+    The version that serves answers, unless one is named by its number or an alias. min_revision: of an acknowledgement,
+    so that the answer contains what was taught, whichever service took it; refused with 503 where it takes too long.
     """
     body: dict[str, Any] = {"covariance": covariance, "components": list(components)}
     for name, values in (("q", q), ("dq", dq), ("ddq", ddq), ("tau", tau)):
         if values is not None:
             body[name] = np.asarray(values, dtype=np.float64).tolist()
-    body |= given(version=version, alias=alias)
+    body |= given(version=version, alias=alias, min_revision=min_revision)
     return at(read_prediction, names={"model": model}, json=body)
 
 
@@ -47,12 +49,14 @@ def evaluate(
     version: int | None = None,
     alias: str | None = None,
     part: Literal["all", "held_out"] = "all",
+    min_revision: int | None = None,
 ) -> Call[Evaluation]:
     """Compare a model with a data set: the version that serves, unless one is named by its number or an alias.
 
-    part: `held_out` compares with what the version's training has held out of the data set.
+    part: `held_out` compares with what the version's training has held out of the data set. min_revision: as of
+    `predict`.
     """
-    body = {"dataset": dataset, "part": part} | given(version=version, alias=alias)
+    body = {"dataset": dataset, "part": part} | given(version=version, alias=alias, min_revision=min_revision)
     return at(read_evaluation, names={"model": model}, json=body)
 
 

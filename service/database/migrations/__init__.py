@@ -51,7 +51,7 @@ def _upgrade(connection: Connection, found: str | None) -> None:
     known = {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}
     if found is not None and found not in known:
         raise DatabaseVersionError(
-            f"the database has revision {found!r}, expected at most {HEAD!r}: a later release of LIPServe has used "
-            "this home; start that one, or set LIPSERVE_HOME to another folder"
+            f"the database has revision {found!r}, expected at most {HEAD!r}: a later release of LIPServe has used it; "
+            "start that one, or set LIPSERVE_HOME, or LIPSERVE_DATABASE_URL, to another"
         )
     command.upgrade(config, HEAD)

@@ -39,10 +39,9 @@ def decide(service: Service, model: str, request: ChangeRequest) -> Decided:
     """
     version = revisions.serving(service.database, model)
     rows, done, ended = 0, None, False
-    monitor = service.updates.monitor(model)
     while not ended:
-        # a batch is judged and logged under the monitor's lock: none is judged as held and logged after the hold
-        with monitor.lock, service.database.transaction() as session:
+        # a batch is judged and logged in its turn: none is judged as held and logged after the hold
+        with service.updates.turn(model), service.database.transaction(model) as session:
             held = _held(session, model)
             if request.decision == "adapt":
                 _log_change(session, model, held)

@@ -31,7 +31,7 @@ def replay(service: Service, model: str, stream_id: str, sequence: int, request:
     """
     version = revisions.serving(service.database, model)
     wanted = REPLAYABLE if request.codes is None else request.codes
-    with service.database.transaction() as session:
+    with service.database.turn(model), service.database.transaction(model) as session:
         batch = find_learnt(session, model, stream_id, sequence)
         learnt = admit(session, batch, wanted, time.time())
         if not learnt:

@@ -34,7 +34,7 @@ def find_learnt(session: Session, model: str, stream_id: str, sequence: int) -> 
 def unlearn(service: Service, model: str, stream_id: str, sequence: int) -> Unlearnt:
     """Take a batch and what was replayed of it out again; raise NotFoundError or ConflictError."""
     version = revisions.serving(service.database, model)
-    with service.database.transaction() as session:
+    with service.database.turn(model), service.database.transaction(model) as session:
         batch = find_learnt(session, model, stream_id, sequence)
         rows = batch.learnt + sum(each.learnt for each in inspection.replays(session, batch) if not each.void)
         trained = select(LearnerRow.version).where(LearnerRow.model == model, LearnerRow.start >= batch.number)
@@ -62,7 +62,7 @@ def rollback(service: Service, model: str, request: RollbackRequest) -> RolledBa
 
 def _to_revision(service: Service, model: str, revision: int) -> RolledBack:
     version = revisions.serving(service.database, model)
-    with service.database.transaction() as session:
+    with service.database.turn(model), service.database.transaction(model) as session:
         newest = revisions.current(session, model, version)
         if revision >= newest:
             raise invalid_request("revision", revision, f"one below {newest}, the newest of version {version}")

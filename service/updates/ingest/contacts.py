@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +27,16 @@ class ContactGate:
     def start(cls, seconds: float) -> ContactGate:
         """A gate that keeps contacts out for so long."""
         return cls(Patience(seconds))
+
+    def to_json(self) -> list[list[Any] | None]:
+        """All it knows, as numbers and lists; `from_json` gives back the same gate to the last bit."""
+        return [None if each is None else list(astuple(each)[1:]) for each in (self.patience, self.calm)]
+
+    @classmethod
+    def from_json(cls, values: Sequence[Sequence[Any] | None], seconds: float) -> ContactGate:
+        """The gate that `to_json` wrote, with the patience that is set now, s."""
+        patience, calm = (None if each is None else Patience(seconds, *each) for each in values)
+        return cls(patience or Patience(seconds), calm)
 
     @property
     def open(self) -> bool:

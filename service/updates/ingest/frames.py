@@ -67,7 +67,7 @@ def observe_frames(ingest: Ingest, monitor: Monitor, frames: Frames) -> FramesRe
     ExpiredError, BusyError or StorageFullError.
     """
     _check_order(frames)
-    with monitor.lock:
+    with ingest.turn(monitor, frames.model):
         with ingest.database.session() as session:
             options = enabled(session, frames.model)
             source = log.stream(session, frames.model, frames.stream_id)

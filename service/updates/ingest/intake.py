@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -93,10 +94,32 @@ class Ingest:
         came = measured(request, served.model, self.settings)
         content = identity.digest(came)
         monitor = self._monitor(served)
-        with monitor.lock:
+        with self.turn(monitor, model):
             answer = self._take(monitor, served, request, came, content, received)
         self.follow_up(monitor, model)
         return answer
+
+    @contextmanager
+    def turn(self, monitor: Monitor, model: str) -> Iterator[None]:
+        """Be the only one, of all services, that takes something for a model; its monitor knows what others took.
+
+        Raise StorageUnavailableError where the turn does not come within `database_timeout_s`.
+        """
+        # the turn first: who only looks at the monitor does not wait for other services
+        with self.database.turn(model), monitor.lock:
+            self._follow(monitor, model)
+            yield
+
+    def follow(self, monitor: Monitor, model: str) -> None:
+        """Take in what other services took for a model."""
+        if self.database.shared:
+            with monitor.lock:
+                self._follow(monitor, model)
+
+    def _follow(self, monitor: Monitor, model: str) -> None:
+        if self.database.shared:
+            with self.database.session() as session:
+                monitor.follow(session, model)
 
     def _take(
         self,
@@ -144,7 +167,7 @@ class Ingest:
         """
         model = served.name
         self.disk.take(ROW_NUMBERS * NUMBER_BYTES * served.model.n_joints * arrival.rows)
-        with self.database.transaction() as session:
+        with self.database.transaction(model) as session:
             _check_kept(session, served)
             held = learning.held(session, model) is not None
             if monitor.held and not held:
@@ -188,14 +211,17 @@ class Ingest:
                 "rejected": verdict.rows.rejected(),
                 "gaps": [list(pair) for pair in source.missing["ranges"][-MOST_GAPS:]],
                 "held": verdict.held,
-                # for the batches that follow, and for a service that starts again
+                # for the batches that follow, for other services, and for one that starts again
                 "own": [screened.own.start, screened.own.stop],
                 "span": arrival.span,
                 "open": verdict.watch.gate.open,
+                "gate": verdict.watch.gate.to_json(),
+                "waited": held,
+                "until": screened.until,
                 "surprise": None if verdict.surprise is None else verdict.surprise.tolist(),
             }
             event.report = report
-        monitor.note(arrival.stream_id, verdict, report, arrival.received)
+        monitor.note(event, arrival.stream_id, verdict, report)
         self._show(Judged(served, arrival.stream_id, verdict.rows, screened))
         return report
 

@@ -51,6 +51,11 @@ class Screened:
     bare: Array
     noise_std: Array
 
+    @property
+    def until(self) -> float | None:
+        """Latest event time of the rows that were predicted, s; None where there are none."""
+        return float(self.rows.time[self.predicted].max()) if self.predicted.any() else None
+
 
 def limits(model: TorqueModel, options: LearningOptions, settings: Settings) -> Limits:
     """What a row of a model may hold: its actuators' limits are those of its options, else those of its URDF."""

@@ -23,9 +23,10 @@ from service.limits.disk import Disk
 from service.settings import Settings
 from service.storage_errors import translated
 from service.updates.learner import publication, recent
+from service.updates.learner.course import RewoundError
 from service.updates.learner.messages import Published
 from service.updates.learner.novelty import Novelty
-from service.updates.learner.restore import Arrival, RewoundError, advance, restore
+from service.updates.learner.restore import Arrival, advance, restore
 from service.updates.storage import log, snapshots
 
 logger = logging.getLogger(__name__)
@@ -59,6 +60,7 @@ class Follower:
         self._revision: Revision | None = None
         self._published = self.start
         self._stored, self._stored_at = self.known.number, time.monotonic()
+        self._snapshot: str | None = None
         self._seconds = 0.0
 
     @property
@@ -73,13 +75,7 @@ class Follower:
             following = advance(self.database, self.known, watch=self._watch)
         except RewoundError as error:
             following = restore(
-                self.database,
-                self.files,
-                self.model,
-                self.version,
-                self.base,
-                rewound_to=error.number,
-                most_rows=0,
+                self.database, self.files, self.model, self.version, self.base, rewound=error, most_rows=0
             )
         self.behind = self.woken = following is not self.known
         self.known = following
@@ -88,7 +84,7 @@ class Follower:
     @property
     def unpublished(self) -> bool:
         """Whether there is something that the service does not know."""
-        return self.known.number > self._published
+        return self.known.number > self._published and self.known.settled
 
     def publish(self) -> Published:
         """Solve, write the arrays for the service, and return the message that goes with them."""
@@ -121,25 +117,38 @@ class Follower:
             return np.inf
         return self._stored_at + self.settings.snapshot_every_s
 
+    def store_in_turn(self) -> None:
+        """Store the state, unless another service has stored what this version has learnt since it was due last.
+
+        Whoever comes first does it for all: they learn the same.
+        """
+        if self.database.shared:
+            with self.database.session() as session:
+                last = snapshots.last_stored(session, self.model, self.version)
+            since = None if last is None or last[0] == self._snapshot else time.time() - last[1]
+            if since is not None and since < self.settings.snapshot_every_s:
+                self._stored_at = time.monotonic()
+                return
+        self.store()
+
     def store(self) -> None:
-        """Store the state, unless it is stored or would not be what the log says.
+        """Store the state, unless it is stored, or a later one, or it is a stage on the way to another one.
 
         Where there is no room for it, learning goes on all the same: the log has everything.
         """
-        if self.number == self._stored or not self.known.settled:
+        if self.number == self._stored or not self.known.settled or self._is_stored():
             return
         self._stored_at = time.monotonic()
         payload = state.dump(self.known.online)
         try:
             self.disk.take(len(payload))
-            snapshots.save(
+            self._snapshot = snapshots.save(
                 self.database,
                 self.files,
                 self.model,
                 self.version,
                 self.number,
                 payload,
-                seen=self.known.seen,
                 most=self.settings.max_snapshots,
             )
         except (StorageFullError, OSError, DBAPIError) as error:
@@ -149,6 +158,14 @@ class Follower:
             logger.warning("what version %d of model %s has learnt is not stored: %s", self.version, self.model, said)
             return
         self._stored = self.number
+
+    def _is_stored(self) -> bool:
+        """Whether another service has stored this state or a later one; a single one knows what it has stored."""
+        if not self.database.shared:
+            return False
+        with self.database.session() as session:
+            row = snapshots.latest(session, self.model, self.version, None)
+        return row is not None and row.number >= self.number
 
     def _solve(self, floor: Array) -> Revision:
         """The arrays of the state; those of the last time where nothing but the number has changed."""

@@ -30,7 +30,7 @@ class Learnt:
 def find(database: Database, files: Files, model: str, version: int, base: TorqueModel) -> Learnt | None:
     """Return what a version has learnt, None where that is nothing. base: the version as trained.
 
-    One that neither serves nor is a candidate has learnt what its last snapshot says.
+    One that neither serves nor is a candidate has learnt what its last snapshot says, less what was unlearnt since.
     """
     state = _restored(database, files, model, version, base, MOST_ROWS)
     if state is None:
@@ -69,7 +69,7 @@ def _restored(
     if not learns and row is None:
         return None
     at_most = None if learns or row is None else row.number
-    known = restore(database, files, model, version, base, at_most, most_rows=most_rows)
+    known = restore(database, files, model, version, base, at_most, most_rows=most_rows, taken_back=not learns)
     return known, start, newest if learns else None
 
 

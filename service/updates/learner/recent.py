@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from sqlalchemy import select
+from sqlalchemy.orm import Session
 
 from lipcore.online.floor import error_floor
 from lipcore.online.record import Record
@@ -19,24 +20,37 @@ def floor(database: Database, model: str, version: int, through: int, n_joints: 
     """Function variance (N·m)², (n,), that the errors of a version prove in the last batches up to event `through`.
 
     Those of the last SECONDS before the newest of them was received, and before that until there are FEWEST_ROWS rows.
+    Like what is learnt it is a function of the log up to that event, whatever was taken back since.
     """
-    query = (
-        select(EventRow.received, EventRow.record)
-        .where(
-            EventRow.model == model,
-            EventRow.number <= through,
-            EventRow.kind == "batch",
-            EventRow.version == version,
-            EventRow.void.is_(False),
-        )
-        .order_by(EventRow.number.desc())
-        .limit(MOST_EVENTS)
-    )
+    of_version = (EventRow.kind == "batch", EventRow.version == version)
+    upto = (EventRow.model == model, EventRow.number <= through)
+    query = select(EventRow.received, EventRow.record).where(*upto, *of_version).order_by(EventRow.number.desc())
     with database.session() as session:
-        found = [(received, record) for received, record in session.execute(query) if record is not None]
+        counts = EventRow.void.is_(False) | EventRow.number.in_(_undone_later(session, model, through))
+        rows = session.execute(query.where(counts).limit(MOST_EVENTS))
+        found = [(received, record) for received, record in rows if record is not None]
     total = Record.empty(n_joints)
     for received, record in found:
         if total.rows >= FEWEST_ROWS and received < found[0][0] - SECONDS:
             break
         total += Record.from_json(record)
     return error_floor(total)
+
+
+def _undone_later(session: Session, model: str, through: int) -> list[int]:
+    """Batches up to event `through` that count there and were taken back since; the newest ones, and seldom any."""
+    kinds = EventRow.kind.in_(("unlearn", "rollback"))
+    query = select(EventRow.number, EventRow.kind, EventRow.detail).where(EventRow.model == model, kinds)
+    later = session.execute(query.where(EventRow.number > through)).all()
+    if not later:
+        return []
+    lowest = min(each.detail["to"] + 1 if each.kind == "rollback" else each.detail["event"] for each in later)
+    before = session.execute(query.where(EventRow.number > lowest, EventRow.number <= through)).all()
+    undone = {each.detail["event"] for each in before if each.kind == "unlearn"}
+    spans = [range(each.detail["to"] + 1, each.number) for each in before if each.kind == "rollback"]
+    void = select(EventRow.number).where(
+        EventRow.model == model, EventRow.kind == "batch", EventRow.void, EventRow.number >= lowest
+    )
+    numbers = session.scalars(void.where(EventRow.number <= through).order_by(EventRow.number.desc()))
+    counted = [each for each in numbers if each not in undone and not any(each in span for span in spans)]
+    return counted[:MOST_EVENTS]

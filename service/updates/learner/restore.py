@@ -1,18 +1,28 @@
 """What a version has learnt, made from its last snapshot and the log of events since.
 
-The state after event number k is a function of the log, whoever makes it and in however many steps: the version as
-trained, and all batches with start < number <= k that teach, less those that were unlearnt or rolled back since. It is
-made one page of the log at a time, so that what comes of it can be published in between.
+The state after event number k is a function of the log up to k, to the last bit, whoever makes it, when, from which
+snapshot and in however many steps; so services that share a log answer alike. It is folded event by event, ((s + e1)
++ e2) + …, in the order of their numbers:
+
+* a batch, or a replay, is learnt by itself at its place, even where it is unlearnt later;
+* unlearning subtracts it again, at the place of the unlearning. Where it cannot be subtracted, since two changes or
+  another forgetting have come in between, the log is learnt anew from the state before it, without it and without all
+  else that is unlearnt on the way (`course.left_out`);
+* a rollback leads to the state after the event that it names, less what was unlearnt between that and the rollback.
+  Events that it undoes are passed over where that is known before they are learnt.
+
+It holds for as long as the log has what is needed. Where `retention` has deleted it, the newest snapshot is gone on
+from, whoever stored it; without one, what is left of the log is learnt, and a batch that only the log could take out
+stays in what is learnt. It also takes the same arithmetic: the same release, kind of processor and number of threads.
+
+Pages of the log are bounded, so that what comes of one can be published, and others have their turn, in between.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-
-from sqlalchemy import select
-from sqlalchemy.orm import Session, undefer
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 from lipcore.model import TorqueModel
 from lipcore.online import state
@@ -20,35 +30,34 @@ from lipcore.online.batch import Rows
 from lipcore.online.learner import ForgottenError, OnlineModel
 from service.database import Database, EventRow
 from service.files import Files
+from service.updates.learner import course
+from service.updates.learner.course import RewoundError, Stretch, Taking, batch_of
 from service.updates.storage import log, snapshots
 from service.updates.storage.payload import decode
 
 logger = logging.getLogger(__name__)
 
-PAGE_ROWS = 500
-"""Rows that are learnt in one step, unless a single batch has more: about 0.4 s for a robot of seven joints."""
-PAGE_EVENTS = 200
-
 
 @dataclass(frozen=True)
 class Restored:
-    """What a version had learnt after event `number`.
+    """What a version has learnt after event `number`. start: the event that it contains by training.
 
-    seen: newest event that was looked at: no rollback up to it is left to be followed; taken: newest unlearning that is
-    accounted for, which may be an event beyond `number`.
+    without: batches that are left out, each up to the number of an event (see `course.left_out`); torn: whether the
+    newest snapshot could not be read, so that nothing is to be waited for where the log has gaps.
     """
 
     model: str
     version: int
+    start: int
     online: OnlineModel
     number: int
-    seen: int
-    taken: int
+    without: Mapping[int, int] = field(default_factory=dict)
+    torn: bool = False
 
     @property
     def settled(self) -> bool:
-        """Whether the state is that of the log up to `number` and of nothing later, so that it can be stored."""
-        return self.taken <= self.number and self.online.since is not None
+        """Whether this is what the log up to `number` says, and not a stage on the way to a later event."""
+        return not any(batch <= self.number < until for batch, until in self.without.items())
 
 
 @dataclass(frozen=True)
@@ -62,14 +71,6 @@ class Arrival:
 Watch = Callable[[Sequence[Arrival]], None]
 
 
-class RewoundError(Exception):
-    """The state cannot be changed into what the log now says: make it anew, from a snapshot up to event `number`."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__(f"the state has to be made anew from event {number} or earlier")
-        self.number = number
-
-
 def restore(
     database: Database,
     files: Files,
@@ -78,12 +79,14 @@ def restore(
     base: TorqueModel,
     at_most: int | None = None,
     *,
-    rewound_to: int | None = None,
+    rewound: RewoundError | None = None,
     most_rows: int | None = None,
+    taken_back: bool = False,
 ) -> Restored:
     """Return what a version has learnt, after event `at_most` where given. base: the version as trained.
 
-    rewound_to: begin with a snapshot up to this number; most_rows: stop after the page that reaches so many rows.
+    rewound: begin where this says; most_rows: stop after the page that reaches so many rows, with the last state that
+    is settled; taken_back: take out what has been unlearnt since event `at_most`, too.
     """
     rows = 0
 
@@ -91,17 +94,19 @@ def restore(
         nonlocal rows
         rows += sum(len(each.rows) for each in arrivals)
 
-    known = _begin(database, files, model, version, base, _least(at_most, rewound_to))
+    known = settled = _begin(database, files, model, version, base, at_most, rewound)
     while most_rows is None or rows < most_rows:
         try:
             following = advance(database, known, at_most, count)
+            if following is known and taken_back and at_most is not None:
+                return _without_later(database, known)
         except RewoundError as error:
-            rewound_to = _least(error.number, rewound_to)
-            following = _begin(database, files, model, version, base, _least(at_most, rewound_to))
+            following = _begin(database, files, model, version, base, at_most, error)
         if following is known:
             break
         known = following
-    return known
+        settled = known if known.settled else settled
+    return settled
 
 
 def advance(database: Database, known: Restored, at_most: int | None = None, watch: Watch | None = None) -> Restored:
@@ -110,162 +115,135 @@ def advance(database: Database, known: Restored, at_most: int | None = None, wat
     watch: is told the batches of the page before they are learnt. Raise RewoundError.
     """
     with database.session() as session:
-        page = _Page.read(session, known, at_most)
-        rolled_back = [to for to, number in page.rollbacks if number > known.seen and to < known.number]
-        if rolled_back:
-            raise RewoundError(min(rolled_back))
-        unlearnt = _unlearnt(session, known, page)
-        events = log.events(session, known.model, known.number, page.count, void=True) if page.count else []
-    if not events and not unlearnt:
-        return known
-    events = [each for each in events if each.number <= page.end and not page.is_void(each)]
-    if known.online.since is None and any(each.kind == "batch" for each in events):
-        raise RewoundError(known.number)  # from when on the training is forgotten, the first batch tells
-    arrivals = [Arrival(each, decode(each.payload)) for each in events if each.payload is not None]
-    if watch is not None:
-        watch(arrivals)
-    online = _learn(_unlearn(database, known, unlearnt), events, {each.event.number: each.rows for each in arrivals})
-    taken = max([known.taken, *page.unlearnings.values()])
-    return Restored(known.model, known.version, online, page.end, page.seen, taken)
-
-
-@dataclass(frozen=True)
-class _Page:
-    """The next `count` events, up to number `end`, and what events up to `seen`, later ones too, say about others.
-
-    unlearnings: number of the unlearning by that of its batch; rollbacks: where each leads, and its own number.
-    """
-
-    end: int
-    count: int
-    seen: int
-    unlearnings: dict[int, int]
-    rollbacks: list[tuple[int, int]]
-
-    @classmethod
-    def read(cls, session: Session, known: Restored, at_most: int | None) -> _Page:
-        newest = log.newest(session, known.model)  # first: what is committed meanwhile is seen now or the next time
-        later = (EventRow.model == known.model, EventRow.number > known.number)
+        newest = log.newest(session, known.model)
         last = newest if at_most is None else min(at_most, newest)
-        upcoming = select(EventRow.number, EventRow.rows).where(*later, EventRow.number <= last)
-        end, count, total = known.number, 0, 0
-        for number, rows in session.execute(upcoming.order_by(EventRow.number).limit(PAGE_EVENTS)):
-            if count and total + rows > PAGE_ROWS:
-                break
-            end, count, total = number, count + 1, total + rows
-        kinds = EventRow.kind.in_(("unlearn", "rollback"))
-        found = session.execute(select(EventRow.number, EventRow.kind, EventRow.detail).where(*later, kinds)).all()
-        unlearnings = {each.detail["event"]: each.number for each in found if each.kind == "unlearn"}
-        rollbacks = [(each.detail["to"], each.number) for each in found if each.kind == "rollback"]
-        return cls(end, count, max([newest, *(each.number for each in found)]), unlearnings, rollbacks)
-
-    def is_void(self, event: EventRow) -> bool:
-        """Whether an event of this page has been taken out since."""
-        batch = _batch(event) if event.kind == "replay" else event.number
-        return batch in self.unlearnings or any(to < event.number < number for to, number in self.rollbacks)
+        if last <= known.number:
+            return known
+        part = course.ahead(session, known.model, known.start, known.number, last)
+        if not part.complete and not known.torn and _has_newer(database, known, at_most):
+            raise RewoundError(None)
+    if part.is_rollback and any(until < part.end for until in _active(known).values()):
+        raise RewoundError(known.number)  # what was left out was so for the sake of events that are undone
+    events = [each for each in part.events if not _is_left_out(known, each)]
+    arrivals = [Arrival(each, decode(each.payload)) for each in events if each.payload is not None]
+    if watch is not None and arrivals:
+        watch(arrivals)
+    teaches = any(len(each.rows.learnt) for each in arrivals) or any(each.events for each in part.takings.values())
+    online = known.online.detached() if teaches else known.online
+    if part.is_rollback:
+        for taking in part.takings.values():
+            online = _take(database, known, online, taking, part.end)
+        for forgetting_s in part.forgetting_s or ():
+            online = online.with_forgetting(forgetting_s)
+    else:
+        online = _learn(database, known, online, part, {each.event.number: each.rows for each in arrivals})
+    online = online.whole() if teaches else online
+    return replace(known, online=online, number=part.end, without=_active(replace(known, number=part.end)))
 
 
 def _begin(
-    database: Database, files: Files, model: str, version: int, base: TorqueModel, at_most: int | None
+    database: Database,
+    files: Files,
+    model: str,
+    version: int,
+    base: TorqueModel,
+    at_most: int | None,
+    rewound: RewoundError | None,
 ) -> Restored:
     """The newest snapshot that can be read, up to a number where given, or the version as trained."""
+    without = {} if rewound is None else rewound.without
+    limits = [each for each in (at_most, None if rewound is None else rewound.number) if each is not None]
+    limit, torn = min(limits, default=None), False
     with database.session() as session:
-        seen = log.newest(session, model)  # first: of the rollbacks up to it, a snapshot that is still there knows
         start = log.start_of(session, model, version)
-        while (row := snapshots.latest(session, model, version, at_most)) is not None:
+        while (row := snapshots.latest(session, model, version, limit)) is not None:
             try:
                 online = state.load(base, snapshots.read(files, row))
-                return Restored(model, version, online, row.number, max(seen, row.number), row.number)
+                return Restored(model, version, start, online, row.number, without, torn)
             except (ValueError, OSError) as error:
                 logger.error("snapshot %s of version %d of model %r cannot be used: %s", row.id, version, model, error)
-                at_most = row.number - 1
-        first = select(EventRow.received).where(
-            EventRow.model == model, EventRow.number > start, EventRow.kind == "batch"
-        )
-        since = session.scalar(first.order_by(EventRow.number).limit(1))
-        online = OnlineModel.start(base, log.forgetting(session, model, start), since)
-    return Restored(model, version, online, start, max(seen, start), start)
+                limit, torn = row.number - 1, True
+        online = OnlineModel.start(base, course.in_force(session, model, start))
+    return Restored(model, version, start, online, start, without, torn)
 
 
-def _unlearnt(session: Session, known: Restored, page: _Page) -> list[EventRow]:
-    """The batches, and their replays, that the state contains and an unlearning takes out of it."""
-    start = log.start_of(session, known.model, known.version)
-    found: list[EventRow] = []
-    for batch, unlearning in sorted(page.unlearnings.items()):
-        if unlearning <= known.taken or not start < batch <= known.number:
-            continue
-        others = EventRow.kind.in_(("replay", "unlearn", "rollback"))
-        since = (EventRow.model == known.model, EventRow.number >= batch, (EventRow.number == batch) | others)
-        rows = list(session.scalars(select(EventRow).where(*since).options(undefer(EventRow.payload))))
-        if any(row.kind == "unlearn" and _batch(row) == batch and row.number <= known.taken for row in rows):
-            continue  # more than once is once
-        spans = [range(row.detail["to"] + 1, row.number) for row in rows if row.kind == "rollback" and row.detail]
-        contained = [row for row in rows if row.number <= known.number and row.payload is not None]
-        contained = [row for row in contained if batch in (row.number, _batch(row))]
-        found += [row for row in contained if not any(row.number in span for span in spans)]
-    return found
+def _learn(
+    database: Database, known: Restored, online: OnlineModel, part: Stretch, rows: Mapping[int, Rows]
+) -> OnlineModel:
+    """Take in the events of a page, one after the other. online: one whose sums nobody else has, where any teaches."""
+    for event in part.events:
+        if event.kind == "batch":
+            online = online.begin(event.received)
+        if event.number in rows:
+            online = online.learn(rows[event.number], own=True)
+        elif event.kind == "unlearn":
+            online = _take(database, known, online, part.takings[event.number], event.number)
+        elif event.kind == "change":
+            online = online.change((event.detail or {})["t"])
+        elif event.kind == "settings":
+            online = online.with_forgetting((event.detail or {})["forgetting_s"])
+    return online
 
 
-def _unlearn(database: Database, known: Restored, events: list[EventRow]) -> OnlineModel:
-    """The state without these batches; raise RewoundError where it takes the log to tell what they have left behind."""
-    if not events:
-        return known.online
+def _take(database: Database, known: Restored, online: OnlineModel, taking: Taking, end: int) -> OnlineModel:
+    """Take a batch and its replays out again, for the sake of event `end`; raise RewoundError where that takes the log.
+
+    online: one whose sums nobody else has.
+    """
+    if _is_without(known, taking.batch, taking.number) or not taking.events:
+        return online
     try:
-        oldest = min(each.number for each in events)
-        with database.session() as session:
-            reweighed = select(EventRow.number).where(
-                EventRow.model == known.model,
-                EventRow.number > oldest,
-                EventRow.number <= known.number,
-                EventRow.kind == "settings",
-                EventRow.void.is_(False),
-            )
-            if session.scalar(reweighed.limit(1)) is not None:
-                raise ForgottenError("forgetting has changed since")
-        online = known.online
-        for event in events:
-            online = online.unlearn(decode(event.payload or b""))
+        if taking.reweighed:
+            raise ForgottenError("forgetting has changed since")
+        every = [decode(each.payload or b"") for each in taking.events]
+        for rows in every:
+            online.check_unlearn(rows)
+        for rows in every:
+            online = online.unlearn(rows, own=True)
         return online
     except ForgottenError as error:
-        if _can_restore(database, known, oldest - 1):
-            raise RewoundError(oldest - 1) from error
-        numbers = ", ".join(str(each.number) for each in events)
+        with database.session() as session:
+            without = _active(known) | course.left_out(session, known.model, known.start, taking.batch, end)
+            oldest = min(without)
+            row = snapshots.latest(session, known.model, known.version, oldest - 1)
+            begin = known.start if row is None else row.number
+            complete = log.is_complete(session, known.model, begin, end - 1)
+        if complete:
+            raise RewoundError(oldest - 1, without) from error
+        if not known.torn and _has_newer(database, known, None):
+            raise RewoundError(None) from error
+        numbers = ", ".join(str(each.number) for each in taking.events)
         logger.error("events %s of model %r stay in what is learnt: %s", numbers, known.model, error)
-        return known.online
+        return online
 
 
-def _can_restore(database: Database, known: Restored, at_most: int) -> bool:
-    """Whether the log reaches from a snapshot up to a number, or from the version as trained, to the state."""
+def _without_later(database: Database, known: Restored) -> Restored:
+    """A state less what has been unlearnt since; raise RewoundError."""
+    with database.session() as session:
+        newest = log.newest(session, known.model)
+        takings = course.takings_since(session, known.model, known.start, known.number, newest + 1)
+    online = known.online.detached()
+    for taking in takings:
+        online = _take(database, known, online, taking, newest + 1)
+    return replace(known, online=online.whole(), without={}) if takings else known
+
+
+def _has_newer(database: Database, known: Restored, at_most: int | None) -> bool:
+    """Whether there is a snapshot that goes beyond a state."""
     with database.session() as session:
         row = snapshots.latest(session, known.model, known.version, at_most)
-        begin = log.start_of(session, known.model, known.version) if row is None else row.number
-        return log.is_complete(session, known.model, begin, known.number)
+    return row is not None and row.number > known.number
 
 
-def _learn(online: OnlineModel, events: Sequence[EventRow], rows: dict[int, Rows]) -> OnlineModel:
-    """Take in events in order; batches between two others together."""
-    waiting: list[Rows] = []
-    for event in events:
-        if event.number in rows:
-            waiting.append(rows[event.number])
-        elif event.kind in ("change", "settings"):
-            online = _learn_rows(online, waiting)
-            waiting = []
-            detail = event.detail or {}
-            online = (
-                online.change(detail["t"]) if event.kind == "change" else online.with_forgetting(detail["forgetting_s"])
-            )
-    return _learn_rows(online, waiting)
+def _active(known: Restored) -> dict[int, int]:
+    """What is still left out."""
+    return {batch: until for batch, until in known.without.items() if until > known.number}
 
 
-def _learn_rows(online: OnlineModel, parts: Sequence[Rows]) -> OnlineModel:
-    return online.learn(Rows.concatenate(parts)) if parts else online
+def _is_without(known: Restored, batch: int, number: int) -> bool:
+    """Whether a batch is left out up to an event."""
+    return number <= known.without.get(batch, 0)
 
 
-def _batch(event: EventRow) -> int | None:
-    """Number of the batch that a replay or an unlearning is about."""
-    return (event.detail or {}).get("event")
-
-
-def _least(one: int | None, other: int | None) -> int | None:
-    return min((each for each in (one, other) if each is not None), default=None)
+def _is_left_out(known: Restored, event: EventRow) -> bool:
+    return event.kind in ("batch", "replay") and _is_without(known, batch_of(event), event.number)

@@ -11,7 +11,6 @@ from multiprocessing.connection import Connection
 
 from sqlalchemy import select
 
-import lipcore
 from service.database import Database, LearnerRow
 from service.files import Files
 from service.models import registry
@@ -66,6 +65,7 @@ class Learner:
         self.followers: dict[Key, Follower] = {}  # in the order in which they were woken last
         self.duels = Duels(settings)
         self._woken: set[str] = set()
+        self._unread: dict[str, float] = {}  # when models are looked up again, where the database was away
         self._failed: dict[Key, tuple[float, float]] = {}
 
     def wake(self, models: set[str]) -> None:
@@ -74,7 +74,7 @@ class Learner:
 
     def pause(self) -> float:
         """Seconds until there is something to do, if nothing happens."""
-        times = [at for at, _ in self._failed.values()]
+        times = [*self._unread.values(), *(at for at, _ in self._failed.values())]
         for follower in self.followers.values():
             if follower.behind:
                 return 0.0
@@ -85,7 +85,9 @@ class Learner:
 
     def turn(self) -> Iterator[Message]:
         """Let every follower do the next thing that is to be done; yield what the service has to know."""
-        again = {model for (model, _), (at, _) in self._failed.items() if time.monotonic() >= at}
+        now = time.monotonic()
+        again = {model for (model, _), (at, _) in self._failed.items() if now >= at}
+        again |= {model for model, at in self._unread.items() if now >= at}
         woken, self._woken = self._woken | again, set()
         for model in sorted(woken):
             yield from self._enlist(model)
@@ -109,11 +111,17 @@ class Learner:
             yield follower.publish()
             self._failed.pop((follower.model, follower.version), None)
         if time.monotonic() >= follower.snapshot_due:
-            follower.store()
+            follower.store_in_turn()
 
     def _enlist(self, model: str) -> Iterator[Message]:
         """Wake the followers of a model: of the version that serves and of the candidates for its place."""
-        versions = self._learning(model)
+        try:
+            versions = self._learning(model)
+        except Exception:  # of the database; the followers keep what they have learnt meanwhile
+            logger.exception("which versions of model %r learn cannot be read: tried again", model)
+            self._unread[model] = time.monotonic() + FIRST_PAUSE
+            return
+        self._unread.pop(model, None)
         for key in [key for key in self.followers if key[0] == model and key[1] not in versions]:
             self._drop(key)
         self._failed = {key: tried for key, tried in self._failed.items() if key[0] != model or key[1] in versions}
@@ -153,7 +161,7 @@ class Learner:
         while len(self.followers) >= self.settings.max_learning_models:
             self._drop(next(iter(self.followers)))
         row = registry.find(self.database, *key)
-        base = lipcore.load(self.files.versions / row.folder, row.checksums)
+        base = self.files.load_version(row.folder, row.checksums)
         return Follower(self.database, self.files, self.settings, *key, base)
 
     def _drop(self, key: Key) -> None:

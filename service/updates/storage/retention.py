@@ -26,7 +26,7 @@ def retain(database: Database, settings: Settings, model: str, now: float) -> in
             chosen = _chosen(session, settings, model, now)
         if not chosen:
             return gone
-        with database.transaction() as session:
+        with database.transaction(model) as session:
             of_chosen = select(EventRow).where(EventRow.seq.in_(chosen), *_deletable(session, model))
             events = list(session.scalars(of_chosen))
             for event in events:
@@ -76,9 +76,11 @@ def _deletable(session: Session, model: str) -> list[ColumnElement[bool]]:
     in_force = and_(EventRow.kind == "settings", EventRow.void.is_(False))
     within = [EventRow.model == model, EventRow.number <= through, not_(in_force)]
     pending = select(EventRow).where(EventRow.model == model, EventRow.number > through, EventRow.kind == "unlearn")
-    if batches := {_batch(event) for event in session.scalars(pending)}:
+    if batches := {batch for event in session.scalars(pending) if (batch := _batch(event)) is not None}:
         replays = session.scalars(select(EventRow).where(*within, EventRow.kind == "replay"))
         needed = batches | {event.number for event in replays if _batch(event) in batches}
+        rollbacks = select(EventRow.number).where(*within, EventRow.kind == "rollback", EventRow.number > min(batches))
+        needed |= set(session.scalars(rollbacks))  # they tell which of the replays are learnt
         within.append(EventRow.number.not_in(needed))
     return within
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import datetime
 
 from sqlalchemy import Select, delete, select
 from sqlalchemy.exc import SQLAlchemyError
@@ -10,25 +11,26 @@ from sqlalchemy.orm import Session
 
 from service.database import Database, EventRow, SnapshotRow, VersionRow, now
 from service.files import Files, new_id
+from service.storage_errors import undecided
 
 
 def save(
-    database: Database, files: Files, model: str, version: int, number: int, payload: bytes, *, seen: int, most: int
+    database: Database, files: Files, model: str, version: int, number: int, payload: bytes, *, most: int
 ) -> str | None:
     """Store a version's state after event `number` durably and return its id; thin what is kept to `most`.
 
-    seen: newest event that had been read when the state was made. None, and nothing is stored, where an event since
-    then took something out that the state may contain: the state of that number is another one now; and where the
-    version has been deleted.
+    None, and nothing is stored, where a rollback has gone back behind that event since: nothing goes on from there any
+    more; and where the version has been deleted. Unlearnings make none outdated: whoever goes on from it comes to them.
     """
     snapshot = new_id("snap")
     digest = files.write_snapshot(snapshot, payload)
     try:
-        with database.transaction() as session:
-            outdated = _is_outdated(session, model, version, number, seen)
+        with database.transaction(model) as session:
+            outdated = _is_outdated(session, model, version, number)
             gone = [snapshot] if outdated else _add(session, snapshot, digest, model, version, number, most)
-    except SQLAlchemyError:
-        files.delete_snapshot(snapshot)
+    except SQLAlchemyError as error:
+        if not undecided(error):
+            files.delete_snapshot(snapshot)
         raise
     for name in gone:  # only after the commit: until then the rows still name them
         files.delete_snapshot(name)
@@ -36,7 +38,12 @@ def save(
 
 
 def sweep(database: Database, files: Files) -> int:
-    """Delete the files that an interrupted `save` has left; return how many. Only for the process that saves."""
+    """Delete the files that an interrupted `save` has left; return how many. Only for the process that saves.
+
+    None where several services store snapshots: one whose row is not there yet may be another's.
+    """
+    if database.shared:
+        return 0
     with database.session() as session:
         known = {f"{snapshot}.safetensors" for snapshot in session.scalars(select(SnapshotRow.id))}
     left = [path for path in files.learning.iterdir() if path.is_file() and path.name not in known]
@@ -49,6 +56,13 @@ def latest(session: Session, model: str, version: int, at_most: int | None) -> S
     """The snapshot of a version with the highest number, up to `at_most` where given."""
     query = _of(model, version) if at_most is None else _of(model, version).where(SnapshotRow.number <= at_most)
     return session.scalar(query.limit(1))
+
+
+def last_stored(session: Session, model: str, version: int) -> tuple[str, float] | None:
+    """Id of the snapshot of a version that was stored last, by whichever service, and when: Unix time, s."""
+    query = select(SnapshotRow).where(SnapshotRow.model == model, SnapshotRow.version == version)
+    row = session.scalar(query.order_by(SnapshotRow.seq.desc()).limit(1))
+    return None if row is None else (row.id, datetime.fromisoformat(row.created_at).timestamp())
 
 
 def read(files: Files, row: SnapshotRow) -> bytes:
@@ -77,19 +91,15 @@ def _of(model: str, version: int) -> Select[SnapshotRow]:
     )
 
 
-def _is_outdated(session: Session, model: str, version: int, number: int, seen: int) -> bool:
-    """Whether an event after `seen` took out something at or before `number`, or the version is no more."""
+def _is_outdated(session: Session, model: str, version: int, number: int) -> bool:
+    """Whether a rollback has undone event `number`, or the version is no more."""
     of_version = (VersionRow.model == model, VersionRow.version == version)
     if session.scalar(select(VersionRow.version).where(*of_version)) is None:
         return True
-    since = select(EventRow).where(
-        EventRow.model == model, EventRow.number > seen, EventRow.kind.in_(("rollback", "unlearn"))
+    since = select(EventRow.detail).where(
+        EventRow.model == model, EventRow.number > number, EventRow.kind == "rollback"
     )
-    for event in session.scalars(since):
-        detail = event.detail or {}
-        if (detail["to"] < number) if event.kind == "rollback" else (detail["event"] <= number):
-            return True
-    return False
+    return any(detail["to"] < number for detail in session.scalars(since))
 
 
 def _add(session: Session, snapshot: str, digest: str, model: str, version: int, number: int, most: int) -> list[str]:

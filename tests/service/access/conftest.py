@@ -40,7 +40,7 @@ def bearer(secret: str) -> dict[str, str]:
 def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
     """A service that asks for keys."""
     home = tmp_path_factory.mktemp("guarded")
-    database = Database(home)
+    database = Database.of(Settings(home=home))
     secrets = {scope: keys.create(database, f"only {scope}", [scope], None)[1] for scope in SCOPES}
     settings = Settings(home=home, keys="on", keys_refresh_s=REFRESH_S)
     with TestClient(create_app(settings), "http://robot.example") as api:
@@ -51,6 +51,6 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
 @pytest.fixture
 def keys_database(home) -> Iterator[Database]:
     """An empty database."""
-    opened = Database(home)
+    opened = Database.of(Settings(home=home))
     yield opened
     opened.close()

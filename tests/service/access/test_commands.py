@@ -13,6 +13,7 @@ from service.access.credentials import headers_of
 from service.access.keys import digest_of
 from service.client import Client
 from service.database import Database
+from service.settings import Settings
 from tests.service.access.conftest import bearer
 from tests.service.data import eventually
 
@@ -135,6 +136,6 @@ def test_what_cannot_be_a_key_is_not_repeated(key):
 def test_a_home_is_made_for_its_first_key(lipserve, home):
     assert not home.exists()
     assert lipserve("keys", "create", "--name", "admin", "--scope", "admin")[0] == 0
-    database = Database(home)
+    database = Database.of(Settings(home=home))
     assert [row.name for row in keys.stored(database)] == ["admin"]
     database.close()

@@ -19,6 +19,7 @@ from tests.service.access.conftest import REFRESH_S, bearer
 from tests.service.data import error, eventually
 
 
+@pytest.mark.own_files("reads the file of the database")
 def test_a_key_is_long_random_and_not_stored(keys_database, home):
     made = [keys.create(keys_database, "arm", ["predict"], None) for _ in range(20)]
     secrets = [secret for _, secret in made]

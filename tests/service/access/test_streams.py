@@ -12,6 +12,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from service.access import keys
 from service.client import ApiError, Client
 from service.database import Database
+from service.settings import Settings
 from service.stream.client import StreamClient, StreamError
 from tests.service.access.conftest import bearer
 from tests.service.data import eventually
@@ -33,7 +34,7 @@ def locked(tmp_path_factory):
 @pytest.fixture(scope="module")
 def make(locked):
     """Make a key of a server as the CLI does, and wait until it is known; return id and key."""
-    database = Database(locked.home)
+    database = Database.of(Settings(home=locked.home))
 
     def made(*scopes):
         row, secret = keys.create(database, "test", scopes, None)

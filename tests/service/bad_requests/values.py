@@ -85,6 +85,7 @@ PREDICTING = [
     *wrong(PREDICT, QUERY, "components", ["gravity", "gravity"], named="components[1]"),
     *wrong(PREDICT, QUERY, "version", "1", 1.0, True, 0, -1, 1.5, 2**31, 10**30, "x", [], {}, NAN),
     *wrong(PREDICT, QUERY, "version", 99, status=404, code="not_found"),
+    *wrong(PREDICT, QUERY, "min_revision", "1", 1.0, True, -1, 1.5, 2**31, 10**30, [], NAN),
     *wrong(PREDICT, QUERY, "tau", ZERO, [], "0"),
     *wrong(PREDICT, QUERY, "Q", ZERO),
     *wrong(PREDICT, QUERY, "qdd", ZERO),
@@ -115,6 +116,7 @@ TRAINING = [
     *option("device", "gpu", "CPU"),
     *option("compact_tolerance", "0.1", True, 0, -1, 1.1, NAN, INF),
     *option("max_inducing_outputs", 0, "all"),
+    *option("statistics", "some", None, True),
     *option("epochs", 5),
     *wrong(JOBS, JOB, "priority", 1),
 ]
@@ -175,6 +177,7 @@ ASSESSING = [
     *wrong(EVALUATE, {}, "dataset", None, 5, [], "d" * 1000),
     *wrong(EVALUATE, {}, "dataset", "ds_0", "", status=404, code="not_found"),
     *wrong(EVALUATE, {"dataset": "ds_0"}, "version", 0, "x", 10**30),
+    *wrong(EVALUATE, {"dataset": "ds_0"}, "min_revision", -1, "x", 10**30),
     *wrong(TRACE, {}, "dataset", None, 5, [], "d" * 1000),
     *wrong(TRACE, {}, "dataset", "ds_0", "", "../x", status=404, code="not_found"),
     *wrong(TRACE, {"dataset": "ds_0"}, "part", "held", None, 5),

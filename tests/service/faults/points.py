@@ -43,11 +43,14 @@ UPLOADS = [
     Point(
         "upload: half of the file written",
         actions.upload,
-        Fault(RENAME, within="service.files:Files.write_samples"),
+        Fault(RENAME, within="service.files.store:Files.write_samples"),
         "nothing",
     ),
     Point(
-        "upload: file complete, no row", actions.upload, Fault("service.files:Files.write_samples", "after"), "nothing"
+        "upload: file complete, no row",
+        actions.upload,
+        Fault("service.files.store:Files.write_samples", "after"),
+        "nothing",
     ),
     *_around_commit("upload", actions.upload, "service.datasets.store:add"),
     *_around_commit("upload of a robot", actions.upload_robot, "service.robots.store:add"),
@@ -55,7 +58,7 @@ UPLOADS = [
     Point(
         "deletion of a data set: before its file goes",
         actions.delete_dataset,
-        Fault("service.files:Files.delete_samples"),
+        Fault("service.files.store:Files.delete_samples"),
         "all",
     ),
 ]
@@ -94,11 +97,15 @@ LEARNING = [
     ),
     Point("publication: before it is read", actions.observe, Fault("service.updates.learner.publication:read"), "all"),
     *_both("snapshot: half of the file", actions.observe, Fault(RENAME, "before", STORE)),
-    *_both("snapshot: file complete, no row", actions.observe, Fault("service.files:Files.write_snapshot", "after")),
+    *_both(
+        "snapshot: file complete, no row", actions.observe, Fault("service.files.store:Files.write_snapshot", "after")
+    ),
     *_both("snapshot: before the commit", actions.observe, Fault(COMMIT, "before", STORE)),
     *_both("snapshot: after the commit", actions.observe, Fault(COMMIT, "after", STORE)),
     *_both(
-        "snapshot: older ones still there", actions.observe_on, Fault("service.files:Files.delete_snapshot", "before")
+        "snapshot: older ones still there",
+        actions.observe_on,
+        Fault("service.files.store:Files.delete_snapshot", "before"),
     ),
 ]
 MOVE = "service.models.aliases:_move"
@@ -136,7 +143,7 @@ POINTS = [*UPLOADS, *JOBS, *LEARNING, *MOVES, *ARCHIVES, *DELETIONS]
 RECOVER = "service.training.queue:JobQueue.recover"
 STARTS = {
     "the home is held": Fault("service.app:_open", victim="itself"),
-    "all is swept": Fault("service.files:Files.sweep", "after", victim="itself"),
+    "all is swept": Fault("service.files.store:Files.sweep", "after", victim="itself"),
     "before jobs are queued again": Fault(COMMIT, "before", RECOVER, "itself"),
     "jobs are queued again": Fault(COMMIT, "after", RECOVER, "itself"),
 }

@@ -14,7 +14,7 @@ from fastapi.testclient import TestClient
 
 from lipcore.persistence import MANIFEST, TENSORS
 from service.app import create_app
-from service.database.engine import FILE
+from service.database.sqlite import FILE
 from service.home import HomeError, check_home
 from service.settings import Settings
 from tests.service.data import ended, error, eventually, queue, stream, upload

@@ -17,7 +17,8 @@ from sqlalchemy import create_engine, event, text
 from sqlalchemy.exc import DBAPIError
 
 from service.app import create_app
-from service.database.engine import FILE, Database
+from service.database import Database
+from service.database.sqlite import FILE
 from service.errors import ServiceError, StorageFullError, StorageUnavailableError
 from service.files import Files
 from service.home import HomeError, check_home
@@ -240,7 +241,7 @@ def test_no_service_starts_on_the_database_of_a_later_release(tmp_path):
     with database.transaction() as session:
         session.execute(text("UPDATE alembic_version SET version_num = '9999'"))
     database.close()
-    with pytest.raises(HomeError, match=r"a later release of LIPServe has used this home"):
+    with pytest.raises(HomeError, match=r"a later release of LIPServe has used it"):
         check_home(Settings(home=tmp_path))
 
 

@@ -40,7 +40,7 @@ def test_damaged_data_set_is_not_evaluated_and_not_trained_on(api, trained, spoi
     answer = api.post(f"/v1/models/{trained.name}/evaluate", json={"dataset": dataset["id"]})
     assert dataset["id"] in error(answer, 500, "damaged_data")["message"]
     with pytest.raises(DamagedDataError, match="Upload it again"):
-        recorded(service.database, service.files, {"datasets": [dataset["id"]]})
+        recorded(service.settings, service.database, service.files, {"datasets": [dataset["id"]]})
     assert api.get(f"/v1/datasets/{dataset['id']}").status_code == 200
     assert api.delete(f"/v1/datasets/{dataset['id']}").status_code == 204
 
@@ -80,7 +80,7 @@ def test_version_that_is_whole_but_another_one_is_not_loaded(arm, name):
 
 def snapshot(arm, number):
     known = restore(arm.database, arm.files, ARM, 1, arm.base, number)
-    return snapshots.save(arm.database, arm.files, ARM, 1, number, state.dump(known.online), seen=known.seen, most=20)
+    return snapshots.save(arm.database, arm.files, ARM, 1, number, state.dump(known.online), most=20)
 
 
 def test_damaged_snapshot_gives_way_to_the_one_before(arm, caplog):

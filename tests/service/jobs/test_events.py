@@ -11,6 +11,7 @@ from sqlalchemy import select
 
 from service.database import Database, JobRow
 from service.errors import BusyError
+from service.settings import Settings
 from service.training import feed
 from service.training.feed import Feed
 from tests.service.data import ENDLESS, error, eventually, queue, service_of, stream, upload
@@ -115,7 +116,7 @@ def test_a_reader_that_leaves_is_forgotten(no_worker):
 def job_row(home, monkeypatch):
     """A job in a database of its own, which a feed looks at often."""
     monkeypatch.setattr(feed, "LOOK_S", 0.01)
-    database = Database(home)
+    database = Database.of(Settings(home=home))
     with database.transaction() as session:
         session.add(new_row("x"))
     yield database

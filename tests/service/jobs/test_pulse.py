@@ -10,6 +10,7 @@ from sqlalchemy.exc import OperationalError
 
 from lipcore.fitting import FitProgress
 from service.database import Database, JobRow
+from service.settings import Settings
 from service.training import pulse
 from service.training.pulse import Pulse, SupersededError
 from tests.service.data import eventually
@@ -20,10 +21,10 @@ from tests.service.jobs.conftest import new_row
 def beating(home, monkeypatch):
     """A database with a running job, and a pulse of it that beats quickly."""
     monkeypatch.setattr(pulse, "BEAT_S", 0.01)
-    database = Database(home)
+    database = Database.of(Settings(home=home))
     with database.transaction() as session:
         session.add(new_row("x", state="running", attempts=1))
-    with Pulse(database, own) as talk:
+    with Pulse(database, own, "arm") as talk:
         yield database, talk
     database.close()
 
@@ -88,10 +89,10 @@ def test_a_database_that_fails_for_a_while_stops_nothing(beating, monkeypatch, c
     transaction, failures = database.transaction, iter([OperationalError("BEGIN", {}, Exception("locked"))] * 2)
 
     @contextmanager
-    def sometimes():
+    def sometimes(model: str | None = None):
         for failure in failures:
             raise failure
-        with transaction() as session:
+        with transaction(model) as session:
             yield session
 
     monkeypatch.setattr(database, "transaction", sometimes)

@@ -173,7 +173,8 @@ def test_a_state_without_room_is_not_stored_and_learning_goes_on(monkeypatch, ca
     monkeypatch.setattr("service.updates.learner.follower.state.dump", lambda _: bytes(1000))
     follower = Follower.__new__(Follower)
     follower.model, follower.version, follower._stored = "limits", 1, 0
-    follower.known = SimpleNamespace(number=5, settled=True, online=None, seen=5)
+    follower.known = SimpleNamespace(number=5, settled=True, online=None)
+    follower.database = SimpleNamespace(shared=False)
     follower.settings = Settings(home=tmp_path, max_home_bytes=1, snapshot_every_s=60)
     follower.disk = Disk(follower.settings)
     follower.store()

@@ -10,6 +10,7 @@ import pytest
 from sqlalchemy import select
 
 from service.database import Database, JobRow, SnapshotRow
+from service.settings import Settings
 from tests.service.data import DEADLINE, ENDLESS, error, eventually, queue, running, stream, upload
 from tests.service.limits.serving import Raw, Serving
 from tests.service.server import Server
@@ -113,7 +114,7 @@ def test_a_service_that_stops_keeps_what_it_has_learnt_and_its_jobs(home):
         name = queue(server.client, "stopped", upload(server.client, stream("panda", 200))["id"], options=ENDLESS)["id"]
         running(server.client, name)
         assert server.terminate() == -signal.SIGTERM
-    database = Database(home)
+    database = Database.of(Settings(home=home))
     with database.session() as session:
         row = session.scalars(select(JobRow)).one()
         assert (row.state, row.attempts) == ("queued", 0)

@@ -148,6 +148,7 @@ def test_a_model_has_so_many_aliases_and_no_more(api, arm, monkeypatch):
     assert put(api, arm, "three", version=1).status_code == 200
 
 
+@pytest.mark.own_files("damages the files below the home, where others lie in the store")
 def test_a_version_that_cannot_be_read_is_not_pointed_to(api, arm):
     put(api, arm, "production", version=1)
     service = service_of(api)

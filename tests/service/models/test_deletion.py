@@ -30,6 +30,7 @@ from service.errors import ConflictError, NotFoundError, UnreadableVersionError
 from service.files import Files
 from service.inference.loaded import LoadedModels
 from service.models import registry
+from service.settings import Settings
 from service.training.states import CANCELLED, RUNNING
 from service.updates.storage import snapshots
 from tests.service.data import error, service_of
@@ -65,7 +66,7 @@ def end(api, name):
 
 def snapshot(api, model, version, number=1):
     service = service_of(api)
-    return snapshots.save(service.database, service.files, model, version, number, b"state", seen=number, most=5)
+    return snapshots.save(service.database, service.files, model, version, number, b"state", most=5)
 
 
 def observe(api, model, sequence=1):
@@ -82,6 +83,7 @@ def arm(api, request):
     return name
 
 
+@pytest.mark.own_files("looks for the files below the home")
 def test_a_version_goes_with_its_files_and_its_number(api, arm):
     service, place = service_of(api), folder(api, arm, 2)
     kept, gone = snapshot(api, arm, 1), snapshot(api, arm, 2)
@@ -235,7 +237,7 @@ def test_files_that_are_damaged_are_told_from_files_that_were_deleted(api, arm):
 
 
 def test_the_shipped_model_stays_deleted(home):
-    database, files = Database(home), Files(home)
+    database, files = Database.of(Settings(home=home)), Files(home)
     registry.install_shipped(database, files)
     registry.install_shipped(database, files)
     with database.session() as session:

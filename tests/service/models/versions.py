@@ -27,7 +27,8 @@ def publish(api: Any, model: str, found: TorqueModel | None = None, lineage: Any
     """Add a version to a model of the service, which answers from then on; return its number."""
     service = service_of(api)
     folder = new_id("mv")
-    manifest = lipcore.save(found or trained(), service.files.versions / folder, lineage or {})
+    with service.files.new_version(folder) as target:
+        manifest = lipcore.save(found or trained(), target, lineage or {})
     with service.database.transaction() as session:
         version = registry.publish(session, model, folder, manifest, None, **arguments)
     service.loaded.announce([model])

@@ -105,6 +105,7 @@ def test_a_request_that_asks_is_in_flight(api):
     assert service_of(api).meters.requests.in_flight == 0
 
 
+@pytest.mark.own_files("counts the bytes of files below the home")
 def test_the_service_tells_of_itself(api):
     samples = scraped(api)
     assert value(samples, "lipserve_models_loaded") == len(service_of(api).loaded.versions())

@@ -92,10 +92,10 @@ def test_versions_that_cannot_be_read_are_a_warning_while_others_can(api, traine
     assert trained.name not in said
 
 
-def test_without_a_version_that_can_be_read_the_service_is_not_ready(api, look, monkeypatch, tmp_path):
+def test_without_a_version_that_can_be_read_the_service_is_not_ready(api, look, monkeypatch):
     service = service_of(api)
     monkeypatch.setattr(service.loaded, "versions", set)
-    monkeypatch.setattr(service.files, "versions", tmp_path)
+    monkeypatch.setattr(service.files, "has_version", lambda folder: False)
     assert look(service)["models"][0] == "failed"
 
 

@@ -11,6 +11,7 @@ from sqlalchemy import select
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES
 from service.database import Database, EventRow, ModelRow, StreamRow, VersionRow, now
+from service.settings import Settings
 from service.updates.storage import log
 from service.updates.storage.log import NewBatch
 
@@ -19,7 +20,7 @@ MODEL, OTHER = "arm", "other"
 
 def opened(home: Path) -> Database:
     """A database with two models, each of one version."""
-    database = Database(home)
+    database = Database.of(Settings(home=home))
     with database.transaction() as session:
         session.add_all(ModelRow(name=name, created_at=now()) for name in (MODEL, OTHER))
         session.flush()

@@ -17,6 +17,6 @@ from tests.service.updates.lessons import school as opened
 def school(api: object, trained: Trained, tmp_path_factory: pytest.TempPathFactory) -> Iterator[School]:
     """A service; every test enrols models of its own."""
     service = service_of(api)
-    folder = service.files.versions / registry.find(service.database, trained.name, 1).folder
+    folder = service.files.version_folder(registry.find(service.database, trained.name, 1).folder)
     with opened(tmp_path_factory.mktemp("school"), folder) as started:
         yield started

@@ -48,7 +48,8 @@ class School:
     def publish(self, model: str, **how: Any) -> None:
         """Add a version to a model, which is the same as trained; how: as in `registry.publish`."""
         folder = new_id("mv")
-        manifest = lipcore.copy_model(self.trained, self.service.files.versions / folder)
+        with self.service.files.new_version(folder) as target:
+            manifest = lipcore.copy_model(self.trained, target)
         with self.service.database.transaction() as session:
             registry.publish(session, model, folder, manifest, None, **how)
 

@@ -71,7 +71,8 @@ class Arm:
     @classmethod
     def open(cls, home: Path, **settings: Any) -> Arm:
         """A home with version 1 of the model."""
-        arm = cls(Database(home), Files(home), Settings(home=home, publish_every_s=0.02, **settings))
+        chosen = Settings(home=home, publish_every_s=0.02, **settings)
+        arm = cls(Database.of(chosen), Files.of(chosen), chosen)
         arm.publish()
         return arm
 
@@ -79,14 +80,15 @@ class Arm:
         """Add the trained model as a version, of this model unless said."""
         model = model or self.model
         folder = f"mv_{model}_{len(list(self.files.versions.iterdir()))}"
-        manifest = lipcore.save(trained(), self.files.versions / folder)
+        with self.files.new_version(folder) as target:
+            manifest = lipcore.save(trained(), target)
         with self.database.transaction() as session:
             return registry.publish(session, model, folder, manifest, None, **arguments)
 
     @property
     def base(self) -> TorqueModel:
         """The version as trained, as the service loads it."""
-        return lipcore.load(self.files.versions / registry.find(self.database, self.model, 1).folder)
+        return lipcore.load(self.files.version_folder(registry.find(self.database, self.model, 1).folder))
 
     def batch(self, number: int, size: int = ROWS, model: str | None = None, **fields: Any) -> int:
         """Log the batch with this sequence, predicted without error unless said; return its event's number."""

@@ -153,6 +153,22 @@ def test_a_state_that_a_rollback_has_overtaken_is_not_stored(arm, follower):
     assert stored(arm) == [4]
 
 
+def test_one_of_several_services_stores_for_all(arm, follower, monkeypatch):
+    monkeypatch.setattr(arm.database.adapter, "shared", True)
+    other = Follower(arm.database, arm.files, arm.settings, ARM, 1, arm.base)
+    arm.batches(0, 1)
+    caught_up(follower).store_in_turn()
+    arm.batches(2)
+    caught_up(other).store_in_turn()
+    assert stored(arm) == [2]
+    caught_up(follower).store_in_turn()
+    other.store()
+    assert stored(arm) == [2, 3]
+    arm.batches(3)
+    caught_up(other).store()  # at the end all of it, whoever was the last
+    assert stored(arm) == [2, 3, 4]
+
+
 def test_watchers_see_batches_before_they_are_learnt(arm, follower):
     seen = []
 

@@ -120,7 +120,7 @@ def test_stored_states_and_the_candidate_are_listed(school):
     pupil.teach(0, 1)
     service = school.service
     school.publish("candidate", candidate=True, start=1)
-    assert snapshots.save(service.database, service.files, "candidate", 1, 2, b"state", seen=2, most=9) is not None
+    assert snapshots.save(service.database, service.files, "candidate", 1, 2, b"state", most=9) is not None
     status = pupil.get("learning")["status"]
     assert (status["version"], status["candidate"]) == (1, {"version": 2, "revision": 1})
     assert [each["revision"] for each in status["snapshots"]] == [2]

@@ -11,6 +11,7 @@ from contextlib import suppress
 import numpy as np
 
 from service.database import Database
+from service.settings import Settings
 from service.updates.storage import log
 from service.updates.storage.payload import encode
 from tests.service.data import DEADLINE
@@ -19,9 +20,9 @@ from tests.service.updates.batches import MODEL, batch, everything, opened, rows
 ROWS = 50
 
 
-def send_batches(home, acknowledged, sequence, count, later):
+def send_batches(settings, acknowledged, sequence, count, later):
     """Send batches from a sequence on; be killed `later` s after `count` have been acknowledged."""
-    database = Database(home)
+    database = Database.of(settings)
     killing = threading.Timer(later, os.kill, (os.getpid(), signal.SIGKILL))
     while True:
         with database.transaction() as session:
@@ -39,7 +40,8 @@ def sent_until_killed(home, sequence, count, later):
     processes = multiprocessing.get_context("forkserver")
     processes.set_forkserver_preload([__name__])  # many processes, one import
     ours, theirs = processes.Pipe(duplex=False)
-    process = processes.Process(target=send_batches, args=(home, theirs, sequence, count, later), daemon=True)
+    given = Settings(home=home), theirs, sequence, count, later
+    process = processes.Process(target=send_batches, args=given, daemon=True)
     process.start()
     theirs.close()
     acknowledged = []
@@ -60,7 +62,7 @@ def test_a_kill_at_any_moment_loses_no_acknowledged_batch_and_leaves_none_twice(
         following = acknowledged[-1] + 1 if acknowledged else 0  # again what may be there, never what was acknowledged
         acknowledged += sent_until_killed(home, following, int(chance.integers(1, 6)), later)
 
-    database = Database(home)
+    database = Database.of(Settings(home=home))
     found = everything(database)
     sequences = [event.sequence for event in found]
     assert set(acknowledged) <= set(sequences)

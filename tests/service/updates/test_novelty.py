@@ -156,7 +156,8 @@ def test_a_worse_candidate_is_not_promoted(story):
     service, pupil = story.school.service, Pupil(story.pupil.client, "steady")
     for number, samples in enumerate((fast(seed=7).rows(slice(0, 4000, 40)), slow()), start=1):
         model = lipcore.train(samples, ["revolute"] * 2, options=lipcore.FitOptions(**OPTIONS))
-        manifest = lipcore.save(model, service.files.versions / f"mv_steady{number}", {})
+        with service.files.new_version(f"mv_steady{number}") as target:
+            manifest = lipcore.save(model, target, {})
         with service.database.transaction() as session:
             registry.publish(session, pupil.model, f"mv_steady{number}", manifest, None, candidate=number == 2)
     pupil.put("learning", {"contact_threshold": 1e6, "on_change": "learn", "auto_refresh": False})
@@ -189,4 +190,4 @@ def _queries() -> list[np.ndarray]:
 
 def _folder(story: Story, version: int) -> Any:
     service = story.school.service
-    return service.files.versions / registry.find(service.database, "arm", version).folder
+    return service.files.version_folder(registry.find(service.database, "arm", version).folder)

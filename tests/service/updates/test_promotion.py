@@ -28,7 +28,8 @@ def pupil(school):
 def publish(school, pupil, candidate=True, start=None):
     """Another version of a model, with the same torques."""
     folder = f"mv_{pupil.model}_{len(pupil.client.get(f'/v1/models/{pupil.model}').json()['versions'])}"
-    manifest = lipcore.copy_model(school.trained, school.service.files.versions / folder)
+    with school.service.files.new_version(folder) as target:
+        manifest = lipcore.copy_model(school.trained, target)
     with school.service.database.transaction() as session:
         return registry.publish(session, pupil.model, folder, manifest, None, candidate=candidate, start=start)
 

@@ -12,7 +12,7 @@ import pytest
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.online.revision import Revision
-from service.inference import loaded as memory
+from service.files import Files
 from service.inference.loaded import LoadedModels
 from service.updates.learner import learnt, publication
 from service.updates.learner.messages import Published
@@ -153,14 +153,14 @@ def test_a_version_dropped_from_memory_that_a_stream_holds_learns_on(arm, loaded
 
 def test_what_is_learnt_while_a_version_is_being_loaded_is_not_lost(arm, loaded, monkeypatch):
     drop(arm, loaded)
-    load = memory.lipcore.load
+    load = Files.load_version
 
     def meanwhile(*given):
         model = load(*given)
         assert not adopt(loaded, published(arm, 4))
         return model
 
-    monkeypatch.setattr(memory.lipcore, "load", meanwhile)
+    monkeypatch.setattr(Files, "load_version", meanwhile)
     assert loaded.get(ARM, None).revision == 4
     assert loaded.hot(ARM, None).revision == 4
 

@@ -95,7 +95,8 @@ def test_a_model_that_is_held_is_not_refreshed(ready):
 
 def test_a_candidate_in_contest_is_waited_for(ready):
     school, pupil = ready
-    manifest = lipcore.copy_model(school.trained, school.service.files.versions / f"mv_{pupil.model}_2")
+    with school.service.files.new_version(f"mv_{pupil.model}_2") as target:
+        manifest = lipcore.copy_model(school.trained, target)
     with school.service.database.transaction() as session:
         registry.publish(session, pupil.model, f"mv_{pupil.model}_2", manifest, None, candidate=True)
     assert consider(school, pupil) is None

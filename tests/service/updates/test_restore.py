@@ -10,9 +10,10 @@ import pytest
 from lipcore.online import state
 from lipcore.online.learner import OnlineModel
 from lipcore.vocabulary import CODES
-from service.updates.learner import learnt, recent
+from service.updates.learner import course, learnt, recent
 from service.updates.learner import restore as restoring
-from service.updates.learner.restore import RewoundError, advance
+from service.updates.learner.course import RewoundError
+from service.updates.learner.restore import advance
 from service.updates.storage import snapshots
 from tests.service.updates.pendulums import (
     ARM,
@@ -40,7 +41,7 @@ def arm(home):
 @pytest.fixture(params=[1, 25, 500], ids="pages of {} rows".format)
 def pages(request, monkeypatch):
     """Pages of one batch, of a few, and of all."""
-    monkeypatch.setattr(restoring, "PAGE_ROWS", request.param)
+    monkeypatch.setattr(course, "PAGE_ROWS", request.param)
 
 
 def snapshot(arm, at_most=None):
@@ -48,10 +49,8 @@ def snapshot(arm, at_most=None):
     known = arm.restored(at_most=at_most)
     assert known.settled
     payload = state.dump(known.online)
-    saved = snapshots.save(
-        arm.database, arm.files, ARM, 1, known.number, payload, seen=known.seen, most=arm.settings.max_snapshots
-    )
-    assert saved is not None
+    most = arm.settings.max_snapshots
+    assert snapshots.save(arm.database, arm.files, ARM, 1, known.number, payload, most=most) is not None
     return known.number
 
 
@@ -68,7 +67,7 @@ def followed(arm, known):
 def test_the_rows_of_a_log_are_learnt_as_if_there_had_been_one_batch(arm, pages):
     arm.batches(*range(12))
     known = arm.restored()
-    assert known.number == known.seen == 12
+    assert known.number == 12
     assert known.online.samples == pytest.approx(120)
     same(known.online, at_once(range(12)))
     assert differ(at_once(range(12)), at_once())
@@ -77,7 +76,6 @@ def test_the_rows_of_a_log_are_learnt_as_if_there_had_been_one_batch(arm, pages)
 def test_nothing_is_learnt_from_an_empty_log(arm):
     known = arm.restored()
     assert known.number == 0
-    assert not known.settled
     same(known.online, predicted(trained()))
 
 
@@ -102,7 +100,7 @@ def test_a_version_learns_what_came_after_its_training(arm):
 
 
 def test_a_page_takes_no_more_rows_than_it_may_and_at_least_a_batch(arm, monkeypatch):
-    monkeypatch.setattr(restoring, "PAGE_ROWS", 25)
+    monkeypatch.setattr(course, "PAGE_ROWS", 25)
     arm.batches(0, 1, 2)
     arm.batch(1, size=40, stream_id="other")
     known, seen = arm.restored(most_rows=0), []
@@ -113,7 +111,7 @@ def test_a_page_takes_no_more_rows_than_it_may_and_at_least_a_batch(arm, monkeyp
 
 
 def test_restoring_can_stop_after_some_rows_and_go_on(arm, monkeypatch):
-    monkeypatch.setattr(restoring, "PAGE_ROWS", 10)
+    monkeypatch.setattr(course, "PAGE_ROWS", 10)
     arm.batches(*range(6))
     known = arm.restored(most_rows=25)
     assert known.number == 3
@@ -159,6 +157,32 @@ def test_a_snapshot_of_another_version_is_not_taken(arm):
     same(found.online, at_once([1]))
 
 
+def test_who_is_overtaken_by_retention_goes_on_from_the_newest_snapshot(arm):
+    arm.batches(*range(4))
+    known = arm.restored(at_most=1)
+    assert snapshot(arm) == 4
+    arm.batches(4)
+    with arm.database.transaction() as session:
+        session.connection().exec_driver_sql("DELETE FROM events WHERE number <= 4")
+    with pytest.raises(RewoundError) as rewound:
+        advance(arm.database, known)
+    assert rewound.value.number is None
+    same(arm.restored(rewound=rewound.value).online, at_once(range(5)))
+
+
+def test_where_that_snapshot_is_lost_what_is_left_of_the_log_is_learnt(arm):
+    arm.batches(*range(4))
+    snapshot(arm)
+    arm.batches(4, 5)
+    with arm.database.transaction() as session:
+        session.connection().exec_driver_sql("DELETE FROM events WHERE number <= 4")
+    for path in arm.files.learning.glob("*.safetensors"):
+        path.unlink()
+    found = arm.restored()
+    assert found.number == 6
+    same(found.online, at_once([4, 5]))
+
+
 # taking out
 
 
@@ -201,20 +225,18 @@ def test_unlearning_twice_is_unlearning_once(arm):
     same(arm.restored().online, at_once([1]))
 
 
-def test_a_state_that_knows_of_a_later_unlearning_is_not_stored_as_that_of_its_number(arm, monkeypatch):
-    monkeypatch.setattr(restoring, "PAGE_ROWS", 10)
+def test_a_batch_that_is_unlearnt_later_is_learnt_at_its_place(arm, monkeypatch):
+    monkeypatch.setattr(course, "PAGE_ROWS", 10)
     arm.batches(*range(4))
     arm.unlearn(1)
-    known = arm.restored(most_rows=10)
-    assert known.number < 5
-    assert not known.settled
-    known = followed(arm, known)
-    assert known.settled
-    same(known.online, at_once([1, 2, 3]))
+    known = arm.restored(most_rows=30)
+    assert known.number == 3
+    same(known.online, at_once(range(3)))
+    same(followed(arm, known).online, at_once([1, 2, 3]))
 
 
 def test_what_was_unlearnt_while_the_pages_were_read_is_taken_out_once(arm, monkeypatch):
-    monkeypatch.setattr(restoring, "PAGE_ROWS", 10)
+    monkeypatch.setattr(course, "PAGE_ROWS", 10)
     arm.batches(*range(6))
     known = arm.restored(most_rows=30)
     assert known.number == 3
@@ -240,7 +262,7 @@ def test_a_rollback_leads_back(arm, pages):
 
 
 def test_a_rollback_reaches_what_was_read_in_between_and_no_more(arm, monkeypatch):
-    monkeypatch.setattr(restoring, "PAGE_ROWS", 10)
+    monkeypatch.setattr(course, "PAGE_ROWS", 10)
     arm.batches(*range(4))
     known = arm.restored(most_rows=20)
     assert known.number == 2
@@ -252,7 +274,7 @@ def test_a_rollback_reaches_what_was_read_in_between_and_no_more(arm, monkeypatc
 
 
 def test_a_rollback_between_two_pages_of_a_restart_is_followed(arm, monkeypatch):
-    monkeypatch.setattr(restoring, "PAGE_ROWS", 10)
+    monkeypatch.setattr(course, "PAGE_ROWS", 10)
     arm.batches(*range(6))
     calls, real = [], restoring.advance
 
@@ -286,11 +308,12 @@ def test_a_batch_that_was_rolled_back_cannot_be_taken_out_again(arm):
     same(arm.restored().online, at_once(range(2)))
 
 
-def test_the_state_of_an_earlier_event_is_without_what_has_been_unlearnt_since(arm):
+def test_the_state_of_an_earlier_event_is_told_with_or_without_what_has_been_unlearnt_since(arm):
     arm.batches(*range(5))
     snapshot(arm, at_most=3)
     arm.unlearn(2)
-    found = arm.restored(at_most=3)
+    same(arm.restored(at_most=3).online, at_once(range(3)))
+    found = arm.restored(at_most=3, taken_back=True)
     assert found.number == 3
     same(found.online, at_once([0, 2]))
 
@@ -367,10 +390,8 @@ def test_forgetting_that_was_set_before_a_version_was_trained_holds_for_it(arm):
 def test_under_forgetting_too_it_does_not_matter_in_which_steps_a_log_is_read(arm):
     arm.event("settings", forgetting_s=1.0)
     known = arm.restored()
-    arm.batch(5)
-    with pytest.raises(RewoundError):  # from the first batch on, the training is forgotten
-        advance(arm.database, known)
-    known = arm.restored()
+    arm.batch(5)  # from the first batch on, the training is forgotten
+    known = advance(arm.database, known)
     arm.batches(2, 3)
     same(followed(arm, known).online, predicted(arm.restored().online.model()))
 
@@ -397,7 +418,7 @@ def test_little_is_learnt_where_a_version_is_loaded_and_the_rest_is_left_to_the_
     found = learnt.find(arm.database, arm.files, ARM, 1, arm.base)
     assert (found.revision, found.behind) == (6, False)
     same(found.model, at_once(range(6)))
-    monkeypatch.setattr(restoring, "PAGE_ROWS", 10)
+    monkeypatch.setattr(course, "PAGE_ROWS", 10)
     monkeypatch.setattr(learnt, "MOST_ROWS", 20)
     found = learnt.find(arm.database, arm.files, ARM, 1, arm.base)
     assert (found.revision, found.behind) == (2, True)

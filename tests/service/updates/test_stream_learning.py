@@ -16,6 +16,7 @@ from sqlalchemy.orm import undefer
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from service.database import Database, EventRow
+from service.settings import Settings
 from service.stream.client import StreamClient, StreamError
 from service.updates.storage import payload
 from tests.service.data import DEADLINE, eventually, stream, train, upload
@@ -56,7 +57,7 @@ def client_of(server: Server, stream_id: str, model: str = "pendulum", **options
 
 def batches(server: Server, stream_id: str) -> list[EventRow]:
     """What is durable of a stream, in the order of the log."""
-    database = Database(server.home)
+    database = Database.of(Settings(home=server.home))
     try:
         with database.session() as session:
             query = select(EventRow).where(EventRow.stream_id == stream_id, EventRow.kind == "batch")
@@ -101,7 +102,7 @@ def test_what_a_controller_measures_is_learnt_while_it_asks(learning, measured):
 
 
 def test_nothing_is_acknowledged_before_it_is_in_the_database(learning, measured):
-    database = Database(learning.home)
+    database = Database.of(Settings(home=learning.home))
     with dial(learning, f"{STREAM}?stream_id=locked") as connection:
         hello(connection)
         with database.transaction() as session:  # nobody else can write

@@ -7,20 +7,21 @@ from alembic import op
 
 revision = "0001"
 down_revision = None
+NUMBER = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
 
 
 def upgrade() -> None:
     """Create what is missing."""
     op.create_table(
         "datasets",
-        sa.Column("seq", sa.Integer(), autoincrement=True, nullable=False),
+        sa.Column("seq", NUMBER, autoincrement=True, nullable=False),
         sa.Column("id", sa.String(length=40), nullable=False),
         sa.Column("name", sa.String(), nullable=False),
         sa.Column("created_at", sa.String(), nullable=False),
         sa.Column("sha256", sa.String(), nullable=False),
         sa.Column("torque_convention", sa.String(), nullable=False),
         sa.Column("joint_names", sa.JSON(), nullable=False),
-        sa.Column("rows", sa.Integer(), nullable=False),
+        sa.Column("rows", NUMBER, nullable=False),
         sa.Column("report", sa.JSON(), nullable=False),
         sa.PrimaryKeyConstraint("seq"),
         sa.UniqueConstraint("id"),
@@ -28,19 +29,19 @@ def upgrade() -> None:
     )
     op.create_table(
         "jobs",
-        sa.Column("seq", sa.Integer(), autoincrement=True, nullable=False),
+        sa.Column("seq", NUMBER, autoincrement=True, nullable=False),
         sa.Column("id", sa.String(length=40), nullable=False),
         sa.Column("model", sa.String(), nullable=False),
         sa.Column("state", sa.String(), nullable=False),
         sa.Column("request", sa.JSON(), nullable=False),
         sa.Column("progress", sa.JSON(), nullable=False),
-        sa.Column("attempts", sa.Integer(), nullable=False),
+        sa.Column("attempts", NUMBER, nullable=False),
         sa.Column("cancel_requested", sa.Boolean(), nullable=False),
         sa.Column("created_at", sa.String(), nullable=False),
         sa.Column("started_at", sa.String(), nullable=True),
         sa.Column("finished_at", sa.String(), nullable=True),
         sa.Column("heartbeat_at", sa.String(), nullable=True),
-        sa.Column("version", sa.Integer(), nullable=True),
+        sa.Column("version", NUMBER, nullable=True),
         sa.Column("error", sa.JSON(), nullable=True),
         sa.PrimaryKeyConstraint("seq"),
         sa.UniqueConstraint("id"),
@@ -49,7 +50,7 @@ def upgrade() -> None:
     op.create_index(op.f("ix_jobs_state"), "jobs", ["state"], unique=False, if_not_exists=True)
     op.create_table(
         "models",
-        sa.Column("seq", sa.Integer(), autoincrement=True, nullable=False),
+        sa.Column("seq", NUMBER, autoincrement=True, nullable=False),
         sa.Column("name", sa.String(length=64), nullable=False),
         sa.Column("created_at", sa.String(), nullable=False),
         sa.PrimaryKeyConstraint("seq"),
@@ -58,7 +59,7 @@ def upgrade() -> None:
     )
     op.create_table(
         "robots",
-        sa.Column("seq", sa.Integer(), autoincrement=True, nullable=False),
+        sa.Column("seq", NUMBER, autoincrement=True, nullable=False),
         sa.Column("id", sa.String(length=40), nullable=False),
         sa.Column("name", sa.String(), nullable=False),
         sa.Column("created_at", sa.String(), nullable=False),
@@ -71,11 +72,11 @@ def upgrade() -> None:
     )
     op.create_table(
         "snapshots",
-        sa.Column("seq", sa.Integer(), autoincrement=True, nullable=False),
+        sa.Column("seq", NUMBER, autoincrement=True, nullable=False),
         sa.Column("id", sa.String(length=40), nullable=False),
         sa.Column("model", sa.String(), nullable=False),
-        sa.Column("version", sa.Integer(), nullable=False),
-        sa.Column("number", sa.Integer(), nullable=False),
+        sa.Column("version", NUMBER, nullable=False),
+        sa.Column("number", NUMBER, nullable=False),
         sa.Column("created_at", sa.String(), nullable=False),
         sa.PrimaryKeyConstraint("seq"),
         sa.UniqueConstraint("id"),
@@ -83,7 +84,7 @@ def upgrade() -> None:
     )
     op.create_table(
         "alarms",
-        sa.Column("seq", sa.Integer(), autoincrement=True, nullable=False),
+        sa.Column("seq", NUMBER, autoincrement=True, nullable=False),
         sa.Column("model", sa.String(length=64), nullable=False),
         sa.Column("kind", sa.String(), nullable=False),
         sa.Column("at", sa.String(), nullable=False),
@@ -98,19 +99,19 @@ def upgrade() -> None:
     )
     op.create_table(
         "events",
-        sa.Column("seq", sa.Integer(), autoincrement=True, nullable=False),
+        sa.Column("seq", NUMBER, autoincrement=True, nullable=False),
         sa.Column("model", sa.String(length=64), nullable=False),
-        sa.Column("number", sa.Integer(), nullable=False),
+        sa.Column("number", NUMBER, nullable=False),
         sa.Column("kind", sa.String(), nullable=False),
         sa.Column("stream_id", sa.String(length=64), nullable=True),
         sa.Column("sequence", sa.BigInteger(), nullable=True),
         sa.Column("last_sequence", sa.BigInteger(), nullable=True),
         sa.Column("digest", sa.String(), nullable=True),
         sa.Column("received", sa.Double(), nullable=False),
-        sa.Column("version", sa.Integer(), nullable=True),
-        sa.Column("revision", sa.Integer(), nullable=True),
-        sa.Column("rows", sa.Integer(), nullable=False),
-        sa.Column("learnt", sa.Integer(), nullable=False),
+        sa.Column("version", NUMBER, nullable=True),
+        sa.Column("revision", NUMBER, nullable=True),
+        sa.Column("rows", NUMBER, nullable=False),
+        sa.Column("learnt", NUMBER, nullable=False),
         sa.Column("first", sa.Double(), nullable=True),
         sa.Column("last", sa.Double(), nullable=True),
         sa.Column("void", sa.Boolean(), nullable=False),
@@ -131,8 +132,8 @@ def upgrade() -> None:
     op.create_table(
         "learners",
         sa.Column("model", sa.String(length=64), nullable=False),
-        sa.Column("version", sa.Integer(), autoincrement=False, nullable=False),
-        sa.Column("start", sa.Integer(), nullable=False),
+        sa.Column("version", NUMBER, autoincrement=False, nullable=False),
+        sa.Column("start", NUMBER, nullable=False),
         sa.Column("role", sa.String(), nullable=False),
         sa.ForeignKeyConstraint(
             ["model"],
@@ -156,8 +157,8 @@ def upgrade() -> None:
     op.create_table(
         "serving",
         sa.Column("model", sa.String(length=64), nullable=False),
-        sa.Column("version", sa.Integer(), nullable=False),
-        sa.Column("change", sa.Integer(), nullable=False),
+        sa.Column("version", NUMBER, nullable=False),
+        sa.Column("change", NUMBER, nullable=False),
         sa.ForeignKeyConstraint(
             ["model"],
             ["models.name"],
@@ -185,7 +186,7 @@ def upgrade() -> None:
     op.create_table(
         "versions",
         sa.Column("model", sa.String(length=64), nullable=False),
-        sa.Column("version", sa.Integer(), autoincrement=False, nullable=False),
+        sa.Column("version", NUMBER, autoincrement=False, nullable=False),
         sa.Column("folder", sa.String(length=40), nullable=False),
         sa.Column("created_at", sa.String(), nullable=False),
         sa.Column("job", sa.String(), nullable=True),

@@ -7,13 +7,14 @@ from alembic import op
 
 revision = "0002"
 down_revision = "0001"
+NUMBER = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
 
 
 def upgrade() -> None:
     """Add them; the highest number of a version is that of those there are."""
     op.create_table(
         "api_keys",
-        sa.Column("seq", sa.Integer(), autoincrement=True, nullable=False),
+        sa.Column("seq", NUMBER, autoincrement=True, nullable=False),
         sa.Column("id", sa.String(length=40), nullable=False),
         sa.Column("name", sa.String(), nullable=False),
         sa.Column("hash", sa.String(length=64), nullable=False),
@@ -28,12 +29,12 @@ def upgrade() -> None:
     )
     op.create_table(
         "alias_moves",
-        sa.Column("seq", sa.Integer(), autoincrement=True, nullable=False),
+        sa.Column("seq", NUMBER, autoincrement=True, nullable=False),
         sa.Column("model", sa.String(length=64), nullable=False),
         sa.Column("alias", sa.String(length=64), nullable=False),
-        sa.Column("version", sa.Integer(), nullable=True),
-        sa.Column("before", sa.Integer(), nullable=True),
-        sa.Column("takes_back", sa.Integer(), nullable=True),
+        sa.Column("version", NUMBER, nullable=True),
+        sa.Column("before", NUMBER, nullable=True),
+        sa.Column("takes_back", NUMBER, nullable=True),
         sa.Column("at", sa.String(), nullable=False),
         sa.ForeignKeyConstraint(
             ["model"],
@@ -46,7 +47,7 @@ def upgrade() -> None:
         "aliases",
         sa.Column("model", sa.String(length=64), nullable=False),
         sa.Column("alias", sa.String(length=64), nullable=False),
-        sa.Column("version", sa.Integer(), nullable=False),
+        sa.Column("version", NUMBER, nullable=False),
         sa.Column("changed_at", sa.String(), nullable=False),
         sa.ForeignKeyConstraint(
             ["model"],
@@ -57,14 +58,14 @@ def upgrade() -> None:
     op.create_table(
         "deleted_models",
         sa.Column("name", sa.String(length=64), nullable=False),
-        sa.Column("last_version", sa.Integer(), nullable=False),
+        sa.Column("last_version", NUMBER, nullable=False),
         sa.Column("deleted_at", sa.String(), nullable=False),
         sa.PrimaryKeyConstraint("name"),
     )
     op.add_column("jobs", sa.Column("history", sa.JSON(), server_default="[]", nullable=False))
     op.add_column("jobs", sa.Column("retry_of", sa.String(length=40), nullable=True))
     op.add_column("jobs", sa.Column("request_id", sa.String(length=64), nullable=True))
-    op.add_column("models", sa.Column("last_version", sa.Integer(), server_default="0", nullable=False))
+    op.add_column("models", sa.Column("last_version", NUMBER, server_default="0", nullable=False))
     op.add_column("snapshots", sa.Column("sha256", sa.String(), nullable=True))
     op.add_column("versions", sa.Column("checksums", sa.JSON(), nullable=True))
     op.execute(

@@ -1,0 +1,44 @@
+"""`lipserve worker`."""
+
+from __future__ import annotations
+
+import os
+from typing import Annotated
+
+import typer
+from pydantic import ValidationError
+
+from service.cli.errors import CommandError
+from service.observability import logs
+from service.settings import Settings
+from service.training.process import THREAD_VARIABLES
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+@app.command()
+def worker(
+    gpus: Annotated[int, typer.Option(min=0, help="GPUs of this worker, for jobs that ask for one.")] = 0,
+    name: Annotated[str | None, typer.Option(help="Name in the cluster; its address by default.")] = None,
+) -> None:
+    """Run training jobs and shards of statistics for services that share a cluster, LIPSERVE_CLUSTER.
+
+    It needs the same LIPSERVE_DATABASE_URL and LIPSERVE_FILES_URL as they, and a home of its own for copies of files.
+    """
+    try:
+        settings = Settings()
+    except ValidationError as error:
+        faults = (f"{'.'.join(map(str, each['loc'])) or 'settings'}: {each['msg']}" for each in error.errors())
+        raise CommandError("; ".join(faults)) from None
+    if settings.cluster is None:
+        raise CommandError("LIPSERVE_CLUSTER is not set, expected the address of a scheduler such as tcp://host:8786")
+    logs.configure(logs.LogOptions(settings.log_level, settings.log_format))
+    # before numerics are imported: they start their threads then
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(settings.training_threads)))
+    from service.compute import membership  # noqa: PLC0415
+
+    try:
+        membership.check(settings)
+    except membership.CannotJoinError as error:
+        raise CommandError(str(error)) from None
+    membership.join(settings, gpus, name)

@@ -1,0 +1,117 @@
+"""The connection of a service to the scheduler of its cluster; a thread makes it again whenever it is lost."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+from urllib.parse import urlsplit
+
+from service.compute.executors import ClusterUnavailableError, connect
+
+logger = logging.getLogger(__name__)
+
+LOOK_S = 2.0
+"""Seconds between two looks at the scheduler."""
+JOB, GPU = "JOB", "GPU"
+"""Tags of workers that take jobs, and of those that have a GPU."""
+
+
+class Cluster:
+    """A cluster as one service sees it. All but `close` return at once, whatever the scheduler does.
+
+    problem: why it cannot be used now, None while it can; jobs, gpus: how many jobs its workers take at a time, and
+    how many of these with a GPU, as they were counted last.
+    """
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+        self.problem: str | None = f"the scheduler {address} has not answered yet"
+        self.jobs = self.gpus = 0
+        self._client: Any = None
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True, name="cluster")
+        self._thread.start()
+
+    def submit(self, key: str, gpu: bool, function: Callable[..., Any], *given: Any) -> Any:
+        """Have a worker that takes jobs call a function, even where this service is no more: a future of the cluster.
+
+        Raise ClusterUnavailableError.
+        """
+        client = self._client
+        if self.problem is not None or client is None:
+            raise ClusterUnavailableError(self.problem or "not connected")
+        import distributed  # noqa: PLC0415 - an extra
+
+        keep: Any = distributed.fire_and_forget  # its module is typed in part
+        resources = {JOB: 1, GPU: 1} if gpu else {JOB: 1}
+        try:
+            future = client.submit(function, *given, key=key, resources=resources, pure=False)
+            keep(future)
+        except Exception as error:  # it was lost just now, which has many forms
+            raise ClusterUnavailableError(f"the scheduler {self.address} cannot be used: {error}") from None
+        return future
+
+    def knows(self, future: Any) -> bool:
+        """Whether the scheduler still has the call in hand."""
+        return future.client is self._client and not future.done()
+
+    def drop(self, future: Any) -> None:
+        """Take a call back that nobody needs any more, if it has not begun."""
+        if self.knows(future):  # in a thread: it waits for the scheduler
+            threading.Thread(target=_cancel, args=(future,), daemon=True).start()
+
+    def close(self) -> None:
+        """Leave the cluster; what was submitted goes on."""
+        self._closing.set()
+        self._thread.join()
+        self._leave()
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            try:
+                self._look()
+                self.problem = None
+            except Exception as error:
+                said = str(error) or type(error).__name__
+                if self.problem != said:
+                    logger.warning("the cluster cannot be used: %s", said)
+                self.problem, self.jobs, self.gpus = said, 0, 0
+            self._closing.wait(LOOK_S)
+
+    def _look(self) -> None:
+        if self._client is not None and self._client.status not in ("running", "connecting"):
+            self._leave()
+        if self._client is None:
+            self._reach()
+            self._client = connect(self.address)
+        if self._client.status != "running":
+            raise ClusterUnavailableError(f"the scheduler {self.address} of the cluster does not answer")
+        workers = self._client.scheduler_info()["workers"].values()
+        takes = [each["resources"] for each in workers if each["resources"].get(JOB)]
+        self.jobs = round(sum(each[JOB] for each in takes))
+        self.gpus = sum(bool(each.get(GPU)) for each in takes)
+
+    def _reach(self) -> None:
+        """Raise an error where nobody listens: a client would try for long, and log it."""
+        parts = urlsplit(self.address)
+        try:
+            socket.create_connection((parts.hostname or "", parts.port or 8786), LOOK_S).close()
+        except OSError as error:
+            raise ClusterUnavailableError(
+                f"the scheduler {self.address} of the cluster cannot be reached: {error.strerror or error}"
+            ) from None
+
+    def _leave(self) -> None:
+        client, self._client = self._client, None
+        if client is not None:
+            with suppress(Exception):  # it may be gone
+                client.close(timeout=1.0)
+
+
+def _cancel(future: Any) -> None:
+    with suppress(Exception):  # then a worker finds that there is nothing to do
+        future.cancel(force=True)

@@ -1,0 +1,7 @@
+"""Files of the service: below its home, or in a store that several services share."""
+
+from service.files.durable import DamagedFileError
+from service.files.objects import FilesUnreachableError
+from service.files.store import Files, new_id
+
+__all__ = ["DamagedFileError", "Files", "FilesUnreachableError", "new_id"]

@@ -1,0 +1,143 @@
+"""The pass of a job over all of its rows: a posterior that stands on every one of them, summed shard by shard.
+
+What a shard's worker is given is plain data, so that it may be a process of another host: it opens the data set's file
+itself, and makes the basis of what the model is stored as. Both are kept for the shards that follow.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+import zlib
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TypeVar
+
+import numpy as np
+import torch
+
+from lipcore import persistence
+from lipcore.compact.statistics import empty
+from lipcore.compact.summing import Summing
+from lipcore.conditioning import Told, conditioned, told
+from lipcore.fit_options import FitOptions
+from lipcore.model import TorqueModel
+from lipcore.online import spacing
+from lipcore.samples import Array, Samples
+from service.compute.executors import placed, sent, shard_executor
+from service.compute.shards import summed
+from service.files import Files
+from service.sample_file import Reader
+from service.settings import Settings
+from service.training.material import Material
+from service.training.rows import Shard, Table
+
+Made = TypeVar("Made")
+
+
+@dataclass(frozen=True)
+class Context:
+    """What all shards of a pass share, in plain data. settings: None for a worker with settings of its own; model: its
+    files, packed; joint_names: of the data; device: to compute on."""
+
+    settings: Settings | None
+    model: dict[str, bytes]
+    joint_names: tuple[str, ...]
+    device: str
+
+
+def all_rows(
+    settings: Settings,
+    model: TorqueModel,
+    material: Material,
+    table: Table,
+    options: FitOptions,
+    cancelled: Callable[[], bool],
+    progress: Callable[[float], None],
+) -> TorqueModel:
+    """The model with the posterior of all rows of its material, instead of those that its fit has chosen.
+
+    table: the data sets' rows, each with what it counts; progress: told what share is done.
+    Raise FitCancelledError when `cancelled` says so.
+    """
+    gpu = options.device == "cuda"
+    found: Told | None = None
+    shards = table.shards()
+    if shards:
+        progress(0.0)
+        context = Context(sent(settings), packed(model), model.joint_names, "cuda" if gpu else "cpu")
+        with shard_executor(settings, gpu) as executor:
+            work = partial(shard_told, context)
+            done = partial(_report, progress, len(table) / material.rows, len(shards))
+            found = summed(executor, work, shards, cancelled, done=done)
+    if material.logged is not None:
+        logged = told(Summing.of(model.posterior), *material.logged, cancelled)
+        found = logged if found is None else found + logged
+    assert found is not None  # a job has samples
+    return conditioned(model, found, material.rows)
+
+
+def shard_told(context: Context, shard: Shard) -> Told:
+    """What the rows of one shard tell: done by a worker."""
+    summing = _cached(_SUMMING, _name(context), 2, lambda: _summing(context))
+    samples, weights = read(placed(context.settings), context.joint_names, shard)
+    return told(summing, samples, weights)
+
+
+def read(settings: Settings, joint_names: tuple[str, ...], shard: Shard) -> tuple[Samples, Array]:
+    """The rows of a shard that count, and how much each of them does, (N,)."""
+
+    def opened() -> Reader:
+        return Reader(Files.of(settings).samples_file(shard.dataset, shard.sha256))
+
+    reader = _cached(_READERS, shard.sha256 + shard.dataset, 8, opened)
+    # one more row at both ends, as weights are those of the whole recording
+    first, last = max(0, shard.first - 1), min(reader.rows, shard.last + 1)
+    rows, mask = slice(shard.first - first, shard.last - first), shard.mask()
+    values = {name: reader.array(name, first, last) for name in ("t", "episode")}
+    weights = np.full(shard.last - shard.first, shard.factor)
+    if shard.timed:
+        weights *= spacing.recorded(values["t"], values["episode"])[rows]
+    values = {name: each[rows] for name, each in values.items()}
+    values |= {name: reader.array(name, shard.first, shard.last) for name in ("q", "dq", "ddq", "tau")}
+    samples = Samples(joint_names=joint_names, **values)
+    return (samples, weights) if mask is None else (samples.rows(mask), weights[mask])
+
+
+def packed(model: TorqueModel) -> dict[str, bytes]:
+    """The files of a model without what it has learnt, a tenth of a megabyte: its basis and noise are in them."""
+    posterior = replace(model.posterior, statistics=empty(len(model.posterior.basis)))
+    _, files = persistence.encode(replace(model, posterior=posterior))
+    return {name: zlib.compress(each) for name, each in files.items()}
+
+
+def _summing(context: Context) -> Summing:
+    files = {name: zlib.decompress(each) for name, each in context.model.items()}
+    return Summing.of(persistence.decode(files).posterior, torch.device(context.device))
+
+
+def _name(context: Context) -> str:
+    return hashlib.sha256(b"".join(context.model.values())).hexdigest() + context.device
+
+
+def _report(progress: Callable[[float], None], share: float, shards: int, done: int) -> None:
+    progress(share * done / shards)
+
+
+_SUMMING: OrderedDict[str, Summing] = OrderedDict()
+_READERS: OrderedDict[str, Reader] = OrderedDict()
+_lock = threading.Lock()
+"""A worker of a cluster has several threads."""
+
+
+def _cached(kept: OrderedDict[str, Made], key: str, most: int, make: Callable[[], Made]) -> Made:
+    """What is kept under a key, made where it is not; the `most` used last are kept."""
+    with _lock:
+        if key not in kept:
+            kept[key] = make()
+        kept.move_to_end(key)
+        while len(kept) > most:
+            kept.popitem(last=False)
+        return kept[key]

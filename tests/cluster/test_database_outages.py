@@ -1,0 +1,140 @@
+"""The PostgreSQL server goes away and comes back: clients are told to come again, and everything goes on by itself."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import httpx
+import pytest
+from fastapi.testclient import TestClient
+from sqlalchemy import select
+
+from service.app import create_app
+from service.database import Database, EventRow
+from service.files import Files
+from tests.cluster.pairs import Pair, publish, train
+from tests.service.data import ADDRESS, ENDLESS, arrays, ended, error, eventually, npz, queue, running, stream, upload
+from tests.service.data import job as looked
+from tests.service.data import train as train_job
+from tests.service.server import Server
+from tests.service.updates.lessons import Pupil, lesson
+
+ARM = "arm"
+
+
+@pytest.fixture
+def away(postgres) -> Iterator[None]:
+    """The server is not there for the while of a test, unless it starts it itself."""
+    yield postgres.stop()
+    postgres.start()
+
+
+@pytest.fixture
+def service(shared) -> Iterator[Pair]:
+    """A service with settings under which a test need not wait."""
+    settings = shared.settings(publish_every_s=0.02, database_timeout_s=2.0)
+    with TestClient(create_app(settings), ADDRESS, raise_server_exceptions=False) as client:
+        yield Pair((client,), train(shared.folder / "trained"))
+
+
+def restarted(postgres, answered):
+    """Restart the server once something was answered twice, and wait until it is answered twice again."""
+    for _ in range(2):
+        seen = len(answered)
+        eventually(lambda seen=seen: len(answered) >= seen + 2)
+        postgres.restart()
+    seen = len(answered)
+    eventually(lambda: len(answered) >= seen + 2)
+
+
+def test_while_the_server_is_away_clients_are_told_to_come_again(service, postgres):
+    (pupil,), (client,) = service.enrol(ARM), service.clients
+    body = npz(**arrays(stream()))
+    upload_it = {"content": body, "headers": {"content-type": "application/x-npz"}}
+    requests = [
+        ("GET", "/v1/models", {}),
+        ("GET", "/v1/jobs", {}),
+        ("GET", f"/v1/models/{ARM}", {}),
+        ("POST", "/v1/datasets", upload_it),
+        ("POST", f"/v1/models/{ARM}/observations", {"json": lesson(0)}),
+        ("PUT", f"/v1/models/{ARM}/learning", {"json": {}}),
+    ]
+    postgres.stop()
+    try:
+        for method, path, request in requests:
+            answer = client.request(method, path, **request)
+            assert "cannot be reached" in error(answer, 503, "storage_unavailable")["message"], path
+            assert answer.headers["retry-after"] == "1"
+        said = error(client.get("/health/ready"), 503, "not_ready")
+        assert "database" in {item["field"] for item in said["detail"]}
+        assert client.get("/health/live").status_code == 200
+        assert pupil.predict()["revision"] == 0  # what is loaded goes on answering
+    finally:
+        postgres.start()
+    for method, path, request in requests:
+        assert client.request(method, path, **request).is_success, path
+    assert pupil.settled(1)["revision"] == 1
+    eventually(lambda: client.get("/health/ready").status_code == 200)
+
+
+@pytest.mark.slow
+def test_a_service_does_not_notice_that_the_server_was_restarted_between_two_requests(service, postgres):
+    (pupil,) = service.enrol(ARM)
+    pupil.teach(0)
+    postgres.restart()
+    assert service.clients[0].get("/v1/models").is_success
+    assert pupil.teach(1)["revision"] == 2
+
+
+def test_restarts_under_load_lose_nothing_that_was_acknowledged(shared, postgres):
+    settings = shared.settings("before")
+    database = Database.of(settings)
+    publish(database, Files.of(settings), train(shared.folder / "trained"), ARM)
+    answered: list[int] = []
+    revisions: list[int] = []
+    failures: list[Exception] = []
+    enough = threading.Event()
+
+    def send(client: httpx.Client) -> None:
+        number = 0
+        try:
+            while not enough.is_set():
+                answer = client.post(f"/v1/models/{ARM}/observations", json=lesson(number % 40, sequence=number))
+                if answer.status_code == 200:
+                    answered.append(number)
+                    revisions.append(answer.json()["revision"])
+                    number += 1
+                else:
+                    assert answer.status_code == 503, answer.text
+                    assert answer.headers["retry-after"]
+        except Exception as error:
+            failures.append(error)
+
+    with Server(shared.home("one"), **shared.env(), LIPSERVE_PUBLISH_EVERY_S="0.1") as server:
+        pupil = Pupil(server.client, ARM)
+        pupil.put("learning", {"contact_threshold": 1e6, "on_change": "learn", "auto_refresh": False})
+        dataset = upload(server.client, stream())["id"]
+        panda = upload(server.client, stream("panda", samples=200))["id"]
+        job = queue(server.client, "endless", panda, options=ENDLESS)["id"]
+        running(server.client, job)
+        with httpx.Client(base_url=server.url, timeout=60) as own:
+            sender = threading.Thread(target=send, args=(own,))
+            sender.start()
+            try:
+                restarted(postgres, answered)
+            finally:
+                enough.set()
+                sender.join()
+        assert failures == []
+        before = looked(server.client, job)["progress"]["iteration"]
+        eventually(lambda: looked(server.client, job)["progress"]["iteration"] > before)
+        assert server.client.post(f"/v1/jobs/{job}/cancel").is_success
+        assert (ended(server.client, job)["state"], looked(server.client, job)["attempts"]) == ("cancelled", 1)
+        train_job(server.client, "trained", dataset)
+        assert pupil.settled(revisions[-1])["revision"] == revisions[-1]
+        assert server.client.get("/health/ready").status_code == 200
+    with database.session() as session:
+        query = select(EventRow.sequence).where(EventRow.kind == "batch").order_by(EventRow.number)
+        assert session.scalars(query).all() == answered
+    database.close()

@@ -1,0 +1,80 @@
+"""`--backend shared`: the services of these tests on PostgreSQL and S3, with nothing else changed.
+
+A home then names what a service shares as well as what it has for itself: settings with the same home find the same
+database and the same prefix, in this process and in those that tests start.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from unittest.mock import patch
+
+from service.settings import Settings
+
+if TYPE_CHECKING:
+    from tests.cluster.servers import S3, Postgres
+
+OWN, SHARED = "own", "shared"
+"""SQLite and files below the home of each service, or PostgreSQL and S3."""
+_DATABASE, _FILES = "LIPSERVE_DATABASE_URL", "LIPSERVE_FILES_URL"
+_backend: Backend | None = None
+
+
+class Backend:
+    """Servers, and which database and prefix each home has on them."""
+
+    def __init__(self, postgres: Postgres, s3: S3) -> None:
+        self._postgres, self._s3 = postgres, s3
+        self._databases: dict[str, str] = {}
+
+    def urls(self, home: Path | str) -> dict[str, str]:
+        """Settings of a service on a home; the first time its database is made."""
+        from tests.cluster.servers import BUCKET
+
+        key = str(Path(home).resolve())
+        if key not in self._databases:
+            self._databases[key] = self._postgres.create()
+        database = self._databases[key]
+        return {"database_url": self._postgres.url_of(database), "files_url": f"s3://{BUCKET}/{database}"}
+
+
+def environment(home: Path) -> dict[str, str]:
+    """What a service in a process of its own needs in its environment; nothing on its own files."""
+    if _backend is None:
+        return {}
+    urls = _backend.urls(home)
+    return {_DATABASE: urls["database_url"], _FILES: urls["files_url"]}
+
+
+@contextmanager
+def shared() -> Iterator[None]:
+    """Have every service that is made meanwhile, here or by `tests.service.server`, share a database and files."""
+    global _backend  # noqa: PLW0603 - settings are made all over the tests
+    from tests.cluster.servers import S3, Postgres, server_folder
+
+    with server_folder() as folder:
+        postgres, s3 = Postgres(folder), S3()
+        _backend = Backend(postgres, s3)
+        try:
+            with patch.object(Settings, "__init__", _init), patch.dict(os.environ, s3.env):
+                yield
+        finally:
+            _backend = None
+            s3.close()
+            postgres.close()
+
+
+_own_init = Settings.__init__
+
+
+def _init(self: Settings, **values: Any) -> None:
+    """As `Settings` does it, with the database and the prefix of the home unless some are named."""
+    home = values.get("home") or os.environ.get("LIPSERVE_HOME")
+    named = {"database_url", "files_url"} & set(values) or {_DATABASE, _FILES} & set(os.environ)
+    if _backend is not None and home is not None and not named:
+        values |= _backend.urls(home)
+    _own_init(self, **values)

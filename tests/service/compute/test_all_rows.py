@@ -1,0 +1,142 @@
+"""A job's pass over all rows of its data sets: what is read, and what it comes to, whoever does it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+import lipcore
+from lipcore.conditioning import SHARD, condition
+from lipcore.online import spacing
+from lipcore.samples import Samples
+from service.compute.executors import Inline, shard_executor
+from service.compute.shards import summed
+from service.database import DatasetRow
+from service.files import Files, new_id
+from service.sample_file import Reader
+from service.settings import Settings
+from service.training.rows import CANDIDATES, STRETCHES, Part, Table, opened
+from service.training.summing import Context, packed, read, shard_told
+from tests.service.data import QUICK, stream
+
+ROWS = SHARD + 700
+
+
+def recording(seed: int = 1) -> Samples:
+    """Two episodes at 100 Hz, longer than a shard together."""
+    samples = stream(samples=ROWS, seed=seed, rate=100.0)
+    return replace(samples, episode=np.repeat([4, 9], [900, ROWS - 900]))
+
+
+@pytest.fixture(scope="module")
+def settings(tmp_path_factory):
+    return Settings(home=tmp_path_factory.mktemp("rows"), statistics_workers=2, training_cpus=2, training_niceness=0)
+
+
+@pytest.fixture(scope="module")
+def parts(settings):
+    """Two data sets; the second has no times."""
+    files, rows = Files.of(settings), []
+    for seed, rate in ((1, 100.0), (2, None)):
+        samples, name = recording(seed), new_id("ds")
+        sha256 = files.write_samples(name, ROWS, 2, partial(getattr, samples))
+        joints = list(samples.joint_names)
+        rows.append(DatasetRow(id=name, sha256=sha256, joint_names=joints, report={"rate_hz": rate}))
+    return opened(files, rows)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return lipcore.train(stream(), ["revolute"] * 2, options=lipcore.FitOptions(**QUICK, statistics="chosen"))
+
+
+def masked(part: Part) -> Part:
+    """Some stretches of it, and none of the middle."""
+    mask = np.arange(ROWS) % 50 < 30
+    mask[1000:2000] = False
+    return replace(part, chosen=mask)
+
+
+def test_a_reader_reads_rows(parts):
+    reader: Reader = parts[0].reader
+    np.testing.assert_array_equal(reader.array("q", 17, 940), recording().q[17:940])
+    index = np.array([0, 3, 4, 899, 900, ROWS - 1])
+    for name, values in reader.take(index).items():
+        np.testing.assert_array_equal(values, getattr(recording(), name)[index])
+    assert reader.take(np.empty(0, np.int64))["tau"].shape == (0, 2)
+    with pytest.raises(ValueError, match="tau ends before"):
+        reader.array("tau", 0, ROWS + 1)
+
+
+def test_a_table_is_its_parts_in_order(parts):
+    table = Table([masked(parts[0]), parts[1]])
+    whole = Samples.concatenate([recording(1).rows(table.parts[0].chosen), recording(2)])
+    assert len(table) == len(whole) == len(table.thinned(10**6))
+    np.testing.assert_array_equal(table.thinned(10**6).tau, whole.tau)
+    index = np.linspace(0, len(whole) - 1, 300).round().astype(np.int64)
+    np.testing.assert_array_equal(table.thinned(300).q, whole.q[index])
+    # a new episode begins where rows are left out
+    assert len(Table([masked(parts[0])]).thinned(10**6).episodes()) == 35
+    assert len(Table([parts[0]]).thinned(10**6).episodes()) == 2
+
+
+def test_stretches_are_contiguous(parts):
+    found = Table(parts).stretches()
+    assert len(found) <= min(2 * ROWS, STRETCHES * 500) < CANDIDATES + 1
+    for each in found.episodes():
+        np.testing.assert_allclose(np.diff(found.t[each]), 0.01, rtol=1e-6)
+
+
+def test_shards_weigh_rows_as_the_whole_does(settings, parts):
+    for part in (masked(parts[0]), parts[0]):
+        shards = list(part.shards())
+        assert {each.last - each.first for each in shards} == {SHARD, ROWS - SHARD}
+        read_back = [read(settings, tuple(part.row.joint_names), each) for each in shards]
+        samples, mask = recording(), slice(None) if part.chosen is None else part.chosen
+        weights = np.concatenate([weights for _, weights in read_back])
+        np.testing.assert_array_equal(weights, spacing.recorded(samples.t, samples.episode)[mask])
+        np.testing.assert_array_equal(np.concatenate([each.tau for each, _ in read_back]), samples.tau[mask])
+        assert part.worth() == pytest.approx(weights.sum())
+
+
+def test_rows_without_times_count_for_no_more_than_the_chosen_ones(parts):
+    table = Table(parts).weighed(500)
+    assert [part.factor for part in table.parts] == [1.0, 500 / ROWS]
+    assert table.worth() == pytest.approx(0.1 * ROWS + 500, rel=0.01)
+    assert Table([parts[1]]).weighed(500).worth() == pytest.approx(500)
+
+
+def test_shards_without_rows_are_left_out(parts):
+    mask = np.zeros(ROWS, dtype=bool)
+    mask[SHARD + 5] = True
+    (shard,) = replace(parts[0], chosen=mask).shards()
+    assert (shard.first, shard.last) == (SHARD, ROWS)
+
+
+def test_the_pass_is_the_same_in_processes_and_here(settings, parts, model):
+    """To the last bit; and what the plain way finds, to rounding."""
+    table = Table([masked(parts[0]), parts[0]])
+    context = Context(settings, packed(model), model.joint_names, "cpu")
+    work, shards = partial(shard_told, context), table.shards()
+    here = summed(Inline(), work, shards, lambda: False)
+    with shard_executor(settings) as executor:
+        there = summed(executor, work, shards, lambda: False)
+    assert here.a.tobytes() == there.a.tobytes()
+    assert here.b.tobytes() == there.b.tobytes()
+
+    samples = recording()
+    weights = spacing.recorded(samples.t, samples.episode)
+    mask = table.parts[0].chosen
+    both = Samples.concatenate([samples.rows(mask), samples])
+    plain = condition(model, both, np.concatenate([weights[mask], weights])).posterior.statistics
+    assert here.weight == pytest.approx(plain.samples)
+    a = plain.a.numpy()[np.triu_indices(len(plain.a))]
+    assert np.abs(here.a - a).max() <= 1e-8 * np.abs(a).max()
+    assert np.abs(here.b - plain.b.numpy()).max() <= 1e-8 * np.abs(plain.b.numpy()).max()
+
+
+def test_a_packed_model_is_small(model):
+    assert sum(map(len, packed(model).values())) < 100_000

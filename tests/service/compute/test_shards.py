@@ -1,0 +1,140 @@
+"""Sums over shards: the same bits whoever computes what when, and nothing is lost with a worker."""
+
+from __future__ import annotations
+
+import random
+import threading
+from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lipcore.fitting import FitCancelledError
+from service.compute.executors import Inline, shard_executor
+from service.compute.shards import AHEAD, ShardFailedError, summed
+from service.settings import Settings
+from tests.service.compute.work import dying, numbers
+
+SHARDS = list(range(37))
+
+
+def deadly(shard: int) -> np.ndarray:
+    """Nobody survives this one."""
+    raise BrokenProcessPool(f"shard {shard}")
+
+
+def wrong(shard: int) -> np.ndarray:
+    raise ZeroDivisionError(str(shard))
+
+
+def never() -> bool:
+    return False
+
+
+def tree(parts: list[np.ndarray]) -> np.ndarray:
+    """The sum as it is meant: the largest power of two first, halved again and again."""
+    if len(parts) == 1:
+        return parts[0]
+    half = 1 << ((len(parts) - 1).bit_length() - 1)
+    return tree(parts[:half]) + tree(parts[half:])
+
+
+class Shuffled(Executor):
+    """Ends what was submitted in an order of its own."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng, self.waiting = random.Random(seed), []
+
+    def submit(self, fn, /, *args, **kwargs):
+        future: Future = Future()
+        self.waiting.append((future, partial(fn, *args, **kwargs)))
+        return future
+
+    def one(self) -> bool:
+        """End one of them; asked with every look at whether to stop."""
+        if self.waiting and self.rng.random() < 0.7:
+            future, call = self.waiting.pop(self.rng.randrange(len(self.waiting)))
+            if self.rng.random() < 0.1:
+                future.set_exception(CancelledError())  # as of a worker that is gone
+            else:
+                future.set_result(call())
+        return False
+
+
+@settings(max_examples=25, deadline=None)
+@given(count=st.integers(1, 90), seed=st.integers(0, 10**6))
+def test_the_sum_does_not_depend_on_the_order(count, seed):
+    executor = Shuffled(seed)
+    shards = list(range(count))
+    found = summed(executor, numbers, shards, executor.one, attempts=1000)
+    assert found.tobytes() == summed(Inline(), numbers, shards, never).tobytes()
+    assert found.tobytes() == tree([numbers(each) for each in shards]).tobytes()
+
+
+def test_a_lost_process_costs_its_shard_another_attempt(tmp_path):
+    expected = summed(Inline(), numbers, SHARDS, never)
+    with shard_executor(Settings(home=tmp_path, statistics_workers=2, training_cpus=2)) as executor:
+        found = summed(executor, partial(dying, str(tmp_path)), SHARDS, never)
+    assert found.tobytes() == expected.tobytes()
+    assert {"3", "20"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_a_shard_that_loses_every_worker_fails():
+    with pytest.raises(ShardFailedError, match="shard 1 of 37: its worker was lost 3 times"):
+        summed(Inline(), deadly, SHARDS, never)
+
+
+def test_an_error_of_the_work_is_raised():
+    with pytest.raises(ZeroDivisionError):
+        summed(Inline(), wrong, SHARDS, never)
+
+
+def test_a_sum_can_be_cancelled():
+    release, begun = threading.Event(), []
+
+    def slow(shard: int) -> np.ndarray:
+        begun.append(shard)
+        release.wait(60)
+        return numbers(shard)
+
+    try:
+        with ThreadPoolExecutor(1) as pool:
+            with pytest.raises(FitCancelledError):
+                summed(pool, slow, SHARDS, lambda: bool(begun))
+            release.set()
+        assert len(begun) <= 2  # what waited was taken back
+    finally:
+        release.set()
+
+
+def test_no_more_results_wait_than_may():
+    """The first shard is the last to end: the others wait for it, and no further ones are begun meanwhile."""
+    first, begun = Future(), []
+
+    class Late(Inline):
+        def submit(self, fn, /, *args, **kwargs):
+            begun.append(args[0])
+            return first if args[0] == 0 else super().submit(fn, *args, **kwargs)
+
+    looks = iter(range(3 * AHEAD))
+
+    def look() -> bool:
+        if next(looks, None) == 3 * AHEAD - 1:
+            assert len(begun) == AHEAD
+            first.set_result(numbers(0))
+        return False
+
+    shards = list(range(2 * AHEAD))
+    found = summed(Late(), numbers, shards, look)
+    assert found.tobytes() == summed(Inline(), numbers, shards, never).tobytes()
+    assert sorted(begun) == shards
+
+
+def test_progress_counts_what_is_added():
+    seen = []
+    summed(Inline(), numbers, SHARDS, never, done=seen.append)
+    assert seen == [each + 1 for each in SHARDS]

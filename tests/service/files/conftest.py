@@ -1,0 +1,47 @@
+"""Shared stores: a folder, and a bucket of a real S3 endpoint."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from itertools import count
+from pathlib import Path
+from unittest.mock import patch
+
+import pytest
+
+from service.files import Files
+from tests.cluster.servers import BUCKET, S3
+
+_prefixes = count(1)
+
+
+@pytest.fixture(scope="session")
+def s3() -> Iterator[S3]:
+    """An S3 endpoint; a test that stops it starts it again."""
+    server = S3()
+    yield server
+    server.close()
+
+
+@pytest.fixture
+def bucket(s3: S3) -> Iterator[str]:
+    """A prefix of a bucket of its own."""
+    with patch.dict(os.environ, s3.env):
+        yield f"s3://{BUCKET}/files{next(_prefixes)}"
+
+
+@pytest.fixture(params=["folder", "bucket"])
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """A shared store, of either kind."""
+    if request.param == "bucket":
+        return str(request.getfixturevalue("bucket"))
+    folder = tmp_path / "mounted here"
+    folder.mkdir()
+    return folder.as_uri()
+
+
+@pytest.fixture
+def host(url: str, tmp_path: Path) -> Callable[..., Files]:
+    """Files of a service with a home of its own, by its name."""
+    return lambda name="one", **more: Files(tmp_path / name, url, **more)

@@ -1,0 +1,179 @@
+"""A shared store that is not there: who needs it is told so, in time, and what has a copy here goes on."""
+
+from __future__ import annotations
+
+import errno
+import os
+import pickle
+import shutil
+import threading
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from service import storage_errors
+from service.errors import StorageFullError, StorageUnavailableError
+from service.files import Files, FilesUnreachableError, objects
+from service.home import HomeError, check_home
+from service.settings import Settings
+from tests.service.data import stream
+
+
+def put(files, dataset="ds_one"):
+    samples = stream(samples=10)
+    return files.write_samples(dataset, len(samples), samples.n_joints, partial(getattr, samples))
+
+
+def asked(files):
+    """Everything that needs the store."""
+    return {
+        "write": lambda: put(files, "ds_two"),
+        "read": lambda: files.samples_file("ds_else", "0" * 64),
+        "snapshot": lambda: files.read_snapshot("snap_else"),
+        "load": lambda: files.load_version("mv_else", None),
+        "versions": lambda: files.versions_marked("job"),
+        "sweep": lambda: files.sweep(set(), set(), set()),
+        "check": files.check,
+    }
+
+
+def refused(files):
+    """What is said to each question."""
+    found = {}
+    for name, ask in asked(files).items():
+        with pytest.raises(FilesUnreachableError) as caught:
+            ask()
+        found[name] = str(caught.value)
+    return found
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Requests that are sent once: the library's pauses are its own affair."""
+    pytest.importorskip("s3fs")
+    monkeypatch.setattr("service.files.bucket.ATTEMPTS", 1)
+
+
+def test_an_endpoint_that_is_down_is_found_and_found_again(s3, bucket, tmp_path, quick):
+    files = Files(tmp_path, bucket)
+    digest = put(files)
+    s3.stop()
+    try:
+        said = refused(files)
+        assert all("does not answer" in each for each in said.values())
+        assert files.samples_file("ds_one", digest).exists()
+        files.delete_samples("ds_one")  # it is swept later
+    finally:
+        s3.start()
+    assert Files(tmp_path / "other", bucket).samples_file("ds_one", digest).exists()
+    put(files, "ds_two")
+
+
+def test_a_bucket_that_is_gone_does_not_make_data_lost(bucket, tmp_path, quick):
+    said = refused(Files(tmp_path, "s3://nobody-has-this/files"))
+    assert all("bucket" in each for each in said.values()), said
+
+
+def test_a_folder_that_is_not_mounted_is_not_made(tmp_path):
+    root = tmp_path / "mounted"
+    said = refused(Files(tmp_path / "home", root.as_uri()))
+    assert all("is it mounted?" in each for each in said.values())
+    assert not root.exists()
+
+
+def test_a_folder_that_was_unmounted_is_found(tmp_path):
+    root = tmp_path / "mounted"
+    root.mkdir()
+    files = Files(tmp_path / "home", root.as_uri())
+    digest = put(files)
+    shutil.move(root, tmp_path / "away")
+    refused(files)
+    shutil.move(tmp_path / "away", root)
+    assert Files(tmp_path / "other", root.as_uri()).samples_file("ds_one", digest).exists()
+
+
+@pytest.mark.parametrize(
+    ("raised", "said"),
+    [
+        (PermissionError("User: arn:secret is not allowed"), "access is denied"),
+        (TimeoutError(), "in time"),
+        (OSError(errno.EIO, "Reduce your rate"), "refuses"),
+    ],
+)
+def test_what_a_bucket_refuses_is_told_without_secrets(bucket, tmp_path, monkeypatch, raised, said):
+    files = Files(tmp_path, bucket)
+
+    def refuse(*_, **__):
+        raise raised
+
+    monkeypatch.setattr(files._place.objects._system, "put_file", refuse)
+    with pytest.raises(FilesUnreachableError, match=said) as caught:
+        put(files)
+    assert "secret" not in str(caught.value)
+
+
+def test_a_disk_without_room_for_a_copy_is_a_full_disk(bucket, tmp_path, monkeypatch):
+    digest = put(Files(tmp_path / "one", bucket))
+    files = Files(tmp_path / "other", bucket)
+
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(files._place.objects._system, "get_file", full)
+    with pytest.raises(OSError, match="No space left") as caught:
+        files.samples_file("ds_one", digest)
+    assert isinstance(storage_errors.translated(caught.value), StorageFullError)
+
+
+def test_no_credentials_are_named(bucket, tmp_path, monkeypatch):
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    with pytest.raises(FilesUnreachableError, match="AWS_ACCESS_KEY_ID"):
+        Files(tmp_path, bucket).check()
+
+
+def test_clients_are_asked_to_come_again(tmp_path):
+    with pytest.raises(FilesUnreachableError) as caught:
+        Files(tmp_path / "home", (tmp_path / "gone").as_uri()).check()
+    told = storage_errors.translated(caught.value)
+    assert isinstance(told, StorageUnavailableError)
+    assert told.headers == storage_errors.RETRY_AFTER
+    again = pickle.loads(pickle.dumps(caught.value))  # a worker on another host says it too
+    assert (type(again), again.strerror) == (FilesUnreachableError, caught.value.strerror)
+
+
+def test_who_has_patience_gets_what_comes_back(tmp_path, monkeypatch):
+    monkeypatch.setattr(objects, "FIRST_PAUSE_S", 0.01)
+    root = tmp_path / "mounted"
+    files = Files(tmp_path / "home", root.as_uri(), patience_s=30.0)
+    warned = threading.Event()
+    monkeypatch.setattr(objects.logger, "warning", lambda *_: warned.set())
+    mount = threading.Thread(target=lambda: warned.wait(30.0) and root.mkdir())
+    mount.start()
+    digest = put(files)
+    mount.join()
+    assert Files(tmp_path / "other", root.as_uri()).samples_file("ds_one", digest).exists()
+
+
+def test_patience_ends(tmp_path, monkeypatch):
+    monkeypatch.setattr(objects, "FIRST_PAUSE_S", 0.01)
+    with pytest.raises(FilesUnreachableError):
+        put(Files(tmp_path / "home", (tmp_path / "gone").as_uri(), patience_s=0.05))
+
+
+@pytest.mark.parametrize("url", ["s3://nobody-has-this/files", "file:///nobody/has/this"])
+def test_no_service_starts_without_its_store(url, s3, bucket, tmp_path, quick):
+    settings = Settings(home=tmp_path, database_url="postgresql://nowhere/none", files_url=url)
+    with pytest.raises(HomeError, match=f"files_url is '{url}'"):
+        check_home(settings)
+
+
+def test_a_service_alone_loads_nothing_of_stores(tmp_path):
+    files = Files(tmp_path)
+    files.check()
+    files.try_out()
+    assert not files.shared
+    assert not Path(tmp_path, "cache").exists()
