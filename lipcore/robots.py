@@ -9,6 +9,7 @@ import importlib
 import site
 import sys
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -104,11 +105,16 @@ class Robot:
     def configuration(self, q: Array) -> Array:
         """Pinocchio's configuration of joint positions q (n,): unbounded joints take (cos, sin)."""
         out = np.empty(self.model.nq)
-        for index in range(1, self.model.njoints):
-            joint, at = self.model.joints[index], self.model.idx_qs[index]
-            angle = q[self.model.idx_vs[index]]
-            out[at : at + joint.nq] = angle if joint.nq == 1 else (np.cos(angle), np.sin(angle))
+        for at, size, place in self._places:
+            angle = q[place]
+            out[at : at + size] = angle if size == 1 else (np.cos(angle), np.sin(angle))
         return out
+
+    @cached_property
+    def _places(self) -> list[tuple[int, int, int]]:
+        """Of each joint: where its configuration starts, how long that is, where its position is."""
+        model = self.model  # looked at once: asking Pinocchio takes longer than the dynamics of a sample
+        return [(model.idx_qs[joint], model.joints[joint].nq, model.idx_vs[joint]) for joint in range(1, model.njoints)]
 
 
 def pinocchio() -> Any:
