@@ -26,6 +26,8 @@ from service.bench.online.promises import targets as online_targets
 from service.bench.online.running import PARTS
 from service.bench.online.scene import Scene
 from service.bench.running import KEYS, Options, run
+from service.bench.scale import running as scale_running
+from service.bench.scale.running import PARTS as SCALE_PARTS
 from service.bench.soak import running as soak_running
 from service.bench.soak import table as soak_table
 from service.bench.targets import Target, targets
@@ -206,6 +208,35 @@ def ingest(
     if json_file is not None:
         results.write(json_file, [{**asdict(each), "met": each.met} for each in found])
     _tell(ingest_running.grids(results), [], found, console, markdown, strict)
+
+
+@app.command()
+def scale(
+    sizes: Annotated[
+        str | None, typer.Option(help="Samples of the training jobs, with commas: 200000,1000000 by default.")
+    ] = None,
+    only: Annotated[str | None, typer.Option(help=f"Names separated by commas: {', '.join(SCALE_PARTS)}.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of all that is random.")] = 0,
+    quick: Annotated[bool, typer.Option("--quick", help="A first look in a few minutes.")] = False,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", dir_okay=False, help="Also write all figures here.")
+    ] = None,
+    markdown: Annotated[Path | None, typer.Option(dir_okay=False, help="Also write the tables here.")] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where something promised was missed.")] = False,
+) -> None:
+    """Several services and workers, with PostgreSQL, S3 and Dask started here: scaling, following, costs, faults."""
+    chosen: dict[str, Any] = {**(scale_running.QUICK if quick else {}), "seed": seed}
+    if sizes is not None:
+        chosen["sizes"] = tuple(int(size) for size in sizes.split(","))
+    if only is not None:
+        chosen["only"] = tuple(name.strip() for name in only.split(","))
+    options = scale_running.Options(**chosen)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # ends all that was started, too
+    console = _console()
+    results = scale_running.run(options, console)
+    if json_file is not None:
+        results.write(json_file)
+    _tell(list(results.grids()), results.notes(), results.targets(), console, markdown, strict)
 
 
 def _console() -> Console:

@@ -122,10 +122,10 @@ def open_bed(home: Path, source: Source, console: Console) -> Iterator[Bed]:
 
 def model_folder(name: str) -> Path:
     """Folder of the latest version of a model in the home of the settings; raise NotFoundError."""
-    home = Settings().home
-    database = Database(home)
+    settings = Settings()
+    database = Database.of(settings)
     try:
-        return Files(home).versions / registry.find(database, name, None).folder
+        return Files.of(settings).version_folder(registry.find(database, name, None).folder)
     finally:
         database.close()
 
@@ -134,7 +134,8 @@ def _install(home: Path, folder: Path) -> None:
     """Publish a copy of a saved model in a home that no service has opened yet."""
     database, files, name = Database(home), Files(home), new_id("mv")
     try:
-        manifest = lipcore.copy_model(folder, files.versions / name)
+        with files.new_version(name) as target:
+            manifest = lipcore.copy_model(folder, target)
         with database.transaction() as session:
             registry.publish(session, MODEL, name, manifest, None)
     finally:

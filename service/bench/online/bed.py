@@ -65,7 +65,8 @@ def install(home: Path, folder: Path, models: Mapping[str, LearningOptions], n_j
     try:
         for model, options in models.items():
             name = new_id("mv")
-            manifest = lipcore.copy_model(folder, files.versions / name)
+            with files.new_version(name) as target:
+                manifest = lipcore.copy_model(folder, target)
             with database.transaction() as session:
                 registry.publish(session, model, name, manifest, None)
             set_options(database, model, options, n_joints, time.time())

@@ -1,0 +1,1 @@
+"""`lipserve bench scale`: several services and workers, with a database, a store and a scheduler of their own."""
