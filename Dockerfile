@@ -1,4 +1,4 @@
-# The serving image: no robot descriptions, no C compiler, no CUDA.
+# The image of services and workers: no robot descriptions, no C compiler, no CUDA.
 FROM python:3.11-slim AS build
 WORKDIR /src
 RUN python -m venv /opt/lipserve
@@ -9,15 +9,18 @@ COPY lipcore lipcore
 COPY service service
 COPY docs docs
 COPY models/panda-sim models/panda-sim
-RUN /opt/lipserve/bin/python -m pip install --no-cache-dir --disable-pip-version-check . \
+RUN /opt/lipserve/bin/python -m pip install --no-cache-dir --disable-pip-version-check '.[cluster]' \
     && /opt/lipserve/bin/python -m pip uninstall --yes --quiet setuptools pip \
     && site=$(echo /opt/lipserve/lib/python3*/site-packages) \
     && rm -rf "$site"/torch/include "$site"/torch/share "$site"/torch/test \
     && find "$site"/plotly -mindepth 1 -maxdepth 1 ! -name package_data ! -name __init__.py -exec rm -rf {} + \
+    && find "$site"/botocore/data -mindepth 1 -maxdepth 1 -type d ! -name s3 ! -name sts ! -name 'sso*' ! -name signin \
+        -exec rm -rf {} + \
     && find /opt/lipserve -name __pycache__ -prune -exec rm -rf {} + \
-    && find "$site"/numpy "$site"/scipy "$site"/sympy "$site"/networkx -type d -name tests -prune -exec rm -rf {} + \
+    && find "$site"/numpy "$site"/scipy "$site"/sympy "$site"/networkx "$site"/dask \
+        "$site"/distributed -type d -name tests -prune -exec rm -rf {} + \
     && cd / && NUMBA_CACHE_DIR=/opt/numba /opt/lipserve/bin/python -m lipcore.warm_up \
-    && /opt/lipserve/bin/python -c "import service.cli.serve, service.client"
+    && /opt/lipserve/bin/python -c "import service.cli.serve, service.cli.worker, service.client, distributed, s3fs, psycopg"
 # the last two also leave the bytecode of what a start imports, 50 MB: the container's user cannot write it, and without
 # it every start takes four seconds longer
 

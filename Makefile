@@ -5,15 +5,16 @@ BIN := $(VENV)/bin
 # one thread a process: the tests' matrices are small, and three parts run side by side, each in its fixed order
 TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: demo test warm-lip warm-chain test-lipcore test-service test-packages test-updates test-docs test-browser test-kills \
-	test-all screenshots lint install serve image clean
+.PHONY: demo test warm-lip warm-chain test-lipcore test-service test-packages test-updates test-cluster test-shared test-docs \
+	test-browser test-kills test-all screenshots lint install serve image clean
 
 demo: install
 	$(BIN)/lipserve demo
 
 test: install
 	$(MAKE) -j2 warm-lip warm-chain
-	$(MAKE) -j3 test-service test-updates test-lipcore test-packages test-docs test-browser test-kills
+	$(MAKE) -j3 test-service test-updates test-lipcore test-packages test-cluster test-shared test-docs test-browser \
+		test-kills
 
 # compiles what the parts below would else compile once each, side by side: a minute of one core
 warm-lip: install
@@ -34,6 +35,23 @@ test-packages: install
 test-updates: install
 	$(TEST) -m "not slow" tests/service/updates --ignore tests/service/updates/test_kill_trials.py
 
+# several services with a real PostgreSQL server, S3 endpoint and Dask cluster, which the tests start
+test-cluster: install
+	$(TEST) -m "not slow" tests/cluster
+
+# the API once more, as the other parts test it with SQLite and local files: now on PostgreSQL and S3
+SHARED := models/test_aliases.py models/test_alias_answers.py models/test_deletion.py access/test_keys.py \
+	access/test_scopes.py access/test_commands.py test_job_requests.py test_dataset_listing.py test_training.py \
+	test_cancelling.py test_predicting.py test_evaluating.py test_health_and_errors.py test_robots.py \
+	test_upload_transport.py bad_requests client/test_idempotency.py archives/test_round_trip.py \
+	observability/test_metrics_of_service.py updates/test_observations.py updates/test_learning_routes.py \
+	updates/test_rollback.py updates/test_unlearning.py updates/test_inspection.py updates/test_alarm_routes.py \
+	updates/test_log.py
+
+# (pytest's own tracebacks run into a limit of Python's parser on rewritten assertions of this depth)
+test-shared: install
+	$(TEST) --backend shared --tb=native -m "not slow" $(addprefix tests/service/,$(SHARED))
+
 # what the documentation says, run
 test-docs: install
 	$(TEST) -m "not slow" tests/docs
@@ -48,6 +66,7 @@ test-kills: install
 
 test-all: install
 	$(TEST) --hypothesis-profile thorough
+	$(MAKE) test-shared
 
 # pictures of the dashboard for the README, made by its tests
 screenshots: install
