@@ -72,18 +72,22 @@ def test_shards_of_a_pass_tell_what_all_rows_do(tmp_path):
 
 def test_a_ratio_is_that_of_pairs():
     seconds = {passes.POOL: {1: [10.0, 20.0, 10.0], 2: [5.0, 10.0, 8.0]}}
-    part = passes._part(1000, seconds, 1)
-    ratio, sums = part.targets
+    part = passes._part(1000, seconds, 42.0, 1)
+    ratio, linear, sums = part.targets
     assert ratio.value == pytest.approx(2.0)
     assert ratio.met
+    assert linear.value == pytest.approx(42.0 / 5 / 8.0)
     assert sums.met
-    assert passes._part(1000, seconds, 2).targets[-1].met is False
+    assert passes._part(1000, seconds, 42.0, 2).targets[-1].met is False
 
 
 def test_promises_of_training_are_judged_by_the_largest_job():
     stages = {"hyperparameters": 60.0, "statistics": 40.0}
-    small = training.Trained(200_000, 2, 5.0, 100.0, stages, {"service": 300.0, "training": 900.0})
-    large = training.Trained(1_000_000, 10, 25.0, 300.0, {**stages, "statistics": 220.0}, {"training": 2100.0})
+    memory = {"service": 300.0, "training": 900.0}
+    small = training.Trained(200_000, 2, 5.0, 100.0, stages, memory, inducing=500)
+    large = training.Trained(
+        1_000_000, 10, 25.0, 300.0, {**stages, "statistics": 880.0}, {"training": 2100.0}, inducing=1000
+    )
     seconds, memory, ratio = training._targets([small, large])
     assert seconds.met
     assert memory.value == 2100.0

@@ -33,6 +33,8 @@ NAME = "pass"
 MODEL = "panda-sim"
 NAMES = ("t", "episode", "q", "dq", "ddq", "tau")
 LEAST_SPEEDUP = 1.7
+LONGER, MOST_RATIO = 5, 1.1
+"""Times as many samples, for the cost of one; and how much more one may cost."""
 POOL, CLUSTER = "processes of this host", "Dask workers"
 
 
@@ -65,6 +67,7 @@ def run(engines: Engines, rows: int, pairs: int, seed: int, console: Console) ->
     shards = _shards(engines.home("recording"), rows, seed)
     seconds: dict[str, dict[int, list[float]]] = {}
     sums: set[str] = set()
+    longer = float("nan")
     for kind, opened in ((POOL, _pools(engines)), (CLUSTER, _clusters(engines))):
         with opened as by_count:
             found = seconds[kind] = {count: [] for count in by_count}
@@ -78,7 +81,11 @@ def run(engines: Engines, rows: int, pairs: int, seed: int, console: Console) ->
                     sums.add(hashlib.sha256(total.a.tobytes() + total.b.tobytes()).hexdigest())
                 one, two = found[1][-1], found[2][-1]
                 console.print(f"{kind}: {one:.1f} s with one, {two:.1f} s with two", highlight=False)
-    return _part(rows, seconds, len(sums))
+            if kind == POOL:
+                began = time.monotonic()
+                summed(by_count[2], work, LONGER * shards, _never)
+                longer = time.monotonic() - began
+    return _part(rows, seconds, longer, len(sums))
 
 
 @contextmanager
@@ -118,7 +125,7 @@ def _shards(folder: Path, rows: int, seed: int) -> list[Shard]:
     return [Shard(model, str(folder), first, min(first + SHARD, rows)) for first in range(0, rows, SHARD)]
 
 
-def _part(rows: int, seconds: Mapping[str, Mapping[int, list[float]]], sums: int) -> Part:
+def _part(rows: int, seconds: Mapping[str, Mapping[int, list[float]]], longer: float, sums: int) -> Part:
     table, targets = [], []
     for kind, found in seconds.items():
         ratio = float(np.median(np.array(found[1]) / np.array(found[2])))
@@ -127,10 +134,18 @@ def _part(rows: int, seconds: Mapping[str, Mapping[int, list[float]]], sums: int
             table.append((kind, str(count), f"{rate:,.0f}", f"{min(times):.1f}", f"{max(times):.1f}"))
         table.append((f"{kind}: median ratio of pairs", "", f"{ratio:.2f}", "", ""))
         targets.append(Target(f"two over one, {kind}", ratio, "×", "≥", LEAST_SPEEDUP))
+    table.append((f"{POOL}: {LONGER * rows:,} samples", "2", f"{LONGER * rows / longer:,.0f}", f"{longer:.1f}", ""))
+    ratio = longer / LONGER / float(np.median(seconds[POOL][2]))
+    targets.append(Target(f"cost of a sample among {LONGER} times as many", ratio, "×", "≤", MOST_RATIO))
     targets.append(Target("different sums", sums, "", "≤", 1))
     columns = ("", "processes", "samples/s", "fastest s", "slowest s")
     title = f"pass over {rows:,} samples of seven joints in shards of {SHARD:,}, as {MODEL} takes them in"
-    figures = {"rows": rows, "seconds": {kind: dict(found) for kind, found in seconds.items()}, "sums": sums}
+    figures = {
+        "rows": rows,
+        "seconds": {kind: dict(found) for kind, found in seconds.items()},
+        "longer_s": longer,
+        "sums": sums,
+    }
     return Part(NAME, figures, [Grid(title, columns, table)], targets)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -50,7 +51,8 @@ class Trial:
 
 def run(engines: Engines, trials: int, seed: int, console: Console) -> Part:
     """Teach one model through both services alternately, so many times; their learners run when that begins."""
-    settings = {"min_revision_wait_s": _WAIT}
+    # on one machine: services on machines of their own leave each learner a CPU, too
+    settings = {"min_revision_wait_s": _WAIT, "training_cpus": os.cpu_count() or 1}
     services = [engines.service(settings), engines.service(settings)]
     clients = [ready(service) for service in services]
     try:
