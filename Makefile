@@ -42,11 +42,11 @@ test-cluster: install
 # the API once more, as the other parts test it with SQLite and local files: now on PostgreSQL and S3
 SHARED := models/test_aliases.py models/test_alias_answers.py models/test_deletion.py access/test_keys.py \
 	access/test_scopes.py access/test_commands.py test_job_requests.py test_dataset_listing.py test_training.py \
-	test_cancelling.py test_predicting.py test_evaluating.py test_health_and_errors.py test_robots.py \
-	test_upload_transport.py bad_requests client/test_idempotency.py archives/test_round_trip.py \
-	observability/test_metrics_of_service.py updates/test_observations.py updates/test_learning_routes.py \
-	updates/test_rollback.py updates/test_unlearning.py updates/test_inspection.py updates/test_alarm_routes.py \
-	updates/test_log.py
+	test_predicting.py test_health_and_errors.py
+MORE_SHARED := test_cancelling.py test_evaluating.py test_robots.py test_upload_transport.py bad_requests \
+	client/test_idempotency.py archives/test_round_trip.py observability/test_metrics_of_service.py \
+	updates/test_observations.py updates/test_learning_routes.py updates/test_rollback.py updates/test_unlearning.py \
+	updates/test_inspection.py updates/test_alarm_routes.py updates/test_log.py
 
 # (pytest's own tracebacks run into a limit of Python's parser on rewritten assertions of this depth)
 test-shared: install
@@ -66,7 +66,7 @@ test-kills: install
 
 test-all: install
 	$(TEST) --hypothesis-profile thorough
-	$(MAKE) test-shared
+	$(TEST) --backend shared --tb=native $(addprefix tests/service/,$(SHARED) $(MORE_SHARED))
 
 # pictures of the dashboard for the README, made by its tests
 screenshots: install

@@ -16,7 +16,7 @@ from service.client import ApiError
 from tests.service.server import free_port
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
-PRINTS_NO_RESULT = {"serve", "demo"}
+PRINTS_NO_RESULT = {"serve", "worker", "demo"}
 
 
 def test_reference_is_up_to_date():

@@ -229,6 +229,7 @@ def test_who_asks_for_a_pointer_is_answered_though_it_moves_and_the_version_befo
     assert fresh.get(arm, None).version == 1
 
 
+@pytest.mark.own_files("damages a file below the home, of which there is another copy")
 def test_files_that_are_damaged_are_told_from_files_that_were_deleted(api, arm):
     (folder(api, arm, 1) / "model.safetensors").write_bytes(b"")
     with pytest.raises(UnreadableVersionError):
