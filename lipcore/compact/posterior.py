@@ -25,7 +25,7 @@ class CompactPosterior(Posterior):
         mean       E f(x) + φᵀ ŵ                = E f(x) + cᵀ α,     α = B⁻ᵀ ŵ
         variance   k(x, x) − φᵀφ + φᵀ Σ φ       = k(x, x) − |Q c|²,  QᵀQ = B⁻ᵀ (I − Σ) B⁻¹
 
-    where φ does not reach, the variance is the prior's. root: Q, (M, M) upper triangular; noise_variance: (n,) R;
+    where φ does not reach, the variance is the prior's. root: Q, (M, M) lower triangular; noise_variance: (n,) R;
     floor: (n,) (N·m)², which the variance of a torque is never below, whatever the samples say; zero but for models
     that learn online (see `online.floor`). statistics: what it was made from; None where that is more than one sum.
     """
@@ -61,9 +61,8 @@ class CompactPosterior(Posterior):
     ) -> CompactPosterior:
         """Posterior of the torques, given that of the whitened variables."""
         weights = torch.linalg.solve_triangular(basis.root.T, solution.mean[:, None], upper=True)[:, 0]
-        # triangular, by QR and not from QᵀQ itself: B⁻¹ is badly conditioned
-        raw = torch.linalg.solve_triangular(basis.root, solution.learnt, upper=False, left=False)
-        root = torch.linalg.qr(raw, mode="r").R
+        # and not from QᵀQ itself: B⁻¹ is badly conditioned
+        root = torch.linalg.solve_triangular(basis.root, solution.learnt, upper=False, left=False)
         floor = torch.zeros_like(noise_variance) if floor is None else floor
         return cls(kernel, basis.params, std_factor, weights, basis, noise_variance, root, floor)
 

@@ -37,7 +37,7 @@ class Statistics:
 
 @dataclass(frozen=True)
 class Solution:
-    """Posterior N(mean, Σ) of the M whitened variables. learnt: (M, M), its square learntᵀ learnt is I − Σ."""
+    """Posterior N(mean, Σ) of the M whitened variables. learnt: (M, M) lower triangular, learntᵀ learnt = I − Σ."""
 
     mean: Tensor
     learnt: Tensor
@@ -123,18 +123,40 @@ def copied(statistics: Statistics) -> Statistics:
 def solve(statistics: Statistics, centre: Tensor | None = None) -> Solution:
     """Posterior of the whitened variables given the statistics, with the prior N(centre, I).
 
-    Mean (I + A)⁻¹ (centre + b), covariance (I + A)⁻¹. centre: (M,), zero where None.
+    Mean (I + A)⁻¹ (centre + b), covariance Σ = (I + A)⁻¹. centre: (M,), zero where None.
     Raise NotPositiveDefiniteError for statistics that no samples have.
     """
-    values, vectors = torch.linalg.eigh(statistics.a)
+    said = statistics.b if centre is None else centre + statistics.b
+    return _by_cholesky(statistics.a, said) or _by_eigenvalues(statistics.a, said)
+
+
+def _by_cholesky(a: Tensor, said: Tensor) -> Solution | None:
+    """The posterior where samples tell of every variable, so that I − Σ is positive definite; None elsewhere."""
+    total = a.clone()
+    total.diagonal().add_(1.0)
+    factor, failed = torch.linalg.cholesky_ex(total)
+    if failed:
+        return None
+    told = torch.cholesky_inverse(factor).neg_()
+    told.diagonal().add_(1.0)
+    # with the variables in reverse order, told = Uᵀ U: the factor that is sought is the lower triangular one
+    upper, failed = torch.linalg.cholesky_ex(told.flip(0, 1), upper=True)
+    if failed:
+        return None
+    return Solution(torch.cholesky_solve(said[:, None], factor)[:, 0], upper.flip(0, 1))
+
+
+def _by_eigenvalues(a: Tensor, said: Tensor) -> Solution:
+    """The same from any statistics, at three times the cost; raise NotPositiveDefiniteError for impossible ones."""
+    values, vectors = torch.linalg.eigh(a)
     if not float(values[0]) >= -ROUNDING * max(float(values[-1]), 1.0):
         raise NotPositiveDefiniteError(
             f"statistics of size {len(values)} have the eigenvalue {float(values[0]):.3g}, expected none below zero"
         )
     values = values.clamp_min(0.0)
-    said = statistics.b if centre is None else centre + statistics.b
     mean = vectors @ ((vectors.T @ said) / (1 + values))
-    return Solution(mean, (values / (1 + values)).sqrt()[:, None] * vectors.T)
+    root = (values / (1 + values)).sqrt()[:, None] * vectors.T
+    return Solution(mean, torch.linalg.qr(root.flip(1), mode="r").R.flip(0, 1))
 
 
 def _square(features: Tensor) -> Tensor:

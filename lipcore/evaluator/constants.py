@@ -32,7 +32,7 @@ def linear_prior(linear: Sequence[LinearKernel], params: Params) -> tuple[Array,
 
 
 def check(outputs: Indices, torques: int, weights: Array, root: Array, linear_weights: int) -> None:
-    """Raise ValueError where shapes do not fit, an output is none of `torques`, or root is not upper triangular."""
+    """Raise ValueError where shapes do not fit, an output is none of `torques`, or root is not lower triangular."""
     size = len(outputs) + linear_weights
     if outputs.ndim != 1 or np.any((outputs < 0) | (outputs >= torques)):
         raise ValueError(f"outputs are {outputs}, expected numbers from 0 to {torques - 1}")
@@ -42,8 +42,8 @@ def check(outputs: Indices, torques: int, weights: Array, root: Array, linear_we
         raise ValueError(f"weights have shape {weights.shape}, expected ({size},)")
     if root.shape != (size, size):
         raise ValueError(f"root has shape {root.shape}, expected ({size}, {size})")
-    if np.any(np.tril(root, -1)):
-        raise ValueError("root has elements below the diagonal, expected an upper triangular matrix")
+    if np.any(np.triu(root, 1)):
+        raise ValueError("root has elements above the diagonal, expected a lower triangular matrix")
 
 
 def lay_out(weights: Array, root: Array, means: Array, variances: Array) -> Array:

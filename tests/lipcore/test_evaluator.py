@@ -95,7 +95,7 @@ def case(
     chosen[:2], chosen[2, 1:], chosen[2, 0] = False, False, True
     outputs = np.flatnonzero(chosen) if kernel else np.zeros(0, dtype=np.int64)
     anchors = len(outputs) + size
-    root = np.triu(rng.standard_normal((anchors, anchors)) + 4 * np.eye(anchors))
+    root = np.tril(rng.standard_normal((anchors, anchors)) + 4 * np.eye(anchors))
     made = Case(
         term=problem.kernel if kernel else None,
         linear=list(linear),
@@ -269,6 +269,6 @@ def test_arguments_that_do_not_fit_are_named() -> None:
     assert "outputs are" in refused(outputs=np.append(-1, good.outputs[1:]))
     assert f"weights have shape (3,), expected ({anchors},)" in refused(weights=np.zeros(3))
     assert f"expected ({anchors}, {anchors})" in refused(root=np.zeros((anchors, anchors - 1)))
-    assert "below the diagonal" in refused(root=np.ones((anchors, anchors)))
+    assert "above the diagonal" in refused(root=np.ones((anchors, anchors)))
     assert "term and inducing" in refused(inducing=None)
     assert "neither term nor linear" in refused(term=None, inducing=None, linear=[])

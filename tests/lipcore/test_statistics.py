@@ -148,6 +148,25 @@ def test_solution_is_that_of_bayesian_linear_regression() -> None:
     assert np.allclose((found.learnt.T @ found.learnt).numpy(), np.eye(len(basis)) - covariance, atol=1e-9)
 
 
+@pytest.mark.parametrize(("told", "largest"), [(3, 1e2), (20, 1e2), (60, 1e2), (60, 1e5)])
+def test_what_is_learnt_is_exact_and_triangular(told: int, largest: float) -> None:
+    """From samples that tell of all 20 variables or only of some, as much of one as 1e10 times another's prior."""
+    generator = np.random.default_rng(told)
+    columns = generator.standard_normal((20, told)) * np.geomspace(1, largest, 20)[:, None]
+    b, centre = generator.standard_normal(20), generator.standard_normal(20)
+    found = solve(
+        Statistics(torch.from_numpy(columns @ columns.T), torch.from_numpy(b), told), torch.from_numpy(centre)
+    )
+    # from the columns and not from their products, whose condition number is the square
+    vectors, values, _ = np.linalg.svd(columns)
+    values = np.concatenate([values, np.zeros(20 - len(values))]) ** 2
+    learnt = (vectors * (values / (1 + values))) @ vectors.T
+    mean = (vectors / (1 + values)) @ vectors.T @ (centre + b)
+    assert np.allclose((found.learnt.T @ found.learnt).numpy(), learnt, rtol=0, atol=1e-10)
+    assert np.allclose(found.mean.numpy(), mean, rtol=0, atol=1e-9)
+    assert torch.count_nonzero(found.learnt.triu(1)) == 0
+
+
 def test_without_data_the_prior_is_left() -> None:
     found = solve(empty(5), torch.arange(5.0, dtype=torch.float64))
     assert torch.equal(found.mean, torch.arange(5.0, dtype=torch.float64))

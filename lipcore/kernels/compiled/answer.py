@@ -52,12 +52,13 @@ def answer(
     covariance[:] = 0.0
     panel = linear + ROWS * size
     for first in range(0, size, ROWS):  # all queries meet a panel while the cache holds it
+        reach = min(first + ROWS, size)
         for query in range(queries):
             for group in range(groups):
-                columns = query * step + (group * size + first) * WIDTH
-                multiply(fixed, panel, memory, columns, size - first, memory, products + group * ROWS * WIDTH)
+                columns = query * step + group * size * WIDTH
+                multiply(fixed, panel, memory, columns, reach, memory, products + group * ROWS * WIDTH)
             _add_squares(memory, products, full, covariance[query])
-        panel += ROWS * (size - first)
+        panel += ROWS * reach
     for query in range(queries):
         _subtract(blocks[query, -1], fixed, features[query], std_factor * std_factor, full, covariance[query])
         for j in range(n):

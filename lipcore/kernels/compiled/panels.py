@@ -1,7 +1,7 @@
-"""Upper triangular matrix times a few columns: the inner loop of every standard deviation.
+"""Lower triangular matrix times a few columns: the inner loop of every standard deviation.
 
 BLAS is made for larger products and reaches half of what a core can do on these; it also starts threads when it sees
-fit. Here the matrix lies in panels of ROWS rows, each stored column by column from its diagonal on, and one loop in
+fit. Here the matrix lies in panels of ROWS rows, each stored column by column up to its diagonal, and one loop in
 LLVM's own vectors holds all of ROWS × WIDTH sums in registers (12 of AVX2's 16, two at a time of AVX-512's).
 """
 
@@ -27,11 +27,11 @@ WIDTH = 8
 def pack(matrix: Array, triangular: bool) -> Array:
     """Panels of `matrix`, (K, M), one after the other, flat; zeros fill the last.
 
-    triangular: what lies left of each panel's first diagonal element is zero, and left out.
+    triangular: what lies right of each panel's last diagonal element is zero, and left out.
     """
     panels = []
     for first in range(0, matrix.shape[0], ROWS):
-        rows = matrix[first : first + ROWS, first if triangular else 0 :]
+        rows = matrix[first : first + ROWS, : first + ROWS if triangular else None]
         panel = np.zeros((rows.shape[1], ROWS))
         panel[:, : len(rows)] = rows.T
         panels.append(panel.reshape(-1))

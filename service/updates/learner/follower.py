@@ -107,7 +107,7 @@ class Follower:
         )
         self._published, self._seconds = self.number, 0.0
         # at most half of the time goes into solving
-        self.due = ended + max(self.settings.publish_every_s, ended - began)
+        self.due = max(began + self.settings.publish_every_s, ended + (ended - began))
         return message
 
     @property
