@@ -13,6 +13,8 @@ CHECKOUT_MODELS = Path(__file__).resolve().parents[1] / "models"
 PACKAGED_MODELS = Path(__file__).resolve().parent / "shipped"
 DEFAULT_URL = "http://127.0.0.1:8000"
 """Where a service listens by default, for its clients."""
+CONNECTIONS = 20
+"""Most connections to PostgreSQL of one process, unless set."""
 
 MiB = 1024 * 1024
 Count = Annotated[int, Field(ge=1)]
@@ -174,7 +176,7 @@ class Settings(BaseSettings):
         description="PostgreSQL server that several services share, postgresql://user:password@host/name; SQLite below "
         "the home where not set. Needs LIPSERVE_FILES_URL.",
     )
-    database_connections: Count = Field(20, description="Most connections to PostgreSQL of one process.")
+    database_connections: Count = Field(CONNECTIONS, description="Most connections to PostgreSQL of one process.")
     files_url: str | None = Field(
         None,
         pattern="^(s3|file)://",

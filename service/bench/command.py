@@ -52,6 +52,12 @@ QUICK_ONLINE: dict[str, Any] = {
     "refit_every": 6.0,
 }
 
+Seed = Annotated[int, typer.Option(min=0, help="Of all that is random.")]
+Robot = Annotated[str, typer.Option(help=f"One of {', '.join(ROBOTS)}.")]
+JsonFile = Annotated[Path | None, typer.Option("--json", dir_okay=False, help="Also write all figures here.")]
+Markdown = Annotated[Path | None, typer.Option(dir_okay=False, help="Also write the tables here.")]
+Strict = Annotated[bool, typer.Option("--strict", help="Exit with 1 where something promised was missed.")]
+
 
 @app.callback()
 def _bench() -> None:
@@ -77,9 +83,9 @@ def latency(
     motions: Annotated[bool, typer.Option("--motions", help="Also train on four kinds of motion: minutes.")] = False,
     only: Annotated[str | None, typer.Option(help=f"Names separated by commas: {', '.join(KEYS)}.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A first look in about two minutes.")] = False,
-    json_file: Annotated[Path | None, typer.Option("--json", dir_okay=False, help="Also write every run here.")] = None,
-    markdown: Annotated[Path | None, typer.Option(dir_okay=False, help="Also write the tables here.")] = None,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where something promised was missed.")] = False,
+    json_file: JsonFile = None,
+    markdown: Markdown = None,
+    strict: Strict = False,
 ) -> None:
     """Time answers in process and over every transport, idle and while training, next to baselines."""
     if model is not None and folder is not None:
@@ -92,21 +98,20 @@ def latency(
         seconds=seconds if seconds is not None else (QUICK_SECONDS if quick else 60.0),
         training=training,
         motions=motions,
-        only=() if only is None else tuple(name.strip() for name in only.split(",")),
+        only=() if only is None else _names(only),
     )
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # ends the service that is measured, too
-    console = _console()
+    console = _begin()
     results = run(options, console)
     found = targets(results)
     if json_file is not None:
-        results.write(json_file, [{**asdict(each), "met": each.met} for each in found])
+        results.write(json_file, _judged(found))
     _tell(table.grids(results), results.notes, found, console, markdown, strict)
 
 
 @app.command()
 def online(
-    robot: Annotated[str, typer.Option(help=f"One of {', '.join(ROBOTS)}.")] = "panda",
-    seed: Annotated[int, typer.Option(min=0, help="Of all that is random.")] = 0,
+    robot: Robot = "panda",
+    seed: Seed = 0,
     speed: Annotated[float, typer.Option(help="Multiplies the frequencies of the motion.")] = 5.0,
     payload: Annotated[float, typer.Option(min=0, help="kg, attached in the middle of the stream.")] = 1.5,
     drift: Annotated[float, typer.Option(min=0, help="Share by which friction grows over the stream.")] = 0.3,
@@ -117,11 +122,9 @@ def online(
     websocket: Annotated[bool, typer.Option("--websocket", help="Stream in frames, not in batches over HTTP.")] = False,
     only: Annotated[str | None, typer.Option(help=f"Names separated by commas: {', '.join(PARTS)}.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A first look in about two minutes.")] = False,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", dir_okay=False, help="Also write all figures here.")
-    ] = None,
-    markdown: Annotated[Path | None, typer.Option(dir_okay=False, help="Also write the tables here.")] = None,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where something promised was missed.")] = False,
+    json_file: JsonFile = None,
+    markdown: Markdown = None,
+    strict: Strict = False,
 ) -> None:
     """Teach a served model in real time while it answers: throughput, latency, cost, and quality over a change."""
     short = QUICK_ONLINE if quick else {}
@@ -131,35 +134,32 @@ def online(
         fit={**online_running.FIT, **(QUICK_FIT if quick else {}), "max_inducing_outputs": inducing},
         forgetting_s=forgetting,
         websocket=websocket,
-        only=() if only is None else tuple(name.strip() for name in only.split(",")),
+        only=() if only is None else _names(only),
         **short,
     )
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    console = _console()
+    console = _begin()
     results = online_running.run(options, console)
     found = online_targets(results)
     if json_file is not None:
-        results.write(json_file, [{**asdict(each), "met": each.met} for each in found])
+        results.write(json_file, _judged(found))
     _tell(online_table.grids(results), results.notes, found, console, markdown, strict)
 
 
 @app.command()
 def durability(
     trials: Annotated[int, typer.Option(min=1, help="Kills: of the service and of its learner in turn.")] = 100,
-    seed: Annotated[int, typer.Option(min=0, help="Of all that is random.")] = 0,
-    json_file: Annotated[Path | None, typer.Option("--json", dir_okay=False, help="Also write the tally here.")] = None,
-    markdown: Annotated[Path | None, typer.Option(dir_okay=False, help="Also write the tables here.")] = None,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where something promised was missed.")] = False,
+    seed: Seed = 0,
+    json_file: JsonFile = None,
+    markdown: Markdown = None,
+    strict: Strict = False,
 ) -> None:
     """Kill the service, or its learner, while batches come; count what is lost or learnt twice. 2 to 4 s a trial."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    console = _console()
+    console = _begin()
     with TemporaryDirectory(prefix="lipserve-bench-") as folder:
         tally = durable.run(Path(folder), trials, seed, console)
     found = durable.targets(tally)
     if json_file is not None:
-        said = [{**asdict(each), "met": each.met} for each in found]
-        json_file.write_text(json.dumps({**asdict(tally), "targets": said}, indent=2) + "\n")
+        json_file.write_text(json.dumps({**asdict(tally), "targets": _judged(found)}, indent=2) + "\n")
     _tell(durable.grids(tally), [durable.SAID], found, console, markdown, strict)
 
 
@@ -168,22 +168,19 @@ def load(
     connections: Annotated[int, typer.Option(min=4, help="At the same time.")] = 64,
     seconds: Annotated[float, typer.Option(min=1, help="How long.")] = 120.0,
     pause: Annotated[float, typer.Option(min=0, help="s between an answer and the next question.")] = 0.02,
-    robot: Annotated[str, typer.Option(help=f"One of {', '.join(ROBOTS)}.")] = "panda",
-    seed: Annotated[int, typer.Option(min=0, help="Of all that is random.")] = 0,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", dir_okay=False, help="Also write all figures here.")
-    ] = None,
-    markdown: Annotated[Path | None, typer.Option(dir_okay=False, help="Also write the tables here.")] = None,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where something promised was missed.")] = False,
+    robot: Robot = "panda",
+    seed: Seed = 0,
+    json_file: JsonFile = None,
+    markdown: Markdown = None,
+    strict: Strict = False,
 ) -> None:
     """Predict, stream, teach and upload at once; then count errors, memory, and whether every write is there."""
     options = soak_running.Options(connections, seconds, pause, robot, seed)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    console = _console()
+    console = _begin()
     results = soak_running.run(options, console)
     found = soak_table.targets(results)
     if json_file is not None:
-        results.write(json_file, [{**asdict(each), "met": each.met} for each in found])
+        results.write(json_file, _judged(found))
     _tell(soak_table.grids(results), [], found, console, markdown, strict)
 
 
@@ -192,21 +189,18 @@ def ingest(
     rows: Annotated[int, typer.Option(min=1000, help="Of the recording, at 1 kHz.")] = 1_000_000,
     joints: Annotated[int, typer.Option(min=1, max=32, help="Of the robot.")] = 7,
     formats: Annotated[str, typer.Option(help="Names separated by commas.")] = ",".join(FORMATS),
-    seed: Annotated[int, typer.Option(min=0, help="Of all that is random.")] = 0,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", dir_okay=False, help="Also write all figures here.")
-    ] = None,
-    markdown: Annotated[Path | None, typer.Option(dir_okay=False, help="Also write the tables here.")] = None,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where something promised was missed.")] = False,
+    seed: Seed = 0,
+    json_file: JsonFile = None,
+    markdown: Markdown = None,
+    strict: Strict = False,
 ) -> None:
     """Upload a long recording; time and memory until its report is there."""
-    options = ingest_running.Options(rows, joints, tuple(name.strip() for name in formats.split(",")), seed=seed)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    console = _console()
+    options = ingest_running.Options(rows, joints, _names(formats), seed=seed)
+    console = _begin()
     results = ingest_running.run(options, console)
     found = ingest_running.targets(results)
     if json_file is not None:
-        results.write(json_file, [{**asdict(each), "met": each.met} for each in found])
+        results.write(json_file, _judged(found))
     _tell(ingest_running.grids(results), [], found, console, markdown, strict)
 
 
@@ -216,31 +210,39 @@ def scale(
         str | None, typer.Option(help="Samples of the training jobs, with commas: 200000,1000000 by default.")
     ] = None,
     only: Annotated[str | None, typer.Option(help=f"Names separated by commas: {', '.join(SCALE_PARTS)}.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of all that is random.")] = 0,
+    seed: Seed = 0,
     quick: Annotated[bool, typer.Option("--quick", help="A first look in a few minutes.")] = False,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", dir_okay=False, help="Also write all figures here.")
-    ] = None,
-    markdown: Annotated[Path | None, typer.Option(dir_okay=False, help="Also write the tables here.")] = None,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where something promised was missed.")] = False,
+    json_file: JsonFile = None,
+    markdown: Markdown = None,
+    strict: Strict = False,
 ) -> None:
     """Several services and workers, with PostgreSQL, S3 and Dask started here: scaling, following, costs, faults."""
     chosen: dict[str, Any] = {**(scale_running.QUICK if quick else {}), "seed": seed}
     if sizes is not None:
         chosen["sizes"] = tuple(int(size) for size in sizes.split(","))
     if only is not None:
-        chosen["only"] = tuple(name.strip() for name in only.split(","))
+        chosen["only"] = _names(only)
     options = scale_running.Options(**chosen)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # ends all that was started, too
-    console = _console()
+    console = _begin()
     results = scale_running.run(options, console)
     if json_file is not None:
         results.write(json_file)
     _tell(list(results.grids()), results.notes(), results.targets(), console, markdown, strict)
 
 
-def _console() -> Console:
+def _begin() -> Console:
+    """Let a request to end also end the services that are measured; return where to print."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     return Console(width=None if sys.stdout.isatty() else table.WIDTH)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(","))
+
+
+def _judged(found: Sequence[Target]) -> list[dict[str, Any]]:
+    """What was promised and measured, as JSON values."""
+    return [{**asdict(each), "met": each.met} for each in found]
 
 
 def _tell(

@@ -7,9 +7,9 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
-PROC = Path("/proc")
+from service.bench.processes import PROC, stats
+
 KNOWN = (PROC / "stat").exists()
 """Whether the system tells."""
 _BUSY, _STOLEN = (0, 1, 2, 5, 6), 7
@@ -51,12 +51,8 @@ def watched(usage: Usage, service: int) -> Iterator[None]:
 def seconds_below(pid: int, itself: bool = False) -> float:
     """Processor time of all children of a process and of theirs, s, and of the process where wanted."""
     found: dict[int, tuple[int, float]] = {}
-    for path in PROC.glob("[0-9]*/stat"):
-        try:
-            fields = path.read_text().rpartition(")")[2].split()
-        except (FileNotFoundError, ProcessLookupError):
-            continue
-        found[int(path.parent.name)] = (int(fields[_PARENT]), sum(int(fields[each]) for each in _TIMES) / _hertz())
+    for each, fields in stats():
+        found[each] = (int(fields[_PARENT]), sum(int(fields[at]) for at in _TIMES) / _hertz())
     below = {pid}
     while more := {child for child, (parent, _) in found.items() if parent in below} - below:
         below |= more

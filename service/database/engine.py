@@ -15,7 +15,7 @@ from service.database import notices
 from service.database.migrations import migrate
 from service.database.notices import Notice
 from service.database.sqlite import Sqlite
-from service.settings import Settings
+from service.settings import CONNECTIONS, Settings
 
 PATIENCE_S = 30.0
 """Longest wait for another writer, of processes that nobody waits for."""
@@ -62,7 +62,7 @@ class Database:
     """
 
     def __init__(
-        self, home: Path, timeout_s: float = PATIENCE_S, url: str | None = None, connections: int | None = None
+        self, home: Path, timeout_s: float = PATIENCE_S, url: str | None = None, connections: int = CONNECTIONS
     ) -> None:
         self.adapter = _adapter(home, timeout_s, url, connections)
         self.engine = self.adapter.engine
@@ -124,7 +124,7 @@ class Database:
         self.adapter.close()
 
 
-def _adapter(home: Path, timeout_s: float, url: str | None, connections: int | None) -> Adapter:
+def _adapter(home: Path, timeout_s: float, url: str | None, connections: int) -> Adapter:
     if url is None:
         return Sqlite(home, timeout_s)
     try:

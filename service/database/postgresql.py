@@ -23,7 +23,6 @@ from service.database.notices import CHANNEL
 WRITERS, TURNS = 0x4C495053, 0x4C495054
 """Names of the two kinds of locks among those of the database."""
 ALL = 0
-CONNECTIONS = 20
 OPTIONS = {
     "idle_in_transaction_session_timeout": "60s",  # a service that hangs shall not keep its locks for ever
     "tcp_keepalives_idle": "10",
@@ -46,10 +45,9 @@ class Postgresql:
 
     shared = True
 
-    def __init__(self, url: str, timeout_s: float, connections: int | None = None) -> None:
-        most = CONNECTIONS if connections is None else connections
-        turns = max(1, most // 4)
-        self.engine = _engine(url, timeout_s, max(1, most - turns))
+    def __init__(self, url: str, timeout_s: float, connections: int) -> None:
+        turns = max(1, connections // 4)
+        self.engine = _engine(url, timeout_s, max(1, connections - turns))
         # who has a turn needs another connection, which none of those that wait for a turn may have
         self._turns = _engine(url, timeout_s, turns)
 
@@ -79,12 +77,15 @@ class Postgresql:
                     yield notice.payload
 
     def check(self, seconds: float) -> None:
-        """Raise an error unless the server answers, and takes writes, with every writer done within so many seconds."""
+        """Raise an error unless the server answers and takes writes of a model within so many seconds.
+
+        Others need not be done for that: what looks every second must not hold up those that write.
+        """
         with self.engine.connect() as connection:
             connection.execute(text(f"SET LOCAL lock_timeout = {max(1, round(1000 * seconds))}"))
             if connection.scalar(text("SELECT pg_is_in_recovery()")):
                 raise OSError("the PostgreSQL server is a standby, which cannot be written")
-            self.lock(connection)
+            _take(connection, "pg_advisory_xact_lock_shared", WRITERS, ALL)
 
     def close(self) -> None:
         """Close all connections."""

@@ -2,6 +2,6 @@
 
 from service.files.durable import DamagedFileError
 from service.files.objects import FilesUnreachableError
-from service.files.store import Files, new_id
+from service.files.store import PATIENCE_S, Files, new_id
 
-__all__ = ["DamagedFileError", "Files", "FilesUnreachableError", "new_id"]
+__all__ = ["PATIENCE_S", "DamagedFileError", "Files", "FilesUnreachableError", "new_id"]

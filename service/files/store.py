@@ -37,6 +37,8 @@ logger = logging.getLogger(__name__)
 Result = TypeVar("Result")
 
 CACHE_BYTES = 4 << 30
+PATIENCE_S = 60.0
+"""How long training asks again for shared files that cannot be reached, before it is given up."""
 
 
 def new_id(prefix: str) -> str:

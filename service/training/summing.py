@@ -28,7 +28,7 @@ from lipcore.online import spacing
 from lipcore.samples import Array, Samples
 from service.compute.executors import placed, sent, shard_executor
 from service.compute.shards import summed
-from service.files import Files
+from service.files import PATIENCE_S, Files
 from service.sample_file import Reader
 from service.settings import Settings
 from service.training.material import Material
@@ -90,7 +90,7 @@ def read(settings: Settings, joint_names: tuple[str, ...], shard: Shard) -> tupl
     """The rows of a shard that count, and how much each of them does, (N,)."""
 
     def opened() -> Reader:
-        return Reader(Files.of(settings).samples_file(shard.dataset, shard.sha256))
+        return Reader(Files.of(settings, PATIENCE_S).samples_file(shard.dataset, shard.sha256))
 
     reader = _cached(_READERS, shard.sha256 + shard.dataset, 8, opened)
     # one more row at both ends, as weights are those of the whole recording

@@ -18,7 +18,7 @@ from service import storage_errors
 from service.compute.executors import ClusterUnavailableError
 from service.database import Database, JobRow, LearnerRow, now
 from service.errors import ServiceError, StorageFullError, StorageUnavailableError
-from service.files import Files
+from service.files import PATIENCE_S, Files
 from service.limits.disk import Disk
 from service.models import registry
 from service.models.lineage import figures, software, training_metrics
@@ -36,9 +36,6 @@ from service.updates.refreshing import scope
 
 logger = logging.getLogger(__name__)
 
-FILES_PATIENCE_S = 60.0
-"""How long shared files are asked for again where they cannot be reached, before an attempt is given up."""
-
 
 class StorageError(RuntimeError):
     """The database or the disk could not be used: the job has not failed, it is to be started again."""
@@ -54,7 +51,7 @@ def run(settings: Settings, job: str) -> None:
     Raise StorageError where the outcome could not be written, or what is needed not be read.
     """
     token = job_id.set(job)
-    database, files = Database.of(settings), Files.of(settings, FILES_PATIENCE_S)
+    database, files = Database.of(settings), Files.of(settings, PATIENCE_S)
     try:
         claim = _claim(settings, database, job)
         if claim is not None:

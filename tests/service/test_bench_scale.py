@@ -11,9 +11,10 @@ from rich.console import Console
 
 import lipcore
 from lipcore.conditioning import SHARD, conditioned
+from service.bench.processes import resident
 from service.bench.scale import engines, passes, plan, replicas, running, streams, training
 from service.bench.scale.part import Results
-from service.bench.scale.peaks import KINDS, Peaks, resident
+from service.bench.scale.peaks import KINDS, Peaks
 from service.bench.workload import BenchError
 from service.compute.executors import Inline
 from service.compute.shards import summed
@@ -129,7 +130,7 @@ def test_a_shared_model_costs_what_its_teachers_do():
 
 def test_the_most_memory_of_a_process_is_seen():
     peaks = Peaks(os.getpid())
-    peaks.look()
+    peaks.note()
     assert peaks.found[KINDS[0]] == resident(os.getpid(), "VmHWM")
     assert resident(2**22 + 1) is None
 

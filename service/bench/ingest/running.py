@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import tempfile
 import time
 from dataclasses import asdict, dataclass, field, replace
@@ -14,7 +13,7 @@ from rich.console import Console
 
 from service.bench import facts
 from service.bench.ingest import recording
-from service.bench.processor import PROC
+from service.bench.processes import resident
 from service.bench.table import NOTHING, Grid, promises
 from service.bench.targets import Target
 from service.client import Client
@@ -124,24 +123,14 @@ def _upload(path: Path, kind: str, home: Path, options: Options) -> Ingested:
     try:
         with Client(service.url) as client:
             service.wait_ready(client)
-            before = _resident(service.process.pid, "VmRSS")
+            before = resident(service.process.pid, "VmRSS")
             began = time.monotonic()
             dataset = client.upload(path)
             seconds = time.monotonic() - began
-            peak = _resident(service.process.pid, "VmHWM")
+            peak = resident(service.process.pid, "VmHWM")
     finally:
         service.stop()
     return Ingested(kind, path.stat().st_size / MIB, seconds, before, peak, dataset.report.rows)
-
-
-def _resident(pid: int, name: str) -> float | None:
-    """Resident memory of a process, MiB: VmRSS now, VmHWM the most since it started."""
-    try:
-        status = (PROC / str(pid) / "status").read_text()
-    except OSError:
-        return None
-    found = re.search(rf"^{name}:\s+(\d+) kB", status, re.MULTILINE)
-    return None if found is None else int(found.group(1)) / 1024
 
 
 def _text(value: float | None) -> str:

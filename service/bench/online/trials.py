@@ -22,7 +22,7 @@ from service.bench.clients import BadAnswerError, HttpClient
 from service.bench.online.bed import Bed
 from service.bench.online.scene import rows_of
 from service.bench.online.sending import Ack, batch_request, send
-from service.bench.processor import PROC
+from service.bench.processes import PROC, levels
 from service.bench.workload import BenchError
 from service.client import Client
 from service.demo import ServiceProcess
@@ -197,13 +197,10 @@ class Trials:
 def learners(service: int) -> list[int]:
     """Process ids of the learner process of a service, which is its only spawned child while nothing is trained."""
     found = []
-    for path in PROC.glob("[0-9]*"):
-        try:
-            parent = int((path / "stat").read_text().rpartition(")")[2].split()[1])
-            if parent == service and "spawn_main" in (path / "cmdline").read_text():
-                found.append(int(path.name))
-        except (FileNotFoundError, ProcessLookupError):
-            continue
+    for child in (each for level in levels(service)[1:2] for each in level):
+        with suppress(FileNotFoundError, ProcessLookupError):
+            if "spawn_main" in (PROC / str(child) / "cmdline").read_text():
+                found.append(child)
     return found
 
 

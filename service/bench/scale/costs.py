@@ -16,11 +16,11 @@ from lipcore.samples import Samples
 from service.bench.clients import HttpClient, post
 from service.bench.online.sending import batch_request, send
 from service.bench.online.trials import learners
+from service.bench.processes import resident
 from service.bench.processor import seconds_below
 from service.bench.scale import plan, streams
 from service.bench.scale.engines import Engines, eventually, ready, stored
 from service.bench.scale.part import Part
-from service.bench.scale.peaks import resident
 from service.bench.scale.replicas import LEARNING, MODEL
 from service.bench.table import NOTHING, Grid
 from service.client import Client

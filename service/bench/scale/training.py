@@ -78,7 +78,7 @@ def _train(engines: Engines, rows: int, fit: Mapping[str, Any], seed: int, conso
             stages[job.progress.stage] = stages.get(job.progress.stage, 0.0) + _POLL
             time.sleep(_POLL)
         seconds = time.monotonic() - began
-        peaks.look()
+        peaks.note()
         if job.state != SUCCEEDED or job.version is None:
             raise BenchError(f"the training job has {job.state}: {job.error.message if job.error else ''}")
         version = client.version("bench", job.version)

@@ -2,52 +2,33 @@
 
 from __future__ import annotations
 
-import re
-import threading
-import time
-from pathlib import Path
-from types import TracebackType
-from typing import Self
-
 import numpy as np
 
-from service.bench.processor import PROC
+from service.bench.processes import Watch, levels, proportional
 
 PERIOD = 1.0
 
 
-class MemoryWatch:
-    """Looks once a second, in a thread of its own, while it is entered.
+class MemoryWatch(Watch):
+    """Looks once a second while it is entered.
 
-    service, children: MiB at each look, of the service's own process and of those below it; empty where the system does
-    not tell. Memory that processes share counts once, in parts (PSS).
+    service, children: MiB at each look, of the service's own process and of those that it has started; empty where the
+    system does not tell. Memory that processes share counts once, in parts.
     """
 
     def __init__(self, pid: int) -> None:
+        super().__init__(PERIOD, self.note)
         self.pid = pid
         self.service: list[float] = []
         self.children: list[float] = []
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._watch, daemon=True)
 
-    def _watch(self) -> None:
-        began = time.monotonic()
-        while not self._end.wait(max(0.0, began + PERIOD * len(self.service) - time.monotonic())):
-            own = _mib(self.pid)
-            if own is None:
-                return
+    def note(self) -> None:
+        """Take down what there is now, while the service lives."""
+        own = proportional(self.pid)
+        if own is not None:
             self.service.append(own)
-            self.children.append(sum(_mib(child) or 0.0 for child in _children(self.pid)))
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._end.set()
-        self._thread.join()
+            below = [child for level in levels(self.pid)[1:2] for child in level]
+            self.children.append(sum(proportional(child) or 0.0 for child in below))
 
 
 def growth(looks: list[float]) -> float | None:
@@ -60,24 +41,3 @@ def growth(looks: list[float]) -> float | None:
         return None
     before, after = looks[quarter : 2 * quarter], looks[-quarter:]
     return float(np.median(after) / np.median(before) - 1)
-
-
-def _mib(pid: int) -> float | None:
-    try:
-        text = (PROC / str(pid) / "smaps_rollup").read_text()
-    except OSError:
-        return None
-    found = re.search(r"^Pss:\s+(\d+) kB", text, re.MULTILINE)
-    return None if found is None else int(found.group(1)) / 1024
-
-
-def _children(pid: int) -> list[int]:
-    found = []
-    for path in PROC.glob("[0-9]*/stat"):
-        try:
-            parent = int(Path(path).read_text().rpartition(")")[2].split()[1])
-        except OSError:
-            continue
-        if parent == pid:
-            found.append(int(path.parent.name))
-    return found

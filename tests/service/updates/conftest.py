@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from service.models import registry
+from service.updates.learner import course
 from tests.service.conftest import Trained
 from tests.service.data import service_of
 from tests.service.updates.lessons import School
 from tests.service.updates.lessons import school as opened
+from tests.service.updates.pendulums import Arm
 
 
 @pytest.fixture(scope="session")
@@ -20,3 +23,17 @@ def school(api: object, trained: Trained, tmp_path_factory: pytest.TempPathFacto
     folder = service.files.version_folder(registry.find(service.database, trained.name, 1).folder)
     with opened(tmp_path_factory.mktemp("school"), folder) as started:
         yield started
+
+
+@pytest.fixture
+def arm(home: Path) -> Iterator[Arm]:
+    """A model of one version."""
+    opened = Arm.open(home)
+    yield opened
+    opened.database.close()
+
+
+@pytest.fixture(params=[1, 25, 500], ids="pages of {} rows".format)
+def pages(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages of one batch, of a few, and of all."""
+    monkeypatch.setattr(course, "PAGE_ROWS", request.param)

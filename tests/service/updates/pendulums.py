@@ -15,6 +15,7 @@ import lipcore
 from lipcore import FitOptions, Samples, TorqueModel
 from lipcore.compact.posterior import CompactPosterior
 from lipcore.compact.statistics import collect, merge
+from lipcore.online import state
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.online.record import Record
@@ -25,8 +26,8 @@ from service.models import registry
 from service.settings import Settings
 from service.updates.learner import publication
 from service.updates.learner.messages import Published
-from service.updates.learner.restore import restore
-from service.updates.storage import log
+from service.updates.learner.restore import Restored, advance, restore
+from service.updates.storage import log, snapshots
 from service.updates.storage.log import NewBatch
 from tests.service.data import QUICK, stream
 
@@ -89,6 +90,20 @@ class Arm:
     def base(self) -> TorqueModel:
         """The version as trained, as the service loads it."""
         return lipcore.load(self.files.version_folder(registry.find(self.database, self.model, 1).folder))
+
+    def followed(self, known: Restored) -> Restored:
+        """Advance a state until there is nothing new."""
+        while (following := advance(self.database, known)) is not known:
+            known = following
+        return known
+
+    def snapshot(self, at_most: int | None = None) -> int:
+        """Store the state after an event, the last one unless said; return the number of the event that it is of."""
+        known = self.restored(at_most=at_most)
+        assert known.settled
+        payload, most = state.dump(known.online), self.settings.max_snapshots
+        assert snapshots.save(self.database, self.files, self.model, 1, known.number, payload, most=most) is not None
+        return known.number
 
     def batch(self, number: int, size: int = ROWS, model: str | None = None, **fields: Any) -> int:
         """Log the batch with this sequence, predicted without error unless said; return its event's number."""

@@ -16,15 +16,7 @@ from service.files import Files
 from service.inference.loaded import LoadedModels
 from service.updates.learner import learnt, publication
 from service.updates.learner.messages import Published
-from tests.service.updates.pendulums import ARM, QUERIES, Arm, adopt, at_once, differ, predicted, rows, same, trained
-
-
-@pytest.fixture
-def arm(home):
-    """A model of one version."""
-    opened = Arm.open(home)
-    yield opened
-    opened.database.close()
+from tests.service.updates.pendulums import ARM, QUERIES, adopt, at_once, differ, predicted, rows, same, trained
 
 
 @pytest.fixture

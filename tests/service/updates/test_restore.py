@@ -1,4 +1,4 @@
-"""What is learnt is a function of the log: from a snapshot or not, in pages or at once, whatever was taken out."""
+"""What is learnt is a function of the log: from a snapshot or not, in pages or at once."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lipcore.online import state
-from lipcore.online.learner import OnlineModel
 from lipcore.vocabulary import CODES
 from service.updates.learner import course, learnt, recent
 from service.updates.learner import restore as restoring
@@ -17,9 +15,7 @@ from service.updates.learner.restore import advance
 from service.updates.storage import snapshots
 from tests.service.updates.pendulums import (
     ARM,
-    BEGIN,
     QUERIES,
-    Arm,
     at_once,
     differ,
     predicted,
@@ -28,38 +24,6 @@ from tests.service.updates.pendulums import (
     same,
     trained,
 )
-
-
-@pytest.fixture
-def arm(home):
-    """A model of one version."""
-    opened = Arm.open(home)
-    yield opened
-    opened.database.close()
-
-
-@pytest.fixture(params=[1, 25, 500], ids="pages of {} rows".format)
-def pages(request, monkeypatch):
-    """Pages of one batch, of a few, and of all."""
-    monkeypatch.setattr(course, "PAGE_ROWS", request.param)
-
-
-def snapshot(arm, at_most=None):
-    """Store the state after an event; return what it is of."""
-    known = arm.restored(at_most=at_most)
-    assert known.settled
-    payload = state.dump(known.online)
-    most = arm.settings.max_snapshots
-    assert snapshots.save(arm.database, arm.files, ARM, 1, known.number, payload, most=most) is not None
-    return known.number
-
-
-def followed(arm, known):
-    """Advance until there is nothing new."""
-    while (following := advance(arm.database, known)) is not known:
-        known = following
-    return known
-
 
 # learning
 
@@ -116,7 +80,7 @@ def test_restoring_can_stop_after_some_rows_and_go_on(arm, monkeypatch):
     known = arm.restored(most_rows=25)
     assert known.number == 3
     same(known.online, at_once(range(3)))
-    same(followed(arm, known).online, at_once(range(6)))
+    same(arm.followed(known).online, at_once(range(6)))
 
 
 # snapshots
@@ -125,7 +89,7 @@ def test_restoring_can_stop_after_some_rows_and_go_on(arm, monkeypatch):
 @pytest.mark.parametrize("at", [1, 7, 12])
 def test_a_snapshot_changes_nothing_but_the_time_it_takes(arm, pages, at, monkeypatch):
     arm.batches(*range(12))
-    assert snapshot(arm, at_most=at) == at
+    assert arm.snapshot(at_most=at) == at
     decoded, decode = [], restoring.decode
     monkeypatch.setattr(restoring, "decode", lambda payload: decoded.append(1) or decode(payload))
     found = arm.restored()
@@ -136,9 +100,9 @@ def test_a_snapshot_changes_nothing_but_the_time_it_takes(arm, pages, at, monkey
 
 def test_a_damaged_snapshot_gives_way_to_the_one_before(arm, caplog):
     arm.batches(0, 1)
-    snapshot(arm)
+    arm.snapshot()
     arm.batches(2, 3)
-    snapshot(arm)
+    arm.snapshot()
     with arm.database.session() as session:
         newest = snapshots.latest(session, ARM, 1, None)
     path = arm.files.learning / f"{newest.id}.safetensors"
@@ -151,7 +115,7 @@ def test_a_damaged_snapshot_gives_way_to_the_one_before(arm, caplog):
 
 def test_a_snapshot_of_another_version_is_not_taken(arm):
     arm.batches(0, 1)
-    snapshot(arm)
+    arm.snapshot()
     arm.publish(candidate=True, start=1)
     found = restoring.restore(arm.database, arm.files, ARM, 2, arm.base)
     same(found.online, at_once([1]))
@@ -160,7 +124,7 @@ def test_a_snapshot_of_another_version_is_not_taken(arm):
 def test_who_is_overtaken_by_retention_goes_on_from_the_newest_snapshot(arm):
     arm.batches(*range(4))
     known = arm.restored(at_most=1)
-    assert snapshot(arm) == 4
+    assert arm.snapshot() == 4
     arm.batches(4)
     with arm.database.transaction() as session:
         session.connection().exec_driver_sql("DELETE FROM events WHERE number <= 4")
@@ -172,7 +136,7 @@ def test_who_is_overtaken_by_retention_goes_on_from_the_newest_snapshot(arm):
 
 def test_where_that_snapshot_is_lost_what_is_left_of_the_log_is_learnt(arm):
     arm.batches(*range(4))
-    snapshot(arm)
+    arm.snapshot()
     arm.batches(4, 5)
     with arm.database.transaction() as session:
         session.connection().exec_driver_sql("DELETE FROM events WHERE number <= 4")
@@ -181,232 +145,6 @@ def test_where_that_snapshot_is_lost_what_is_left_of_the_log_is_learnt(arm):
     found = arm.restored()
     assert found.number == 6
     same(found.online, at_once([4, 5]))
-
-
-# taking out
-
-
-@pytest.mark.parametrize("at", [None, 1, 3, 5], ids="snapshot at {}".format)
-def test_a_batch_that_was_unlearnt_leaves_nothing_behind(arm, pages, at):
-    arm.batches(*range(6))
-    if at is not None:
-        snapshot(arm, at_most=at)
-    known = arm.restored()
-    assert arm.unlearn(3) == 7
-    expected = at_once([0, 1, 3, 4, 5])
-    assert differ(expected, at_once(range(6)))
-    same(arm.restored().online, expected)
-    same(followed(arm, known).online, expected)
-    arm.batches(6)
-    same(arm.restored().online, at_once([0, 1, 3, 4, 5, 6]))
-    same(followed(arm, known).online, at_once([0, 1, 3, 4, 5, 6]))
-
-
-def test_replays_go_with_their_batch(arm):
-    code = np.array([0] * 5 + [6] * 5, np.uint8)
-    arm.batch(0)
-    arm.batch(1, rows=replace(rows(1), code=code))
-    arm.event("replay", replace(rows(1), code=6 - code), event=2)
-    known = arm.restored()
-    same(known.online, at_once([0, 1]))
-    arm.unlearn(2)
-    same(followed(arm, known).online, at_once([0]))
-    same(arm.restored().online, at_once([0]))
-
-
-def test_unlearning_twice_is_unlearning_once(arm):
-    arm.batches(0, 1)
-    known = arm.restored()
-    arm.unlearn(1)
-    known = followed(arm, known)
-    assert snapshot(arm) == 3
-    arm.unlearn(1)
-    same(followed(arm, known).online, at_once([1]))
-    same(arm.restored().online, at_once([1]))
-
-
-def test_a_batch_that_is_unlearnt_later_is_learnt_at_its_place(arm, monkeypatch):
-    monkeypatch.setattr(course, "PAGE_ROWS", 10)
-    arm.batches(*range(4))
-    arm.unlearn(1)
-    known = arm.restored(most_rows=30)
-    assert known.number == 3
-    same(known.online, at_once(range(3)))
-    same(followed(arm, known).online, at_once([1, 2, 3]))
-
-
-def test_what_was_unlearnt_while_the_pages_were_read_is_taken_out_once(arm, monkeypatch):
-    monkeypatch.setattr(course, "PAGE_ROWS", 10)
-    arm.batches(*range(6))
-    known = arm.restored(most_rows=30)
-    assert known.number == 3
-    arm.unlearn(2)
-    arm.unlearn(5)
-    same(followed(arm, known).online, at_once([0, 2, 3, 5]))
-
-
-def test_a_rollback_leads_back(arm, pages):
-    arm.batches(*range(4))
-    snapshot(arm)
-    arm.batches(4, 5, 6)
-    snapshot(arm)
-    known = arm.restored()
-    assert arm.rollback(5) == 8
-    same(arm.restored().online, at_once(range(5)))
-    with pytest.raises(RewoundError) as rewound:
-        followed(arm, known)
-    assert rewound.value.number == 5
-    arm.batches(7)
-    same(arm.restored().online, at_once([0, 1, 2, 3, 4, 7]))
-    assert arm.restored().number == 9
-
-
-def test_a_rollback_reaches_what_was_read_in_between_and_no_more(arm, monkeypatch):
-    monkeypatch.setattr(course, "PAGE_ROWS", 10)
-    arm.batches(*range(4))
-    known = arm.restored(most_rows=20)
-    assert known.number == 2
-    arm.rollback(3)
-    same(followed(arm, known).online, at_once(range(3)))
-    arm.rollback(1)
-    with pytest.raises(RewoundError):
-        followed(arm, known)
-
-
-def test_a_rollback_between_two_pages_of_a_restart_is_followed(arm, monkeypatch):
-    monkeypatch.setattr(course, "PAGE_ROWS", 10)
-    arm.batches(*range(6))
-    calls, real = [], restoring.advance
-
-    def disturbed(*arguments):
-        calls.append(arguments)
-        if len(calls) == 5:
-            arm.rollback(2)
-        return real(*arguments)
-
-    monkeypatch.setattr(restoring, "advance", disturbed)
-    found = arm.restored()
-    assert found.number == 7
-    same(found.online, at_once(range(2)))
-
-
-def test_what_was_unlearnt_stays_unlearnt_after_a_rollback(arm):
-    arm.batches(*range(4))
-    snapshot(arm)
-    arm.unlearn(2)
-    arm.batches(4)
-    arm.rollback(4)
-    same(arm.restored().online, at_once([0, 2, 3]))
-
-
-def test_a_batch_that_was_rolled_back_cannot_be_taken_out_again(arm):
-    arm.batches(*range(4))
-    arm.rollback(2)
-    known = arm.restored()
-    arm.unlearn(4)
-    same(followed(arm, known).online, at_once(range(2)))
-    same(arm.restored().online, at_once(range(2)))
-
-
-def test_the_state_of_an_earlier_event_is_told_with_or_without_what_has_been_unlearnt_since(arm):
-    arm.batches(*range(5))
-    snapshot(arm, at_most=3)
-    arm.unlearn(2)
-    same(arm.restored(at_most=3).online, at_once(range(3)))
-    found = arm.restored(at_most=3, taken_back=True)
-    assert found.number == 3
-    same(found.online, at_once([0, 2]))
-
-
-# changes and forgetting: their oracle is the model's own order of calls
-
-
-def test_a_change_begins_a_regime_where_the_log_says(arm, pages):
-    arm.batches(0, 1, 2)
-    arm.event("change", t=BEGIN + 0.3)
-    arm.batches(3, 4)
-    expected = OnlineModel.start(arm.base, None, 0.0)
-    expected = expected.learn(_together(0, 1, 2)).change(BEGIN + 0.3).learn(_together(3, 4))
-    same(arm.restored().online, predicted(expected.model()))
-    snapshot(arm, at_most=4)
-    same(arm.restored().online, predicted(expected.model()))
-    assert differ(predicted(expected.model()), at_once(range(5)))
-
-
-def test_a_batch_from_before_two_changes_is_unlearnt_by_learning_the_others_again(arm):
-    arm.batches(0, 1)
-    arm.event("change", t=BEGIN + 0.2)
-    arm.batches(2)
-    arm.event("change", t=BEGIN + 0.3)
-    arm.batches(3)
-    known = arm.restored()
-    arm.unlearn(1)
-    expected = OnlineModel.start(arm.base, None, 0.0).learn(rows(1)).change(BEGIN + 0.2)
-    expected = expected.learn(rows(2)).change(BEGIN + 0.3).learn(rows(3))
-    same(arm.restored().online, predicted(expected.model()))
-    with pytest.raises(RewoundError):
-        followed(arm, known)
-
-
-def test_where_the_log_reaches_back_no_more_such_a_batch_stays_and_that_is_said(arm, caplog):
-    arm.batches(0, 1)
-    arm.event("change", t=BEGIN + 0.2)
-    arm.batches(2)
-    arm.event("change", t=BEGIN + 0.3)
-    arm.batches(3)
-    known = arm.restored()
-    arm.unlearn(2)
-    with arm.database.transaction() as session:
-        session.connection().exec_driver_sql("DELETE FROM events WHERE number = 1")
-    same(followed(arm, known).online, predicted(known.online.model()))
-    assert "events 2 of model 'arm' stay in what is learnt" in caplog.text
-
-
-@pytest.mark.parametrize("at", [None, 2, 5])
-def test_forgetting_is_that_of_the_log(arm, pages, at):
-    arm.event("settings", forgetting_s=2.0)
-    arm.batches(0, 1, 2)
-    arm.event("settings", forgetting_s=0.5)
-    arm.batches(3, 4)
-    if at is not None:
-        snapshot(arm, at_most=at)
-    expected = OnlineModel.start(arm.base, 2.0, BEGIN + 0.09).learn(_together(0, 1, 2))
-    expected = expected.with_forgetting(0.5).learn(_together(3, 4))
-    found = arm.restored()
-    same(found.online, predicted(expected.model()))
-    assert found.online.forgetting_s == 0.5
-    assert differ(predicted(expected.model()), at_once(range(5)))
-
-
-def test_forgetting_that_was_set_before_a_version_was_trained_holds_for_it(arm):
-    arm.batches(0)
-    arm.event("settings", forgetting_s=3.0)
-    arm.publish(candidate=True)
-    arm.batches(1)
-    found = restoring.restore(arm.database, arm.files, ARM, 2, arm.base)
-    assert found.online.forgetting_s == 3.0
-
-
-def test_under_forgetting_too_it_does_not_matter_in_which_steps_a_log_is_read(arm):
-    arm.event("settings", forgetting_s=1.0)
-    known = arm.restored()
-    arm.batch(5)  # from the first batch on, the training is forgotten
-    known = advance(arm.database, known)
-    arm.batches(2, 3)
-    same(followed(arm, known).online, predicted(arm.restored().online.model()))
-
-
-def test_a_batch_under_forgetting_that_has_changed_since_is_unlearnt_by_learning_the_others_again(arm):
-    arm.batches(0, 1)
-    snapshot(arm)
-    arm.event("settings", forgetting_s=0.5)
-    arm.batches(2)
-    known = arm.restored()
-    arm.unlearn(1)
-    with pytest.raises(RewoundError):
-        followed(arm, known)
-    expected = OnlineModel.start(arm.base, None, BEGIN + 0.09).learn(rows(1)).with_forgetting(0.5).learn(rows(2))
-    same(arm.restored().online, predicted(expected.model()))
 
 
 # for the process that serves
@@ -427,7 +165,7 @@ def test_little_is_learnt_where_a_version_is_loaded_and_the_rest_is_left_to_the_
 
 def test_a_version_that_learns_no_more_has_learnt_what_its_last_snapshot_says(arm):
     arm.batches(0, 1, 2)
-    snapshot(arm, at_most=2)
+    arm.snapshot(at_most=2)
     arm.publish()
     arm.batches(3)
     found = learnt.find(arm.database, arm.files, ARM, 1, arm.base)
@@ -463,7 +201,3 @@ def test_slow_streams_are_judged_by_enough_rows(arm):
         arm.batch(number, received=100.0 + 60 * number, record=record(1.0 if number < 2 else 0.0))
     assert recent.floor(arm.database, ARM, 1, 4, 2)[0] == 0.0  # 200 rows without error
     assert recent.floor(arm.database, ARM, 1, 3, 2)[0] > 0.1
-
-
-def _together(*numbers):
-    return rows(0).concatenate([rows(number) for number in numbers])

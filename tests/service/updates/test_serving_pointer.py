@@ -13,17 +13,9 @@ from service.inference.loaded import LoadedModels
 from service.models import registry
 from service.models.registry import Serving
 from tests.service.data import ADDRESS
-from tests.service.updates.pendulums import ARM, Arm
+from tests.service.updates.pendulums import ARM
 
 QUERY = {"q": [0.1, 0.2], "dq": [0.0, 0.0], "ddq": [0.0, 0.0]}
-
-
-@pytest.fixture
-def arm(home):
-    """A model of one version."""
-    opened = Arm.open(home)
-    yield opened
-    opened.database.close()
 
 
 @pytest.fixture
