@@ -5,14 +5,14 @@ BIN := $(VENV)/bin
 # one thread a process: the tests' matrices are small, and three parts run side by side, each in its fixed order
 TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
-.PHONY: demo test warm-lip warm-chain test-lipcore test-service test-packages test-updates test-cluster test-shared test-docs \
+.PHONY: demo test warm-lip warm-chain bytecode test-lipcore test-service test-packages test-updates test-cluster test-shared test-docs \
 	test-browser test-kills test-all screenshots lint install serve image clean
 
 demo: install
 	$(BIN)/lipserve demo
 
 test: install
-	$(MAKE) -j2 warm-lip warm-chain
+	$(MAKE) -j2 warm-lip warm-chain bytecode
 	$(MAKE) -j3 test-service test-updates test-lipcore test-packages test-cluster test-shared test-docs test-browser \
 		test-kills
 
@@ -22,6 +22,10 @@ warm-lip: install
 
 warm-chain: install
 	$(BIN)/python -m lipcore.warm_up lip-chain
+
+# of ours: where Python is told to write none, each of the many processes that tests start would else compile it again
+bytecode: install
+	$(BIN)/python -m compileall -q lipcore service
 
 test-lipcore: install
 	$(TEST) -m "not slow" tests/lipcore
@@ -40,10 +44,10 @@ test-cluster: install
 	$(TEST) -m "not slow" tests/cluster
 
 # the API once more, as the other parts test it with SQLite and local files: now on PostgreSQL and S3
-SHARED := models/test_aliases.py models/test_alias_answers.py models/test_deletion.py access/test_keys.py \
-	access/test_scopes.py access/test_commands.py test_job_requests.py test_dataset_listing.py test_training.py \
-	test_predicting.py test_health_and_errors.py
-MORE_SHARED := test_cancelling.py test_evaluating.py test_robots.py test_upload_transport.py bad_requests \
+SHARED := models/test_aliases.py models/test_deletion.py access/test_keys.py test_job_requests.py test_predicting.py \
+	test_health_and_errors.py
+MORE_SHARED := models/test_alias_answers.py access/test_scopes.py access/test_commands.py test_dataset_listing.py \
+	test_training.py test_cancelling.py test_evaluating.py test_robots.py test_upload_transport.py bad_requests \
 	client/test_idempotency.py archives/test_round_trip.py observability/test_metrics_of_service.py \
 	updates/test_observations.py updates/test_learning_routes.py updates/test_rollback.py updates/test_unlearning.py \
 	updates/test_inspection.py updates/test_alarm_routes.py updates/test_log.py

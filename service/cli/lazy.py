@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-import importlib
 import sys
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
@@ -12,6 +10,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from service.cli.errors import explain, tell
+from service.importing import imported
 
 
 class Entry(NamedTuple):
@@ -41,14 +40,7 @@ class LazyGroup(TyperGroup):
         """Import a command and return it; raise KeyError for an unknown one."""
         entry = self.entries[name]
         if entry.module not in sys.modules:
-            # what is imported stays: searching it for garbage would take a fifth of a start, and 40 ms of the
-            # service's loop later
-            gc.disable()
-            try:
-                importlib.import_module(entry.module)
-                gc.freeze()
-            finally:
-                gc.enable()
+            imported(entry.module)
         found = typer.main.get_command(sys.modules[entry.module].app)
         found.name = name
         return found

@@ -14,8 +14,9 @@ import signal
 import threading
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
-from typing import Literal
+from typing import Any, Literal
 
+from service.importing import imported
 from service.observability import logs
 from service.observability.logs import LogOptions
 from service.settings import Settings
@@ -77,6 +78,11 @@ def start_process(place: Place) -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def call(module: str, function: str, *given: Any) -> None:
+    """Call a function in a process that may not have imported its module yet."""
+    getattr(imported(module), function)(*given)
 
 
 def _end_with(parent: BaseProcess) -> None:

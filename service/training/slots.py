@@ -15,7 +15,7 @@ from contextlib import suppress
 from multiprocessing.process import BaseProcess
 from typing import Any
 
-from service.training.process import Place, start_process
+from service.training.process import Place, call, start_process
 
 REAPING_S = 0.5
 """Longest wait for what the system says of a process that has ended, s."""
@@ -30,16 +30,17 @@ class Slot:
         self._process: BaseProcess | None = None
 
     def start(self, function: Callable[..., None], *given: Any) -> Future[None]:
-        """Call a function in the process, started where there is none.
+        """Call a function of a module in the process, started where there is none.
 
         The future's error is BrokenProcessPool where the process ends before the function does. Raise OSError where no
         process can be started.
         """
+        named = function.__module__, function.__qualname__
         try:
-            future = self._pool.submit(function, *given)
+            future = self._pool.submit(call, *named, *given)
         except BrokenProcessPool:  # it has died while it had nothing to do
             self._renew()
-            future = self._pool.submit(function, *given)
+            future = self._pool.submit(call, *named, *given)
         except OSError:  # a pool does not try again
             self._renew()
             raise

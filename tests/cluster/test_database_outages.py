@@ -48,6 +48,7 @@ def restarted(postgres, answered):
     eventually(lambda: len(answered) >= seen + 2)
 
 
+@pytest.mark.slow
 def test_while_the_server_is_away_clients_are_told_to_come_again(service, postgres):
     (pupil,), (client,) = service.enrol(ARM), service.clients
     body = npz(**arrays(stream()))

@@ -53,6 +53,7 @@ def test_jobs_run_one_after_the_other_and_the_one_that_ends_is_told(services):
     assert sorted(eventually(lambda: len(first.made) == 3 and first.made)) == [("n0", 1), ("n1", 1), ("n2", 1)]
 
 
+@pytest.mark.slow
 def test_a_cancel_ends_a_process_that_does_not_obey_and_another_service_may_ask(services):
     one, other = services("a"), services("b")
     deaf = one.add("deaf", "deaf")
@@ -123,6 +124,7 @@ def test_a_scheduler_that_is_gone_costs_no_attempt_and_what_waits_goes_on_after_
     eventually(lambda: queue.cluster.problem is None)
 
 
+@pytest.mark.slow
 def test_a_job_that_needs_a_gpu_waits_for_a_worker_that_has_one(services, workers):
     queue = services("a")
     job, plain = queue.add("gpu", "wait", device="cuda"), queue.add("plain", "finish")

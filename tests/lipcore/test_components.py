@@ -30,7 +30,7 @@ class Setting(NamedTuple):
 SETTINGS = [
     Setting("lip-chain", "finger-edu"),
     Setting("lip", "finger-edu"),
-    Setting("lip-chain", "ur5", viscous=0.5),
+    pytest.param(Setting("lip-chain", "ur5", viscous=0.5), marks=pytest.mark.slow),
     Setting("rigid-body", "ur5", viscous=0.5),
     Setting("rigid-body+lip-chain", "double-pendulum", prior="urdf"),
 ]

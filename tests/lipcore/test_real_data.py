@@ -79,7 +79,8 @@ def test_panda_predicts_the_rest_of_its_trajectory(options: FitOptions, lowest_c
 
 @pytest.mark.skipif(not SCHUNK.exists(), reason=f"no recording at {SCHUNK}")
 @pytest.mark.parametrize(
-    "options", [pytest.param(QUICK, id="quick"), pytest.param(DEFAULT, id="default", marks=pytest.mark.slow)]
+    "options",
+    [pytest.param(each, id=name, marks=pytest.mark.slow) for name, each in (("quick", QUICK), ("default", DEFAULT))],
 )
 def test_schunk_predicts_episodes_held_out(options: FitOptions) -> None:
     """Every fourth episode is held out: trajectories of the same kinds, driven at other speeds or again."""

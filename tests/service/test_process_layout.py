@@ -82,6 +82,7 @@ def test_a_place_of_its_own_accord_leaves_priority_and_cpus_as_they_are():
     assert set(found) == {Thread(os.nice(0), os.SCHED_OTHER, frozenset(os.sched_getaffinity(0)))}
 
 
+@pytest.mark.slow
 @linux
 def test_a_training_process_stands_behind_the_service_that_started_it(home):
     available = os.sched_getaffinity(0)

@@ -18,7 +18,7 @@ from multiprocessing.process import BaseProcess
 
 from service.observability import logs
 from service.settings import Settings
-from service.training.process import Place, start_process, training_cpus
+from service.training.process import Place, call, start_process, training_cpus
 from service.updates.learner.messages import Message
 
 logger = logging.getLogger(__name__)
@@ -153,6 +153,4 @@ def _learn(place: Place, settings: Settings, connection: Connection) -> None:
     start_process(place)
     # a signal to all processes of the service ends the parent in order, which then lets this one store its state
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    from service.updates.learner.worker import run  # noqa: PLC0415 - numerics, see above
-
-    run(settings, connection)
+    call("service.updates.learner.worker", "run", settings, connection)  # numerics, see above

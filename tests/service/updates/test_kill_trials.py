@@ -12,7 +12,7 @@ from service.bench.online import durability
 from service.bench.online.durability import VICTIMS, grids, open_trials, targets
 from service.bench.online.trials import BATCHES, Tally
 
-TRIALS = 6
+TRIALS = 2
 """Kills, of the service and of its learner in turn."""
 
 
