@@ -51,10 +51,12 @@ def folder(api, model, version):
 
 
 def job(api, model, state, **request):
-    """A job of a model, as a row."""
+    """A job of a model, as a row: of this service, which else would take it for one of a service that is gone."""
+    service = service_of(api)
     row = JobRow(id=f"job_{model[-30:]}", model=model, state=state, created_at=now(), heartbeat_at=now())
     row.request, row.progress = {"estimator": "lip-chain", "datasets": []} | request, {"stage": "waiting"}
-    with service_of(api).database.transaction() as session:
+    row.owner = service.jobs.replicas.id
+    with service.database.transaction() as session:
         session.add(row)
     return row.id
 
