@@ -6,15 +6,14 @@ BIN := $(VENV)/bin
 TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
 .PHONY: demo test warm-lip warm-chain bytecode test-lipcore test-service test-packages test-updates test-cluster test-shared test-docs \
-	test-browser test-kills test-all screenshots lint install serve image clean
+	test-browser test-all screenshots lint install serve image clean
 
 demo: install
 	$(BIN)/lipserve demo
 
 test: install
 	$(MAKE) -j2 warm-lip warm-chain bytecode
-	$(MAKE) -j3 test-service test-updates test-lipcore test-packages test-cluster test-shared test-docs test-browser \
-		test-kills
+	$(MAKE) -j3 test-service test-updates test-lipcore test-packages test-cluster test-docs test-browser test-shared
 
 # compiles what the parts below would else compile once each, side by side: a minute of one core
 warm-lip: install
@@ -37,7 +36,7 @@ test-packages: install
 	$(TEST) -m "not slow" $(filter-out %/updates/ %/__pycache__/,$(wildcard tests/service/*/))
 
 test-updates: install
-	$(TEST) -m "not slow" tests/service/updates --ignore tests/service/updates/test_kill_trials.py
+	$(TEST) -m "not slow" tests/service/updates
 
 # several services with a real PostgreSQL server, S3 endpoint and Dask cluster, which the tests start
 test-cluster: install
@@ -63,10 +62,6 @@ test-docs: install
 # skipped where there is no Chromium
 test-browser: install
 	$(TEST) -m "not slow" tests/browser
-
-# by itself, because a minute of it is waiting for services to start: when one of the others has ended
-test-kills: install
-	$(TEST) tests/service/updates/test_kill_trials.py
 
 test-all: install
 	$(TEST) --hypothesis-profile thorough

@@ -173,6 +173,7 @@ def make(home: Path, page_rows: int, connection) -> None:
     database.close()
 
 
+@pytest.mark.slow
 def test_two_processes_reach_the_same_bits(home):
     arm = Arm.open(home)
     arm.batches(*range(4))

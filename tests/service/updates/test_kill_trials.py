@@ -12,7 +12,7 @@ from service.bench.online import durability
 from service.bench.online.durability import VICTIMS, grids, open_trials, targets
 from service.bench.online.trials import BATCHES, Tally
 
-TRIALS = 2
+TRIALS = 6
 """Kills, of the service and of its learner in turn."""
 
 
@@ -25,18 +25,21 @@ def tally(tmp_path_factory) -> Tally:
     return trials.tally
 
 
+@pytest.mark.slow
 def test_no_acknowledged_batch_is_lost(tally):
     assert tally.kills == {"service": TRIALS // 2, "learner": TRIALS // 2}
     assert tally.batches == 20 * TRIALS
     assert tally.lost == 0
 
 
+@pytest.mark.slow
 def test_no_batch_is_applied_twice(tally):
     assert tally.repeated > 0
     assert tally.late > 0
     assert tally.twice == 0
 
 
+@pytest.mark.slow
 def test_what_is_learnt_is_what_was_sent(tally):
     assert tally.refused == 0
     # a single batch more or less would show
