@@ -13,7 +13,7 @@ demo: install
 
 test: install
 	$(MAKE) -j2 warm-lip warm-chain bytecode
-	$(MAKE) -j3 test-service test-updates test-lipcore test-packages test-cluster test-docs test-browser test-shared
+	$(MAKE) -j3 test-packages test-service test-lipcore test-updates test-cluster test-browser test-docs test-shared
 
 # compiles what the parts below would else compile once each, side by side: a minute of one core
 warm-lip: install

@@ -60,7 +60,10 @@ def read_panda() -> tuple[tuple[str, ...], np.ndarray]:
 @pytest.mark.skipif(not PANDA.exists(), reason=f"no recording at {PANDA}")
 @pytest.mark.parametrize(
     ("options", "lowest_coverage"),
-    [pytest.param(QUICK, 0.4, id="quick"), pytest.param(DEFAULT, 0.3, id="default", marks=pytest.mark.slow)],
+    [
+        pytest.param(QUICK, 0.4, id="quick"),
+        pytest.param(DEFAULT, 0.3, id="default", marks=pytest.mark.slow),
+    ],
 )
 def test_panda_predicts_the_rest_of_its_trajectory(options: FitOptions, lowest_coverage: float) -> None:
     names, signals = read_panda()
