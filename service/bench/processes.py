@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -27,10 +27,10 @@ def stats() -> Iterator[tuple[int, list[str]]]:
         yield int(path.parent.name), fields
 
 
-def levels(pid: int) -> list[list[int]]:
-    """A process, then its children, then theirs, and so on."""
+def levels(pid: int, known: Mapping[int, list[str]] | None = None) -> list[list[int]]:
+    """A process, then its children, then theirs, and so on. known: what `stats` found, looked up where None."""
     children: dict[int, list[int]] = {}
-    for child, fields in stats():
+    for child, fields in stats() if known is None else known.items():
         children.setdefault(int(fields[_PARENT]), []).append(child)
     found = [[pid]]
     while below := [child for parent in found[-1] for child in children.get(parent, [])]:

@@ -8,13 +8,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from service.bench.processes import PROC, stats
+from service.bench.processes import PROC, levels, stats
 
 KNOWN = (PROC / "stat").exists()
 """Whether the system tells."""
 _BUSY, _STOLEN = (0, 1, 2, 5, 6), 7
 """Fields of /proc/stat: user, nice, system, irq and softirq; what the host gave to others."""
-_PARENT, _TIMES = 1, (11, 12, 13, 14)
+_TIMES = (11, 12, 13, 14)
 """Fields of /proc/PID/stat after the name: user and system time, of the process and of children that have ended."""
 
 
@@ -50,14 +50,9 @@ def watched(usage: Usage, service: int) -> Iterator[None]:
 
 def seconds_below(pid: int, itself: bool = False) -> float:
     """Processor time of all children of a process and of theirs, s, and of the process where wanted."""
-    found: dict[int, tuple[int, float]] = {}
-    for each, fields in stats():
-        found[each] = (int(fields[_PARENT]), sum(int(fields[at]) for at in _TIMES) / _hertz())
-    below = {pid}
-    while more := {child for child, (parent, _) in found.items() if parent in below} - below:
-        below |= more
-    counted = below if itself else below - {pid}
-    return sum(found[each][1] for each in counted & found.keys())
+    known = dict(stats())
+    counted = [each for level in levels(pid, known)[0 if itself else 1 :] for each in level if each in known]
+    return sum(int(known[each][at]) for each in counted for at in _TIMES) / _hertz()
 
 
 def _look(service: int) -> tuple[float, float, float]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
@@ -11,9 +9,10 @@ from sqlalchemy import inspect, select, text
 from sqlalchemy.exc import DBAPIError
 
 from service.database import Base, Database, LearningRow, ModelRow, now
-from service.database.migrations import HEAD, DatabaseVersionError, revision
+from service.database.migrations import DatabaseVersionError
 from service.errors import StorageUnavailableError
 from service.storage_errors import translated
+from tests.service.database.starting import check_starts_together
 
 
 @pytest.fixture
@@ -51,25 +50,7 @@ def test_migrations_end_in_the_tables_of_the_release(database):
 
 def test_services_that_start_together_migrate_once(postgres, tmp_path):
     url = postgres.url_of(postgres.create_empty())
-    failures, opened, barrier = [], [], threading.Barrier(4)
-
-    def start():
-        barrier.wait()
-        try:
-            opened.append(Database(tmp_path, url=url))
-        except Exception as error:
-            failures.append(error)
-
-    threads = [threading.Thread(target=start) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert failures == []
-    with opened[0].engine.connect() as connection:
-        assert revision(connection) == HEAD
-    for database in opened:
-        database.close()
+    check_starts_together(lambda: Database(tmp_path, url=url))
 
 
 def test_a_database_of_a_later_release_is_refused(shared, database):

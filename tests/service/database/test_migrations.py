@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sqlite3
-import threading
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,8 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import inspect, select, text
 
 from service.database import Base, Database, JobRow, ModelRow, SnapshotRow, VersionRow, migrations
-from service.database.migrations import HEAD, DatabaseVersionError, revision
+from service.database.migrations import HEAD, DatabaseVersionError
+from tests.service.database.starting import check_starts_together
 
 BEFORE = (Path(__file__).parent / "before_migrations.sql").read_text()
 FILE = "lipserve.sqlite3"
@@ -93,23 +93,4 @@ def test_a_database_of_a_later_release_is_refused(home):
 
 
 def test_processes_that_start_together_migrate_once(earlier):
-    failures, opened = [], []
-    barrier = threading.Barrier(4)
-
-    def start() -> None:
-        barrier.wait()
-        try:
-            opened.append(Database(earlier))
-        except Exception as error:
-            failures.append(error)
-
-    threads = [threading.Thread(target=start) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert failures == []
-    with opened[0].engine.connect() as connection:
-        assert revision(connection) == HEAD
-    for database in opened:
-        database.close()
+    check_starts_together(lambda: Database(earlier))

@@ -19,6 +19,16 @@ from tests.service.updates.pendulums import (
 )
 
 
+def changed_twice(arm):
+    """Two batches, then a change before each of two more; return the state after the last."""
+    arm.batches(0, 1)
+    arm.event("change", t=BEGIN + 0.2)
+    arm.batches(2)
+    arm.event("change", t=BEGIN + 0.3)
+    arm.batches(3)
+    return arm.restored()
+
+
 def test_a_change_begins_a_regime_where_the_log_says(arm, pages):
     arm.batches(0, 1, 2)
     arm.event("change", t=BEGIN + 0.3)
@@ -32,12 +42,7 @@ def test_a_change_begins_a_regime_where_the_log_says(arm, pages):
 
 
 def test_a_batch_from_before_two_changes_is_unlearnt_by_learning_the_others_again(arm):
-    arm.batches(0, 1)
-    arm.event("change", t=BEGIN + 0.2)
-    arm.batches(2)
-    arm.event("change", t=BEGIN + 0.3)
-    arm.batches(3)
-    known = arm.restored()
+    known = changed_twice(arm)
     arm.unlearn(1)
     expected = OnlineModel.start(arm.base, None, 0.0).learn(rows(1)).change(BEGIN + 0.2)
     expected = expected.learn(rows(2)).change(BEGIN + 0.3).learn(rows(3))
@@ -47,12 +52,7 @@ def test_a_batch_from_before_two_changes_is_unlearnt_by_learning_the_others_agai
 
 
 def test_where_the_log_reaches_back_no_more_such_a_batch_stays_and_that_is_said(arm, caplog):
-    arm.batches(0, 1)
-    arm.event("change", t=BEGIN + 0.2)
-    arm.batches(2)
-    arm.event("change", t=BEGIN + 0.3)
-    arm.batches(3)
-    known = arm.restored()
+    known = changed_twice(arm)
     arm.unlearn(2)
     with arm.database.transaction() as session:
         session.connection().exec_driver_sql("DELETE FROM events WHERE number = 1")

@@ -1,0 +1,33 @@
+"""Several that start on one database at once."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+from service.database import Database
+from service.database.migrations import HEAD, revision
+
+
+def check_starts_together(opens: Callable[[], Database], count: int = 4) -> None:
+    """Open a database from so many threads at the same moment: none fails, and it is that of this release."""
+    failures, opened = list[Exception](), list[Database]()
+    barrier = threading.Barrier(count)
+
+    def start() -> None:
+        barrier.wait()
+        try:
+            opened.append(opens())
+        except Exception as error:
+            failures.append(error)
+
+    threads = [threading.Thread(target=start) for _ in range(count)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert failures == []
+    with opened[0].engine.connect() as connection:
+        assert revision(connection) == HEAD
+    for database in opened:
+        database.close()
