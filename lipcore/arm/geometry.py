@@ -1,0 +1,227 @@
+"""Where the joint axes of a serial arm lie.
+
+Every joint has a frame, placed in the frame of the joint before it; its axis is a fixed vector of its own frame. What
+torque can tell of a joint is where its axis lies relative to the one before: two turns of it and two shifts, across the
+axis (of a prismatic joint the turns alone), and of the first joint how it stands to gravity. A change of a geometry is
+therefore a step in these numbers,
+
+    T_j ← T_j exp(ε_j),    ε_j = (turn about e1, about e2, shift along e1, along e2),    e1, e2 across the axis,
+
+which is smooth everywhere. (Denavit–Hartenberg's numbers are not: for two parallel axes, of which most arms have some,
+the place of the common normal is undetermined, and a small turn of an axis moves it without bound.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from lipcore.kernels.compiled.arm import ACROSS, AXIS, CONSTANTS, KIND, PLACE, SCREWS, TURN
+from lipcore.motion import check_joint_types
+from lipcore.samples import Array
+from lipcore.urdf import RigidBody
+from lipcore.vocabulary import JointType
+
+STANDARD_GRAVITY = 9.81
+"""m/s², as Pinocchio has it."""
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Geometry of a serial arm of n joints, from base to tip.
+
+    joint_types: `revolute` or `prismatic`; rotation: (n, 3, 3), axes of joint j's frame in the frame of joint j − 1 (of
+    the base for the first) at q_j = 0; translation: (n, 3) m, its origin there; axis: (n, 3), unit vectors in the
+    joints' own frames; gravity: (3,) m/s² in the base's frame, zero where torques are without it.
+    """
+
+    joint_types: tuple[JointType, ...]
+    rotation: Array
+    translation: Array
+    axis: Array
+    gravity: Array
+
+    def __post_init__(self) -> None:
+        check_joint_types(self.joint_types)
+        n = len(self.joint_types)
+        for name, shape in (("rotation", (n, 3, 3)), ("translation", (n, 3)), ("axis", (n, 3)), ("gravity", (3,))):
+            value = getattr(self, name)
+            if value.shape != shape or not np.isfinite(value).all():
+                raise ValueError(f"{name} has shape {value.shape}, expected finite numbers of shape {shape}")
+        if not np.allclose(self.rotation @ self.rotation.mT, np.eye(3), atol=1e-6):
+            raise ValueError("rotation holds a matrix that is no rotation")
+        if not np.allclose(np.linalg.norm(self.axis, axis=1), 1.0, atol=1e-6):
+            raise ValueError("axis holds a vector that is not of length one")
+
+    @classmethod
+    def from_robot(cls, robot: RigidBody, gravity: bool = True) -> Geometry:
+        """Geometry of a URDF, frames and axes as it has them; gravity: whether torques contain it."""
+        model = robot.model
+        places, order = tuple(model.jointPlacements)[1:], np.argsort(robot.order)
+        axes = np.array([_axis(model.joints[joint]) for joint in range(1, model.njoints)])
+        return cls(
+            tuple(robot.joint_types[joint] for joint in order),
+            np.array([place.rotation for place in places]),
+            np.array([place.translation for place in places]),
+            axes,
+            np.array(model.gravity.linear) if gravity else np.zeros(3),
+        )
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints n."""
+        return len(self.joint_types)
+
+    @cached_property
+    def across(self) -> Array:
+        """Two unit vectors across each joint's axis, in its own frame: (n, 2, 3)."""
+        helper = np.eye(3)[np.abs(self.axis).argmin(axis=1)]
+        first = np.cross(helper, self.axis)
+        first /= np.linalg.norm(first, axis=1, keepdims=True)
+        return np.stack([first, np.cross(self.axis, first)], axis=1)
+
+    @property
+    def screws(self) -> tuple[int, ...]:
+        """How many numbers of each joint torque can tell: four, two of a prismatic one, two or none of the first."""
+        first = 2 if np.any(self.gravity) else 0
+        return (first, *(4 if kind == "revolute" else 2 for kind in self.joint_types[1:]))
+
+    @property
+    def size(self) -> int:
+        """Numbers of the geometry, g."""
+        return sum(self.screws)
+
+    @property
+    def turns(self) -> Array:
+        """Which of the numbers are angles, rad; the others are lengths, m: (g,)."""
+        return np.concatenate([np.arange(count) < 2 for count in self.screws]).astype(bool)
+
+    @cached_property
+    def constants(self) -> Array:
+        """The geometry as `kernels.compiled.arm` reads it: (n, CONSTANTS)."""
+        out = np.zeros((self.n_joints, CONSTANTS))
+        for j, (kind, turn, axis) in enumerate(zip(self.joint_types, self.rotation, self.axis, strict=True)):
+            along = np.outer(axis, axis)
+            parts = (along, skew(axis), np.eye(3) - along)  # exp(q axis×) = these times 1, sin q and cos q
+            if kind == "prismatic":
+                parts = (np.eye(3), np.zeros((3, 3)), np.zeros((3, 3)))
+            out[j, TURN:PLACE] = np.concatenate([(turn @ part).reshape(-1) for part in parts])
+            out[j, AXIS:ACROSS] = turn @ axis
+            out[j, ACROSS:KIND] = (self.across[j] @ turn.T).reshape(-1)
+        out[:, PLACE:AXIS] = self.translation
+        out[:, KIND] = [kind == "prismatic" for kind in self.joint_types]
+        out[:, SCREWS] = self.screws
+        return out
+
+    def moved(self, step: Array) -> Geometry:
+        """The geometry a step away, (g,) rad and m."""
+        rotation, translation, at = self.rotation.copy(), self.translation.copy(), 0
+        for j, count in enumerate(self.screws):
+            part = step[at : at + count]
+            at += count
+            if count:
+                turn = part[:2] @ self.across[j]
+                if count == 4:
+                    translation[j] += self.rotation[j] @ (part[2:] @ self.across[j])
+                rotation[j] = self.rotation[j] @ rotation_of(turn)
+        return replace(self, rotation=rotation, translation=translation)
+
+    def towards(self, other: Geometry) -> Array:
+        """The step, (g,), that leads to another geometry of the same joints, to first order in what lies between."""
+        step: list[float] = []
+        for j, count in enumerate(self.screws):
+            if count:
+                step += (self.across[j] @ turn_of(self.rotation[j].T @ other.rotation[j])).tolist()
+            if count == 4:
+                step += (self.across[j] @ (self.rotation[j].T @ (other.translation[j] - self.translation[j]))).tolist()
+        return np.array(step)
+
+    def shifts(self) -> Array:
+        """Where each axis lies across itself, seen from the frame before: (g,) m, zero in the place of turns."""
+        step: list[float] = []
+        for j, count in enumerate(self.screws):
+            step += [0.0] * min(count, 2)
+            if count == 4:
+                step += (self.across[j] @ (self.rotation[j].T @ self.translation[j])).tolist()
+        return np.array(step)
+
+    def canonical(self) -> Geometry:
+        """The same arm with each frame where its axis comes closest to the frame before, and the first at the base.
+
+        Where a frame lies along its axis, torque cannot tell. Revolute joints only: a prismatic joint's frame stays at
+        the origin of the one before.
+        """
+        translation, moved = self.translation.copy(), np.zeros(3)
+        for j, kind in enumerate(self.joint_types):
+            place = translation[j] - moved
+            if j == 0 or kind == "prismatic":
+                kept = np.zeros(3)
+            else:
+                axis = self.rotation[j] @ self.axis[j]
+                kept = place - axis * (axis @ place)
+            # what the frame of this joint was moved by, as the frame itself sees it
+            moved = self.rotation[j].T @ (kept - place)
+            if kind == "revolute":
+                moved = self.axis[j] * (self.axis[j] @ moved)
+            translation[j] = kept
+        return replace(self, translation=translation)
+
+    def placements(self, q: Array) -> tuple[Array, Array]:
+        """Rotations (n, 3, 3) and origins (n, 3) m of all joints' frames in the base's, at positions q (n,)."""
+        turn, place, turns, places = np.eye(3), np.zeros(3), [], []
+        for j, kind in enumerate(self.joint_types):
+            place, turn = place + turn @ self.translation[j], turn @ self.rotation[j]
+            if kind == "revolute":
+                turn = turn @ rotation_of(self.axis[j] * q[j])
+            else:
+                place = place + turn @ self.axis[j] * q[j]
+            turns.append(turn)
+            places.append(place)
+        return np.array(turns), np.array(places)
+
+
+def skew(vector: Array) -> Array:
+    """The matrix of vector × …, (3, 3)."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def rotation_of(turn: Array) -> Array:
+    """Rotation by the vector `turn` (3,), rad: exp(turn×), Rodrigues' formula."""
+    angle = float(np.linalg.norm(turn))
+    if angle == 0.0:
+        return np.eye(3)
+    unit = skew(turn / angle)
+    return np.eye(3) + np.sin(angle) * unit + (1 - np.cos(angle)) * unit @ unit
+
+
+def turn_of(rotation: Array) -> Array:
+    """The vector (3,) rad that `rotation_of` makes this rotation of, shorter than π."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - serving does without it
+
+    return np.asarray(Rotation.from_matrix(rotation).as_rotvec())
+
+
+def aligned(axis: Sequence[float]) -> Array:
+    """A rotation whose third column is the unit vector `axis`: (3, 3)."""
+    third = np.asarray(axis, np.float64)
+    first = np.cross(np.eye(3)[int(np.abs(third).argmin())], third)
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(third, first), third], axis=1)
+
+
+def _axis(joint: object) -> Array:
+    """Unit vector of the axis of a joint of Pinocchio's, in its own frame."""
+    name = joint.shortname()  # type: ignore[attr-defined]
+    for letter, vector in zip("XYZ", np.eye(3), strict=True):
+        if name.endswith(letter):
+            return vector
+    data = joint.createData()  # type: ignore[attr-defined]
+    q = np.zeros(joint.nq) if joint.nq == 1 else np.array([1.0, 0.0])  # type: ignore[attr-defined]
+    joint.calc(data, q)  # type: ignore[attr-defined]
+    screw = np.asarray(data.S).reshape(6)
+    vector = screw[3:] if np.any(screw[3:]) else screw[:3]
+    return np.asarray(vector / np.linalg.norm(vector))

@@ -1,0 +1,218 @@
+"""The evidence of a geometry, with masses, rotor inertia and friction integrated out, and its descent.
+
+    τ = Y(θ) π + r ∘ ddq + P f + ε,    ε_j ~ N(0, σ_j²),    w = (π, r, f) ~ N(μ, diag s²)
+
+The torque is linear in w, so w is integrated out in closed form; what is minimised is −log p(τ | θ, σ) − log p(θ). The
+step is that of Gauss and Newton on (w, θ) together, damped in θ (Levenberg–Marquardt): J = ∂(Y π)/∂θ is exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.linalg import LinAlgError
+from scipy.linalg import cho_factor, cho_solve, lapack, solve_triangular
+
+from lipcore.arm.geometry import Geometry
+from lipcore.kernels.compiled.arm import PARAMETERS, arm_masses, arm_shapes
+from lipcore.samples import Array
+
+ANGLE, LENGTH = 1.0, 0.5
+"""Prior widths of a geometry that nothing is known of, rad and m."""
+LARGEST_TURN, LARGEST_SHIFT = 0.5, 0.3
+"""Longest step in one number, rad and m: beyond it the linearisation says nothing."""
+DAMPING, EASIER, HARDER, TRIALS = 1e-2, 8.0, 8.0, 7
+CONVERGED = 1e-2
+"""nats."""
+NOISE_WIDTH = 3.0
+"""Prior width of log σ."""
+MOST_LEVERAGE = 0.9
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What a geometry is expected to be. widths: (g,) rad and m.
+
+    around: the geometry of a URDF, where there is one. Without it axes may point anywhere, and lie about where the
+    frame before them is.
+    """
+
+    widths: Array
+    around: Geometry | None = None
+
+    @classmethod
+    def anything(cls, geometry: Geometry) -> Expected:
+        """Nothing is known."""
+        return cls(np.where(geometry.turns, ANGLE, LENGTH))
+
+    def step(self, geometry: Geometry) -> Array:
+        """From a geometry to what is expected, (g,) rad and m."""
+        return -geometry.shifts() if self.around is None else geometry.towards(self.around)
+
+    def value(self, geometry: Geometry) -> float:
+        """−log of the prior's density, without its constant."""
+        return 0.5 * float(np.sum((self.step(geometry) / self.widths) ** 2))
+
+
+@dataclass(frozen=True)
+class Point:
+    """A geometry with what follows from it. value: −log posterior, nats; sigma: (n,) noise std, N·m; weights: (k,) the
+    most likely w, in units of s around μ; features: (N, n, k), of them; factor: Cholesky of I + their precision."""
+
+    geometry: Geometry
+    sigma: Array
+    value: float
+    weights: Array
+    features: Array
+    factor: Array
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Samples that a geometry is to explain.
+
+    motions: (N, 3, n), q, dq and ddq from base to tip; tau: (N, n); counts: (N,), independent samples that a row stands
+    for; friction: (N, n, f), its features; centre, scale: (k,), μ and s of w; noise: (n,), where its prior lies;
+    floor: (n,), the smallest admitted; expected: prior of the geometry.
+    """
+
+    motions: Array
+    tau: Array
+    counts: Array
+    friction: Array
+    centre: Array
+    scale: Array
+    noise: Array
+    floor: Array
+    expected: Expected
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints n."""
+        return self.tau.shape[1]
+
+    def rows(self, rows: Array) -> Problem:
+        """The same with some of the samples."""
+        kept = {name: getattr(self, name)[rows] for name in ("motions", "tau", "counts", "friction")}
+        return replace(self, **kept)
+
+    def parameters(self, weights: Array) -> Array:
+        """Inertial parameters π of weights: (n, 10)."""
+        n = self.n_joints
+        return np.ascontiguousarray((self.centre + weights * self.scale)[: PARAMETERS * n].reshape(n, PARAMETERS))
+
+    def features(self, geometry: Geometry) -> Array:
+        """Features of w, in units of s: (N, n, k)."""
+        size, n = self.tau.shape
+        out = np.empty((size, n, len(self.scale)))
+        masses = np.empty((size, PARAMETERS * n, n))
+        arm_masses(geometry.constants, geometry.gravity, np.arange(n), self.motions, masses)
+        first = PARAMETERS * n
+        out[:, :, :first] = masses.transpose(0, 2, 1)
+        out[:, :, first : first + n] = self.motions[:, 2, :, None] * np.eye(n)
+        out[:, :, first + n :] = self.friction
+        out *= self.scale
+        return out
+
+    def shapes(self, geometry: Geometry, weights: Array) -> Array:
+        """J = ∂(Y π)/∂θ: (N, n, g)."""
+        n = self.n_joints
+        out = np.empty((len(self.tau), geometry.size, n))
+        parameters = self.parameters(weights)
+        arm_shapes(geometry.constants, geometry.gravity, parameters, np.arange(n), self.motions, out)
+        return out.transpose(0, 2, 1)
+
+    def at(self, geometry: Geometry, sigma: Array, features: Array | None = None) -> Point:
+        """The evidence of a geometry and of a noise, (n,); raise LinAlgError where it cannot be computed."""
+        features = self.features(geometry) if features is None else features
+        scaled, target = self._scaled(features, sigma)
+        precision = scaled.T @ scaled
+        precision.flat[:: len(precision) + 1] += 1.0
+        lower, failed = lapack.dpotrf(precision, lower=1, overwrite_a=1)
+        if failed:
+            raise LinAlgError("the precision of the weights is not positive definite")
+        right = scaled.T @ target
+        weights = cho_solve((lower, True), right)
+        value = 0.5 * (target @ target - right @ weights) + np.log(lower.diagonal()).sum()
+        value += self.counts.sum() * np.log(sigma).sum() + self.expected.value(geometry)
+        value += 0.5 * np.sum((np.log(sigma / self.noise) / NOISE_WIDTH) ** 2)
+        return Point(geometry, sigma, float(value), weights, features, lower)
+
+    def residual(self, point: Point) -> Array:
+        """What a point leaves of the torque: (N, n) N·m."""
+        return self.tau - point.features @ (point.weights + self.centre / self.scale)
+
+    def with_noise(self, point: Point) -> Point:
+        """The point with the noise that its residuals say: squares over the samples left to tell it."""
+        size, n = self.tau.shape
+        scaled, _ = self._scaled(point.features, point.sigma)
+        white = solve_triangular(point.factor, scaled.T, lower=True, check_finite=False)
+        leverage = np.square(white).sum(0).reshape(size, n).sum(0)
+        total = self.counts.sum()
+        left = np.maximum(total - np.minimum(leverage, MOST_LEVERAGE * total), 1.0)
+        squares = (self.counts[:, None] * self.residual(point) ** 2).sum(0)
+        sigma = np.maximum(np.sqrt(squares / left), self.floor)
+        return self.at(point.geometry, sigma, point.features)
+
+    def descend(
+        self,
+        start: Geometry,
+        sigma: Array,
+        iterations: int,
+        stop: Callable[[], bool] | None = None,
+        noise: bool = True,
+    ) -> Point:
+        """The optimum that a geometry leads to; `noise`: the noise is estimated on the way.
+
+        stop: asked at every step. Raise LinAlgError where the evidence cannot be computed.
+        """
+        point, damping = self.at(start, sigma), DAMPING
+        largest = np.where(start.turns, LARGEST_TURN, LARGEST_SHIFT)
+        for iteration in range(iterations):
+            before = point.value
+            hessian, gradient, k = self._normal(point)
+            for _ in range(TRIALS):
+                damped = hessian.copy()
+                shape = np.arange(k, len(damped))
+                damped[shape, shape] *= 1 + damping
+                step = cho_solve(cho_factor(damped, lower=True, check_finite=False), gradient)[k:]
+                step /= max(1.0, float(np.abs(step / largest).max(initial=0.0)))
+                moved = point.geometry.moved(step)
+                if self.expected.around is None:
+                    moved = moved.canonical()
+                trial = self.at(moved, point.sigma)
+                if trial.value < point.value:
+                    point, damping = trial, max(damping / EASIER, 1e-8)
+                    break
+                damping = min(damping * HARDER, 1e8)
+            for _ in range(2 if noise else 0):
+                point = self.with_noise(point)
+            if (abs(before - point.value) < CONVERGED and iteration > 2) or (stop is not None and stop()):
+                break
+        return point
+
+    def _normal(self, point: Point) -> tuple[Array, Array, int]:
+        """Normal equations of (w, θ): precision, right-hand side, and where θ begins."""
+        k = len(self.scale)
+        both = np.concatenate([point.features, self.shapes(point.geometry, point.weights)], axis=2)
+        scaled, _ = self._scaled(both, point.sigma)
+        weight = np.sqrt(self.counts)[:, None] / point.sigma
+        left = (self.residual(point) * weight).reshape(-1)
+        hessian, gradient = scaled.T @ scaled, scaled.T @ left
+        precision = np.concatenate([np.ones(k), self.expected.widths**-2.0])
+        hessian.flat[:: len(hessian) + 1] += precision
+        gradient[:k] -= point.weights
+        gradient[k:] += self.expected.step(point.geometry) * precision[k:]
+        return hessian, gradient, k
+
+    def _scaled(self, features: Array, sigma: Array) -> tuple[Array, Array]:
+        """Features (N n, …) and the torque that μ leaves, (N n,), in units of the noise."""
+        weight = np.sqrt(self.counts)[:, None] / sigma
+        target = self.tau
+        if np.any(self.centre):
+            k = len(self.centre)
+            target = target - features[:, :, :k] @ (self.centre / self.scale)
+        scaled = features * weight[:, :, None]
+        return scaled.reshape(-1, features.shape[2]), (target * weight).reshape(-1)

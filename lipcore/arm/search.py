@@ -1,0 +1,154 @@
+"""The search for an arm's geometry: many starts, then hops from the best optima."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.linalg import LinAlgError
+
+from lipcore.arm.geometry import Geometry
+from lipcore.arm.problem import Point, Problem
+from lipcore.arm.starts import draw, hop
+from lipcore.samples import Array
+from lipcore.vocabulary import JointType
+
+SCREENED, STARTS = 400, 20
+"""Random arms whose evidence is looked at, and how many of the best are followed."""
+IDLE, IDLE_AT_NOISE = 60, 15
+"""Hops in a row that must bring nothing: where the residuals are larger than the sensor's noise, and where not."""
+EXPLAINED = 1.3
+"""Residuals up to this many times the sensor's noise are explained."""
+GAIN = 1.0
+"""nats, by which a hop has to be better to have brought something."""
+SAME = 0.5
+"""nats, within which two optima count as one: an arm and its mirror image have the same evidence."""
+KEPT = 6
+ITERATIONS = 25
+WIDER, WIDEST = 3.0, 0.02
+"""Noise that a hop sets out with: this many times the optimum's, at least this share of the torque's spread."""
+FAVOUR = 1.5
+"""Scale of the exponential by whose draw one of the optima, best first, is hopped from."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search found: optima, best first, and how.
+
+    points: up to KEPT distinct optima; starts, hops: descents; distinct: optima seen that differ by more than SAME;
+    times_best: descents that ended in the best; explained: whether its residuals look like the sensor's noise;
+    ended: `idle`, or `time` where the time limit came first; seconds.
+    """
+
+    points: tuple[Point, ...]
+    starts: int
+    hops: int
+    distinct: int
+    times_best: int
+    explained: bool
+    ended: str
+    seconds: float
+
+
+class Stopped(Exception):  # noqa: N818 - no error: somebody asked
+    """The search is to be given up."""
+
+
+def search(
+    problem: Problem,
+    joint_types: tuple[JointType, ...],
+    gravity: bool,
+    sensor_noise: Array,
+    seconds: float,
+    seed: int = 0,
+    known: Sequence[Geometry] = (),
+    step: Callable[[float, float], None] | None = None,
+) -> Found:
+    """Find the geometry of the best evidence; `problem` holds few rows, some eighty.
+
+    sensor_noise: (n,) N·m, what the signals say of their white noise; seconds: time limit; known: geometries to begin
+    from, too; step: told the best value and the fraction of the work after each descent, may raise to end it all.
+    Raise LinAlgError where no start has an evidence.
+    """
+    rng, began = np.random.default_rng(seed), time.monotonic()
+    pool = _Pool()
+    spread = problem.tau.std(0)
+    wide = 0.3 * spread + problem.floor
+    drawn = [draw(rng, joint_types, gravity) for _ in range(SCREENED)]
+    ranked = sorted(drawn, key=lambda each: _value(problem, each, wide))
+    begin = [*known, *ranked[:STARTS]]
+
+    def late() -> bool:
+        return time.monotonic() - began > seconds
+
+    def descend(geometry: Geometry, sigma: Array) -> None:
+        try:
+            pool.add(problem.descend(geometry, sigma, ITERATIONS))
+        except LinAlgError:
+            pool.failed += 1
+
+    for number, geometry in enumerate(begin):
+        descend(geometry, wide)
+        if step is not None:
+            step(pool.best, 0.4 * (number + 1) / len(begin))
+        if late() and pool.points:
+            break
+    if not pool.points:
+        raise LinAlgError("no start of the search has an evidence that can be computed")
+    starts, hops, quiet = pool.descents, 0, 0
+    while not late() and quiet < (IDLE_AT_NOISE if _explained(pool.points[0], sensor_noise, problem.floor) else IDLE):
+        before = pool.best
+        chosen = pool.points[min(int(rng.exponential(FAVOUR)), len(pool.points) - 1)]
+        descend(hop(rng, chosen.geometry), np.maximum(WIDER * chosen.sigma, WIDEST * spread))
+        hops += 1
+        quiet = 0 if pool.best < before - GAIN else quiet + 1
+        if step is not None:
+            step(pool.best, 0.4 + 0.6 * max(quiet / IDLE, (time.monotonic() - began) / seconds))
+    best = pool.points[0]
+    return Found(
+        tuple(pool.points),
+        starts,
+        hops,
+        len(pool.values),
+        sum(1 for value in pool.ends if value < best.value + SAME),
+        _explained(best, sensor_noise, problem.floor),
+        "time" if late() else "idle",
+        time.monotonic() - began,
+    )
+
+
+class _Pool:
+    """Distinct optima, best first."""
+
+    def __init__(self) -> None:
+        self.points: list[Point] = []
+        self.values: list[float] = []
+        self.ends: list[float] = []
+        self.failed = 0
+
+    @property
+    def best(self) -> float:
+        return self.points[0].value if self.points else np.inf
+
+    @property
+    def descents(self) -> int:
+        return len(self.ends) + self.failed
+
+    def add(self, point: Point) -> None:
+        self.ends.append(point.value)
+        if all(abs(point.value - value) > SAME for value in self.values):
+            self.values.append(point.value)
+            self.points = sorted([*self.points, point], key=lambda each: each.value)[:KEPT]
+
+
+def _explained(point: Point, sensor_noise: Array, floor: Array) -> bool:
+    return bool(np.all(point.sigma <= EXPLAINED * np.maximum(sensor_noise, floor)))
+
+
+def _value(problem: Problem, geometry: Geometry, sigma: Array) -> float:
+    try:
+        return problem.at(geometry, sigma).value
+    except LinAlgError:
+        return np.inf
