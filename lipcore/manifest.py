@@ -186,7 +186,7 @@ def _check_range(name: str, value: Any, n: int) -> None:
 
 
 def _check_parameters(name: str, value: Any, n: int) -> None:
-    _check_keys(name, value, ("friction",), ("inertia",))
+    _check_keys(name, value, ("friction",), ("inertia", "rotor", "geometry"))
     _check_keys(f"{name}.friction", value["friction"], FRICTION_TERMS)
     for term, figures in value["friction"].items():
         _check_keys(f"{name}.friction.{term}", figures, ("mean", "std"))
