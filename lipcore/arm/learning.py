@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from lipcore import noise
@@ -81,6 +82,21 @@ def learn(
 
     Raise FitCancelledError when `cancelled` answers true, ValueError for samples that no arm can be learnt from.
     """
+    with threadpool_limits(1):  # matrices are small: more threads would take longer
+        return _learn(samples, joint_types, options, gravity, robot, known, on_progress, cancelled, stretches)
+
+
+def _learn(
+    samples: Samples,
+    joint_types: tuple[JointType, ...],
+    options: FitOptions,
+    gravity: bool,
+    robot: RigidBody | None,
+    known: Sequence[Geometry],
+    on_progress: Progress | None,
+    cancelled: Cancelled | None,
+    stretches: Samples | None,
+) -> Learnt:
     watch = _Watch(on_progress, cancelled, time.monotonic(), options.max_iterations)
     mode = mode_of(options, robot)
     rows = spread_out(samples.motion(), options.posterior_samples).numpy()

@@ -92,7 +92,7 @@ class Problem:
     @property
     def n_joints(self) -> int:
         """Number of joints n."""
-        return self.tau.shape[1]
+        return int(self.tau.shape[1])
 
     def rows(self, rows: Array) -> Problem:
         """The same with some of the samples."""

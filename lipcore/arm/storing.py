@@ -46,7 +46,7 @@ def read_arm(tensors: Mapping[str, Tensor], joint_types: Sequence[JointType], mo
     """
     if mode not in GEOMETRY_MODES:
         raise ValueError(f"fit.geometry is {mode!r}, expected one of {', '.join(GEOMETRY_MODES)}")
-    kind: GeometryMode = mode  # type: ignore[assignment]
+    kind: GeometryMode = mode
     try:
         parts = {name: tensors[f"{PREFIX}{name}"].numpy() for name in (*_GEOMETRY, *_ARM, "order")}
     except KeyError as error:
