@@ -37,9 +37,9 @@ class ArmKernel(LinearKernel):
     the geometry (g,), base to tip; and for each alternative arm how much of it is taken (K,). Standard deviations are
     those of the arm, of π and r times `exp(rigid_body.log_scale)` (4,) by kind.
 
-    An alternative's feature is the torque that it has more than the arm itself, δ_k = τ_k − τ_0. With c one of them or
-    none, by their probabilities, mean and variance of Σ c_k δ_k are those of the mixture of arms; its weights are
-    taken for independent, which states a little more variance than the mixture has.
+    An alternative arm has the torque δ_k = τ_k − τ_0 more than the arm itself. With c one of them or none, by their
+    probabilities p, c has mean p and covariance C = diag p − p pᵀ = L Lᵀ, so that Σ c_k δ_k has the mean and the
+    variance of the mixture of arms. The features are Lᵀ δ, whose weights L⁻¹ c are independent with variance one.
     """
 
     def __init__(self, arm: Arm) -> None:
@@ -47,9 +47,10 @@ class ArmKernel(LinearKernel):
         kinds = np.concatenate([np.tile(KINDS, arm.n_joints), np.full(arm.n_joints, SCALES - 1)])
         self._kinds = torch.from_numpy(kinds)
         self._unit = torch.from_numpy(arm.unit)
-        shares = np.array([each.probability for each in arm.alternatives[1:]])
-        self._rest = torch.from_numpy(np.concatenate([arm.widths, np.sqrt(shares * (1 - shares))]))
-        self._mean = torch.from_numpy(np.concatenate([_in_data(arm), np.zeros(self.n_joints), arm.expected, shares]))
+        shares = _shares(arm)
+        mixed = np.linalg.solve(_mixing(shares), shares)
+        self._rest = torch.from_numpy(np.concatenate([arm.widths, np.ones(len(shares))]))
+        self._mean = torch.from_numpy(np.concatenate([_in_data(arm), np.zeros(self.n_joints), arm.expected, mixed]))
         self._recent: tuple[tuple[Motion, Tensor], ...] = ()
 
     @property
@@ -147,10 +148,21 @@ def _in_data(arm: Arm) -> Array:
     return np.asarray(arm.centre[arm.place].reshape(-1))
 
 
-def _stacked(arm: Arm) -> tuple[Array, Array, Array, Array]:
-    """Constants (K + 1, n, …), gravity, parameters (K + 1, n, 10) and linear coefficients (K + 1, n, 1 + f)."""
+def _shares(arm: Arm) -> Array:
+    """Probabilities of the alternatives, (K,), the arm itself left out."""
+    return np.array([each.probability for each in arm.alternatives[1:]])
+
+
+def _mixing(shares: Array) -> Array:
+    """L with L Lᵀ = diag p − p pᵀ, (K, K)."""
+    return np.ascontiguousarray(np.linalg.cholesky(np.diag(shares) - np.outer(shares, shares)))
+
+
+def _stacked(arm: Arm) -> tuple[Array, Array, Array, Array, Array]:
+    """L (K, K), constants (K + 1, n, …), gravity, parameters (K + 1, n, 10), linear coefficients (K + 1, n, 1 + f)."""
     each = arm.alternatives
     return (
+        _mixing(_shares(arm)),
         np.stack([one.geometry.constants for one in each]),
         arm.geometry.gravity,
         np.stack([one.parameters for one in each]),

@@ -459,6 +459,7 @@ def arm_shapes(constants: Array, gravity: Array, parameters: Array, order: Indic
 
 @compiled
 def arm_differences(
+    mixing: Array,
     constants: Array,
     gravity: Array,
     parameters: Array,
@@ -468,8 +469,11 @@ def arm_differences(
     features: Array,
     out: Array,
 ) -> None:
-    """Torque of each of K arms less that of the first: constants (K + 1, n, CONSTANTS), parameters (K + 1, n, 10);
-    linear: (K + 1, n, l), coefficients of `features` (N, n, l) of each joint; motions (N, 3, n), out (N, K, n)."""
+    """Lᵀ δ of N queries, δ the torque of each of K arms less that of the first.
+
+    mixing: L (K, K), lower triangular; constants: (K + 1, n, CONSTANTS); parameters: (K + 1, n, 10); linear:
+    (K + 1, n, l), coefficients of `features` (N, n, l) of each joint; motions (N, 3, n), out (N, K, n).
+    """
     n = order.shape[0]
     work, first, other = np.zeros((n + 1, WORK)), np.zeros(n), np.zeros(n)
     for k in range(motions.shape[0]):
@@ -483,3 +487,9 @@ def arm_differences(
                     out[k, arm - 1, j] = other[j] + added - first[j]
                 else:
                     first[j] += added
+        for row in range(mixing.shape[0]):  # those below are not yet mixed
+            for j in range(n):
+                total = 0.0
+                for arm in range(row, mixing.shape[0]):
+                    total += mixing[arm, row] * out[k, arm, j]
+                out[k, row, j] = total
