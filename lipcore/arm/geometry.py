@@ -194,7 +194,7 @@ def rotation_of(turn: Array) -> Array:
     if angle == 0.0:
         return np.eye(3)
     unit = skew(turn / angle)
-    return np.asarray(np.eye(3) + np.sin(angle) * unit + (1 - np.cos(angle)) * unit @ unit
+    return np.asarray(np.eye(3) + np.sin(angle) * unit + (1 - np.cos(angle)) * unit @ unit)
 
 
 def turn_of(rotation: Array) -> Array:
