@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -17,8 +15,9 @@ from lipcore.kernels.compiled.arm import (
     arm_differences,
     arm_energies,
     arm_features,
-    arm_rows,
+    arm_query,
 )
+from lipcore.kernels.compiled.views import Memory
 from lipcore.kernels.friction import friction_features
 from lipcore.kernels.regressor import Regressor
 from lipcore.motion import Motion
@@ -118,25 +117,18 @@ class ArmRegressor(Regressor):
 
     def __init__(self, arm: Arm, size: int) -> None:
         self.n_joints, self.size = arm.n_joints, size
-        self._arm = (arm.geometry.constants, arm.geometry.gravity, arm.parameters, arm.order.astype(np.int64))
+        self._order = arm.order.astype(np.int64)
         self._first = (PARAMETERS + 1) * arm.n_joints + arm.steps
         self._others = _stacked(arm) if arm.alternatives else None
-        self._memory = _Workspace(arm.n_joints)
+        fixed = arm.geometry.constants, arm.geometry.gravity, arm.parameters
+        self._memory = Memory(fixed, (arm.n_joints + 1) * WORK + TABLE)
 
     def fill(self, motion: Array, out: Array) -> None:
         """Write Φᵀ of the query, (p, n)."""
-        memory = self._memory
-        arm_rows(*self._arm, motion, memory.work, memory.table, out[: self._first])
+        arm_query(self._memory.flat, self._order, motion, out[: self._first])
         if self._others is not None:
             motions = motion[None]
-            arm_differences(*self._others, self._arm[3], motions, _linear_features(motions), out[None, self._first :])
-
-
-class _Workspace(threading.local):
-    """One thread's memory."""
-
-    def __init__(self, joints: int) -> None:
-        self.work, self.table = np.zeros((joints + 1, WORK)), np.zeros(TABLE)
+            arm_differences(*self._others, self._order, motions, _linear_features(motions), out[None, self._first :])
 
 
 def _motions(x: Motion) -> Array:
