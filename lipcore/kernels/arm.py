@@ -69,7 +69,7 @@ class ArmKernel(LinearKernel):
             if seen.q is x.q and seen.dq is x.dq and seen.ddq is x.ddq:
                 return features
         out = np.zeros((len(x), self.size, self.n_joints))
-        motions, first = _motions(x), self.steps.stop
+        motions, first = x.arrays(), self.steps.stop
         arm = self.arm
         arm_features(arm.geometry.constants, arm.geometry.gravity, arm.parameters, arm.order, motions, out[:, :first])
         if arm.alternatives:
@@ -106,7 +106,7 @@ class ArmKernel(LinearKernel):
             arm.geometry.gravity,
             arm.parameters,
             arm.order,
-            _motions(x),
+            x.arrays(),
             out[:, :, : self.steps.stop],
         )
         return torch.from_numpy(out).to(x.device)
@@ -129,10 +129,6 @@ class ArmRegressor(Regressor):
         if self._others is not None:
             motions = motion[None]
             arm_differences(*self._others, self._order, motions, _linear_features(motions), out[None, self._first :])
-
-
-def _motions(x: Motion) -> Array:
-    return np.ascontiguousarray(np.stack([part.cpu().numpy() for part in (x.q, x.dq, x.ddq)], axis=1))
 
 
 def _in_data(arm: Arm) -> Array:
