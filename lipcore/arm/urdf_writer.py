@@ -1,8 +1,8 @@
 """A URDF of an arm whose geometry was learnt: a link a joint, with its mass, its friction and its rotor.
 
 URDF has no tag for rotor inertia: it is written as Drake reads it, in a `<transmission>` that others skip. The torque
-of a simulator that skips it lacks rotor · ddq. Offset torque is written as a comment. Where gravity does not point down the
-base's z axis, a fixed joint from `world` to `base` turns the base.
+of a simulator that skips it lacks rotor · ddq. Offset torque is written as a comment. Where gravity does not point down
+the base's z axis, a fixed joint from `world` to `base` turns the base.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from lipcore.arm.geometry import STANDARD_GRAVITY, Geometry, aligned, rotation_of, skew
+from lipcore.arm.report import bodies_of, read_geometry
 from lipcore.samples import Array
 
 Element = ElementTree.Element
@@ -120,36 +121,31 @@ def urdf_of_parameters(
         raise ValueError("the model has no rigid bodies, so no masses: a URDF needs the estimator 'rigid-body'")
     if "geometry" not in parameters:
         raise ValueError("the model does not hold where its joints lie: train it again to have a URDF written of it")
-    shape, bodies = parameters["geometry"], parameters["inertia"]["bodies"]
-    order = list(shape["order"])
-    places = shape["joints"]
-    geometry = Geometry(
-        tuple(place["type"] for place in places),
-        *(np.array([place[key] for place in places], np.float64) for key in ("rotation", "translation", "axis")),
-        np.array(shape["gravity"], np.float64),
-    )
-    plausible = [bodies[joint]["plausible"] for joint in order]
-    friction = parameters["friction"]
-    speeds = np.abs([training_range["dq"]["min"], training_range["dq"]["max"]]).max(axis=0)
-    rotor = parameters["rotor"]["mean"] if "rotor" in parameters else np.zeros(len(order))
+    n = len(joint_names)
+    geometry, order = read_geometry(parameters["geometry"], n)
+    places, bodies = parameters["geometry"]["joints"], parameters["inertia"]["bodies"]
+    friction, ranges = parameters["friction"], training_range
+    rotor = parameters["rotor"]["mean"] if "rotor" in parameters else [0.0] * n
 
     def chain(values: Any) -> Array:
         return np.asarray(values, np.float64)[order]
 
-    joints = ArmJoints(
-        tuple(joint_names[joint] for joint in order),
-        chain(training_range["q"]["min"]),
-        chain(training_range["q"]["max"]),
-        chain(speeds),
-        *(chain(friction[term]["mean"]) for term in ("viscous", "coulomb", "offset")),
-        chain(rotor),
-        tuple(
-            (*place.get("undetermined", ()), *bodies[joint].get("undetermined", ()))
-            for place, joint in zip(places, order, strict=True)
-        ),
+    undetermined = tuple(
+        (*place["undetermined"], *bodies[joint].get("undetermined", ()))
+        for place, joint in zip(places, order, strict=True)
     )
-    ten = [[body["mass"], *body["first_moment"], *body["inertia"]] for body in plausible]
-    return urdf_text(geometry, np.array(ten, np.float64), joints, name)
+    joints = ArmJoints(
+        names=tuple(joint_names[joint] for joint in order),
+        lower=chain(ranges["q"]["min"]),
+        upper=chain(ranges["q"]["max"]),
+        velocity=chain(np.abs([ranges["dq"]["min"], ranges["dq"]["max"]]).max(axis=0)),
+        viscous=chain(friction["viscous"]["mean"]),
+        coulomb=chain(friction["coulomb"]["mean"]),
+        offset=chain(friction["offset"]["mean"]),
+        rotor=chain(rotor),
+        undetermined=undetermined,
+    )
+    return urdf_text(geometry, bodies_of(parameters["inertia"])[order], joints, name)
 
 
 def rpy(rotation: Array) -> Array:
