@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -196,6 +197,13 @@ def export_(
         print_json({"file": written, "bytes": written.stat().st_size})
     else:
         say(f"{written}: {written.stat().st_size:,} bytes; `lipserve models import {written}` reads it")
+
+
+@app.command()
+def urdf(model: Model, version: Version = None, alias: Alias = None, url: Url = DEFAULT_URL) -> None:
+    """Print the arm that a version has learnt as a URDF: `lipserve models urdf NAME > arm.urdf`."""
+    with connected(url) as client:
+        sys.stdout.write(client.urdf(model, version, alias))
 
 
 @app.command("import")

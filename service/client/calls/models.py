@@ -84,6 +84,15 @@ def export(
     return at(read, names={"model": model}, params=params, save_to=path, timeout=ARCHIVE_TIMEOUT)
 
 
+@route("GET", "/v1/models/{model}/urdf")
+def urdf(at: Route, model: str, version: int | None = None, alias: str | None = None) -> Call[str]:
+    """The arm that a version has learnt, as the text of a URDF; raise ApiError for an estimator without rigid bodies.
+
+    The version that serves, unless one is named.
+    """
+    return at(lambda answer: answer.body.decode(), names={"model": model}, params=given(version=version, alias=alias))
+
+
 @route("POST", "/v1/models/import")
 def import_model(at: Route, path: Path | str, name: str | None = None) -> Call[Version]:
     """Make a new version of an archive that a service has exported; raise ApiError where it is refused.
