@@ -19,8 +19,8 @@ from service.cli.options import Alias, Data, Json, Limit, Model, Url, Version, Y
 from service.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
+    from service.client.results import Version as VersionRecord
     from service.models.alias_schema import Alias as AliasRecord
-    from service.models.schema import Version as VersionRecord
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -273,3 +273,12 @@ def _print_version(shown: VersionRecord) -> None:
         out.print(figures_table(f"on {held['samples']} samples held out", shown.joint_names, held))
     else:
         say("  nothing was held out of its data: `lipserve evaluate` on a recording it has not seen tells how good")
+    arm = shown.arm
+    if arm is not None:
+        from service.cli.tables import arm_tables  # noqa: PLC0415 - as above
+        from service.client.results.arm import LIMITS  # noqa: PLC0415
+
+        for table in arm_tables(arm):
+            out.print(table)
+        for text in LIMITS:
+            say(text)

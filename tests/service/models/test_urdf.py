@@ -61,3 +61,12 @@ def test_the_client_has_its_text(api, arm):
         assert client.urdf(arm) == api.get(f"/v1/models/{arm}/urdf").text
         with pytest.raises(ApiError, match="no rigid bodies"):
             client.urdf("panda-sim")
+
+
+def test_the_client_shows_the_arm(api, arm):
+    with over(api._transport) as client:
+        shown = client.version(arm, 2)
+        assert shown.arm.joint_names == JOINTS
+        assert "mirror image" in str(shown)
+        assert client.version("panda-sim", 1).arm is None
+        assert str(client.version("panda-sim", 1)).startswith("panda-sim version 1: lip")
