@@ -5,15 +5,21 @@ BIN := $(VENV)/bin
 # one thread a process: the tests' matrices are small, and three parts run side by side, each in its fixed order
 TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
+# the longest first
+PARTS := test-packages test-service test-lipcore test-updates test-cluster test-browser test-docs test-shared
+
 .PHONY: demo test warm-lip warm-chain bytecode test-lipcore test-service test-packages test-updates test-cluster test-shared test-docs \
 	test-browser test-all screenshots lint install serve image clean
 
 demo: install
 	$(BIN)/lipserve demo
 
+# a part that fails keeps no other from running; make still fails in the end
 test: install
-	$(MAKE) -j2 warm-lip warm-chain bytecode
-	$(MAKE) -j3 test-packages test-service test-lipcore test-updates test-cluster test-browser test-docs test-shared
+	failed=0; \
+	$(MAKE) -j2 --keep-going warm-lip warm-chain bytecode || failed=1; \
+	$(MAKE) -j3 --keep-going $(PARTS) || failed=1; \
+	exit $$failed
 
 # compiles what the parts below would else compile once each, side by side: a minute of one core
 warm-lip: install
@@ -64,8 +70,10 @@ test-browser: install
 	$(TEST) -m "not slow" tests/browser
 
 test-all: install
-	$(TEST) --hypothesis-profile thorough
-	$(TEST) --backend shared --tb=native $(addprefix tests/service/,$(SHARED) $(MORE_SHARED))
+	failed=0; \
+	$(TEST) --hypothesis-profile thorough || failed=1; \
+	$(TEST) --backend shared --tb=native $(addprefix tests/service/,$(SHARED) $(MORE_SHARED)) || failed=1; \
+	exit $$failed
 
 # pictures of the dashboard for the README, made by its tests
 screenshots: install

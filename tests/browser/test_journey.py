@@ -154,6 +154,7 @@ def promoted(visitor: Visitor, dashboard: Dashboard, dataset: str) -> None:
     page = visitor.page
     train(dashboard.client, "my-arm", dataset)
     page = visitor.open("#/models/my-arm?tab=versions")
+    follow = page.get_by_role("link", name="Follow live").element_handle()
 
     def serving() -> int:
         return dashboard.client.get("/v1/models/my-arm").json()["serving_version"]
@@ -176,6 +177,8 @@ def promoted(visitor: Visitor, dashboard: Dashboard, dataset: str) -> None:
     page.get_by_role("button", name="Let it answer: version 1").click()
     page.get_by_role("dialog").get_by_role("button", name="Serve version 1").click()
     visitor.until(lambda: serving() == 1)
+    assert follow is not None
+    assert follow.evaluate("(each) => each.isConnected")  # the page was drawn anew around it
 
 
 def followed(visitor: Visitor, dashboard: Dashboard) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
+from numpy.typing import ArrayLike
 
 from lipcore import FitOptions, Samples, TorqueModel, dynamics, load, model, save, train
 from lipcore.calibration import FUNCTION_STD_FACTOR, NO_CALIBRATION, Calibration, calibrate
@@ -19,6 +19,8 @@ from lipcore.simulation import Stream, simulate
 from lipcore.urdf import RigidBody
 
 FACTOR = 1.75
+SAME = 1e-6
+"""Share of the largest number by which two fits to the same samples may differ."""
 OPTIONS = FitOptions(hyperparameter_samples=30, max_iterations=20, starts=1, device="cpu", prior="zero")
 
 
@@ -45,42 +47,47 @@ def corrected(plain: TorqueModel, samples: Samples) -> TorqueModel:
         return train(samples, plain.joint_types, plain.estimator.name, OPTIONS, robot=plain.robot)
 
 
+def alike(found: ArrayLike, expected: ArrayLike) -> None:
+    """Assert that what two fits say is the same but for rounding, which the steps of a search magnify."""
+    np.testing.assert_allclose(found, expected, rtol=0, atol=SAME * np.abs(np.asarray(expected)).max())
+
+
 def test_predictions(plain: TorqueModel, corrected: TorqueModel, samples: Samples) -> None:
     assert corrected.calibration == Calibration(FACTOR)
     query = samples.q + 0.3, samples.dq, 2 * samples.ddq
     one, other = (model.predict(*query, covariance=True) for model in (plain, corrected))
-    assert np.array_equal(one.tau, other.tau)
-    assert np.array_equal(one.noise_std, other.noise_std)
-    np.testing.assert_allclose(other.tau_std, FACTOR * one.tau_std, rtol=1e-12)
-    np.testing.assert_allclose(other.covariance, FACTOR**2 * one.covariance, rtol=1e-12, atol=1e-300)
+    alike(other.tau, one.tau)
+    alike(other.noise_std, one.noise_std)
+    alike(other.tau_std, FACTOR * one.tau_std)
+    alike(other.covariance, FACTOR**2 * one.covariance)
     assert (one.tau_std > 0).all()
 
 
 def test_a_term_alone(plain: TorqueModel, corrected: TorqueModel, samples: Samples) -> None:
     for name in plain.estimator.terms:
         one, other = (m.posterior.predict(samples.motion()[:5], m.estimator.terms[name]) for m in (plain, corrected))
-        assert torch.equal(one.mean, other.mean)
-        torch.testing.assert_close(other.std, FACTOR * one.std, rtol=1e-12, atol=0)
+        alike(other.mean, one.mean)
+        alike(other.std, FACTOR * one.std)
 
 
 def test_components(plain: TorqueModel, corrected: TorqueModel, samples: Samples) -> None:
     motion, tau = samples.motion()[10:15], samples.torque()[10:15]
     one, other = (dynamics.components(m, motion, dynamics.COMPONENTS, tau) for m in (plain, corrected))
     for name in dynamics.COMPONENTS:
-        assert torch.equal(one[name].mean, other[name].mean), name
-        torch.testing.assert_close(other[name].std, FACTOR * one[name].std, rtol=1e-12, atol=0)
+        alike(other[name].mean, one[name].mean)
+        alike(other[name].std, FACTOR * one[name].std)
         assert (one[name].std > 0).any(), name
 
 
 def test_parameters(plain: TorqueModel, corrected: TorqueModel) -> None:
     one, other = (friction_coefficients(m.posterior, m.estimator) for m in (plain, corrected))
     for name in ("viscous", "coulomb", "offset"):
-        assert np.array_equal(getattr(one, name), getattr(other, name))
-        np.testing.assert_allclose(getattr(other, f"{name}_std"), FACTOR * getattr(one, f"{name}_std"), rtol=1e-12)
+        alike(getattr(other, name), getattr(one, name))
+        alike(getattr(other, f"{name}_std"), FACTOR * getattr(one, f"{name}_std"))
     if plain.robot is not None:
         bodies, scaled = (inertial_parameters(m.posterior, m.estimator) for m in (plain, corrected))
-        assert np.array_equal(bodies.mean, scaled.mean)
-        np.testing.assert_allclose(scaled.std, FACTOR * bodies.std, rtol=1e-9)
+        alike(scaled.mean, bodies.mean)
+        alike(scaled.std, FACTOR * bodies.std)
         weights, more = (weight_posterior(m.posterior, m.estimator.terms["rigid_body"]) for m in (plain, corrected))
         assert np.array_equal(weights.scale, more.scale)  # the prior's own
 

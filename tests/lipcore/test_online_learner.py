@@ -20,7 +20,7 @@ from lipcore.robots import load_robot
 from lipcore.samples import Samples
 from lipcore.simulation import Payload, Stream, simulate
 from lipcore.vocabulary import LEARNT
-from tests.lipcore.online_checks import as_rows, same_answers
+from tests.lipcore.online_checks import EXACT, as_rows, same_answers
 
 ROBOT = "double-pendulum"
 OPTIONS = FitOptions(hyperparameter_samples=60, max_iterations=60, starts=1, device="cpu")
@@ -168,7 +168,7 @@ def test_what_two_changes_have_passed_over_cannot_be_taken_back(base: TorqueMode
     online = OnlineModel.start(base).learn(rows).change(5000.0).change(6000.0)
     with pytest.raises(ForgottenError, match="two changes have come since"):
         online.unlearn(rows)
-    same_answers(online.learn(rows).model(), online.model(), rows, 0.0)
+    same_answers(online.learn(rows).model(), online.model(), rows)
 
 
 def test_novel_rows_are_told_and_stay_uncertain(base: TorqueModel) -> None:
@@ -191,16 +191,20 @@ def test_novel_rows_are_told_and_stay_uncertain(base: TorqueModel) -> None:
 
 def test_certainty_is_never_below_the_floor(base: TorqueModel, rows: Rows) -> None:
     floor = np.array([0.04, 1e-12])
-    plain = OnlineModel.start(base).learn(rows).model()
-    online = OnlineModel.start(base).learn(rows).model(floor)
+    learnt = OnlineModel.start(base).learn(rows)
+    plain, online = learnt.model(), learnt.model(floor)
     one = np.array([rows.q[0], rows.dq[0], rows.ddq[0]])
     tau, std = online.answer(one)
     expected = plain.predict(rows.q, rows.dq, rows.ddq, covariance=True)
     found = online.predict(rows.q, rows.dq, rows.ddq, covariance=True)
     assert std is not None
-    assert np.array_equal(found.tau, expected.tau)
-    np.testing.assert_allclose(found.tau_std, np.maximum(expected.tau_std, np.sqrt(floor)), rtol=1e-12)
-    np.testing.assert_allclose(std, found.tau_std[0], rtol=0, atol=0)
+    assert (found.tau_std >= np.sqrt(floor) * (1 - 1e-12)).all()
+    # solved twice: rounding shows in the mean, and more in variances, which are differences of large numbers
+    np.testing.assert_allclose(found.tau, expected.tau, rtol=0, atol=EXACT * np.abs(expected.tau).max())
+    variance = np.maximum(expected.tau_std**2, floor)
+    largest = variance.max(0)
+    np.testing.assert_allclose(found.tau_std**2 / largest, variance / largest, rtol=1e-6, atol=EXACT)
+    np.testing.assert_allclose(std, found.tau_std[0], rtol=1e-12)
     assert found.covariance is not None
     assert (np.linalg.eigvalsh(found.covariance) > 0).all()
     dense = online.posterior.predict(rows.motion())

@@ -1,7 +1,7 @@
 // The pieces that pages are made of.
 
 import { ApiError } from "./api.js";
-import { h } from "./dom.js";
+import { h, refresh } from "./dom.js";
 
 let names = 0;
 
@@ -12,12 +12,14 @@ export function heading(text, ...actions) {
 
 /** A part of a page with a title of its own. */
 export function card(title, ...children) {
-  const id = `card-${(names += 1)}`;
-  return h("section", { class: "card", "aria-labelledby": id }, h("h2", { id }, title), children);
+  return h("section", { class: "card", "aria-label": title }, h("h2", {}, title), children);
 }
 
-/** A table; columns: [{label, cell: row => node or text, numeric}]. It scrolls by itself where it is too wide. */
-export function table(columns, rows, { caption } = {}) {
+/**
+ * A table; columns: [{label, cell: row => node or text, numeric}]. It scrolls by itself where it is too wide.
+ * key(row): what tells rows apart where the table is refreshed and rows come, go or move.
+ */
+export function table(columns, rows, { caption, key } = {}) {
   const kind = (column) => (column.numeric ? { class: "numeric" } : {});
   const name = caption ?? columns.map((column) => column.label).join(", ");
   const made = h(
@@ -27,7 +29,7 @@ export function table(columns, rows, { caption } = {}) {
       "table",
       { "aria-label": name },
       h("thead", {}, h("tr", {}, columns.map((column) => h("th", { scope: "col", ...kind(column) }, column.label)))),
-      h("tbody", {}, rows.map((row) => h("tr", {}, columns.map((column) => h("td", kind(column), column.cell(row)))))),
+      h("tbody", {}, rows.map((row) => h("tr", key ? { "data-key": key(row) } : {}, columns.map((column) => h("td", kind(column), column.cell(row)))))),
     ),
   );
   // outside of what scrolls, so that it can be read whole on a phone
@@ -93,9 +95,15 @@ export function field(label, input, hint) {
 
 /** A list to choose one of: [[value, label], …] or texts. */
 export function select(options, chosen, onchange) {
-  const pairs = options.map((option) => (Array.isArray(option) ? option : [option, option]));
   const made = h("select", { onchange: (event) => onchange?.(event.target.value) });
-  made.append(...pairs.map(([value, label]) => h("option", { value, selected: value === chosen }, label)));
+  return offer(made, options, chosen);
+}
+
+/** Bring the options of such a list up to date, and which one is chosen, while it stays where it is. */
+export function offer(made, options, chosen) {
+  const pairs = options.map((option) => (Array.isArray(option) ? option : [option, option]));
+  refresh(made, pairs.map(([value, label]) => h("option", { value }, label)));
+  if (made.value !== chosen && pairs.some(([value]) => value === chosen)) made.value = chosen;
   return made;
 }
 

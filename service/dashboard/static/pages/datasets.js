@@ -1,10 +1,9 @@
 // All data sets, and uploading more.
 
 import { get } from "../api.js";
-import { h, replace } from "../dom.js";
+import { h, refresh, replace } from "../dom.js";
 import { ago, count, number, seconds, when } from "../format.js";
 import { badge, button, card, empty, heading, link, notice, table } from "../ui.js";
-import { refresh } from "./data/prose.js";
 import { robots } from "./data/robots.js";
 import { uploader } from "./data/upload.js";
 
@@ -21,7 +20,7 @@ export async function render(view, params, { signal, title }) {
     if (after === null) found.length = 0;
     found.push(...page.items);
     cursor = page.next_cursor;
-    refresh(list, found.length ? listed(found) : nothing(), cursor ? more : "");
+    refresh(list, found.length ? listed(found) : nothing(), cursor ? more : null);
   };
   const { element, fillRobots } = uploader({ onUploaded: () => load(), signal });
   await load();
@@ -44,7 +43,7 @@ function listed(datasets) {
       { label: "Next", cell: (row) => link("Train", `#/train?datasets=${row.id}`) },
     ],
     datasets,
-    { caption: "Newest first" },
+    { caption: "Newest first", key: (row) => row.id },
   );
 }
 

@@ -1,7 +1,7 @@
 // One training job: followed live, cancelled, repeated, and what came of it.
 
 import { get, path, post } from "../api.js";
-import { h, replace } from "../dom.js";
+import { h, refresh, replace } from "../dom.js";
 import { count, percent, seconds, when } from "../format.js";
 import { badge, button, card, confirm, errorBox, every, facts, heading, link, notice, progress } from "../ui.js";
 import { outcome } from "./job/outcome.js";
@@ -53,15 +53,15 @@ export async function render(view, { id }, { signal, title }) {
     const key = JSON.stringify([job.state, job.history, job.version]);
     if (key !== shown) {
       shown = key;
-      replace(actions, ...offered(job, cancel, retry));
-      replace(state, badge(job.state), " ", job.history.at(-1)?.message ?? "");
-      replace(past, job.history.map((entry) => h("li", {}, h("span", { class: "muted" }, when(entry.at)), " ", badge(entry.state), ` ${entry.message}`)));
-      replace(wanted, asked(job, names));
+      refresh(actions, ...offered(job, cancel, retry));
+      refresh(state, badge(job.state), " ", job.history.at(-1)?.message ?? "");
+      refresh(past, job.history.map((entry) => h("li", {}, h("span", { class: "muted" }, when(entry.at)), " ", badge(entry.state), ` ${entry.message}`)));
+      refresh(wanted, asked(job, names));
       if (!active) outcome(result, job, signal);
     }
     bar.hidden = !active;
     bar.value = job.progress.fraction;
-    replace(figures, facts(live(job, active)));
+    refresh(figures, facts(live(job, active)));
     if (objective.take(job) || first) objective.draw(job).catch((error) => notice(error.message, "bad"));
     first = false;
     curve.hidden = !watched && Objective.points(id) < 2; // it is only known to who looked
@@ -86,7 +86,7 @@ export async function render(view, { id }, { signal, title }) {
     h("div", { class: "grid wide" }, card("What was asked for", wanted), card("What happened", past)),
   );
   take(job);
-  named(names, signal).then(() => replace(wanted, asked(job, names)));
+  named(names, signal).then(() => refresh(wanted, asked(job, names)));
   if (!ACTIVE.has(job.state)) return;
   every(1, async () => hush(), signal);
   follow(id, { onJob: take, onTrouble: (text) => { trouble = text; hush(); }, signal }).catch((error) => {

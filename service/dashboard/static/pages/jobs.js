@@ -1,10 +1,9 @@
 // All training jobs.
 
 import { get } from "../api.js";
-import { h, replace } from "../dom.js";
+import { h, refresh, replace } from "../dom.js";
 import { ago, percent, seconds, when } from "../format.js";
 import { badge, button, card, empty, every, heading, link, progress, table } from "../ui.js";
-import { refresh } from "./data/prose.js";
 import { ACTIVE, left, stage } from "./job/words.js";
 
 /** The page `#/jobs`. */
@@ -19,7 +18,7 @@ export async function render(view, params, { signal, title }) {
   const draw = (newest) => {
     const ids = new Set(newest.map((job) => job.id));
     const jobs = [...newest, ...older.filter((job) => !ids.has(job.id))];
-    refresh(list, jobs.length ? listed(jobs) : nothing(), cursor ? more : "");
+    refresh(list, jobs.length ? listed(jobs) : nothing(), cursor ? more : null);
   };
   let newest = [];
   const more = button("Show older ones", async () => {
@@ -69,7 +68,7 @@ function listed(jobs) {
       { label: "Made", cell: (job) => (job.version === null ? "–" : link(`version ${job.version}`, `#/models/${job.model}?version=${job.version}`)) },
     ],
     jobs,
-    { caption: "Newest first" },
+    { caption: "Newest first", key: (job) => job.id },
   );
 }
 

@@ -1,15 +1,14 @@
 // The live page: what streams measure and what was predicted before it was learnt, as it comes.
 
 import { pages } from "../api.js";
-import { h, replace } from "../dom.js";
-import { empty, heading, link, select } from "../ui.js";
+import { h, refresh, replace } from "../dom.js";
+import { empty, heading, link, offer, select } from "../ui.js";
 import { alarms } from "./live/alarms.js";
 import { follow } from "./live/connection.js";
 import { innovation } from "./live/innovation.js";
 import { quiet } from "./live/quiet.js";
 import { Rows, WINDOW_S } from "./live/rows.js";
 import { answersCard, learningCard, qualityCard } from "./live/standing.js";
-import { refresh } from "./live/refresh.js";
 import { torque } from "./live/torque.js";
 
 const DRAW_MS = 300;
@@ -43,6 +42,7 @@ export async function render(view, { name }, { signal, title }) {
 async function followed(view, name, models, signal) {
   const page = parts(name, models);
   const seen = { rows: null, status: null, connection: null, pausedAt: null, drawn: 0, drawAt: 0, lost: 0 };
+  const stream = streamChoice(seen);
   let plots = null;
   let drawing = false;
 
@@ -67,7 +67,8 @@ async function followed(view, name, models, signal) {
     if (!seen.status) return;
     refresh(page.standing, learningCard(seen.status), qualityCard(seen.status), answersCard(seen.status));
     alarms(page, seen.status, name, signal);
-    offer(page.streams, seen.rows, () => (seen.drawn = -1));
+    const names = seen.rows.streams();
+    refresh(page.streams, names.length < 2 ? null : offer(stream, names, seen.rows.chosen));
   };
   const draw = async () => {
     if (!seen.rows?.came || drawing || seen.pausedAt !== null || document.hidden || seen.drawn === seen.rows.version) return;
@@ -162,18 +163,14 @@ function about({ rows, lost, pausedAt }, age) {
 }
 
 /** A choice of streams, where there are several. */
-function offer(place, rows, chosen) {
-  const names = rows.streams();
-  if (place.dataset.names === names.join() && place.querySelector("select")?.value === rows.chosen) return;
-  place.dataset.names = names.join();
-  if (names.length < 2) return replace(place);
-  const made = select(names, rows.chosen, (name) => {
-    rows.choose(name);
-    chosen();
+function streamChoice(seen) {
+  const made = select([], null, (name) => {
+    seen.rows.choose(name);
+    seen.drawn = -1;
   });
   made.setAttribute("aria-label", "Stream to show");
   made.style.width = "auto";
-  replace(place, made);
+  return made;
 }
 
 function address(name) {

@@ -1,7 +1,7 @@
 // One model: how well it predicts, what it has learnt, its versions, and a form to ask it.
 
 import { get, pages, path, put } from "../api.js";
-import { h, replace } from "../dom.js";
+import { h, refresh, replace } from "../dom.js";
 import { when } from "../format.js";
 import { badge, button, errorBox, facts, heading, link, loading, notice, tabs } from "../ui.js";
 import { accuracy } from "./model/accuracy.js";
@@ -34,7 +34,7 @@ export async function render(view, { name, query }, { signal, title }) {
   const state = { name, where, model, version, datasets, ...firstChoice(version, datasets, query) };
   state.tab = TABS.some(([tab]) => tab === query.get("tab")) ? query.get("tab") : "accuracy";
 
-  const top = h("div", {}), choice = h("div", {}), panel = h("div", { role: "tabpanel" });
+  const choice = h("div", { class: "grid" }), panel = h("div", { role: "tabpanel" });
   let left = new AbortController();
   signal.addEventListener("abort", () => left.abort());
 
@@ -44,10 +44,8 @@ export async function render(view, { name, query }, { signal, title }) {
     const mine = left.signal;
     const [tab, label, draw, needs] = TABS.find(([each]) => each === state.tab);
     remember(state);
-    replace(top, header(state, reload));
-    const focused = [...choice.querySelectorAll("select")].indexOf(document.activeElement);
-    replace(choice, needs.version ? chooser(state, needs, show, select) : null);
-    choice.querySelectorAll("select")[focused]?.focus(); // who uses the keyboard stays where they were
+    updateTop();
+    choose(needs);
     panel.setAttribute("aria-label", label);
     const inner = h("div", { dataset: { tab } });
     replace(panel, inner);
@@ -74,6 +72,8 @@ export async function render(view, { name, query }, { signal, title }) {
     else await show();
   };
 
+  const [top, updateTop] = header(state, reload);
+  const choose = chooser(choice, state, show, select);
   const list = tabs(TABS.map(([tab, label]) => [tab, label]), (tab) => {
     state.tab = tab;
     show();
@@ -82,30 +82,32 @@ export async function render(view, { name, query }, { signal, title }) {
   replace(view, top, choice, list, panel);
 }
 
-function header({ name, where, model, version }, reload) {
-  const { serving_version: serving, aliases } = model;
-  const shown = version.version;
-  const promote = button(`Let version ${shown} answer`, async () => {
-    if (!(await confirmServing(name, shown, serving))) return;
+/** What stands above all tabs: what can be done, and what is looked at. Returns its element, and what brings it up to date. */
+function header(state, reload) {
+  const { name, where } = state;
+  const promote = button("", async () => {
+    const shown = state.version.version;
+    if (!(await confirmServing(name, shown, state.model.serving_version))) return;
     await put(`${where}/aliases/serving`, { version: shown });
     notice(`Version ${shown} of ${name} answers from now on.`);
     await reload();
   }, { kind: "primary" });
-  const names = Object.entries(aliases).map(([alias, number]) => `${alias} → ${number}`);
-  return [
-    heading(
-      name,
-      shown === serving ? badge("serving") : null,
-      shown === serving ? null : promote,
-      link("Follow live", `#/live/${encodeURIComponent(name)}`),
-      link("Train a new version", `#/train?model=${encodeURIComponent(name)}`),
-    ),
-    facts([
+  const actions = h("div", { class: "actions" }), about = h("div", {});
+  const follow = link("Follow live", `#/live/${encodeURIComponent(name)}`);
+  const train = link("Train a new version", `#/train?model=${encodeURIComponent(name)}`);
+  const update = () => {
+    const { version, model: { serving_version: serving, aliases } } = state;
+    const shown = version.version;
+    const names = Object.entries(aliases).map(([alias, number]) => `${alias} → ${number}`);
+    promote.textContent = `Let version ${shown} answer`;
+    refresh(actions, shown === serving ? badge("serving") : promote, follow, train);
+    refresh(about, facts([
       ["Answers now", `version ${serving}`],
       ["You look at", `version ${shown}, ${version.estimator}, made ${when(version.created_at)}`],
       ...(names.length ? [["Aliases", names.join(", ")]] : []),
-    ]),
-  ];
+    ]));
+  };
+  return [h("div", {}, heading(name, actions), about), update];
 }
 
 /** The address names what is looked at, so that it can be shared; nothing is loaded for it. */

@@ -29,7 +29,6 @@ export async function render(view, _params, { signal, title }) {
     places.jobs,
     places.models,
   );
-  const board = jobBoard(places.jobs);
   const seen = { data: null, models: null, jobs: null };
   replace(places.counts, loading());
 
@@ -41,7 +40,7 @@ export async function render(view, _params, { signal, title }) {
   health(well, OFTEN_S, signal);
   follow(OFTEN_S, places.stale, signal, async (until) => {
     seen.jobs = await get("/v1/jobs", {}, until);
-    board(seen.jobs.items);
+    jobBoard(places.jobs, seen.jobs.items);
     tell();
   });
   follow(SELDOM_S, places.stale, signal, async (until) => {

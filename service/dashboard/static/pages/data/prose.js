@@ -11,10 +11,3 @@ export function prose(text) {
 export function sentences(texts) {
   return h("ul", {}, texts.map((text) => h("li", {}, prose(text))));
 }
-
-/** Put new children in an element without taking the keyboard's place away: a link that is there again is focused. */
-export function refresh(element, ...children) {
-  const at = element.contains(document.activeElement) ? document.activeElement.getAttribute("href") : null;
-  element.replaceChildren(...children.flat());
-  if (at !== null) [...element.querySelectorAll("a")].find((each) => each.getAttribute("href") === at)?.focus();
-}

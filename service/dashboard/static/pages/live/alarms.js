@@ -1,10 +1,9 @@
 // What the model's owner should know, and the decision that learning waits for.
 
 import { path, post } from "../../api.js";
-import { h, replace } from "../../dom.js";
+import { h, refresh, replace } from "../../dom.js";
 import { when } from "../../format.js";
 import { badge, button, confirm, field, notice } from "../../ui.js";
-import { refresh } from "./refresh.js";
 
 const WORDS = {
   adapt: "The robot is a different one from now on, with a payload or a new tool: what was learnt before counts less, and it is learnt anew. Adapt?",

@@ -1,8 +1,10 @@
 // Which version and which recording the page is about.
 
-import { h } from "../../dom.js";
+import { refresh } from "../../dom.js";
 import { count } from "../../format.js";
-import { empty, field, link, select } from "../../ui.js";
+import { empty, field, link, offer, select } from "../../ui.js";
+
+const PARTS = [["held_out", "what training held out"], ["all", "all of it"]];
 
 /** Data sets that a version can be compared with: those of its joints and its torque convention. */
 export function fitting(version, datasets) {
@@ -34,17 +36,45 @@ export function firstChoice(version, datasets, query) {
   return { dataset: dataset.id, part };
 }
 
-/** The fields above the tabs. changed(): the data set or part is another one; chosen(number): the version. */
-export function chooser(state, needs, changed, chosen) {
-  const { model, version, datasets } = state;
-  const numbers = [...model.versions].reverse().map((each) => {
+/**
+ * The fields above the tabs, in a place of their own. changed(): the data set or part is another one; chosen(number): the
+ * version. Returns a function of what a tab needs, which brings them up to date.
+ */
+export function chooser(place, state, changed, chosen) {
+  const versions = select([], null, (value) => chosen(Number(value)));
+  const recordings = select([], null, (id) => {
+    state.dataset = id;
+    Object.assign(state, firstChoice(state.version, state.datasets, new URLSearchParams({ dataset: id })));
+    changed();
+  });
+  const parts = select(PARTS, state.part, (part) => {
+    state.part = part;
+    changed();
+  });
+  const fields = { version: field("Version", versions), data: field("Recording", recordings), part: field("Part", parts) };
+  return (needs) => {
+    const { model, version, datasets } = state;
+    const offered = fitting(version, datasets);
+    const dataset = offered.find((each) => each.id === state.dataset);
+    const data = needs.data && offered.length > 0;
+    const part = data && dataset && relation(version, dataset).endsWith("held out");
+    offer(versions, numbered(model), String(version.version));
+    offer(recordings, offered.map((each) => [each.id, described(version, each)]), state.dataset);
+    offer(parts, PARTS, state.part);
+    refresh(place, needs.version ? fields.version : null, data ? fields.data : null, part ? fields.part : null);
+  };
+}
+
+function numbered(model) {
+  return [...model.versions].reverse().map((each) => {
     const role = each.version === model.serving_version ? ", answers now" : "";
     return [String(each.version), `${each.version} – ${each.estimator}${role}`];
   });
-  const fields = [field("Version", select(numbers, String(version.version), (value) => chosen(Number(value))))];
-  const offered = fitting(version, datasets);
-  if (needs.data && offered.length) fields.push(...dataFields(state, offered, changed));
-  return h("div", { class: "grid" }, fields);
+}
+
+function described(version, dataset) {
+  const known = relation(version, dataset);
+  return `${dataset.name || dataset.id} – ${count(dataset.report.rows)} samples${known ? `, ${known}` : ", not seen in training"}`;
 }
 
 /** What is shown where no data set fits. */
@@ -57,28 +87,4 @@ export function noData({ version, datasets }) {
     `${why} Upload a recording of this robot that the model was not trained on.`,
     link("Upload a recording", "#/data", "primary"),
   );
-}
-
-function dataFields(state, offered, changed) {
-  const { version } = state;
-  const options = offered.map((each) => {
-    const known = relation(version, each);
-    return [each.id, `${each.name || each.id} – ${count(each.report.rows)} samples${known ? `, ${known}` : ", not seen in training"}`];
-  });
-  const made = [
-    field("Recording", select(options, state.dataset, (id) => {
-      state.dataset = id;
-      Object.assign(state, firstChoice(version, offered, new URLSearchParams({ dataset: id })));
-      changed();
-    })),
-  ];
-  const dataset = offered.find((each) => each.id === state.dataset);
-  if (dataset && relation(version, dataset).endsWith("held out")) {
-    const held = [["held_out", "what training held out"], ["all", "all of it"]];
-    made.push(field("Part", select(held, state.part, (part) => {
-      state.part = part;
-      changed();
-    })));
-  }
-  return made;
 }

@@ -1,7 +1,7 @@
 // How a model learns while it serves: where it stands, how well it predicted lately, what it reports.
 
 import { get } from "../../api.js";
-import { h, replace } from "../../dom.js";
+import { h, refresh, replace } from "../../dom.js";
 import { ago, count, number, percent, scientific, when } from "../../format.js";
 import { badge, card, empty, every, facts, link, loading, table } from "../../ui.js";
 
@@ -17,15 +17,14 @@ export async function learning(view, { where, name }, { signal }) {
       get(`${where}/alarms`, { limit: 5 }, signal),
     ]);
     if (signal.aborted) return;
-    replace(stale);
+    refresh(stale);
     const now = JSON.stringify([said, quality, alarms]);
-    // what has not changed stays, and with it the keyboard's focus
-    if (now !== seen) replace(place, status(said, name), qualityCard(quality), alarmsCard(alarms.items), options(said.options));
+    if (now !== seen) refresh(place, status(said, name), qualityCard(quality), alarmsCard(alarms.items), options(said.options));
     seen = now;
   };
   await look(); // what goes wrong the first time is shown in the page's place
   every(5, () => look().catch((error) => {
-    if (!signal.aborted) replace(stale, h("div", { class: "banner bad", role: "alert" }, `What is shown here is no longer up to date: ${error.message}. It is tried again.`));
+    if (!signal.aborted) refresh(stale, h("div", { class: "banner bad", role: "alert" }, `What is shown here is no longer up to date: ${error.message}. It is tried again.`));
   }), signal);
 }
 

@@ -28,15 +28,13 @@ function versionTable({ name, where, model, version }, aliases, reload, look) {
     if (number !== serving) made.push(button("Let it answer", async () => {
       if (!(await confirmServing(name, number, serving))) return;
       await put(`${where}/aliases/serving`, { version: number });
-      notice(`Version ${number} of ${name} answers from now on.`);
-      await reload();
+      await done(reload, `Version ${number} of ${name} answers from now on.`);
     }, { kind: "primary" }));
     made.push(button("Export", () => exportVersion(name, number)));
     if (number !== serving && !named(number).length) made.push(button("Delete", async () => {
       if (!(await confirm(`Delete version ${number} of ${name}? It cannot be brought back.`, `Delete version ${number}`))) return;
       await del(`${where}/versions/${number}`);
-      notice(`Version ${number} is deleted.`);
-      await reload();
+      await done(reload, `Version ${number} is deleted.`);
     }, { kind: "danger" }));
     for (const each of made) each.setAttribute("aria-label", `${each.textContent}: version ${number}`);
     return h("div", { class: "actions" }, made);
@@ -64,14 +62,12 @@ function aliasTable({ name, where }, aliases, reload) {
     const what = each.alias === "serving" ? `Version ${each.previous} of ${name} answers again then, and version ${each.version} no more.` : `${each.alias} means version ${each.previous} again then.`;
     if (!(await confirm(`Take the last move of “${each.alias}” back? ${what}`, `Back to version ${each.previous}`, "primary"))) return;
     const now = await post(`${where}/aliases/${encodeURIComponent(each.alias)}/rollback`, {});
-    notice(`${each.alias} is version ${now.version} again.`);
-    await reload();
+    await done(reload, `${each.alias} is version ${now.version} again.`);
   });
   const remove = (each) => button("Remove", async () => {
     if (!(await confirm(`Remove the alias “${each.alias}”? Who asks for it is refused then; version ${each.version} stays.`, "Remove it"))) return;
     await del(path`/v1/models/${name}/aliases/${each.alias}`);
-    notice(`The alias ${each.alias} is removed.`);
-    await reload();
+    await done(reload, `The alias ${each.alias} is removed.`);
   }, { kind: "danger" });
   const named = (made, each) => {
     made.setAttribute("aria-label", `${made.textContent}: ${each.alias}`);
@@ -97,8 +93,7 @@ function aliasForm({ where, model, name }, reload) {
     const chosen = alias.value.trim(), number = Number(version.value);
     if (chosen === "serving" && !(await confirmServing(name, number, model.serving_version))) return;
     await put(`${where}/aliases/${encodeURIComponent(chosen)}`, { version: number });
-    notice(`${chosen} is version ${number} now.`);
-    await reload();
+    await done(reload, `${chosen} is version ${number} now.`);
   });
   return h(
     "details",
@@ -107,4 +102,13 @@ function aliasForm({ where, model, name }, reload) {
     h("div", { class: "grid" }, field("Alias", alias, "Lower-case letters, digits, dots and hyphens, after a letter."), field("Points to", version)),
     set,
   );
+}
+
+/** Say that something was done once the page shows it: what is pressed then is no longer of before. */
+async function done(reload, text) {
+  try {
+    await reload();
+  } finally {
+    notice(text); // it was, even where the page cannot be read again
+  }
 }

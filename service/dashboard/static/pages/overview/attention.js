@@ -1,7 +1,7 @@
 // What somebody has to decide or should know: learning that is held, alarms of the last day, a learner that failed.
 
 import { get, path } from "../../api.js";
-import { h, replace } from "../../dom.js";
+import { h, refresh } from "../../dom.js";
 import { when } from "../../format.js";
 import { badge, card, link } from "../../ui.js";
 import { changed } from "./follow.js";
@@ -46,6 +46,6 @@ async function ofModel(name, signal) {
 export function attention(place, found) {
   if (!changed(place, found)) return;
   const item = ({ model, state, text, at, hash }) =>
-    h("li", {}, h("div", { class: "row" }, badge(state), link(model, hash), h("span", {}, text), at ? h("span", { class: "muted" }, when(at)) : null));
-  replace(place, found.length ? card("Needs attention", h("ul", { class: "rows" }, found.map(item))) : null);
+    h("li", { "data-key": `${model} ${state}` }, h("div", { class: "row" }, badge(state), link(model, hash), h("span", {}, text), at ? h("span", { class: "muted" }, when(at)) : null));
+  refresh(place, found.length ? card("Needs attention", h("ul", { class: "rows" }, found.map(item))) : null);
 }

@@ -1,6 +1,6 @@
 // How much of everything there is.
 
-import { h, replace } from "../../dom.js";
+import { h, refresh } from "../../dom.js";
 import { changed } from "./follow.js";
 
 /** Tiles with numbers; a page of a list that goes on is counted as "at least". */
@@ -14,7 +14,7 @@ export function counts(place, { data, models, jobs }) {
     ["Jobs waiting", String(waiting), "#/jobs"],
   ];
   if (!changed(place, tiles)) return;
-  replace(
+  refresh(
     place,
     h(
       "div",

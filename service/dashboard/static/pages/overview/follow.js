@@ -1,6 +1,6 @@
 // Looks at something again and again. What cannot be looked at any more is still shown, and said to be old.
 
-import { h, replace } from "../../dom.js";
+import { h, refresh } from "../../dom.js";
 import { when } from "../../format.js";
 import { errorBox, every } from "../../ui.js";
 
@@ -34,7 +34,7 @@ export function follow(seconds, place, signal, look) {
         if (error.name !== "ApiError") console.error(error);
         // beside a second one that says the same it would only take room
         if (!closed && place.querySelector(".error") && !note.firstChild) return;
-        replace(
+        refresh(
           note,
           errorBox(error, closed ? again : null),
           last ? h("p", { class: "hint" }, `What is shown below is as of ${when(last.toISOString())}.`) : null,

@@ -1,7 +1,7 @@
 // Live health: what /health/ready says of each part, without a key.
 
 import { get } from "../../api.js";
-import { h, replace } from "../../dom.js";
+import { h, refresh, replace } from "../../dom.js";
 import { when } from "../../format.js";
 import { badge, every } from "../../ui.js";
 import { changed } from "./follow.js";
@@ -24,8 +24,8 @@ export function health(place, seconds, signal) {
   let answered = null;
   const show = (word, kind, checks) => {
     if (!changed(parts, [word, checks])) return;
-    replace(state, badge(word, kind));
-    replace(parts, checks.map(part));
+    refresh(state, badge(word, kind));
+    refresh(parts, checks.map(part));
   };
   return every(
     seconds,

@@ -1,45 +1,26 @@
 // Jobs that run or wait, with their progress; the last ones that ended where none does.
 
-import { h, replace } from "../../dom.js";
+import { h, refresh } from "../../dom.js";
 import { ago, seconds } from "../../format.js";
 import { badge, card, link, progress } from "../../ui.js";
-import { changed } from "./follow.js";
 
 const ENDED = 3;
 
-/** A board that keeps its rows, and with them the focus, while their progress changes: call it with the jobs' page. */
-export function jobBoard(place) {
-  const rows = new Map();
-  return (jobs) => {
-    const active = jobs.filter((job) => job.state === "running" || job.state === "queued");
-    const shown = [...active, ...jobs.filter((job) => !active.includes(job)).slice(0, ENDED)];
-    if (changed(place, shown.map((job) => [job.id, job.state]))) {
-      for (const id of rows.keys()) if (!shown.some((job) => job.id === id)) rows.delete(id);
-      for (const job of shown) if (rows.get(job.id)?.state !== job.state) rows.set(job.id, row(job));
-      const list = h("ul", { class: "rows" }, shown.map((job) => rows.get(job.id).element));
-      replace(place, shown.length ? card("Training", list, h("p", {}, link("All jobs", "#/jobs"))) : null);
-    }
-    for (const job of shown) rows.get(job.id).update(job);
-  };
+/** Show what the page of jobs tells. */
+export function jobBoard(place, jobs) {
+  const active = jobs.filter((job) => job.state === "running" || job.state === "queued");
+  const shown = [...active, ...jobs.filter((job) => !active.includes(job)).slice(0, ENDED)];
+  const list = h("ul", { class: "rows" }, shown.map(row));
+  refresh(place, shown.length ? card("Training", list, h("p", {}, link("All jobs", "#/jobs"))) : null);
 }
 
 function row(job) {
-  const about = h("span", { class: "muted" });
-  const bar = job.state === "running" ? progress(0, `Progress of ${job.model}`) : null;
-  const element = h(
+  return h(
     "li",
-    {},
-    h("div", { class: "row" }, badge(job.state), h("a", { href: `#/jobs/${job.id}` }, `${job.model}, ${job.estimator}`), about),
-    bar,
+    { "data-key": job.id },
+    h("div", { class: "row" }, badge(job.state), link(`${job.model}, ${job.estimator}`, `#/jobs/${job.id}`), h("span", { class: "muted" }, said(job))),
+    job.state === "running" ? progress(job.progress.fraction, `Progress of ${job.model}`) : null,
   );
-  return {
-    element,
-    state: job.state,
-    update(now) {
-      about.textContent = said(now);
-      if (bar) bar.value = now.progress.fraction;
-    },
-  };
 }
 
 function said(job) {

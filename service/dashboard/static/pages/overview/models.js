@@ -1,6 +1,6 @@
 // The newest models, and ways to look at them.
 
-import { h, replace } from "../../dom.js";
+import { h, refresh } from "../../dom.js";
 import { when } from "../../format.js";
 import { card, link, table } from "../../ui.js";
 import { changed } from "./follow.js";
@@ -18,7 +18,7 @@ export function newestModels(place, models) {
     { label: "Trained", cell: (model) => (serving(model) ? when(serving(model).created_at) : "–") },
     { label: "Live", cell: (model) => h("a", { href: `#/live/${encodeURIComponent(model.name)}`, "aria-label": `Follow ${model.name} live` }, "follow") },
   ];
-  replace(place, card("Newest models", table(columns, newest, { caption: "Newest first" }), h("p", {}, link("All models", "#/models"))));
+  refresh(place, card("Newest models", table(columns, newest, { caption: "Newest first", key: (model) => model.name }), h("p", {}, link("All models", "#/models"))));
 }
 
 function serving(model) {

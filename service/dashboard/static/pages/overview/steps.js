@@ -1,6 +1,6 @@
 // What to do first on a service that has not been used yet; gone once all of it is done.
 
-import { h, replace } from "../../dom.js";
+import { h, refresh } from "../../dom.js";
 import { badge, card, link } from "../../ui.js";
 import { changed } from "./follow.js";
 
@@ -11,7 +11,7 @@ export function steps(place, { data, models, jobs }) {
   if (!changed(place, [done, trained?.model, models.items[0]?.name])) return;
   if (done.data && done.trained) return void place.replaceChildren();
   const shipped = models.items.find((model) => model.name === "panda-sim");
-  replace(
+  refresh(
     place,
     card(
       "First steps",

@@ -1,0 +1,128 @@
+"""Pages that draw themselves anew: what is there again stays the node that it was, under a finger and the focus."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from tests.browser.conftest import Dashboard
+from tests.browser.looking import expect
+from tests.browser.visitor import Visitor
+
+if TYPE_CHECKING:
+    from playwright.sync_api import ElementHandle, Locator, Route
+
+
+def node(place: Locator) -> ElementHandle:
+    """The node itself, which another one in its place is not."""
+    found = place.element_handle()
+    assert found is not None
+    return found
+
+
+def there(kept: ElementHandle) -> bool:
+    """Whether a node is still part of the page."""
+    return kept.evaluate("(each) => each.isConnected")
+
+
+REFRESHED = """async () => {
+  const { h, refresh } = await import("/dashboard/dom.js");
+  const row = (id, text) => h("tr", {"data-key": id}, h("td", {}, h("a", {href: `#/${id}`}, text)));
+  const place = h("table", {}, row("a", "A"), row("b", "B"));
+  document.body.append(place);
+  const [a, b] = place.querySelectorAll("a");
+  a.focus();
+  const moved = new MutationObserver(() => null);
+  moved.observe(place, {childList: true, subtree: true});
+  refresh(place, row("c", "C"), row("a", "more of A"), row("b", "B"));
+  const texts = [...place.querySelectorAll("a")].map((each) => each.textContent);
+  const gone = moved.takeRecords().flatMap((each) => [...each.removedNodes]);
+  const added = {links: [...place.querySelectorAll("a")], focus: document.activeElement, gone};
+  refresh(place, row("b", "B"), row("a", "A"));
+  const turned = {links: [...place.querySelectorAll("a")], focus: document.activeElement};
+  refresh(place, row("d", "D"));
+  const control = h("button", {onclick: () => null}, "old");
+  const words = h("p", {class: "one", title: "t"}, "words ", h("b", {}, 1));
+  const [b1, text] = [words.querySelector("b"), words.firstChild];
+  const other = h("div", {}, control, words);
+  refresh(other, h("button", {onclick: () => null}, "new"), h("p", {class: "two"}, "other ", h("b", {}, 2), " more"));
+  const made = other.firstChild;
+  refresh(other, null, made, h("p", {}, "last"));
+  place.remove();
+  return {
+    added: texts,
+    kept: added.links[1] === a && added.links[2] === b && added.focus === a && added.gone.length === 0,
+    turned: turned.links[0] === b && turned.links[1] === a && turned.focus === a,
+    replaced: ![a, b].some((each) => place.contains(each)) && place.textContent === "D",
+    control: made !== control && made.textContent === "new" && other.firstChild === made,
+    words: words.firstChild === text && !words.contains(b1) && !words.hasAttribute("title") && other.contains(words),
+    shown: other.outerHTML,
+  };
+}"""
+
+
+def test_what_is_refreshed_is_changed_in_place(visitor: Visitor) -> None:
+    found = visitor.open("#/train").evaluate(REFRESHED)
+    assert found.pop("added") == ["C", "more of A", "B"]
+    assert found.pop("shown") == "<div><button>new</button><p>last</p></div>"
+    assert all(found.values()), found
+
+
+@pytest.mark.parametrize("route", ["#/", "#/jobs"])
+def test_a_job_that_comes_takes_no_link_away(visitor: Visitor, dashboard: Dashboard, route: str) -> None:
+    page = visitor.open(route)
+    place = page.get_by_role("main")
+    some = place.locator('a[href^="#/jobs/"]').first
+    expect(some).to_be_visible()
+    known = place.locator(f'a[href="{some.get_attribute("href")}"]')
+    links = [node(known), node(place.get_by_role("link", name="Train a model", exact=True).first)]
+    if route == "#/":
+        links += [node(place.get_by_role("link", name=name)) for name in ("All jobs", "Data sets", "Jobs running")]
+    links[0].focus()
+
+    def more(route: Route) -> None:
+        answer: dict[str, Any] = route.fetch().json()
+        begun = {**dashboard.job, "id": "job_begun", "state": "queued", "version": None, "finished_at": None}
+        route.fulfill(json={**answer, "items": [begun, *answer["items"]]})
+
+    page.route("**/v1/jobs", more)
+    expect(place.locator('a[href="#/jobs/job_begun"]')).to_be_visible()
+    if route == "#/":
+        expect(place.get_by_role("link", name="Jobs waiting")).to_contain_text("1")
+    assert [there(each) for each in links] == [True] * len(links)
+    expect(known).to_be_focused()
+    page.unroute_all(behavior="wait")
+
+
+def test_news_of_learning_take_no_link_away(visitor: Visitor, dashboard: Dashboard) -> None:
+    page = visitor.open(f"#/models/{dashboard.model}?tab=learning")
+    live = node(page.get_by_role("link", name="Follow it live"))
+    where = f"**/v1/models/{dashboard.model}/learning"
+
+    def later(route: Route) -> None:
+        answer: dict[str, Any] = route.fetch().json()
+        route.fulfill(json={**answer, "options": {**answer["options"], "forgetting": "another"}})
+
+    page.route(where, later)
+    expect(page.get_by_text("another")).to_be_visible()
+    assert there(live)
+    page.unroute_all(behavior="wait")
+
+
+def test_controls_of_a_model_stay_while_another_tab_is_chosen(visitor: Visitor, dashboard: Dashboard) -> None:
+    page = visitor.open(f"#/models/{dashboard.model}")
+    controls = [
+        node(page.get_by_role("link", name="Follow live")),
+        node(page.get_by_role("link", name="Train a new version")),
+        node(page.get_by_label("Version", exact=True)),
+    ]
+    recording = page.get_by_label("Recording", exact=True)
+    chosen = recording.input_value()
+    page.get_by_role("tab", name="Ask").click()
+    expect(page.get_by_role("button", name="Ask", exact=True)).to_be_visible()
+    expect(recording).to_have_count(0)
+    assert [there(each) for each in controls] == [True] * len(controls)
+    page.get_by_role("tab", name="Accuracy").click()
+    expect(recording).to_have_value(chosen)
+    assert [there(each) for each in controls] == [True] * len(controls)
