@@ -2,8 +2,8 @@
 
 A posterior with fitted hyperparameters knows what the samples leave open, but takes the hyperparameters themselves for
 certain: it is too sure of itself. The standard deviation of the function is therefore multiplied by a factor, one for
-each estimator, measured on simulated arms with random masses: `lip-chain` on four arms, `lip` and `rigid-body` on two,
-the baselines on one; slow and fast motion, 60 to 500 samples, judged on trajectories of twice the bandwidth
+each estimator, measured on simulated arms with random masses: `lip-chain` on four arms, `lip` on two, the baselines on
+one; slow and fast motion, 60 to 500 samples, judged on trajectories of twice the bandwidth
 (`docs/calibration.py`). It is stored with the model and touches neither mean nor noise.
 """
 
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 FUNCTION_STD_FACTOR = {
     "lip": 1.4,
     "lip-chain": 1.1,
-    "rigid-body": 1.1,
+    "rigid-body": 1.0,
     "rigid-body+lip-chain": 1.1,
     "se": 1.75,
     "gip": 1.2,

@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 
 from lipcore.functionals import Estimate, condition
+from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.base import Params, State, row_chunks
 from lipcore.kernels.chain import ChainKernel
 from lipcore.kernels.lip import LipKernel
-from lipcore.kernels.rigid_body import RigidBodyKernel
 from lipcore.motion import Motion
 from lipcore.posterior import Posterior
 
-EnergyKernel = LipKernel | ChainKernel | RigidBodyKernel
+EnergyKernel = LipKernel | ChainKernel | ArmKernel
 """Priors of torques that come from priors of the energies."""
 KINETIC, POTENTIAL = 0, 1
 
@@ -51,7 +51,7 @@ def prior_mean(kernels: Sequence[EnergyKernel], query: Motion) -> Tensor:
     """Prior means of both energies at N queries, (2, N) J."""
     total = torch.zeros((2, len(query)), dtype=torch.float64)
     for kernel in kernels:
-        if isinstance(kernel, RigidBodyKernel) and (weights := kernel.prior_weights()) is not None:
+        if isinstance(kernel, ArmKernel) and (weights := kernel.prior_weights()) is not None:
             total += (kernel.energy_features(query) @ weights).T
     return total
 
@@ -60,7 +60,7 @@ def covariance(params: Params, kernels: Sequence[EnergyKernel], x: Motion, y: Mo
     """Prior covariance of each energy at sample k of x with the same at sample k of y, or its only one: (2, N) J²."""
     total = torch.zeros((2, len(x)), dtype=torch.float64)
     for kernel in kernels:
-        if isinstance(kernel, RigidBodyKernel):
+        if isinstance(kernel, ArmKernel):
             scaled = kernel.energy_features(x) @ kernel.covariance(params)
             total += (scaled * kernel.energy_features(y)).sum(2).T
         else:
@@ -72,7 +72,7 @@ def with_anchors(posterior: Posterior, kernels: Sequence[EnergyKernel], query: M
     """Prior covariance of both energies at N queries with the M anchors of the posterior: (2, M, N)."""
     total = torch.zeros((2, len(posterior.weights), len(query)), dtype=torch.float64)
     for kernel in kernels:
-        if isinstance(kernel, RigidBodyKernel):
+        if isinstance(kernel, ArmKernel):
             scaled = kernel.energy_features(query) @ kernel.covariance(posterior.params)  # (N, 2, p)
             parts = [posterior.with_weights(kernel, scaled[:, energy].T) for energy in (KINETIC, POTENTIAL)]
         else:

@@ -7,13 +7,15 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from lipcore.arm.arm import Arm
+from lipcore.fit_options import FitOptions
+from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.base import SumKernel, TorqueKernel
 from lipcore.kernels.chain import ChainKernel
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.kernels.gip import GeometricallyInspiredKernel
 from lipcore.kernels.lip import LipKernel
 from lipcore.kernels.lse import LagrangianSEKernel
-from lipcore.kernels.rigid_body import RigidBodyKernel
 from lipcore.kernels.se import SquaredExponentialKernel
 from lipcore.motion import Motion, check_joint_types
 from lipcore.urdf import JointMismatchError, RigidBody
@@ -67,31 +69,51 @@ def make_estimator(
     name: str,
     joint_types: Sequence[str],
     tied: bool = True,
-    robot: RigidBody | None = None,
-    prior: str = "urdf",
-    gravity: bool = True,
+    arm: Arm | None = None,
 ) -> Estimator:
     """Build an estimator for a robot; raise UnknownEstimatorError listing the known names.
 
-    robot, prior, gravity: for ROBOT_ESTIMATORS, see RigidBodyKernel; raise MissingRobotError where one is needed but
-    absent or given but of no use, JointMismatchError where its joints are not those of the data.
+    arm: for ROBOT_ESTIMATORS, what was learnt of the rigid bodies (`lipcore.arm.learning`); raise ValueError where it
+    is absent or of no use, JointMismatchError where its joints are not those of the data.
     """
     if name not in ESTIMATORS:
         raise UnknownEstimatorError(f"estimator is {name!r}, expected one of {', '.join(ESTIMATORS)}")
     types = check_joint_types(joint_types)
     terms = {**ESTIMATORS[name](types, tied), "friction": FrictionKernel(len(types))}
-    if name not in ROBOT_ESTIMATORS:
-        if robot is not None:
-            raise MissingRobotError(f"estimator {name!r} takes no robot, only {' and '.join(ROBOT_ESTIMATORS)} do")
+    if (name in ROBOT_ESTIMATORS) != (arm is not None):
+        raise ValueError(f"estimator {name!r}: expected an arm for {' and '.join(ROBOT_ESTIMATORS)}, and for no other")
+    if arm is None:
         return Estimator(name, terms)
+    of_arm = tuple(arm.geometry.joint_types[place] for place in arm.place)
+    if of_arm != types:
+        raise JointMismatchError(f"the arm has joints {of_arm}, the data have {types}")
+    return Estimator(name, {"rigid_body": ArmKernel(arm), **terms})
+
+
+def check_estimator(
+    name: str, joint_types: Sequence[str], robot: RigidBody | None = None, options: FitOptions | None = None
+) -> None:
+    """Check that an estimator can be trained so, before anything is spent on it.
+
+    Raise UnknownEstimatorError, MissingRobotError where a robot is given in vain, ValueError where `options.geometry`
+    needs one and there is none, JointMismatchError where its joints are not those of the data or in another order.
+    """
+    if name not in ESTIMATORS:
+        raise UnknownEstimatorError(f"estimator is {name!r}, expected one of {', '.join(ESTIMATORS)}")
+    types = check_joint_types(joint_types)
     if robot is None:
-        raise MissingRobotError(f"estimator {name!r} needs a robot: a profile such as panda, or a URDF")
+        if name in ROBOT_ESTIMATORS and options is not None and options.geometry in ("calibrate", "fixed"):
+            raise MissingRobotError(
+                f"geometry is {options.geometry!r}, which needs a robot: a profile such as panda, or a URDF"
+            )
+        return
+    if name not in ROBOT_ESTIMATORS:
+        raise MissingRobotError(f"estimator {name!r} takes no robot, only {' and '.join(ROBOT_ESTIMATORS)} do")
     if robot.joint_types != types:
         raise JointMismatchError(f"robot {robot.name!r} has joints {robot.joint_types}, the data have {types}")
-    if "energy" in terms and robot.order != tuple(range(robot.n_joints)):
-        chain = [robot.joint_names[robot.order.index(place)] for place in range(robot.n_joints)]
+    if name != "rigid-body" and robot.order != tuple(range(robot.n_joints)):
+        order = [robot.joint_names[robot.order.index(place)] for place in range(robot.n_joints)]
         raise JointMismatchError(
-            f"estimator {name!r} needs joints from base to tip, {', '.join(chain)}; the data have "
+            f"estimator {name!r} needs joints from base to tip, {', '.join(order)}; the data have "
             f"{', '.join(robot.joint_names)}"
         )
-    return Estimator(name, {"rigid_body": RigidBodyKernel(robot, prior, gravity), **terms})

@@ -5,12 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, get_args
 
-from lipcore.vocabulary import PRIORS
+from lipcore.vocabulary import GEOMETRY_MODES, PRIORS, Prior
 
 if TYPE_CHECKING:
     import torch
 
 Standing = Literal["auto", "all", "chosen"]
+GeometryOption = Literal["auto", "learn", "calibrate", "fixed"]
+
+
+MOST_SECONDS = 3600.0
+"""s; longer no search for a geometry may take."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +25,9 @@ class FitOptions:
     hyperparameter_samples: samples that hyperparameters are fitted on; posterior_samples: samples the posterior is
     conditioned on, where there are more the most spread-out ones; starts: points that the search for hyperparameters is
     tried from, the best of which is followed; tied: links share kernel shapes (see LipKernel);
-    device: "cpu", "cuda" or "auto"; prior: of rigid bodies, "urdf" or "zero" (see RigidBodyKernel);
+    device: "cpu", "cuda" or "auto"; prior: of the masses of rigid bodies, those of the "urdf" or "zero";
+    geometry: of rigid bodies, "learn", "calibrate" (around the URDF), "fixed" (as the URDF has it), or "auto":
+    calibrated where there is a robot, else learnt; search_seconds: time limit of the search for a geometry;
     compact_tolerance: largest deviation of the compact posterior from the exact one, in standard deviations;
     max_inducing_outputs: where that would take more, the compact posterior deviates more, and answers stay fast;
     statistics: what the posterior of the chosen basis stands on in the end: the samples `chosen` before, or `all`, each
@@ -34,10 +41,12 @@ class FitOptions:
     starts: int = 3
     tied: bool = True
     device: str = "auto"
-    prior: str = "urdf"
+    prior: Prior = "urdf"
     compact_tolerance: float = 0.01
     max_inducing_outputs: int = 1500
     statistics: Standing = "auto"
+    geometry: GeometryOption = "auto"
+    search_seconds: float = 30.0
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -56,6 +65,12 @@ class FitOptions:
             raise ValueError(f"device is {self.device!r}, expected auto, cpu or cuda")
         if not (isinstance(self.compact_tolerance, float) and 0 < self.compact_tolerance <= 1):
             raise ValueError(f"compact_tolerance is {self.compact_tolerance!r}, expected a number above 0, 1 at most")
+        if not (isinstance(self.search_seconds, float) and 0 < self.search_seconds <= MOST_SECONDS):
+            raise ValueError(
+                f"search_seconds is {self.search_seconds!r}, expected a number above 0, at most {MOST_SECONDS:g}"
+            )
+        if self.geometry not in ("auto", *GEOMETRY_MODES):
+            raise ValueError(f"geometry is {self.geometry!r}, expected auto, {', '.join(GEOMETRY_MODES)}")
         if self.prior not in PRIORS:
             raise ValueError(f"prior is {self.prior!r}, expected one of {', '.join(PRIORS)}")
 

@@ -92,10 +92,12 @@ def fit(
     on_progress: Progress | None = None,
     cancelled: Cancelled | None = None,
     stretches: Samples | None = None,
+    begin: Params | None = None,
 ) -> Fit:
     """Fit hyperparameters to samples; on_progress after every iteration, `cancelled` asked at every evaluation.
 
-    stretches: contiguous samples that tell the white noise, where `samples` are thinned.
+    stretches: contiguous samples that tell the white noise, where `samples` are thinned; begin: hyperparameters that
+    are known better than the kernel's own start.
     Raise FitCancelledError when `cancelled` answers true, NotPositiveDefiniteError where no hyperparameters give a
     covariance that can be factored.
     """
@@ -104,6 +106,7 @@ def fit(
     floor = torch.from_numpy(np.log(noise.floor(samples))).to(device)
     start = kernel.initial(motion, tau)
     start["noise.log_std"] = torch.from_numpy(np.log(noise.start(samples, stretches))).to(device)
+    start |= {name: value.to(device) for name, value in (begin or {}).items()}
     stop = cancelled or (lambda: False)
     rows = spread_out(motion, options.hyperparameter_samples)
     search = _Search(kernel, start, floor, motion[rows], tau[rows], stop)

@@ -3,27 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from lipcore.arm.arm import Arm
+from lipcore.arm.known import known_geometries
+from lipcore.arm.learning import Learnt, learn
 from lipcore.calibration import NO_CALIBRATION, Calibration, calibrate
 from lipcore.compact.basis import Basis
-from lipcore.compact.compress import compress
+from lipcore.compact.compress import compress, linear
 from lipcore.compact.posterior import CompactPosterior
 from lipcore.compact.statistics import Statistics
-from lipcore.estimators import Estimator, make_estimator
+from lipcore.estimators import Estimator, check_estimator, make_estimator
 from lipcore.evaluator import Evaluator
 from lipcore.fit_options import FitOptions
 from lipcore.fitting import Cancelled, Progress, fit
+from lipcore.kernels.arm import ArmKernel
 from lipcore.motion import Motion, check_finite, check_joint_types, motion_arrays
 from lipcore.posterior import ExactPosterior
 from lipcore.samples import Array, Samples
 from lipcore.urdf import JointMismatchError, RigidBody
-from lipcore.vocabulary import DEFAULT_ESTIMATOR, TORQUE_CONVENTIONS, JointType, TorqueConvention
+from lipcore.vocabulary import DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS, TORQUE_CONVENTIONS, JointType, TorqueConvention
 
 MIN_SAMPLES = 10
 
@@ -70,6 +74,12 @@ class TorqueModel:
     def n_joints(self) -> int:
         """Number of joints n."""
         return len(self.joint_names)
+
+    @property
+    def arm(self) -> Arm | None:
+        """What is known of the rigid bodies, of an estimator that has them."""
+        term = self.estimator.terms.get("rigid_body")
+        return term.arm if isinstance(term, ArmKernel) else None
 
     @property
     def noise_std(self) -> Array:
@@ -175,22 +185,40 @@ def fitted(
             f"{', '.join(samples.joint_names)}"
         )
     gravity = torque_convention == "gravity_included"
-    chosen = make_estimator(estimator, types, options.tied, robot, options.prior, gravity)
-    found = fit(chosen.kernel, samples, options, on_progress, cancelled, stretches)
-    used = samples.rows(found.rows)
-    motion, tau = used.motion(), used.torque()
+    check_estimator(estimator, types, robot, options)
+    learnt: Learnt | None = None
+    if estimator in ROBOT_ESTIMATORS:
+        known = () if robot is not None else known_geometries(types, gravity)
+        learnt = learn(samples, types, options, gravity, robot, known, on_progress, cancelled, stretches)
+    chosen = make_estimator(estimator, types, options.tied, None if learnt is None else learnt.arm)
     calibration = calibrate(estimator)
-    exact = ExactPosterior.fit(chosen.kernel, found.params, motion, tau, calibration.function_std_factor)
-    compression = compress(exact, tau, options.compact_tolerance, options.max_inducing_outputs)
+    if learnt is not None and estimator == "rigid-body":
+        rows, report = learnt.rows, {**learnt.report, "jitter": 0.0}
+        used = samples.rows(rows)
+        weights = torch.full((len(rows),), learnt.weight, dtype=torch.float64)
+        compression = linear(
+            chosen.kernel, learnt.params, used.motion(), used.torque(), weights, options.compact_tolerance
+        )
+    else:
+        start = None if learnt is None else learnt.params
+        found = fit(chosen.kernel, samples, options, on_progress, cancelled, stretches, start)
+        used = samples.rows(found.rows)
+        exact = ExactPosterior.fit(chosen.kernel, found.params, used.motion(), used.torque())
+        exact = replace(exact, std_factor=calibration.function_std_factor)
+        compression = compress(exact, used.torque(), options.compact_tolerance, options.max_inducing_outputs)
+        report = {**asdict(found.report), "jitter": exact.factor.jitter}
+        if learnt is not None:
+            seconds = float(learnt.report["seconds"]) + found.report.seconds
+            report = {**learnt.report, **report, "seconds": seconds}
     return TorqueModel(
         chosen,
         samples.joint_names,
         types,
         torque_convention,
         asdict(options),
-        {**asdict(found.report), "jitter": exact.factor.jitter},
-        compression.posterior,
-        training_range(motion),
+        report,
+        replace(compression.posterior, std_factor=calibration.function_std_factor),
+        training_range(used.motion()),
         compression.report(),
         robot,
         calibration,
@@ -220,14 +248,13 @@ def restore(
     compact: dict[str, float | int | bool],
     robot: RigidBody | None = None,
     calibration: Calibration = NO_CALIBRATION,
+    arm: Arm | None = None,
 ) -> TorqueModel:
     """Rebuild a model from its parts: hyperparameters, inducing outputs (see `Basis`) and statistics.
 
     Raise ValueError naming what is missing, unknown or of the wrong shape.
     """
-    tied, prior = bool(options.get("tied", True)), str(options.get("prior", "urdf"))
-    gravity = torque_convention == "gravity_included"
-    chosen = make_estimator(estimator, joint_types, tied, robot, prior, gravity)
+    chosen = make_estimator(estimator, joint_types, bool(options.get("tied", True)), arm)
     kernel, n = chosen.kernel, len(joint_names)
     expected = {**kernel.shapes(), "noise.log_std": torch.Size([n])}
     for name in expected.keys() | params.keys():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,9 +11,9 @@ import torch
 from torch import Tensor
 
 from lipcore.estimators import Estimator
+from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.base import LinearKernel
 from lipcore.kernels.friction import FRICTION_TERMS, FrictionKernel
-from lipcore.kernels.rigid_body import RigidBodyKernel
 from lipcore.posterior import Posterior
 from lipcore.robots import pinocchio
 from lipcore.samples import Array
@@ -22,6 +23,10 @@ LEAST_MASS, MOST_MASS = 1e-4, 1e2
 """Mass of a plausible body, as a share of the whole arm's: the search must neither vanish nor run away."""
 LEAST_EXTENT, MOST_EXTENT = 1e-3, 1e2
 """Spread of a plausible body's mass along each axis, m: no real body is a point."""
+STEPS = ("turn 1", "turn 2", "shift 1", "shift 2")
+"""Names of a joint's numbers of geometry: about, and along, the two vectors across its axis."""
+UNDETERMINED = 0.5
+"""Torque does not tell what is still as uncertain as this share of what was expected beforehand."""
 LEAST_VARIANCE = 1e-10
 """Smallest posterior variance relative to the prior's that rounding leaves meaningful."""
 
@@ -63,13 +68,14 @@ class InertialParameters:
     """Ten parameters of each of n bodies, (n, 10): mass kg, first moment (3) kg·m, inertia (6) kg·m².
 
     The inertia, xx, xy, yy, xz, yz, zz, is about the frame of the joint that moves the body. mean, std: of the
-    posterior; many are known from torques only in combinations, which std shows. plausible: the physically possible
+    posterior; many are known from torques only in combinations, which std shows. scale: standard deviations
+    beforehand. plausible: the physically possible
     parameters nearest to the mean in the posterior's metric; mean_is_plausible: whether the mean is possible itself.
     """
 
-    joint_names: tuple[str, ...]
     mean: Array
     std: Array
+    scale: Array
     plausible: Array
     mean_is_plausible: bool
 
@@ -101,17 +107,17 @@ def friction_coefficients(posterior: Posterior, estimator: Estimator) -> Frictio
 
 def inertial_parameters(posterior: Posterior, estimator: Estimator) -> InertialParameters:
     """Inertial parameters of each body; raise ValueError for an estimator without rigid bodies."""
-    term = estimator.terms.get("rigid_body")
-    if not isinstance(term, RigidBodyKernel):
-        raise ValueError(f"estimator {estimator.name!r} has no rigid bodies")
-    weights = weight_posterior(posterior, term)
+    term = _arm_kernel(estimator)
+    every = weight_posterior(posterior, term)
+    size = PARAMETERS * term.n_joints
+    weights = WeightPosterior(every.mean[:size], every.covariance[:size, :size], every.scale[:size])
     mean, std = (part.reshape(-1, PARAMETERS) for part in (weights.mean, weights.std))
     plausible = all(is_plausible(body) for body in mean)
-    nearest = mean if plausible else nearest_plausible(weights, term.urdf_parameters)
-    return InertialParameters(term.robot.joint_names, mean, std, nearest, plausible)
+    nearest = mean if plausible else nearest_plausible(weights, term.arm.centre[term.arm.place])
+    return InertialParameters(mean, std, weights.scale.reshape(-1, PARAMETERS), nearest, plausible)
 
 
-def report(posterior: Posterior, estimator: Estimator) -> dict[str, Any]:
+def report(posterior: Posterior, estimator: Estimator, joint_names: Sequence[str]) -> dict[str, Any]:
     """All parameters of an estimator as plain numbers, for a manifest."""
     friction = friction_coefficients(posterior, estimator)
     out: dict[str, Any] = {
@@ -125,13 +131,70 @@ def report(posterior: Posterior, estimator: Estimator) -> dict[str, Any]:
         out["inertia"] = {
             "mean_is_plausible": inertia.mean_is_plausible,
             "bodies": [
-                {"joint": name, "mean": _body(mean), "std": _body(std), "plausible": _body(plausible)}
-                for name, mean, std, plausible in zip(
-                    inertia.joint_names, inertia.mean, inertia.std, inertia.plausible, strict=True
-                )
+                {
+                    "joint": name,
+                    "mean": _body(inertia.mean[j]),
+                    "std": _body(inertia.std[j]),
+                    "plausible": _body(inertia.plausible[j]),
+                    "undetermined": _open(inertia.std[j], inertia.scale[j]),
+                }
+                for j, name in enumerate(joint_names)
             ],
         }
+        out |= _of_arm(posterior, _arm_kernel(estimator), joint_names)
     return out
+
+
+def _of_arm(posterior: Posterior, term: ArmKernel, joint_names: Sequence[str]) -> dict[str, Any]:
+    """Rotor inertias and the geometry as the posterior has it."""
+    weights, arm = weight_posterior(posterior, term), term.arm
+    n = term.n_joints
+    rotors = slice(PARAMETERS * n, (PARAMETERS + 1) * n)
+    steps, step_std = weights.mean[term.steps], weights.std[term.steps]
+    geometry = arm.geometry if arm.mode == "fixed" else arm.geometry.moved(steps)
+    joints, at = [], 0
+    for place, count in enumerate(geometry.screws):
+        std = step_std[at : at + count] if arm.steps else np.zeros(0)
+        usual = arm.widths[at : at + count]
+        at += count
+        joints.append(
+            {
+                "joint": joint_names[arm.order[place]],
+                "type": geometry.joint_types[place],
+                "rotation": geometry.rotation[place].tolist(),
+                "translation": geometry.translation[place].tolist(),
+                "axis": geometry.axis[place].tolist(),
+                "across": geometry.across[place].tolist(),
+                "turn_std": std[:2].tolist(),
+                "shift_std": std[2:].tolist(),
+                "undetermined": [
+                    name for name, one, other in zip(STEPS, std, usual, strict=False) if one > UNDETERMINED * other
+                ],
+            }
+        )
+    return {
+        "rotor": {"mean": weights.mean[rotors].tolist(), "std": weights.std[rotors].tolist()},
+        "geometry": {
+            "mode": arm.mode,
+            "gravity": geometry.gravity.tolist(),
+            "order": arm.order.tolist(),
+            "joints": joints,
+        },
+    }
+
+
+def _arm_kernel(estimator: Estimator) -> ArmKernel:
+    term = estimator.terms.get("rigid_body")
+    if not isinstance(term, ArmKernel):
+        raise ValueError(f"estimator {estimator.name!r} has no rigid bodies")
+    return term
+
+
+def _open(std: Array, scale: Array) -> list[str]:
+    """Which of a body's parameters the samples leave as they were expected."""
+    left = std > UNDETERMINED * scale
+    parts = {"mass": left[0], "first_moment": left[1:4].any(), "inertia": left[4:].any()}
+    return [name for name, is_open in parts.items() if is_open]
 
 
 def pseudo_inertia(body: Array) -> Array:

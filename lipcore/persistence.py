@@ -19,6 +19,7 @@ import numpy as np
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
+from lipcore.arm.storing import arm_tensors, read_arm
 from lipcore.calibration import Calibration
 from lipcore.compact.statistics import Statistics
 from lipcore.manifest import (
@@ -37,6 +38,7 @@ from lipcore.motion import Motion
 from lipcore.parameters import report
 from lipcore.tensors import FLOOR, INDUCING, OUTPUTS, PARAMS, A, B, pack_symmetric, read_tensors, unpack_symmetric
 from lipcore.urdf import RigidBody
+from lipcore.vocabulary import ROBOT_ESTIMATORS
 
 SAME = 1e-6
 """Relative difference of the noise in the manifest and in the tensors that another processor may make."""
@@ -63,6 +65,8 @@ def encode(model: TorqueModel, lineage: Mapping[str, Any] | None = None) -> tupl
     tensors |= {OUTPUTS: basis.outputs, A: pack_symmetric(statistics.a), B: statistics.b}
     if bool((model.posterior.floor > 0).any()):
         tensors[FLOOR] = model.posterior.floor
+    if model.arm is not None:
+        tensors |= arm_tensors(model.arm)
     payload = save_tensors({name: value.contiguous() for name, value in tensors.items()})
     manifest = {
         "format": FORMAT,
@@ -76,7 +80,7 @@ def encode(model: TorqueModel, lineage: Mapping[str, Any] | None = None) -> tupl
         "fit": model.fit,
         "compact": {**model.compact, "data_samples": round(statistics.samples)},
         "calibration": asdict(model.calibration),
-        "parameters": report(model.posterior, model.estimator),
+        "parameters": report(model.posterior, model.estimator, model.joint_names),
         "hyperparameters": {name: value.tolist() for name, value in model.posterior.params.items()},
         "training_range": model.training_range,
         "lineage": dict(lineage or {}),
@@ -238,6 +242,12 @@ def _restore(manifest: Mapping[str, Any], tensors: dict[str, Tensor], robot: Rig
     params = {name.removeprefix(PARAMS): value for name, value in tensors.items() if name.startswith(PARAMS)}
     compact = dict(manifest["compact"])
     statistics = Statistics(unpack_symmetric(A, tensors[A]), tensors[B], float(compact.pop("data_samples")))
+    arm = None
+    if manifest["estimator"] in ROBOT_ESTIMATORS:
+        try:
+            arm = read_arm(tensors, manifest["joint_types"], manifest["fit"].get("geometry"))
+        except ValueError as error:
+            raise ModelFormatError(str(error), TENSORS) from None
     model = restore(
         manifest["estimator"],
         manifest["joint_names"],
@@ -253,6 +263,7 @@ def _restore(manifest: Mapping[str, Any], tensors: dict[str, Tensor], robot: Rig
         compact,
         robot,
         Calibration(**manifest["calibration"]),
+        arm,
     )
     stated = manifest.get("hyperparameters")
     if stated is not None and stated != {name: value.tolist() for name, value in params.items()}:

@@ -11,6 +11,7 @@ from safetensors.torch import load as load_tensors
 from torch import Tensor
 
 from lipcore import strict_json
+from lipcore.arm.storing import is_of_arm
 from lipcore.manifest import TENSORS, Limits, ModelFormatError
 from lipcore.strict_json import quote
 
@@ -124,7 +125,7 @@ def _are_counts(value: object) -> bool:
 
 def _check_sizes(entries: dict[str, Entry], n: int, limits: Limits) -> None:
     for name in entries:
-        if not name.startswith(PARAMS) and name not in (OUTPUTS, *INDUCING, A, B, FLOOR):
+        if not (name.startswith(PARAMS) or is_of_arm(name)) and name not in (OUTPUTS, *INDUCING, A, B, FLOOR):
             raise _bad(f"{TENSORS} has the tensor {quote(name)}, which this release does not know")
     for name in (OUTPUTS, *INDUCING, A, B):
         if name not in entries:

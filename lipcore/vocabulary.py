@@ -28,7 +28,11 @@ COMPONENTS: tuple[ComponentName, ...] = get_args(ComponentName)
 
 DEFAULT_ESTIMATOR = "lip-chain"
 ROBOT_ESTIMATORS = ("rigid-body", "rigid-body+lip-chain")
-"""Estimators with the term `rigid_body`, which needs a robot."""
+"""Estimators with the term `rigid_body`, which take a robot."""
+
+GeometryMode = Literal["learn", "calibrate", "fixed"]
+GEOMETRY_MODES: tuple[GeometryMode, ...] = get_args(GeometryMode)
+"""Where the joint axes of rigid bodies lie: learnt from torque alone, learnt around a URDF, or as the URDF says."""
 
 Prior = Literal["urdf", "zero"]
 PRIORS: tuple[Prior, ...] = get_args(Prior)

@@ -13,7 +13,6 @@ the place of the common normal is undetermined, and a small turn of an axis move
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -205,7 +204,7 @@ def turn_of(rotation: Array) -> Array:
     return np.asarray(Rotation.from_matrix(rotation).as_rotvec())
 
 
-def aligned(axis: Sequence[float]) -> Array:
+def aligned(axis: Array) -> Array:
     """A rotation whose third column is the unit vector `axis`: (3, 3)."""
     third = np.asarray(axis, np.float64)
     first = np.cross(np.eye(3)[int(np.abs(third).argmin())], third)
@@ -218,7 +217,7 @@ def _axis(joint: object) -> Array:
     name = joint.shortname()  # type: ignore[attr-defined]
     for letter, vector in zip("XYZ", np.eye(3), strict=True):
         if name.endswith(letter):
-            return vector
+            return np.asarray(vector)
     data = joint.createData()  # type: ignore[attr-defined]
     q = np.zeros(joint.nq) if joint.nq == 1 else np.array([1.0, 0.0])  # type: ignore[attr-defined]
     joint.calc(data, q)  # type: ignore[attr-defined]

@@ -75,7 +75,8 @@ class Problem:
 
     motions: (N, 3, n), q, dq and ddq from base to tip; tau: (N, n); counts: (N,), independent samples that a row stands
     for; friction: (N, n, f), its features; centre, scale: (k,), μ and s of w; noise: (n,), where its prior lies;
-    floor: (n,), the smallest admitted; expected: prior of the geometry.
+    floor: (n,), the smallest admitted; expected: prior of the geometry,
+    None where it is fixed.
     """
 
     motions: Array
@@ -86,22 +87,26 @@ class Problem:
     scale: Array
     noise: Array
     floor: Array
-    expected: Expected
+    expected: Expected | None
 
     @property
     def n_joints(self) -> int:
         """Number of joints n."""
-        return self.tau.shape[1]
+        return int(self.tau.shape[1])
 
     def rows(self, rows: Array) -> Problem:
         """The same with some of the samples."""
         kept = {name: getattr(self, name)[rows] for name in ("motions", "tau", "counts", "friction")}
         return replace(self, **kept)
 
-    def parameters(self, weights: Array) -> Array:
-        """Inertial parameters π of weights: (n, 10)."""
+    def weights(self, point: Point) -> Array:
+        """The most likely w of a point, in SI units: (k,)."""
+        return self.centre + point.weights * self.scale
+
+    def parameters(self, point: Point) -> Array:
+        """Inertial parameters π of a point: (n, 10)."""
         n = self.n_joints
-        return np.ascontiguousarray((self.centre + weights * self.scale)[: PARAMETERS * n].reshape(n, PARAMETERS))
+        return np.ascontiguousarray(self.weights(point)[: PARAMETERS * n].reshape(n, PARAMETERS))
 
     def features(self, geometry: Geometry) -> Array:
         """Features of w, in units of s: (N, n, k)."""
@@ -116,11 +121,14 @@ class Problem:
         out *= self.scale
         return out
 
-    def shapes(self, geometry: Geometry, weights: Array) -> Array:
-        """J = ∂(Y π)/∂θ: (N, n, g)."""
+    def shapes(self, point: Point) -> Array:
+        """J = ∂(Y π)/∂θ at a point: (N, n, g), g = 0 where the geometry is fixed."""
         n = self.n_joints
-        out = np.empty((len(self.tau), geometry.size, n))
-        parameters = self.parameters(weights)
+        geometry = point.geometry
+        out = np.empty((len(self.tau), geometry.size if self.expected is not None else 0, n))
+        if self.expected is None:
+            return out.transpose(0, 2, 1)
+        parameters = self.parameters(point)
         arm_shapes(geometry.constants, geometry.gravity, parameters, np.arange(n), self.motions, out)
         return out.transpose(0, 2, 1)
 
@@ -136,13 +144,14 @@ class Problem:
         right = scaled.T @ target
         weights = cho_solve((lower, True), right)
         value = 0.5 * (target @ target - right @ weights) + np.log(lower.diagonal()).sum()
-        value += self.counts.sum() * np.log(sigma).sum() + self.expected.value(geometry)
+        value += self.counts.sum() * np.log(sigma).sum()
+        value += 0.0 if self.expected is None else self.expected.value(geometry)
         value += 0.5 * np.sum((np.log(sigma / self.noise) / NOISE_WIDTH) ** 2)
         return Point(geometry, sigma, float(value), weights, features, lower)
 
     def residual(self, point: Point) -> Array:
         """What a point leaves of the torque: (N, n) N·m."""
-        return self.tau - point.features @ (point.weights + self.centre / self.scale)
+        return self.tau - point.features @ (self.weights(point) / self.scale)
 
     def with_noise(self, point: Point) -> Point:
         """The point with the noise that its residuals say: squares over the samples left to tell it."""
@@ -172,15 +181,15 @@ class Problem:
         largest = np.where(start.turns, LARGEST_TURN, LARGEST_SHIFT)
         for iteration in range(iterations):
             before = point.value
-            hessian, gradient, k = self._normal(point)
-            for _ in range(TRIALS):
+            hessian, gradient, k = self.normal(point)
+            for _ in range(TRIALS if self.expected is not None else 0):
                 damped = hessian.copy()
                 shape = np.arange(k, len(damped))
                 damped[shape, shape] *= 1 + damping
                 step = cho_solve(cho_factor(damped, lower=True, check_finite=False), gradient)[k:]
                 step /= max(1.0, float(np.abs(step / largest).max(initial=0.0)))
                 moved = point.geometry.moved(step)
-                if self.expected.around is None:
+                if self.expected is not None and self.expected.around is None:
                     moved = moved.canonical()
                 trial = self.at(moved, point.sigma)
                 if trial.value < point.value:
@@ -193,18 +202,24 @@ class Problem:
                 break
         return point
 
-    def _normal(self, point: Point) -> tuple[Array, Array, int]:
+    def all_features(self, point: Point) -> Array:
+        """Features of (w, θ) around a point at these samples, those of w in units of s: (N, n, k + g)."""
+        return np.concatenate([self.features(point.geometry), self.shapes(point)], axis=2)
+
+    def normal(self, point: Point) -> tuple[Array, Array, int]:
         """Normal equations of (w, θ): precision, right-hand side, and where θ begins."""
         k = len(self.scale)
-        both = np.concatenate([point.features, self.shapes(point.geometry, point.weights)], axis=2)
+        both = np.concatenate([point.features, self.shapes(point)], axis=2)
         scaled, _ = self._scaled(both, point.sigma)
         weight = np.sqrt(self.counts)[:, None] / point.sigma
         left = (self.residual(point) * weight).reshape(-1)
         hessian, gradient = scaled.T @ scaled, scaled.T @ left
-        precision = np.concatenate([np.ones(k), self.expected.widths**-2.0])
-        hessian.flat[:: len(hessian) + 1] += precision
         gradient[:k] -= point.weights
-        gradient[k:] += self.expected.step(point.geometry) * precision[k:]
+        precision = np.ones(len(hessian))
+        if self.expected is not None:
+            precision[k:] = self.expected.widths**-2.0
+            gradient[k:] += self.expected.step(point.geometry) * precision[k:]
+        hessian.flat[:: len(hessian) + 1] += precision
         return hessian, gradient, k
 
     def _scaled(self, features: Array, sigma: Array) -> tuple[Array, Array]:

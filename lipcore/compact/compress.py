@@ -11,10 +11,11 @@ from lipcore.compact.basis import Basis, split
 from lipcore.compact.pivots import Pivots, pivots
 from lipcore.compact.posterior import CompactPosterior
 from lipcore.compact.statistics import collect
-from lipcore.kernels.base import SumKernel
+from lipcore.kernels.base import Params, SumKernel, TorqueKernel
 from lipcore.linalg import cholesky
 from lipcore.motion import Motion
 from lipcore.posterior import ExactPosterior, Prediction
+from lipcore.selection import spread_out
 
 QUERIES = 200
 """Motions that compact and exact posterior are compared at."""
@@ -22,6 +23,8 @@ NEGLIGIBLE = 1e-3
 """Standard deviation, in units of the noise's, that smaller ones count as: what is known for certain has none."""
 STEP = 1.05
 """Ratio of two numbers of inducing outputs that are tried."""
+STORED = 32
+"""Instants that are kept of the motion where no inducing outputs keep any."""
 RESIDUAL = 1e-6
 """Variance, in units of the noise's, below which no more outputs are offered."""
 
@@ -92,6 +95,22 @@ def compress(exact: ExactPosterior, tau: Tensor, tolerance: float, most: int, se
     answer = posterior.predict(check)
     deviation = Deviation.between(expected, answer.mean, answer.std, noise.sqrt())
     return Compression(replace(posterior, std_factor=calibration), deviation, tolerance, deviation.within(tolerance))
+
+
+def linear(
+    kernel: TorqueKernel, params: Params, motion: Motion, tau: Tensor, weights: Tensor, tolerance: float
+) -> Compression:
+    """The posterior of a kernel whose terms are all linear, which is compact as it is: nothing is left out.
+
+    motion, tau: N samples; weights: (N,), independent samples that each stands for. Of the motion, STORED spread-out
+    instants are kept: to ask the model where it should know.
+    """
+    kept = motion[spread_out(motion, STORED)]
+    basis = Basis.build(kernel, params, kept, torch.empty(0, dtype=torch.int64))
+    noise = torch.exp(2 * params["noise.log_std"])
+    statistics = collect(basis, noise, motion, tau - kernel.mean(motion), weights)
+    posterior = CompactPosterior.build(kernel, basis, statistics, noise)
+    return Compression(posterior, Deviation(0.0, 0.0, 0.0, 0), tolerance, True)
 
 
 def checks(motion: Motion, seed: int) -> Motion:

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lipcore.arm.arm import arm_of_robot
 from lipcore.compact.posterior import CompactPosterior
 from lipcore.estimators import make_estimator
 from lipcore.excitation.limits import Limits
@@ -76,7 +77,9 @@ class Belief:
         tau += std * np.random.default_rng(seed).standard_normal(tau.shape)
         t, apart = np.arange(len(motion), dtype=np.float64), np.arange(len(motion), dtype=np.int64)
         samples = Samples(robot.joint_names, t, apart, motion.q.numpy(), motion.dq.numpy(), motion.ddq.numpy(), tau)
-        kernel = make_estimator(estimator, robot.joint_types, robot=bodies).kernel
+        kernel = make_estimator(
+            estimator, robot.joint_types, arm=None if bodies is None else arm_of_robot(bodies, mode="calibrate")
+        ).kernel
         return cls(kernel, fit(kernel, samples, PRIOR_FIT).params, torch.from_numpy(np.square(std)))
 
     @property

@@ -177,7 +177,7 @@ def _checked(files: Mapping[str, bytes], settings: Settings) -> dict[str, Any]:
         Lineage.model_validate(manifest["lineage"])
         model = persistence.decode(files, limits)
         probe(model)
-        manifest["parameters"] = report(model.posterior, model.estimator)
+        manifest["parameters"] = report(model.posterior, model.estimator, model.joint_names)
         manifest["hyperparameters"] = {name: value.tolist() for name, value in model.posterior.params.items()}
         read_manifest_bytes(persistence.manifest_bytes(manifest), limits)
     except ModelFormatError as error:

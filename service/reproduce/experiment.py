@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 import lipcore
-from lipcore.estimators import make_estimator
+from lipcore.estimators import check_estimator
 from lipcore.fit_options import FitOptions
 from lipcore.metrics import evaluate
 from lipcore.robots import Robot, load_robot
@@ -146,10 +146,10 @@ class Experiment:
         return samples, inverse_dynamics(robot, samples.q, samples.dq, samples.ddq)
 
     def check(self, estimators: list[str]) -> Robot:
-        """Load the robot and build each estimator; raise what a cell would raise, before any work."""
+        """Load the robot and check each estimator; raise what a cell would raise, before any work."""
         robot = load_robot(self.robot)
         for name in estimators:
-            make_estimator(name, robot.joint_types, robot=rigid_body(self.robot, name), prior=self.options.prior)
+            check_estimator(name, robot.joint_types, rigid_body(self.robot, name), self.options)
         return robot
 
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from lipcore.estimators import UnknownEstimatorError, make_estimator
+from lipcore.estimators import UnknownEstimatorError, check_estimator
+from lipcore.fit_options import FitOptions
 from lipcore.robots import ROBOTS, SimulationUnavailableError
 from service.database import Database, DatasetRow, JobRow, RobotRow, now
 from service.datasets import store
@@ -172,12 +173,12 @@ def _check_joints(request: JobRequest, rows: list[DatasetRow]) -> list[str]:
 
 
 def _check_estimator(database: Database, request: JobRequest, joint_names: list[str], joint_types: list[str]) -> None:
-    """Build the estimator as the training process will, so that what it refuses is refused here."""
+    """Check what the training process will, so that what it refuses is refused here."""
     try:
         robot = None
         if request.robot is not None:
             robot = robots.resolve(database, request.robot, joint_names, joint_types)
-        make_estimator(request.estimator, joint_types, request.options.tied, robot, request.options.prior)
+        check_estimator(request.estimator, joint_types, robot, FitOptions(**request.options.model_dump()))
     except UnknownEstimatorError as error:
         expected = str(error).partition("expected ")[2]
         raise invalid_request("estimator", request.estimator, expected) from None

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from lipcore.fit_options import FitOptions, Standing
+from lipcore.fit_options import MOST_SECONDS, FitOptions, GeometryOption, Standing
 from lipcore.vocabulary import DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS, JointType
 from service.models.schema import ModelName
 from service.training.holdout_schema import Holdout
@@ -33,6 +33,14 @@ class Options(BaseModel):
     tied: bool = Field(_DEFAULTS.tied, description="Of `lip`: links share kernel shapes; false is the paper's form")
     prior: Literal["urdf", "zero"] = Field(
         "urdf", description="Of rigid bodies: expect the URDF's inertial parameters, or none"
+    )
+    geometry: GeometryOption = Field(
+        _DEFAULTS.geometry,
+        description="Of rigid bodies, where the joint axes lie: `learn` from torque alone, `calibrate` around the "
+        "robot's URDF, `fixed` as it has it; `auto`: calibrate where there is a robot, else learn",
+    )
+    search_seconds: float = Field(
+        _DEFAULTS.search_seconds, gt=0, le=MOST_SECONDS, description="Time limit of the search for a geometry, s"
     )
     device: Literal["auto", "cpu", "cuda"] = "auto"
     compact_tolerance: float = Field(

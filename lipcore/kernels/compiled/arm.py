@@ -455,3 +455,31 @@ def arm_shapes(constants: Array, gravity: Array, parameters: Array, order: Indic
         kinematics(constants, gravity, motions[k], order, work)
         bodies(constants, parameters, work)
         shapes(constants, order, work, out[k])
+
+
+@compiled
+def arm_differences(
+    constants: Array,
+    gravity: Array,
+    parameters: Array,
+    linear: Array,
+    order: Indices,
+    motions: Array,
+    features: Array,
+    out: Array,
+) -> None:
+    """Torque of each of K arms less that of the first: constants (K + 1, n, CONSTANTS), parameters (K + 1, n, 10);
+    linear: (K + 1, n, l), coefficients of `features` (N, n, l) of each joint; motions (N, 3, n), out (N, K, n)."""
+    n = order.shape[0]
+    work, first, other = np.zeros((n + 1, WORK)), np.zeros(n), np.zeros(n)
+    for k in range(motions.shape[0]):
+        for arm in range(constants.shape[0]):
+            kinematics(constants[arm], gravity, motions[k], order, work)
+            bodies(constants[arm], parameters[arm], work)
+            torques(order, work, other if arm else first)
+            for j in range(n):
+                added = _dot(linear[arm, j], 0, features[k, j], 0, features.shape[2])
+                if arm:
+                    out[k, arm - 1, j] = other[j] + added - first[j]
+                else:
+                    first[j] += added

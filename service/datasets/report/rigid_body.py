@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
 
+from lipcore.arm.arm import arm_of_robot
+from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.friction import FRICTION_TERMS, SIGN_WIDTH
-from lipcore.kernels.rigid_body import RigidBodyKernel
 from lipcore.motion import Motion
 from lipcore.robots import SimulationUnavailableError
 from lipcore.samples import Array
@@ -78,7 +79,7 @@ def judge_rigid_bodies(
         return f"not all joints are those of robot {name}: its rigid bodies were not used"
     try:
         robot = RigidBody.from_urdf(urdf, names, limits.joint_types, limits.urdf_joints, name)
-        kernel = RigidBodyKernel(robot, "zero", gravity)
+        kernel = ArmKernel(arm_of_robot(robot, gravity, "zero"))
     except (SimulationUnavailableError, ValueError) as error:
         return f"the rigid bodies of robot {name} were not used: {error}"
     n, size = len(names), len(names) * PARAMETERS
@@ -106,7 +107,7 @@ def judge_rigid_bodies(
     return Found(whole, _friction_stds(information * independent / len(q), reference.back))
 
 
-def _reference(kernel: RigidBodyKernel, limits: Limits) -> _Reference:
+def _reference(kernel: ArmKernel, limits: Limits) -> _Reference:
     motion = _random_motion(limits, max(1, REFERENCE_EQUATIONS // kernel.n_joints))
     regressor = np.concatenate([block for _, block in _regressors(kernel, *motion)])
     size = np.linalg.norm(regressor, axis=0)
@@ -148,13 +149,14 @@ def _condition(gram: Array) -> float | None:
     return float(np.sqrt(values[-1] / values[0])) if values[0] > 1e-14 * values[-1] else None
 
 
-def _regressors(kernel: RigidBodyKernel, q: Array, dq: Array, ddq: Array) -> Iterator[tuple[int, Array]]:
+def _regressors(kernel: ArmKernel, q: Array, dq: Array, ddq: Array) -> Iterator[tuple[int, Array]]:
     """The joint-torque regressor in blocks of equations, (CHUNK, 10 n) each, with the first row of motion of each."""
     rows = max(1, CHUNK // q.shape[1])
     for first in range(0, len(q), rows):
         part = slice(first, first + rows)
         features = kernel.features(Motion.from_arrays(q[part], dq[part], ddq[part])).numpy()
-        yield first, features.reshape(-1, features.shape[2])
+        masses = features[:, :, : PARAMETERS * q.shape[1]]
+        yield first, masses.reshape(-1, masses.shape[2])
 
 
 def _random_motion(limits: Limits, rows: int) -> tuple[Array, Array, Array]:

@@ -1,0 +1,161 @@
+"""An arm as a model stands on it: its geometry, the masses there, and how sure both were beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lipcore.arm.geometry import Geometry
+from lipcore.kernels.compiled.arm import PARAMETERS
+from lipcore.samples import Array
+from lipcore.urdf import RigidBody
+from lipcore.vocabulary import GeometryMode, Prior
+
+KINDS = (0, 1, 1, 1, 2, 2, 2, 2, 2, 2)
+"""Which scale each of a body's ten parameters has: mass, first moment or inertia."""
+MASS_FLOOR = 0.02
+"""Smallest mass scale of a body, as a share of the whole arm's: a link without mass in the URDF may still have some."""
+URDF_SHARE: dict[Prior, float] = {"urdf": 0.1, "zero": 1.0}
+"""Relative deviation from a URDF's parameters that a fit starts from."""
+TURN_WIDTH, SHIFT_WIDTH = 0.02, 0.01
+"""How far a calibrated geometry may lie from its URDF, standard deviations in rad and m: what mounting and machining
+leave, and a tool that the URDF has a little elsewhere."""
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Another arm that explains the recording nearly as well, as the most likely parameters make it.
+
+    geometry: base to tip; parameters: (n, 10), base to tip; rotor: (n,) kg·m²; friction: (n, f), coefficients of the
+    friction kernel's features; both in the order of the data's joints. probability: of it, from the evidence.
+    """
+
+    geometry: Geometry
+    parameters: Array
+    rotor: Array
+    friction: Array
+    probability: float
+
+
+@dataclass(frozen=True)
+class Arm:
+    """Rigid bodies whose torque is taken as linear around this geometry and these parameters.
+
+    geometry: base to tip; order: (n,), the data's joint at each place of the chain; mode: where the geometry is from;
+    parameters: (n, 10), base to tip, at which ∂(Y π)/∂θ is taken; centre: (n, 10), prior mean of π, base to tip; unit:
+    (11 n,), prior standard deviations of π and of the rotor inertias, in the order of the data's joints; expected:
+    (g,), the step from the geometry to its prior mean; widths: (g,), its prior standard deviations, rad and m.
+    alternatives: the arm itself first, then the others; empty where there is no other.
+    """
+
+    geometry: Geometry
+    order: NDArray[np.int64]
+    mode: GeometryMode
+    parameters: Array
+    centre: Array
+    unit: Array
+    expected: Array
+    widths: Array
+    alternatives: tuple[Alternative, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        n, steps = self.geometry.n_joints, 0 if self.mode == "fixed" else self.geometry.size
+        for name, shape in (
+            ("parameters", (n, PARAMETERS)),
+            ("centre", (n, PARAMETERS)),
+            ("unit", ((PARAMETERS + 1) * n,)),
+            ("expected", (steps,)),
+            ("widths", (steps,)),
+        ):
+            value = getattr(self, name)
+            if value.shape != shape or not np.isfinite(value).all():
+                raise ValueError(f"{name} has shape {value.shape}, expected finite numbers of shape {shape}")
+        if sorted(self.order.tolist()) != list(range(n)):
+            raise ValueError(f"order is {self.order.tolist()}, expected each joint from 0 to {n - 1} once")
+        if not ((self.unit > 0).all() and (self.widths > 0).all()):
+            raise ValueError("unit and widths hold numbers that are not above zero, expected standard deviations")
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints n."""
+        return self.geometry.n_joints
+
+    @property
+    def steps(self) -> int:
+        """Numbers of the geometry that are learnt: none where it is fixed."""
+        return len(self.widths)
+
+    @property
+    def place(self) -> NDArray[np.int64]:
+        """Place in the chain of each joint of the data, (n,)."""
+        return np.argsort(self.order)
+
+
+def arm_of_robot(robot: RigidBody, gravity: bool = True, prior: Prior = "urdf", mode: GeometryMode = "fixed") -> Arm:
+    """The arm of a URDF before any samples: its masses expected within URDF_SHARE, its geometry as `mode` says.
+
+    Raise ValueError for a URDF without masses whose prior is "urdf".
+    """
+    mass = robot.parameters()[:, 0]
+    if mass.sum() <= 0 and prior == "urdf":
+        raise ValueError(f"robot {robot.name!r} has no mass in its URDF, expected inertial parameters or prior 'zero'")
+    geometry, order = Geometry.from_robot(robot, gravity), chain(robot, robot.n_joints)
+    unit = unit_of(robot, ROTOR_SHARE * max(float(mass.max()), 1e-3))
+    unit[: PARAMETERS * robot.n_joints] *= URDF_SHARE[prior]
+    steps = 0 if mode == "fixed" else geometry.size
+    bodies = robot.parameters()[order]
+    return Arm(
+        geometry,
+        order,
+        mode,
+        bodies,
+        bodies if prior == "urdf" else np.zeros_like(bodies),
+        unit,
+        np.zeros(steps),
+        widths_of(geometry)[:steps],
+    )
+
+
+def widths_of(geometry: Geometry) -> Array:
+    """How far a calibrated geometry may lie from its URDF, (g,)."""
+    return np.where(geometry.turns, TURN_WIDTH, SHIFT_WIDTH)
+
+
+def unit_of(robot: RigidBody, rotor: float) -> Array:
+    """Usual size of a URDF's parameters, (11 n,): m_i, m_i ℓ and m_i ℓ² for mass, first moment and inertia of a body,
+    in the order of the data; rotor: kg·m².
+    """
+    mass = robot.parameters()[:, 0]
+    total = float(mass.sum())
+    scale = np.maximum(mass, MASS_FLOOR * total) if total > 0 else np.ones(robot.n_joints)
+    powers = robot.length() ** np.array(KINDS)
+    return np.concatenate([(scale[:, None] * powers).reshape(-1), np.full(robot.n_joints, rotor)])
+
+
+def unit_anywhere(torque: float, joints: int) -> Array:
+    """Usual size of the parameters of an arm of which only its largest torque, N·m, is known: (11 n,).
+
+    The mass that makes this torque at a lever of 0.3 m, and what it has about such a lever.
+    """
+    mass = max(torque, 1e-3) / (9.81 * LEVER)
+    body = mass * np.array([1.0, LEVER, 2 * LEVER**2])[list(KINDS)]
+    return np.concatenate([np.tile(body, joints), np.full(joints, ROTOR_SHARE * mass)])
+
+
+LEVER = 0.3
+"""m."""
+ROTOR_SHARE = 0.03
+"""Rotor inertia expected, m² times the mass of an arm's heaviest body."""
+
+
+def chain(robot: RigidBody | None, joints: int) -> NDArray[np.int64]:
+    """The data's joint at each place of the chain, (n,): as the data have them, where no URDF says otherwise."""
+    return np.arange(joints) if robot is None else np.argsort(robot.order)
+
+
+def in_chain(values: Array, order: Sequence[int] | NDArray[np.int64]) -> Array:
+    """Columns in the order of the data, (N, n), from base to tip."""
+    return np.ascontiguousarray(values[:, order])

@@ -1,0 +1,380 @@
+"""Learning an arm from samples: its geometry found, calibrated or taken as it is, then masses, friction and noise."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+from torch import Tensor
+
+from lipcore import noise
+from lipcore.arm.arm import (
+    Alternative,
+    Arm,
+    arm_of_robot,
+    chain,
+    in_chain,
+    unit_anywhere,
+    widths_of,
+)
+from lipcore.arm.geometry import Geometry
+from lipcore.arm.problem import Expected, Point, Problem
+from lipcore.arm.scales import rescale
+from lipcore.arm.search import Found, search
+from lipcore.fit_options import FitOptions
+from lipcore.fitting import Cancelled, FitCancelledError, FitProgress, Progress
+from lipcore.kernels.compiled.arm import PARAMETERS, arm_torques
+from lipcore.kernels.friction import FRICTION_TERMS, friction_features
+from lipcore.samples import Array, Samples
+from lipcore.selection import spread_out
+from lipcore.signals import noise_level
+from lipcore.urdf import RigidBody
+from lipcore.vocabulary import GeometryMode, JointType
+
+SEARCH_ROWS, ROWS_PER_JOINT = 80, 10
+"""Rows that the search looks at: at least the first, and this many a joint."""
+POLISHED, POLISHING = 4, 40
+"""Optima of few rows that are followed on all rows, and steps of that."""
+ROUNDS, ROUND_STEPS = 3, 15
+"""Times that scales and geometry are fitted in turn, and steps of each."""
+NEAR = 7.0
+"""nats: an arm that much less likely than the best counts for a thousandth."""
+DIFFERS = 0.3
+"""An alternative arm matters where its torque differs by this share of the spread that is stated anyway."""
+CHECKS = 200
+CORRELATED = 20_000
+"""Contiguous rows at most that tell how correlated errors are."""
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """What was learnt. arm: its linearisation; params: hyperparameters of arm, friction and noise; rows: samples that
+    it was learnt from; weight: independent samples that each of them stands for; report: for the manifest."""
+
+    arm: Arm
+    params: dict[str, Tensor]
+    rows: NDArray[np.int64]
+    weight: float
+    report: dict[str, float | int | bool | str]
+
+
+def learn(
+    samples: Samples,
+    joint_types: tuple[JointType, ...],
+    options: FitOptions,
+    gravity: bool = True,
+    robot: RigidBody | None = None,
+    known: Sequence[Geometry] = (),
+    on_progress: Progress | None = None,
+    cancelled: Cancelled | None = None,
+    stretches: Samples | None = None,
+) -> Learnt:
+    """Learn the arm that moved so.
+
+    gravity: whether torques contain it; robot: a URDF's bodies, which geometry and masses are expected around, as
+    `options.geometry` and `options.prior` say; known: geometries to look at, too, where none is given; stretches:
+    contiguous samples that tell the white noise, where `samples` are thinned.
+
+    Raise FitCancelledError when `cancelled` answers true, ValueError for samples that no arm can be learnt from.
+    """
+    with threadpool_limits(1):  # matrices are small: more threads would take longer
+        return _learn(samples, joint_types, options, gravity, robot, known, on_progress, cancelled, stretches)
+
+
+def _learn(
+    samples: Samples,
+    joint_types: tuple[JointType, ...],
+    options: FitOptions,
+    gravity: bool,
+    robot: RigidBody | None,
+    known: Sequence[Geometry],
+    on_progress: Progress | None,
+    cancelled: Cancelled | None,
+    stretches: Samples | None,
+) -> Learnt:
+    watch = _Watch(on_progress, cancelled, time.monotonic(), options.max_iterations)
+    mode = mode_of(options, robot)
+    rows = spread_out(samples.motion(), options.posterior_samples).numpy()
+    problem, order = make_problem(samples.rows(rows), joint_types, options, gravity, robot, samples)
+    found: Found | None = None
+    if mode == "learn":
+        few = spread_out(samples.rows(rows).motion(), max(SEARCH_ROWS, ROWS_PER_JOINT * len(joint_types)))
+        types = tuple(joint_types[joint] for joint in order)
+        signals = samples if stretches is None else stretches
+        sensor = noise_level([signals.tau[part][:, order] for part in signals.episodes()])
+        found = search(
+            problem.rows(few.numpy()), types, gravity, sensor, options.search_seconds, 0, known, watch.searching
+        )
+        ends = [problem.descend(each.geometry, each.sigma, POLISHING, watch.stop) for each in found.points[:POLISHED]]
+        ends = sorted(ends, key=lambda each: each.value)
+    else:
+        if robot is None:
+            raise ValueError(f"geometry is {mode!r}, which needs a robot: a profile such as panda, or a URDF")
+        begin = Geometry.from_robot(robot, gravity)
+        ends = [problem.descend(begin, noise.start(samples)[order], POLISHING, watch.stop)]
+    watch.step("hyperparameters", ends[0].value, 0.85)
+    contiguous = (samples if stretches is None else stretches).rows(slice(0, CORRELATED))
+    every, _ = make_problem(contiguous, joint_types, options, gravity, robot)
+    residual = every.tau - every.features(ends[0].geometry) @ (problem.weights(ends[0]) / every.scale)
+    correlation = residual_correlation(residual, contiguous)
+    weight = min(1.0, len(samples) / correlation / len(rows))
+    problem = replace(problem, counts=np.full(len(rows), weight))
+    ends = [problem.at(each.geometry, each.sigma) for each in ends]
+    best, others, problem = _refined(problem, ends, watch)
+    watch.step("posterior", best.value, 0.95)
+    report: dict[str, float | int | bool | str] = {"geometry": mode}
+    if found is not None:
+        report |= _search_report(found, ends, others)
+    report |= {
+        "objective": best.value,
+        "iterations": watch.iteration,
+        "samples_given": len(samples),
+        "samples_hyperparameters": len(rows),
+        "samples_posterior": len(rows),
+        "row_correlation": correlation,
+        "seconds": time.monotonic() - watch.began,
+        "device": "cpu",
+    }
+    arm, params = _arm(problem, best, others, order, mode)
+    return Learnt(arm, params, rows, weight, report)
+
+
+def mode_of(options: FitOptions, robot: RigidBody | None) -> GeometryMode:
+    """How the geometry is to be come by; raise ValueError where that needs a robot and there is none."""
+    if options.geometry == "auto":
+        return "learn" if robot is None else "calibrate"
+    if robot is None and options.geometry != "learn":
+        raise ValueError(f"geometry is {options.geometry!r}, which needs a robot: a profile such as panda, or a URDF")
+    return options.geometry
+
+
+def make_problem(
+    samples: Samples,
+    joint_types: Sequence[JointType],
+    options: FitOptions,
+    gravity: bool,
+    robot: RigidBody | None = None,
+    every: Samples | None = None,
+) -> tuple[Problem, NDArray[np.int64]]:
+    """What samples ask of an arm, base to tip, and the data's joint at each place of the chain.
+
+    every: all samples, which tell how large torques and noise are; `samples` where None.
+    """
+    mode, n, every = mode_of(options, robot), samples.n_joints, samples if every is None else every
+    order = chain(robot, n)
+    tau = in_chain(samples.tau, order)
+    usual = np.sqrt(np.mean(every.tau**2, axis=0))[order]
+    floor, start = noise.floor(every)[order], noise.start(every)[order]
+    motions = np.stack([in_chain(part, order) for part in (samples.q, samples.dq, samples.ddq)], axis=1)
+    speed = np.maximum(np.sqrt(np.mean(every.dq**2, axis=0))[order], 1e-3)
+    # friction's weights of a joint, as large as its torque
+    friction = np.stack([usual / speed, usual, usual], axis=1).reshape(-1) + floor.repeat(len(FRICTION_TERMS))
+    anywhere = unit_anywhere(float(usual.max()), n)
+    body, centre = anywhere, np.zeros((n, PARAMETERS))
+    if robot is not None and mode != "learn":
+        arm = arm_of_robot(robot, gravity, options.prior)
+        masses, rotors = arm.unit[: PARAMETERS * n].reshape(n, -1), arm.unit[PARAMETERS * n :]
+        body, centre = np.concatenate([masses[order].reshape(-1), rotors[order]]), arm.centre
+    types = tuple(joint_types[joint] for joint in order)
+    return (
+        Problem(
+            np.ascontiguousarray(motions),
+            tau,
+            np.ones(len(samples)),
+            _friction(motions[:, 1]),
+            np.concatenate([centre.reshape(-1), np.zeros(n + len(friction))]),
+            np.concatenate([body, friction]),
+            start,
+            floor,
+            _expected(types, gravity, robot, mode),
+        ),
+        order,
+    )
+
+
+def residual_correlation(residual: Array, samples: Samples) -> float:
+    """Rows that one independent row stands for, from the residuals (N, n) of samples in order of time: at least 1.
+
+    1 + 2 Σ ρ_k over the lags at which the autocorrelation, averaged over the joints and within episodes, stays above
+    its chance level: what a filter has smeared over several rows counts once.
+    """
+    white = residual / np.maximum(np.sqrt(np.mean(residual**2, axis=0)), 1e-12)
+    episodes = [part for part in samples.episodes() if part.stop - part.start > 1]
+    longest = max((part.stop - part.start for part in episodes), default=0)
+    total = 1.0
+    for lag in range(1, longest // 4):
+        products = [white[part][lag:] * white[part][:-lag] for part in episodes if part.stop - part.start > lag]
+        pairs = sum(map(len, products))
+        level = float(np.concatenate(products).mean())
+        if level < 2.0 / np.sqrt(pairs * residual.shape[1]):
+            break
+        total += 2 * level
+    return total
+
+
+def _expected(
+    types: tuple[JointType, ...], gravity: bool, robot: RigidBody | None, mode: GeometryMode
+) -> Expected | None:
+    if mode == "fixed":
+        return None
+    if mode == "calibrate" and robot is not None:
+        around = Geometry.from_robot(robot, gravity)
+        return Expected(widths_of(around), around)
+    n = len(types)
+    any_arm = Geometry(
+        types,
+        np.tile(np.eye(3), (n, 1, 1)),
+        np.zeros((n, 3)),
+        np.tile([0.0, 0.0, 1.0], (n, 1)),
+        np.array([0.0, 0.0, -1.0 if gravity else 0.0]),
+    )
+    return Expected.anything(any_arm)
+
+
+def _refined(problem: Problem, ends: Sequence[Point], watch: _Watch) -> tuple[Point, list[Point], Problem]:
+    """Scales, noise and geometry of the best end, then what becomes of the other ends with the same scales."""
+    best = ends[0]
+    for number in range(ROUNDS):
+        scaled = rescale(problem, best)
+        problem = scaled.problem
+        best = problem.descend(best.geometry, scaled.sigma, ROUND_STEPS, watch.stop, noise=False)
+        watch.step("hyperparameters", best.value, 0.85 + 0.03 * number)
+    others = []
+    for end in ends[1:]:
+        if end.value < ends[0].value + 2 * NEAR:
+            other = problem.descend(end.geometry, best.sigma, ROUND_STEPS, watch.stop, noise=False)
+            if other.value < best.value:
+                best, other = other, best
+            others.append(other)
+    return best, [each for each in others if each.value < best.value + NEAR], problem
+
+
+def _arm(
+    problem: Problem, best: Point, others: Sequence[Point], order: NDArray[np.int64], mode: GeometryMode
+) -> tuple[Arm, dict[str, Tensor]]:
+    n, place = problem.n_joints, np.argsort(order)
+    first = (PARAMETERS + 1) * n
+    body = problem.scale[: PARAMETERS * n].reshape(n, PARAMETERS)[place].reshape(-1)
+    unit = np.concatenate([body, problem.scale[PARAMETERS * n : first][place]])
+    friction = problem.scale[first:].reshape(n, -1)[place]
+    params = {
+        "rigid_body.log_scale": torch.zeros(4, dtype=torch.float64),
+        "friction.log_std": torch.from_numpy(np.log(friction)),
+        "noise.log_std": torch.from_numpy(np.log(best.sigma[place])),
+    }
+    expected = problem.expected
+    arm = Arm(
+        best.geometry,
+        order,
+        mode,
+        problem.parameters(best),
+        problem.centre[: PARAMETERS * n].reshape(n, PARAMETERS),
+        unit,
+        np.zeros(0) if expected is None else expected.step(best.geometry),
+        np.zeros(0) if expected is None else expected.widths,
+    )
+    differing = [each for each in others if _differs(problem, best, each)]
+    if not differing:
+        return arm, params
+    chosen = [best, *differing[:3]]
+    odds = np.exp([best.value - each.value for each in chosen])
+    shares = odds / odds.sum()
+    alternatives = tuple(
+        _alternative(problem, each, place, float(share)) for each, share in zip(chosen, shares, strict=True)
+    )
+    return replace(arm, alternatives=alternatives), params
+
+
+def _alternative(problem: Problem, point: Point, place: NDArray[np.int64], share: float) -> Alternative:
+    n = problem.n_joints
+    weights = problem.weights(point)
+    first = (PARAMETERS + 1) * n
+    rotor, friction = weights[PARAMETERS * n : first][place], weights[first:].reshape(n, -1)[place]
+    return Alternative(point.geometry, problem.parameters(point), rotor, friction, share)
+
+
+def _differs(problem: Problem, best: Point, other: Point) -> bool:
+    """Whether two arms differ in torque beyond what is stated, where motions recombine those of the samples."""
+    rng = np.random.default_rng(0)
+    motions = problem.motions.copy()[:CHECKS]
+    for part in range(3):
+        motions[:, part] = problem.motions[rng.integers(len(problem.motions), size=len(motions)), part]
+    asked = replace(
+        problem,
+        motions=np.ascontiguousarray(motions),
+        tau=np.zeros((len(motions), problem.n_joints)),
+        counts=np.ones(len(motions)),
+        friction=_friction(motions[:, 1]),
+    )
+    means = []
+    for point in (best, other):
+        means.append(asked.features(point.geometry) @ (problem.weights(point) / problem.scale))
+    hessian, _, _ = problem.normal(best)
+    root = np.linalg.cholesky(hessian)
+    both = asked.all_features(best)
+    spread = np.square(np.linalg.solve(root, both.reshape(-1, both.shape[2]).T)).sum(0).reshape(means[0].shape)
+    stated = np.sqrt(np.mean(spread, axis=0) + best.sigma**2)
+    return bool(np.any(np.sqrt(np.mean((means[0] - means[1]) ** 2, axis=0)) > DIFFERS * stated))
+
+
+def _search_report(found: Found, ends: Sequence[Point], others: Sequence[Point]) -> dict[str, float | int | bool | str]:
+    report: dict[str, float | int | bool | str] = {
+        "search_starts": found.starts,
+        "search_hops": found.hops,
+        "search_optima": found.distinct,
+        "search_times_best": found.times_best,
+        "search_explained": found.explained,
+        "search_ended": found.ended,
+        "search_seconds": found.seconds,
+        "search_alternatives": len(others),
+    }
+    if len(ends) > 1:
+        report["search_next_nats"] = ends[1].value - ends[0].value
+    return report
+
+
+def _friction(dq: Array) -> Array:
+    """Friction's features of N velocities (N, n), joint by joint: (N, n, f n)."""
+    size, n = dq.shape
+    features = friction_features(torch.from_numpy(np.ascontiguousarray(dq))).numpy()  # (f, N, n)
+    out = np.zeros((size, n, n, len(features)))
+    joints = np.arange(n)
+    out[:, joints, joints] = features.transpose(1, 2, 0)
+    return out.reshape(size, n, -1)
+
+
+@dataclass
+class _Watch:
+    """Progress and cancellation."""
+
+    on_progress: Progress | None
+    cancelled: Cancelled | None
+    began: float
+    most: int
+    iteration: int = 0
+
+    def step(self, stage: str, objective: float, fraction: float) -> None:
+        self.iteration += 1
+        if self.stop():
+            raise FitCancelledError("the fit was cancelled")
+        if self.on_progress is not None:
+            elapsed = time.monotonic() - self.began
+            self.on_progress(FitProgress(stage, self.iteration, self.most, objective, fraction, elapsed))
+
+    def searching(self, objective: float, fraction: float) -> None:
+        self.step("geometry", objective, 0.8 * min(fraction, 1.0))
+
+    def stop(self) -> bool:
+        return self.cancelled is not None and self.cancelled()
+
+
+def torque_of(arm: Arm, motions: Array) -> Array:
+    """Torque of the bodies of an arm alone, (N, n) N·m in the order of the data: motions (N, 3, n)."""
+    out = np.zeros((len(motions), arm.n_joints))
+    arm_torques(arm.geometry.constants, arm.geometry.gravity, arm.parameters, arm.order, motions, out)
+    return out

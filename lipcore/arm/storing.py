@@ -1,0 +1,92 @@
+"""An arm as tensors, for a model's file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lipcore.arm.arm import Alternative, Arm
+from lipcore.arm.geometry import Geometry
+from lipcore.vocabulary import GEOMETRY_MODES, GeometryMode, JointType
+
+PREFIX = "arm/"
+_GEOMETRY = ("rotation", "translation", "axis", "gravity")
+_ARM = ("parameters", "centre", "unit", "expected", "widths")
+_OTHERS = ("rotation", "translation", "parameters", "linear", "probability")
+_NAMES = {f"{PREFIX}{name}" for name in (*_GEOMETRY, *_ARM, "order", *(f"other/{name}" for name in _OTHERS))}
+
+
+def is_of_arm(name: str) -> bool:
+    """Whether a tensor of this name belongs to an arm."""
+    return name in _NAMES
+
+
+def arm_tensors(arm: Arm) -> dict[str, Tensor]:
+    """All numbers of an arm, float64, by name."""
+    parts = {name: getattr(arm.geometry, name) for name in _GEOMETRY} | {name: getattr(arm, name) for name in _ARM}
+    parts["order"] = arm.order.astype(np.float64)
+    if each := arm.alternatives:
+        parts |= {
+            "other/rotation": np.stack([one.geometry.rotation for one in each]),
+            "other/translation": np.stack([one.geometry.translation for one in each]),
+            "other/parameters": np.stack([one.parameters for one in each]),
+            "other/linear": np.stack([np.concatenate([one.rotor[:, None], one.friction], axis=1) for one in each]),
+            "other/probability": np.array([one.probability for one in each]),
+        }
+    return {f"{PREFIX}{name}": torch.from_numpy(np.array(value, np.float64)) for name, value in parts.items()}
+
+
+def read_arm(tensors: Mapping[str, Tensor], joint_types: Sequence[JointType], mode: object) -> Arm:
+    """The arm that `arm_tensors` stored; joint_types: in the order of the data; mode: how its geometry was come by.
+
+    Raise ValueError for tensors that are missing or do not fit together.
+    """
+    if mode not in GEOMETRY_MODES:
+        raise ValueError(f"fit.geometry is {mode!r}, expected one of {', '.join(GEOMETRY_MODES)}")
+    kind: GeometryMode = mode
+    try:
+        parts = {name: tensors[f"{PREFIX}{name}"].numpy() for name in (*_GEOMETRY, *_ARM, "order")}
+    except KeyError as error:
+        raise ValueError(f"tensor {error} is missing: the model is of an earlier release, train it again") from None
+    order = parts.pop("order").astype(np.int64)
+    if order.shape != (len(joint_types),) or sorted(order.tolist()) != list(range(len(joint_types))):
+        raise ValueError(f"tensor 'arm/order' is {order.tolist()}, expected each joint once")
+    types = tuple(joint_types[joint] for joint in order)
+    geometry = Geometry(types, *(parts.pop(name) for name in _GEOMETRY))
+    return Arm(geometry, order, kind, alternatives=_alternatives(tensors, geometry), **parts)
+
+
+def _alternatives(tensors: Mapping[str, Tensor], geometry: Geometry) -> tuple[Alternative, ...]:
+    if f"{PREFIX}other/probability" not in tensors:
+        return ()
+    try:
+        rotation, translation, parameters, linear, probability = (
+            tensors[f"{PREFIX}other/{name}"].numpy() for name in _OTHERS
+        )
+    except KeyError as error:
+        raise ValueError(f"tensor {error} is missing") from None
+    n, count = geometry.n_joints, len(probability)
+    for name, value, shape in (
+        ("parameters", parameters, (count, n, 10)),
+        ("linear", linear, (count, n, linear.shape[-1] if linear.ndim else 0)),
+        ("rotation", rotation, (count, n, 3, 3)),
+        ("translation", translation, (count, n, 3)),
+        ("probability", probability, (count,)),
+    ):
+        if value.shape != shape:
+            raise ValueError(f"tensor 'arm/other/{name}' has shape {value.shape}, expected {shape}")
+    if not ((probability > 0) & (probability < 1)).all():
+        raise ValueError("tensor 'arm/other/probability' holds a number that is none between 0 and 1")
+    return tuple(
+        Alternative(
+            Geometry(geometry.joint_types, rotation[k], translation[k], geometry.axis, geometry.gravity),
+            parameters[k],
+            linear[k, :, 0],
+            np.ascontiguousarray(linear[k, :, 1:]),
+            float(probability[k]),
+        )
+        for k in range(count)
+    )

@@ -1,0 +1,164 @@
+"""The arm's kernel: torque linear in masses, rotor inertia and small changes of geometry."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lipcore.arm.arm import KINDS, Arm
+from lipcore.kernels.base import LinearKernel, Params
+from lipcore.kernels.compiled.arm import (
+    PARAMETERS,
+    TABLE,
+    WORK,
+    arm_differences,
+    arm_energies,
+    arm_features,
+    arm_rows,
+)
+from lipcore.kernels.friction import friction_features
+from lipcore.kernels.regressor import Regressor
+from lipcore.motion import Motion
+from lipcore.samples import Array
+
+REMEMBERED = 4
+"""Motions whose features are kept: the training samples and the query in work, asked for over and over."""
+SCALES = 4
+"""Kinds of weights with a scale of their own: masses, first moments, inertias, rotors."""
+
+
+class ArmKernel(LinearKernel):
+    """tau = Y(θ) π + r ∘ ddq + J (δθ) + Σ c_k δ_k around an arm, J = ∂(Y π)/∂θ.
+
+    Weights: π, ten parameters a body (10 n,), and rotor inertias r (n,), in the order of the data's joints; steps of
+    the geometry (g,), base to tip; and for each alternative arm how much of it is taken (K,). Standard deviations are
+    those of the arm, of π and r times `exp(rigid_body.log_scale)` (4,) by kind.
+
+    An alternative's feature is the torque that it has more than the arm itself, δ_k = τ_k − τ_0. With c one of them or
+    none, by their probabilities, mean and variance of Σ c_k δ_k are those of the mixture of arms; its weights are
+    taken for independent, which states a little more variance than the mixture has.
+    """
+
+    def __init__(self, arm: Arm) -> None:
+        self.arm, self.n_joints = arm, arm.n_joints
+        kinds = np.concatenate([np.tile(KINDS, arm.n_joints), np.full(arm.n_joints, SCALES - 1)])
+        self._kinds = torch.from_numpy(kinds)
+        self._unit = torch.from_numpy(arm.unit)
+        shares = np.array([each.probability for each in arm.alternatives[1:]])
+        self._rest = torch.from_numpy(np.concatenate([arm.widths, np.sqrt(shares * (1 - shares))]))
+        self._mean = torch.from_numpy(np.concatenate([_in_data(arm), np.zeros(self.n_joints), arm.expected, shares]))
+        self._recent: tuple[tuple[Motion, Tensor], ...] = ()
+
+    @property
+    def size(self) -> int:
+        """Number of weights p."""
+        return len(self._mean)
+
+    @property
+    def steps(self) -> slice:
+        """Places of the geometry's steps among the weights."""
+        first = (PARAMETERS + 1) * self.n_joints
+        return slice(first, first + self.arm.steps)
+
+    def features(self, x: Motion) -> Tensor:
+        """Φ at each sample: (N, n, p)."""
+        for seen, features in self._recent:
+            if seen.q is x.q and seen.dq is x.dq and seen.ddq is x.ddq:
+                return features
+        out = np.zeros((len(x), self.size, self.n_joints))
+        motions, first = _motions(x), self.steps.stop
+        arm = self.arm
+        arm_features(arm.geometry.constants, arm.geometry.gravity, arm.parameters, arm.order, motions, out[:, :first])
+        if arm.alternatives:
+            arm_differences(*_stacked(arm), arm.order, motions, _linear_features(motions), out[:, first:])
+        features = torch.from_numpy(np.ascontiguousarray(out.transpose(0, 2, 1))).to(x.device)
+        self._recent = ((x, features), *self._recent[: REMEMBERED - 1])
+        return features
+
+    def regressor(self) -> Regressor:
+        """The same features of one query, for serving."""
+        return ArmRegressor(self.arm, self.size)
+
+    def covariance(self, params: Params) -> Tensor:
+        """Prior variances of the weights on the diagonal: (p, p)."""
+        log_scale = params["rigid_body.log_scale"]
+        device = log_scale.device
+        std = self._unit.to(device) * torch.exp(log_scale[self._kinds.to(device)])
+        return torch.diag(torch.cat([std, self._rest.to(device)]).square())
+
+    def prior_weights(self) -> Tensor | None:
+        """Prior mean of the weights, (p,)."""
+        return self._mean
+
+    def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
+        """The arm's own scales: (4,)."""
+        return {"rigid_body.log_scale": torch.zeros(SCALES, dtype=torch.float64).to(tau.device)}
+
+    def energy_features(self, x: Motion) -> Tensor:
+        """Kinetic and potential energy per unit of each weight: (N, 2, p) J; of alternative arms none is counted."""
+        out = np.zeros((len(x), 2, self.size))
+        arm = self.arm
+        arm_energies(
+            arm.geometry.constants,
+            arm.geometry.gravity,
+            arm.parameters,
+            arm.order,
+            _motions(x),
+            out[:, :, : self.steps.stop],
+        )
+        return torch.from_numpy(out).to(x.device)
+
+
+class ArmRegressor(Regressor):
+    """Features of `ArmKernel`, compiled."""
+
+    def __init__(self, arm: Arm, size: int) -> None:
+        self.n_joints, self.size = arm.n_joints, size
+        self._arm = (arm.geometry.constants, arm.geometry.gravity, arm.parameters, arm.order.astype(np.int64))
+        self._first = (PARAMETERS + 1) * arm.n_joints + arm.steps
+        self._others = _stacked(arm) if arm.alternatives else None
+        self._memory = _Workspace(arm.n_joints)
+
+    def fill(self, motion: Array, out: Array) -> None:
+        """Write Φᵀ of the query, (p, n)."""
+        memory = self._memory
+        arm_rows(*self._arm, motion, memory.work, memory.table, out[: self._first])
+        if self._others is not None:
+            motions = motion[None]
+            arm_differences(*self._others, self._arm[3], motions, _linear_features(motions), out[None, self._first :])
+
+
+class _Workspace(threading.local):
+    """One thread's memory."""
+
+    def __init__(self, joints: int) -> None:
+        self.work, self.table = np.zeros((joints + 1, WORK)), np.zeros(TABLE)
+
+
+def _motions(x: Motion) -> Array:
+    return np.ascontiguousarray(np.stack([part.cpu().numpy() for part in (x.q, x.dq, x.ddq)], axis=1))
+
+
+def _in_data(arm: Arm) -> Array:
+    """Prior mean of π, flat, in the order of the data."""
+    return np.asarray(arm.centre[arm.place].reshape(-1))
+
+
+def _stacked(arm: Arm) -> tuple[Array, Array, Array, Array]:
+    """Constants (K + 1, n, …), gravity, parameters (K + 1, n, 10) and linear coefficients (K + 1, n, 1 + f)."""
+    each = arm.alternatives
+    return (
+        np.stack([one.geometry.constants for one in each]),
+        arm.geometry.gravity,
+        np.stack([one.parameters for one in each]),
+        np.stack([np.concatenate([one.rotor[:, None], one.friction], axis=1) for one in each]),
+    )
+
+
+def _linear_features(motions: Array) -> Array:
+    """ddq and friction's features of each joint, (N, n, 1 + f), for motions (N, 3, n)."""
+    friction = friction_features(torch.from_numpy(motions[:, 1])).numpy()
+    return np.ascontiguousarray(np.concatenate([motions[:, 2, :, None], friction.transpose(1, 2, 0)], axis=2))
