@@ -126,7 +126,7 @@ def _learn(
     correlation = residual_correlation(residual, contiguous)
     weight = min(1.0, len(samples) / correlation / len(rows))
     problem = replace(problem, counts=np.full(len(rows), weight))
-    ends = [problem.at(each.geometry, each.sigma) for each in ends]
+    ends = sorted((problem.at(each.geometry, each.sigma) for each in ends), key=lambda each: each.value)
     best, others, problem = _refined(problem, ends, watch)
     watch.step("posterior", best.value, 0.95)
     report: dict[str, float | int | bool | str] = {"geometry": mode, "search_objective": ends[0].value}
