@@ -139,6 +139,7 @@ def _learn(
         "samples_hyperparameters": len(rows),
         "samples_posterior": len(rows),
         "row_correlation": correlation,
+        "motion_dimensions": motion_dimensions(samples.dq),
         "seconds": time.monotonic() - watch.began,
         "device": "cpu",
     }
@@ -217,6 +218,20 @@ def residual_correlation(residual: Array, samples: Samples) -> float:
             break
         total += 2 * level
     return total
+
+
+def motion_dimensions(dq: Array) -> float:
+    """How many joints' worth of independent motion velocities (N, n) hold: 1 where all move together, n where each
+    moves by itself.
+
+    The participation ratio (Σ λ)² / Σ λ² of their correlation matrix's eigenvalues.
+    """
+    spread = dq.std(axis=0)
+    moving = spread > 1e-9
+    if not moving.any():
+        return 0.0
+    values = np.linalg.eigvalsh(np.atleast_2d(np.corrcoef(dq[:, moving].T)))
+    return float(values.sum() ** 2 / np.square(values).sum())
 
 
 def _expected(
