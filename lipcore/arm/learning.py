@@ -23,7 +23,7 @@ from lipcore.arm.arm import (
     widths_of,
 )
 from lipcore.arm.geometry import Geometry
-from lipcore.arm.problem import Expected, Point, Problem
+from lipcore.arm.problem import Expected, Point, Problem, root_of
 from lipcore.arm.scales import rescale
 from lipcore.arm.search import Found, search
 from lipcore.fit_options import FitOptions
@@ -133,6 +133,7 @@ def _learn(
     report |= {
         "objective": best.value,
         "iterations": watch.iteration,
+        "converged": found is None or found.ended == "idle",
         "samples_given": len(samples),
         "samples_hyperparameters": len(rows),
         "samples_posterior": len(rows),
@@ -315,7 +316,7 @@ def _differs(problem: Problem, best: Point, other: Point) -> bool:
     for point in (best, other):
         means.append(asked.features(point.geometry) @ (problem.weights(point) / problem.scale))
     hessian, _, _ = problem.normal(best)
-    root = np.linalg.cholesky(hessian)
+    root = root_of(hessian)
     both = asked.all_features(best)
     spread = np.square(np.linalg.solve(root, both.reshape(-1, both.shape[2]).T)).sum(0).reshape(means[0].shape)
     stated = np.sqrt(np.mean(spread, axis=0) + best.sigma**2)
