@@ -25,6 +25,7 @@ ORDER = (
     "control-loop.md",
     "safety.md",
     "numbers.md",
+    "method.md",
     "operations.md",
     "monitoring.md",
     "reverse-proxy.md",

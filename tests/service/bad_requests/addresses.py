@@ -103,7 +103,7 @@ PATHS = [
     get(f"{JOBS}/job_0/events", "job", 404, "not_found"),
     *(
         get(f"{MODELS}/nobody/{part}", "model", 404, "not_found")
-        for part in ("aliases", "export", "alarms", "quality", "live")
+        for part in ("aliases", "export", "urdf", "alarms", "quality", "live")
     ),
     Bad("DELETE", f"{MODELS}/nobody", 404, "not_found", "model"),
     Bad("DELETE", f"{MODELS}/panda-sim/versions/99", 404, "not_found", "version"),

@@ -6,6 +6,7 @@ import pytest
 
 from service import cli
 from tests.service.data import QUICK, stream, train, upload
+from tests.service.models.arms import publish_arm_at
 
 QUICKLY = [part for name, value in QUICK.items() for part in ("--option", f"{name}={value}")]
 """Options of `lipserve train` for a fit that takes a fraction of a second."""
@@ -44,3 +45,10 @@ def arm(server):
     for seed in (1, 2):
         train(server.client, "cli-arm", dataset, estimator="se", options={**QUICK, "starts": seed})
     return "cli-arm", dataset
+
+
+@pytest.fixture(scope="session")
+def robot_arm(server):
+    """A version in the shared service whose arm is known; the name of its model."""
+    publish_arm_at(server.home, "cli-robot-arm")
+    return "cli-robot-arm"
