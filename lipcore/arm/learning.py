@@ -286,7 +286,7 @@ def _arm(
         return arm, params
     chosen = [best, *differing[:3]]
     values = np.array([problem.laplace(each) for each in chosen])
-    odds = np.exp(values.min() - values)
+    odds = np.exp(np.maximum(values.min() - values, -2 * NEAR))  # (none of zero: their covariance is to be factored)
     shares = odds / odds.sum()
     alternatives = tuple(
         _alternative(problem, each, place, float(share)) for each, share in zip(chosen, shares, strict=True)

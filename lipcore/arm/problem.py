@@ -164,7 +164,7 @@ class Problem:
         """−log p(τ | σ), nats, of all geometries near a point: its value and half the log determinant of what is left
         of the precision of θ once w is integrated out, without the prior's own constant."""
         hessian, _, k = self.normal(point)
-        roots = np.linalg.cholesky(hessian).diagonal()  # those of w come first
+        roots = root_of(hessian).diagonal()  # those of w come first
         return point.value + float(np.log(roots[k:]).sum())
 
     def residual(self, point: Point) -> Array:

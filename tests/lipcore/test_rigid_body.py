@@ -196,7 +196,7 @@ def test_plausible_mean_is_its_own_nearest(model: TorqueModel, panda: RigidBody)
     weights = weight_posterior(model.posterior, model.estimator.terms["rigid_body"])
     bodies = weights.covariance[:BODIES, :BODIES], weights.scale[:BODIES]
     true = WeightPosterior(panda.parameters().reshape(-1), *bodies)
-    found = nearest_plausible(true, model.robot.parameters()).reshape(-1)
+    found = nearest_plausible(true, panda.n_joints, model.robot.parameters())
     distance = np.abs(found - true.mean) / true.std
     assert distance.max() < 0.5, distance.max()
 
