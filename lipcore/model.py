@@ -188,8 +188,8 @@ def fitted(
     check_estimator(estimator, types, robot, options)
     learnt: Learnt | None = None
     if estimator in ROBOT_ESTIMATORS:
-        known = () if robot is not None else known_geometries(types, gravity)
-        learnt = learn(samples, types, options, gravity, robot, known, on_progress, cancelled, stretches)
+        arms = () if robot is not None else known_geometries(types, gravity)
+        learnt = learn(samples, types, options, gravity, robot, arms, on_progress, cancelled, stretches)
     chosen = make_estimator(estimator, types, options.tied, None if learnt is None else learnt.arm)
     calibration = calibrate(estimator)
     if learnt is not None and estimator == "rigid-body":
@@ -200,7 +200,9 @@ def fitted(
             chosen.kernel, learnt.params, used.motion(), used.torque(), weights, options.compact_tolerance
         )
     else:
-        start = None if learnt is None else learnt.params
+        # not the noise: what rigid bodies leave of the torque is what the other term is there for
+        known = {} if learnt is None else learnt.params
+        start = {name: value for name, value in known.items() if name != "noise.log_std"}
         fewer = options if learnt is None else _independent(options, learnt)
         found = fit(chosen.kernel, samples, fewer, on_progress, cancelled, stretches, start)
         used = samples.rows(found.rows)

@@ -23,7 +23,7 @@ from lipcore.arm.arm import (
     widths_of,
 )
 from lipcore.arm.geometry import Geometry
-from lipcore.arm.problem import Expected, Point, Problem
+from lipcore.arm.problem import Expected, Point, Problem, root_of
 from lipcore.arm.scales import rescale
 from lipcore.arm.search import Found, Pool, search
 from lipcore.fit_options import FitOptions
@@ -135,6 +135,7 @@ def _learn(
     report |= {
         "objective": best.value,
         "iterations": watch.iteration,
+        "converged": found is None or found.ended == "idle",
         "samples_given": len(samples),
         "samples_hyperparameters": len(rows),
         "samples_posterior": len(rows),
@@ -300,7 +301,7 @@ def _arm(
         return arm, params
     chosen = [best, *differing[:3]]
     values = np.array([problem.laplace(each) for each in chosen])
-    odds = np.exp(values.min() - values)
+    odds = np.exp(np.maximum(values.min() - values, -2 * NEAR))  # (none of zero: their covariance is to be factored)
     shares = odds / odds.sum()
     alternatives = tuple(
         _alternative(problem, each, place, float(share)) for each, share in zip(chosen, shares, strict=True)
@@ -321,7 +322,7 @@ def _differs(problem: Problem, best: Point, other: Point) -> bool:
     asked = problem.recombined(CHECKS)
     means = [asked.mean(point) for point in (best, other)]
     hessian, _, _ = problem.normal(best)
-    root = np.linalg.cholesky(hessian)
+    root = root_of(hessian)
     both = asked.all_features(best)
     spread = np.square(np.linalg.solve(root, both.reshape(-1, both.shape[2]).T)).sum(0).reshape(means[0].shape)
     stated = np.sqrt(np.mean(spread, axis=0) + best.sigma**2)
