@@ -264,6 +264,7 @@ def restore(
     robot: RigidBody | None = None,
     calibration: Calibration = NO_CALIBRATION,
     arm: Arm | None = None,
+    selection: Selection | None = None,
 ) -> TorqueModel:
     """Rebuild a model from its parts: hyperparameters, inducing outputs (see `Basis`) and statistics.
 
@@ -298,4 +299,5 @@ def restore(
         compact,
         robot,
         calibration,
+        selection,
     )

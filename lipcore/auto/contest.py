@@ -22,7 +22,7 @@ from lipcore.vocabulary import ROBOT_ESTIMATORS, JointType, TorqueConvention
 RIGID, CHAIN, BOTH = "rigid-body", "lip-chain", "rigid-body+lip-chain"
 SIMPLEST_FIRST = (RIGID, CHAIN, BOTH)
 AGAIN, ALL, FEW = "again", "all", "few"
-PLACES = {RIGID: (0.0, 0.15), BOTH: (0.15, 0.4), CHAIN: (0.4, 0.85), AGAIN: (0.85, 0.95), ALL: (0.95, 1.0), FEW: (0, 1)}
+PLACES = {RIGID: (0, 0.25), BOTH: (0.25, 0.55), CHAIN: (0.55, 0.92), AGAIN: (0.92, 0.97), ALL: (0.97, 1), FEW: (0, 1)}
 """Which share of all the work each fit is, from and to."""
 JUDGED = 2000
 """Held-out samples at most that are predicted."""
