@@ -135,5 +135,6 @@ def test_the_arm_moves_as_its_stream_does(visitor: Visitor, arm: str, streamed: 
     for _ in range(3):
         before = figure.evaluate(LINKS)
         visitor.until(lambda: figure.evaluate(LINKS) != before)  # noqa: B023
+    visitor.shot("arm-live", height=1600)
     assert canvas.evaluate("(each) => each.isConnected"), "the plot was made anew"
     assert audit(page) == []

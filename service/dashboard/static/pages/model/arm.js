@@ -1,7 +1,6 @@
 // The tab of the arm that a version has learnt: drawn at a posture that can be changed, and in numbers.
 
 import { h, replace } from "../../dom.js";
-import { number } from "../../format.js";
 import { button, card, empty } from "../../ui.js";
 import { CANNOT, drawable, drawing, LEGEND } from "../arm/drawing.js";
 import { middle } from "../arm/kinematics.js";
@@ -41,14 +40,14 @@ export async function arm(view, { name, version }, { signal }) {
 /** A slider a joint, within the training range. move(q) is called with all positions. */
 function sliders({ joint_names: names, joint_types: types, training_range: { q: range } }, start, move) {
   const q = [...start];
-  const said = (joint) => (types[joint] === "prismatic" ? `${number(q[joint])} m` : `${number(q[joint] * DEGREES)}°`);
+  const text = (joint) => (types[joint] === "prismatic" ? `${q[joint].toFixed(3)} m` : `${(q[joint] * DEGREES).toFixed(1)}°`);
   const made = names.map((name, joint) => {
     const [low, high] = [range.min[joint], range.max[joint]];
-    const shown = h("output", { class: "muted" }, said(joint));
+    const shown = h("output", { class: "muted" }, text(joint));
     const input = h("input", { type: "range", min: low, max: high, step: (high - low) / STEPS || "any", value: q[joint], "aria-label": `Position of ${name}` });
     const tell = () => {
-      input.setAttribute("aria-valuetext", said(joint));
-      shown.textContent = said(joint);
+      input.setAttribute("aria-valuetext", text(joint));
+      shown.textContent = text(joint);
     };
     input.addEventListener("input", () => {
       q[joint] = Number(input.value);
