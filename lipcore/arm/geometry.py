@@ -194,7 +194,7 @@ def rotation_of(turn: Array) -> Array:
     if angle == 0.0:
         return np.eye(3)
     unit = skew(turn / angle)
-    return np.eye(3) + np.sin(angle) * unit + (1 - np.cos(angle)) * unit @ unit
+    return np.asarray(np.eye(3) + np.sin(angle) * unit + (1 - np.cos(angle)) * unit @ unit)
 
 
 def turn_of(rotation: Array) -> Array:
@@ -215,9 +215,9 @@ def aligned(axis: Array) -> Array:
 def _axis(joint: object) -> Array:
     """Unit vector of the axis of a joint of Pinocchio's, in its own frame."""
     name = joint.shortname()  # type: ignore[attr-defined]
-    for letter, vector in zip("XYZ", np.eye(3), strict=True):
+    for place, letter in enumerate("XYZ"):
         if name.endswith(letter):
-            return np.asarray(vector)
+            return np.asarray(np.eye(3)[place])
     data = joint.createData()  # type: ignore[attr-defined]
     q = np.zeros(joint.nq) if joint.nq == 1 else np.array([1.0, 0.0])  # type: ignore[attr-defined]
     joint.calc(data, q)  # type: ignore[attr-defined]

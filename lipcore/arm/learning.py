@@ -25,7 +25,7 @@ from lipcore.arm.arm import (
 from lipcore.arm.geometry import Geometry
 from lipcore.arm.problem import Expected, Point, Problem
 from lipcore.arm.scales import rescale
-from lipcore.arm.search import Found, search
+from lipcore.arm.search import Found, Pool, search
 from lipcore.fit_options import FitOptions
 from lipcore.fitting import Cancelled, FitCancelledError, FitProgress, Progress
 from lipcore.kernels.compiled.arm import PARAMETERS, arm_torques
@@ -110,8 +110,10 @@ def _learn(
         found = search(
             problem.rows(few.numpy()), types, gravity, sensor, options.search_seconds, 0, known, watch.searching
         )
-        ends = [problem.descend(each.geometry, each.sigma, POLISHING, watch.stop) for each in found.points[:POLISHED]]
-        ends = sorted(ends, key=lambda each: each.value)
+        polished = Pool(problem.recombined(CHECKS))
+        for each in found.points[:POLISHED]:
+            polished.add(problem.descend(each.geometry, each.sigma, POLISHING, watch.stop))
+        ends = polished.points
     else:
         if robot is None:
             raise ValueError(f"geometry is {mode!r}, which needs a robot: a profile such as panda, or a URDF")
@@ -127,7 +129,7 @@ def _learn(
     ends = [problem.at(each.geometry, each.sigma) for each in ends]
     best, others, problem = _refined(problem, ends, watch)
     watch.step("posterior", best.value, 0.95)
-    report: dict[str, float | int | bool | str] = {"geometry": mode}
+    report: dict[str, float | int | bool | str] = {"geometry": mode, "search_objective": ends[0].value}
     if found is not None:
         report |= _search_report(found, ends, others)
     report |= {
@@ -282,7 +284,8 @@ def _arm(
     if not differing:
         return arm, params
     chosen = [best, *differing[:3]]
-    odds = np.exp([best.value - each.value for each in chosen])
+    values = np.array([problem.laplace(each) for each in chosen])
+    odds = np.exp(values.min() - values)
     shares = odds / odds.sum()
     alternatives = tuple(
         _alternative(problem, each, place, float(share)) for each, share in zip(chosen, shares, strict=True)
@@ -300,20 +303,8 @@ def _alternative(problem: Problem, point: Point, place: NDArray[np.int64], share
 
 def _differs(problem: Problem, best: Point, other: Point) -> bool:
     """Whether two arms differ in torque beyond what is stated, where motions recombine those of the samples."""
-    rng = np.random.default_rng(0)
-    motions = problem.motions.copy()[:CHECKS]
-    for part in range(3):
-        motions[:, part] = problem.motions[rng.integers(len(problem.motions), size=len(motions)), part]
-    asked = replace(
-        problem,
-        motions=np.ascontiguousarray(motions),
-        tau=np.zeros((len(motions), problem.n_joints)),
-        counts=np.ones(len(motions)),
-        friction=_friction(motions[:, 1]),
-    )
-    means = []
-    for point in (best, other):
-        means.append(asked.features(point.geometry) @ (problem.weights(point) / problem.scale))
+    asked = problem.recombined(CHECKS)
+    means = [asked.mean(point) for point in (best, other)]
     hessian, _, _ = problem.normal(best)
     root = np.linalg.cholesky(hessian)
     both = asked.all_features(best)

@@ -99,6 +99,19 @@ class Problem:
         kept = {name: getattr(self, name)[rows] for name in ("motions", "tau", "counts", "friction")}
         return replace(self, **kept)
 
+    def recombined(self, count: int, seed: int = 0) -> Problem:
+        """At most `count` motions whose position, velocity and acceleration are those of three samples, without torque:
+        they lie where the robot has been, but were never seen."""
+        rng, size = np.random.default_rng(seed), min(count, len(self.tau))
+        rows = rng.integers(len(self.tau), size=(3, size))
+        motions = np.stack([self.motions[rows[part], part] for part in range(3)], axis=1)
+        nothing = np.zeros((size, self.n_joints))
+        return replace(self, motions=motions, tau=nothing, counts=np.ones(size), friction=self.friction[rows[1]])
+
+    def mean(self, point: Point) -> Array:
+        """The most likely torque of a point at these samples, (N, n) N·m."""
+        return np.asarray(self.features(point.geometry) @ (self.weights(point) / self.scale))
+
     def weights(self, point: Point) -> Array:
         """The most likely w of a point, in SI units: (k,)."""
         return self.centre + point.weights * self.scale
@@ -148,6 +161,13 @@ class Problem:
         value += 0.0 if self.expected is None else self.expected.value(geometry)
         value += 0.5 * np.sum((np.log(sigma / self.noise) / NOISE_WIDTH) ** 2)
         return Point(geometry, sigma, float(value), weights, features, lower)
+
+    def laplace(self, point: Point) -> float:
+        """−log p(τ | σ), nats, of all geometries near a point: its value and half the log determinant of what is left
+        of the precision of θ once w is integrated out, without the prior's own constant."""
+        hessian, _, k = self.normal(point)
+        roots = np.linalg.cholesky(hessian).diagonal()  # those of w come first
+        return point.value + float(np.log(roots[k:]).sum())
 
     def residual(self, point: Point) -> Array:
         """What a point leaves of the torque: (N, n) N·m."""

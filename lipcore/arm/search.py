@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,8 +24,8 @@ EXPLAINED = 1.3
 """Residuals up to this many times the sensor's noise are explained."""
 GAIN = 1.0
 """nats, by which a hop has to be better to have brought something."""
-SAME = 0.5
-"""nats, within which two optima count as one: an arm and its mirror image have the same evidence."""
+SAME, ALIKE, CHECKED = 0.5, 3.0, 40
+"""Two optima count as one within this many nats, and this many noise levels of torque at this many motions."""
 KEPT = 6
 ITERATIONS = 25
 WIDER, WIDEST = 3.0, 0.02
@@ -72,11 +73,14 @@ def search(
     from, too; step: told the best value and the fraction of the work after each descent, may raise to end it all.
     Raise LinAlgError where no start has an evidence.
     """
-    rng, began = np.random.default_rng(seed), time.monotonic()
-    pool = _Pool()
+    rng = np.random.default_rng(seed)
+    pool = Pool(problem.recombined(CHECKED))
     spread = problem.tau.std(0)
     wide = 0.3 * spread + problem.floor
     drawn = [draw(rng, joint_types, gravity) for _ in range(SCREENED)]
+    with suppress(LinAlgError):
+        problem.descend(drawn[0], wide, 1)  # compiles what is not compiled yet: that is none of the search's time
+    began = time.monotonic()
     ranked = sorted(drawn, key=lambda each: _value(problem, each, wide))
     begin = [*known, *ranked[:STARTS]]
 
@@ -111,7 +115,7 @@ def search(
         tuple(pool.points),
         starts,
         hops,
-        len(pool.values),
+        pool.distinct,
         sum(1 for value in pool.ends if value < best.value + SAME),
         _explained(best, sensor_noise, problem.floor),
         "time" if late() else "idle",
@@ -119,28 +123,47 @@ def search(
     )
 
 
-class _Pool:
-    """Distinct optima, best first."""
+class Pool:
+    """Distinct optima, best first: they differ in evidence or, at `checks`, in torque. Mirror images are one."""
 
-    def __init__(self) -> None:
+    def __init__(self, checks: Problem) -> None:
+        self.checks = checks
         self.points: list[Point] = []
-        self.values: list[float] = []
+        self.torques: list[Array] = []
+        self.distinct = 0
         self.ends: list[float] = []
         self.failed = 0
 
     @property
     def best(self) -> float:
+        """The lowest value, nats."""
         return self.points[0].value if self.points else np.inf
 
     @property
     def descents(self) -> int:
+        """How many were made."""
         return len(self.ends) + self.failed
 
     def add(self, point: Point) -> None:
+        """Take in the end of a descent."""
         self.ends.append(point.value)
-        if all(abs(point.value - value) > SAME for value in self.values):
-            self.values.append(point.value)
-            self.points = sorted([*self.points, point], key=lambda each: each.value)[:KEPT]
+        torque = self.checks.mean(point)
+        for place, (other, its) in enumerate(zip(self.points, self.torques, strict=True)):
+            error = np.sqrt(np.mean((torque - its) ** 2, axis=0))
+            if abs(point.value - other.value) <= SAME and (error <= ALIKE * point.sigma).all():
+                if point.value < other.value:
+                    self._keep(place, point, torque)
+                return
+        self.distinct += 1
+        self._keep(None, point, torque)
+
+    def _keep(self, place: int | None, point: Point, torque: Array) -> None:
+        """Take a point in, in the place of another one or beside all."""
+        pairs = [*zip(self.points, self.torques, strict=True)]
+        if place is not None:
+            del pairs[place]
+        pairs = sorted([*pairs, (point, torque)], key=lambda each: each[0].value)[:KEPT]
+        self.points, self.torques = [each for each, _ in pairs], [each for _, each in pairs]
 
 
 def _explained(point: Point, sensor_noise: Array, floor: Array) -> bool:

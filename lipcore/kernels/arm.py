@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -17,8 +15,9 @@ from lipcore.kernels.compiled.arm import (
     arm_differences,
     arm_energies,
     arm_features,
-    arm_rows,
+    arm_query,
 )
+from lipcore.kernels.compiled.views import Memory
 from lipcore.kernels.friction import friction_features
 from lipcore.kernels.regressor import Regressor
 from lipcore.motion import Motion
@@ -37,9 +36,9 @@ class ArmKernel(LinearKernel):
     the geometry (g,), base to tip; and for each alternative arm how much of it is taken (K,). Standard deviations are
     those of the arm, of π and r times `exp(rigid_body.log_scale)` (4,) by kind.
 
-    An alternative's feature is the torque that it has more than the arm itself, δ_k = τ_k − τ_0. With c one of them or
-    none, by their probabilities, mean and variance of Σ c_k δ_k are those of the mixture of arms; its weights are
-    taken for independent, which states a little more variance than the mixture has.
+    An alternative arm has the torque δ_k = τ_k − τ_0 more than the arm itself. With c one of them or none, by their
+    probabilities p, c has mean p and covariance C = diag p − p pᵀ = L Lᵀ, so that Σ c_k δ_k has the mean and the
+    variance of the mixture of arms. The features are Lᵀ δ, whose weights L⁻¹ c are independent with variance one.
     """
 
     def __init__(self, arm: Arm) -> None:
@@ -47,9 +46,10 @@ class ArmKernel(LinearKernel):
         kinds = np.concatenate([np.tile(KINDS, arm.n_joints), np.full(arm.n_joints, SCALES - 1)])
         self._kinds = torch.from_numpy(kinds)
         self._unit = torch.from_numpy(arm.unit)
-        shares = np.array([each.probability for each in arm.alternatives[1:]])
-        self._rest = torch.from_numpy(np.concatenate([arm.widths, np.sqrt(shares * (1 - shares))]))
-        self._mean = torch.from_numpy(np.concatenate([_in_data(arm), np.zeros(self.n_joints), arm.expected, shares]))
+        shares = _shares(arm)
+        mixed = np.linalg.solve(_mixing(shares), shares)
+        self._rest = torch.from_numpy(np.concatenate([arm.widths, np.ones(len(shares))]))
+        self._mean = torch.from_numpy(np.concatenate([_in_data(arm), np.zeros(self.n_joints), arm.expected, mixed]))
         self._recent: tuple[tuple[Motion, Tensor], ...] = ()
 
     @property
@@ -69,7 +69,7 @@ class ArmKernel(LinearKernel):
             if seen.q is x.q and seen.dq is x.dq and seen.ddq is x.ddq:
                 return features
         out = np.zeros((len(x), self.size, self.n_joints))
-        motions, first = _motions(x), self.steps.stop
+        motions, first = x.arrays(), self.steps.stop
         arm = self.arm
         arm_features(arm.geometry.constants, arm.geometry.gravity, arm.parameters, arm.order, motions, out[:, :first])
         if arm.alternatives:
@@ -106,7 +106,7 @@ class ArmKernel(LinearKernel):
             arm.geometry.gravity,
             arm.parameters,
             arm.order,
-            _motions(x),
+            x.arrays(),
             out[:, :, : self.steps.stop],
         )
         return torch.from_numpy(out).to(x.device)
@@ -117,29 +117,18 @@ class ArmRegressor(Regressor):
 
     def __init__(self, arm: Arm, size: int) -> None:
         self.n_joints, self.size = arm.n_joints, size
-        self._arm = (arm.geometry.constants, arm.geometry.gravity, arm.parameters, arm.order.astype(np.int64))
+        self._order = arm.order.astype(np.int64)
         self._first = (PARAMETERS + 1) * arm.n_joints + arm.steps
         self._others = _stacked(arm) if arm.alternatives else None
-        self._memory = _Workspace(arm.n_joints)
+        fixed = arm.geometry.constants, arm.geometry.gravity, arm.parameters
+        self._memory = Memory(fixed, (arm.n_joints + 1) * WORK + TABLE)
 
     def fill(self, motion: Array, out: Array) -> None:
         """Write Φᵀ of the query, (p, n)."""
-        memory = self._memory
-        arm_rows(*self._arm, motion, memory.work, memory.table, out[: self._first])
+        arm_query(self._memory.flat, self._order, motion, out[: self._first])
         if self._others is not None:
             motions = motion[None]
-            arm_differences(*self._others, self._arm[3], motions, _linear_features(motions), out[None, self._first :])
-
-
-class _Workspace(threading.local):
-    """One thread's memory."""
-
-    def __init__(self, joints: int) -> None:
-        self.work, self.table = np.zeros((joints + 1, WORK)), np.zeros(TABLE)
-
-
-def _motions(x: Motion) -> Array:
-    return np.ascontiguousarray(np.stack([part.cpu().numpy() for part in (x.q, x.dq, x.ddq)], axis=1))
+            arm_differences(*self._others, self._order, motions, _linear_features(motions), out[None, self._first :])
 
 
 def _in_data(arm: Arm) -> Array:
@@ -147,10 +136,21 @@ def _in_data(arm: Arm) -> Array:
     return np.asarray(arm.centre[arm.place].reshape(-1))
 
 
-def _stacked(arm: Arm) -> tuple[Array, Array, Array, Array]:
-    """Constants (K + 1, n, …), gravity, parameters (K + 1, n, 10) and linear coefficients (K + 1, n, 1 + f)."""
+def _shares(arm: Arm) -> Array:
+    """Probabilities of the alternatives, (K,), the arm itself left out."""
+    return np.array([each.probability for each in arm.alternatives[1:]])
+
+
+def _mixing(shares: Array) -> Array:
+    """L with L Lᵀ = diag p − p pᵀ, (K, K)."""
+    return np.ascontiguousarray(np.linalg.cholesky(np.diag(shares) - np.outer(shares, shares)))
+
+
+def _stacked(arm: Arm) -> tuple[Array, Array, Array, Array, Array]:
+    """L (K, K), constants (K + 1, n, …), gravity, parameters (K + 1, n, 10), linear coefficients (K + 1, n, 1 + f)."""
     each = arm.alternatives
     return (
+        _mixing(_shares(arm)),
         np.stack([one.geometry.constants for one in each]),
         arm.geometry.gravity,
         np.stack([one.parameters for one in each]),
