@@ -150,7 +150,6 @@ PARAMETERS = [
     get(f"{URDF}?version=1&alias=serving", "version or alias"),
     get(f"{URDF}?version=99", "version", 404, "not_found"),
     get(f"{URDF}?alias=nobody", "alias", 404, "not_found"),
-    get(URDF, "version"),
     get(f"{EXPORT}?version=1&alias=serving", "version or alias"),
     get(f"{EXPORT}?version=99", "version", 404, "not_found"),
     get(f"{EXPORT}?alias=nobody", "alias", 404, "not_found"),

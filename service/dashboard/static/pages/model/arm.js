@@ -1,6 +1,7 @@
 // The tab of the arm that a version has learnt: drawn at a posture that can be changed, and in numbers.
 
 import { h, replace } from "../../dom.js";
+import { number } from "../../format.js";
 import { button, card, empty } from "../../ui.js";
 import { CANNOT, drawable, drawing, LEGEND } from "../arm/drawing.js";
 import { middle } from "../arm/kinematics.js";
@@ -30,7 +31,7 @@ export async function arm(view, { name, version }, { signal }) {
       posture,
       h("div", { class: "actions" }, button("Save as URDF", () => saveUrdf(name, version.version))),
     ),
-    card("In numbers", jointTable(version), massTable(version), h("p", { class: "hint" }, "Masses are the physically possible ones nearest to what was learnt. All is as trained: what was learnt online since is not in it.")),
+    card("In numbers", jointTable(version), massTable(version), h("p", { class: "hint" }, `Masses are the physically possible ones nearest to what was learnt${off(parameters.inertia)}. All is as trained: what was learnt online since is not in it.`)),
   );
   if (figure !== place) return;
   const { draw } = await drawing(place, version, start, { signal });
@@ -86,6 +87,10 @@ function latest(work) {
       busy = false;
     }
   };
+}
+
+function off({ plausible_deviation: deviation }) {
+  return deviation ? `: their torque differs from it by ${number(Math.max(...deviation), 2)} N·m at most, root mean square of a joint` : "";
 }
 
 function upturned(gravity) {
