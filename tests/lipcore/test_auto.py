@@ -222,5 +222,5 @@ def test_too_little_cannot_be_divided():
     with pytest.raises(SplitError, match="rows is 59, expected at least 60"):
         hold_out(recorded(59), TYPES)
     fast = recorded(200)
-    with pytest.raises(SplitError, match="seconds is 0.199, expected at least 4 to hold some out"):
+    with pytest.raises(SplitError, match=r"seconds is 0\.199, expected at least 4 to hold some out"):
         hold_out(replace(fast, t=fast.t / 100), TYPES)
