@@ -118,7 +118,7 @@ def _queue(
         "datasets": [row.id for row in kept],
         "estimator": manifest["estimator"],
         "joint_types": manifest["joint_types"],
-        "robot": None if made_by is None else made_by.request.get("robot"),
+        "robot": made_by.request.get("robot") if made_by is not None and "robot" in manifest else None,
         "options": manifest["options"],
         "refresh": {"version": version.version, "through": through, "trigger": trigger},
     }
