@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from lipcore.arm.arm import Arm
+from lipcore.arm.geometry import Geometry
 from lipcore.arm.known import known_geometries
 from lipcore.arm.learning import Learnt, learn
 from lipcore.calibration import NO_CALIBRATION, Calibration, calibrate
@@ -164,11 +165,12 @@ def fitted(
     cancelled: Cancelled | None = None,
     robot: RigidBody | None = None,
     stretches: Samples | None = None,
+    known: Sequence[Geometry] = (),
 ) -> TorqueModel:
     """Train as `train` does, on the chosen samples alone: where there are too many for memory, on a thinned table.
 
     stretches: contiguous samples of the same recordings, which tell the white noise of signals; the samples themselves
-    where None.
+    where None; known: geometries, base to tip, that the search for one looks at first, as of an earlier version.
     """
     options = options or FitOptions()
     types = check_joint_types(joint_types)
@@ -188,7 +190,7 @@ def fitted(
     check_estimator(estimator, types, robot, options)
     learnt: Learnt | None = None
     if estimator in ROBOT_ESTIMATORS:
-        known = () if robot is not None else known_geometries(types, gravity)
+        known = (*known, *(() if robot is not None else known_geometries(types, gravity)))
         learnt = learn(samples, types, options, gravity, robot, known, on_progress, cancelled, stretches)
     chosen = make_estimator(estimator, types, options.tied, None if learnt is None else learnt.arm)
     calibration = calibrate(estimator)
