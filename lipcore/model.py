@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import torch
 from numpy.typing import ArrayLike
@@ -16,7 +17,7 @@ from lipcore.arm.known import known_geometries
 from lipcore.arm.learning import Learnt, learn
 from lipcore.calibration import NO_CALIBRATION, Calibration, calibrate
 from lipcore.compact.basis import Basis
-from lipcore.compact.compress import compress, linear
+from lipcore.compact.compress import compressed, linear
 from lipcore.compact.posterior import CompactPosterior
 from lipcore.compact.statistics import Statistics
 from lipcore.estimators import Estimator, check_estimator, make_estimator
@@ -25,10 +26,19 @@ from lipcore.fit_options import FitOptions
 from lipcore.fitting import Cancelled, Progress, fit
 from lipcore.kernels.arm import ArmKernel
 from lipcore.motion import Motion, check_finite, check_joint_types, motion_arrays
-from lipcore.posterior import ExactPosterior
 from lipcore.samples import Array, Samples
 from lipcore.urdf import JointMismatchError, RigidBody
-from lipcore.vocabulary import DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS, TORQUE_CONVENTIONS, JointType, TorqueConvention
+from lipcore.vocabulary import (
+    AUTO,
+    DEFAULT_ESTIMATOR,
+    ROBOT_ESTIMATORS,
+    TORQUE_CONVENTIONS,
+    JointType,
+    TorqueConvention,
+)
+
+if TYPE_CHECKING:
+    from lipcore.auto.table import Selection
 
 MIN_SAMPLES = 10
 
@@ -56,7 +66,8 @@ class TorqueModel:
     """Fitted inverse dynamics of one robot: immutable, safe to share between threads.
 
     fit: what the fit reported, compact: how near the compact posterior comes to the exact one, both for the manifest;
-    robot: the rigid bodies of an estimator that has them; calibration: how the posterior's deviations are corrected.
+    robot: the rigid bodies of an estimator that has them; calibration: how the posterior's deviations are corrected;
+    selection: how `auto` has chosen the estimator, None where it was named.
     """
 
     estimator: Estimator
@@ -70,6 +81,7 @@ class TorqueModel:
     compact: dict[str, float | int | bool]
     robot: RigidBody | None = None
     calibration: Calibration = NO_CALIBRATION
+    selection: Selection | None = None
 
     @property
     def n_joints(self) -> int:
@@ -141,7 +153,8 @@ def train(
 ) -> TorqueModel:
     """Train a model on samples; see `lipcore.fitting.fit` for progress and cancellation.
 
-    robot: for estimators of rigid bodies, built for the joints of the samples.
+    estimator: one of `lipcore.estimators.ESTIMATORS`, or `auto`, which chooses (`lipcore.auto`); robot: for estimators
+    of rigid bodies, built for the joints of the samples.
     Raise ValueError for bad arguments, FitCancelledError, or NotPositiveDefiniteError.
     """
     from lipcore import conditioning  # noqa: PLC0415 - it imports this module
@@ -165,12 +178,14 @@ def fitted(
     cancelled: Cancelled | None = None,
     robot: RigidBody | None = None,
     stretches: Samples | None = None,
+    learnt: Learnt | None = None,
     known: Sequence[Geometry] = (),
 ) -> TorqueModel:
     """Train as `train` does, on the chosen samples alone: where there are too many for memory, on a thinned table.
 
     stretches: contiguous samples of the same recordings, which tell the white noise of signals; the samples themselves
-    where None; known: geometries, base to tip, that the search for one looks at first, as of an earlier version.
+    where None; learnt: what these samples have told of the rigid bodies, where that is known already; known:
+    geometries, base to tip, that the search for one looks at first, as of an earlier version.
     """
     options = options or FitOptions()
     types = check_joint_types(joint_types)
@@ -188,10 +203,13 @@ def fitted(
         )
     gravity = torque_convention == "gravity_included"
     check_estimator(estimator, types, robot, options)
-    learnt: Learnt | None = None
-    if estimator in ROBOT_ESTIMATORS:
-        known = (*known, *(() if robot is not None else known_geometries(types, gravity)))
-        learnt = learn(samples, types, options, gravity, robot, known, on_progress, cancelled, stretches)
+    if estimator == AUTO:
+        from lipcore.auto.choosing import choose  # noqa: PLC0415 - it imports this module
+
+        return choose(samples, types, options, torque_convention, on_progress, cancelled, robot, stretches)
+    if learnt is None and estimator in ROBOT_ESTIMATORS:
+        arms = (*known, *(() if robot is not None else known_geometries(types, gravity)))
+        learnt = learn(samples, types, options, gravity, robot, arms, on_progress, cancelled, stretches)
     chosen = make_estimator(estimator, types, options.tied, None if learnt is None else learnt.arm)
     calibration = calibrate(estimator)
     if learnt is not None and estimator == "rigid-body":
@@ -202,13 +220,14 @@ def fitted(
             chosen.kernel, learnt.params, used.motion(), used.torque(), weights, options.compact_tolerance
         )
     else:
-        start = None if learnt is None else learnt.params
-        found = fit(chosen.kernel, samples, options, on_progress, cancelled, stretches, start)
+        # not the noise: what rigid bodies leave of the torque is what the other term is there for
+        known = {} if learnt is None else learnt.params
+        start = {name: value for name, value in known.items() if name != "noise.log_std"}
+        fewer = options if learnt is None else _independent(options, learnt)
+        found = fit(chosen.kernel, samples, fewer, on_progress, cancelled, stretches, start)
         used = samples.rows(found.rows)
-        exact = ExactPosterior.fit(chosen.kernel, found.params, used.motion(), used.torque())
-        exact = replace(exact, std_factor=calibration.function_std_factor)
-        compression = compress(exact, used.torque(), options.compact_tolerance, options.max_inducing_outputs)
-        report = {**asdict(found.report), "jitter": exact.factor.jitter}
+        compression, jitter = compressed(chosen.kernel, found.params, used, options, calibration)
+        report = {**asdict(found.report), "jitter": jitter}
         if learnt is not None:
             seconds = float(learnt.report["seconds"]) + found.report.seconds
             report = {**learnt.report, **report, "seconds": seconds}
@@ -224,6 +243,16 @@ def fitted(
         compression.report(),
         robot,
         calibration,
+    )
+
+
+def _independent(options: FitOptions, learnt: Learnt) -> FitOptions:
+    """Options for no more samples than the recording holds independent ones, as the arm's residuals say."""
+    most = max(MIN_SAMPLES, round(learnt.weight * len(learnt.rows)))
+    return replace(
+        options,
+        hyperparameter_samples=min(options.hyperparameter_samples, most),
+        posterior_samples=min(options.posterior_samples, most),
     )
 
 
@@ -251,6 +280,7 @@ def restore(
     robot: RigidBody | None = None,
     calibration: Calibration = NO_CALIBRATION,
     arm: Arm | None = None,
+    selection: Selection | None = None,
 ) -> TorqueModel:
     """Rebuild a model from its parts: hyperparameters, inducing outputs (see `Basis`) and statistics.
 
@@ -285,4 +315,5 @@ def restore(
         compact,
         robot,
         calibration,
+        selection,
     )

@@ -23,7 +23,7 @@ from lipcore.arm.arm import (
     widths_of,
 )
 from lipcore.arm.geometry import Geometry
-from lipcore.arm.problem import Expected, Point, Problem
+from lipcore.arm.problem import Expected, Point, Problem, root_of
 from lipcore.arm.scales import rescale
 from lipcore.arm.search import Found, Pool, search
 from lipcore.fit_options import FitOptions
@@ -73,17 +73,22 @@ def learn(
     on_progress: Progress | None = None,
     cancelled: Cancelled | None = None,
     stretches: Samples | None = None,
+    begin: Sequence[Geometry] = (),
+    seed: int = 0,
 ) -> Learnt:
     """Learn the arm that moved so.
 
     gravity: whether torques contain it; robot: a URDF's bodies, which geometry and masses are expected around, as
     `options.geometry` and `options.prior` say; known: geometries to look at, too, where none is given; stretches:
-    contiguous samples that tell the white noise, where `samples` are thinned.
+    contiguous samples that tell the white noise, where `samples` are thinned; begin: geometries from base to tip that
+    other samples of the same arm have told, which are followed from there, without a search; seed: of the search.
 
     Raise FitCancelledError when `cancelled` answers true, ValueError for samples that no arm can be learnt from.
     """
     with threadpool_limits(1):  # matrices are small: more threads would take longer
-        return _learn(samples, joint_types, options, gravity, robot, known, on_progress, cancelled, stretches)
+        return _learn(
+            samples, joint_types, options, gravity, robot, known, on_progress, cancelled, stretches, begin, seed
+        )
 
 
 def _learn(
@@ -96,29 +101,31 @@ def _learn(
     on_progress: Progress | None,
     cancelled: Cancelled | None,
     stretches: Samples | None,
+    begin: Sequence[Geometry],
+    seed: int,
 ) -> Learnt:
     watch = _Watch(on_progress, cancelled, time.monotonic(), options.max_iterations)
     mode = mode_of(options, robot)
     rows = spread_out(samples.motion(), options.posterior_samples).numpy()
     problem, order = make_problem(samples.rows(rows), joint_types, options, gravity, robot, samples)
     found: Found | None = None
-    if mode == "learn":
+    if mode == "learn" and not begin:
         few = spread_out(samples.rows(rows).motion(), max(SEARCH_ROWS, ROWS_PER_JOINT * len(joint_types)))
         types = tuple(joint_types[joint] for joint in order)
         signals = samples if stretches is None else stretches
         sensor = noise_level([signals.tau[part][:, order] for part in signals.episodes()])
         found = search(
-            problem.rows(few.numpy()), types, gravity, sensor, options.search_seconds, 0, known, watch.searching
+            problem.rows(few.numpy()), types, gravity, sensor, options.search_seconds, seed, known, watch.searching
         )
-        polished = Pool(problem.recombined(CHECKS))
-        for each in found.points[:POLISHED]:
-            polished.add(problem.descend(each.geometry, each.sigma, POLISHING, watch.stop))
-        ends = polished.points
+        starts = [(each.geometry, each.sigma) for each in found.points[:POLISHED]]
     else:
-        if robot is None:
-            raise ValueError(f"geometry is {mode!r}, which needs a robot: a profile such as panda, or a URDF")
-        begin = Geometry.from_robot(robot, gravity)
-        ends = [problem.descend(begin, noise.start(samples)[order], POLISHING, watch.stop)]
+        if robot is not None and (mode == "fixed" or not begin):
+            begin = [Geometry.from_robot(robot, gravity)]
+        starts = [(each, noise.start(samples)[order]) for each in begin]
+    polished = Pool(problem.recombined(CHECKS))
+    for geometry, sigma in starts:
+        polished.add(problem.descend(geometry, sigma, POLISHING, watch.stop))
+    ends = polished.points
     watch.step("hyperparameters", ends[0].value, 0.85)
     contiguous = (samples if stretches is None else stretches).rows(slice(0, CORRELATED))
     every, _ = make_problem(contiguous, joint_types, options, gravity, robot)
@@ -126,7 +133,7 @@ def _learn(
     correlation = residual_correlation(residual, contiguous)
     weight = min(1.0, len(samples) / correlation / len(rows))
     problem = replace(problem, counts=np.full(len(rows), weight))
-    ends = [problem.at(each.geometry, each.sigma) for each in ends]
+    ends = sorted((problem.at(each.geometry, each.sigma) for each in ends), key=lambda each: each.value)
     best, others, problem = _refined(problem, ends, watch)
     watch.step("posterior", best.value, 0.95)
     report: dict[str, float | int | bool | str] = {"geometry": mode, "search_objective": ends[0].value}
@@ -135,10 +142,12 @@ def _learn(
     report |= {
         "objective": best.value,
         "iterations": watch.iteration,
+        "converged": found is None or found.ended == "idle",
         "samples_given": len(samples),
         "samples_hyperparameters": len(rows),
         "samples_posterior": len(rows),
         "row_correlation": correlation,
+        "motion_dimensions": motion_dimensions(samples.dq),
         "seconds": time.monotonic() - watch.began,
         "device": "cpu",
     }
@@ -219,6 +228,20 @@ def residual_correlation(residual: Array, samples: Samples) -> float:
     return total
 
 
+def motion_dimensions(dq: Array) -> float:
+    """How many joints' worth of independent motion velocities (N, n) hold: 1 where all move together, n where each
+    moves by itself.
+
+    The participation ratio (Σ λ)² / Σ λ² of their correlation matrix's eigenvalues.
+    """
+    spread = dq.std(axis=0)
+    moving = spread > 1e-9
+    if not moving.any():
+        return 0.0
+    values = np.linalg.eigvalsh(np.atleast_2d(np.corrcoef(dq[:, moving].T)))
+    return float(values.sum() ** 2 / np.square(values).sum())
+
+
 def _expected(
     types: tuple[JointType, ...], gravity: bool, robot: RigidBody | None, mode: GeometryMode
 ) -> Expected | None:
@@ -285,7 +308,7 @@ def _arm(
         return arm, params
     chosen = [best, *differing[:3]]
     values = np.array([problem.laplace(each) for each in chosen])
-    odds = np.exp(values.min() - values)
+    odds = np.exp(np.maximum(values.min() - values, -2 * NEAR))  # (none of zero: their covariance is to be factored)
     shares = odds / odds.sum()
     alternatives = tuple(
         _alternative(problem, each, place, float(share)) for each, share in zip(chosen, shares, strict=True)
@@ -306,7 +329,7 @@ def _differs(problem: Problem, best: Point, other: Point) -> bool:
     asked = problem.recombined(CHECKS)
     means = [asked.mean(point) for point in (best, other)]
     hessian, _, _ = problem.normal(best)
-    root = np.linalg.cholesky(hessian)
+    root = root_of(hessian)
     both = asked.all_features(best)
     spread = np.square(np.linalg.solve(root, both.reshape(-1, both.shape[2]).T)).sum(0).reshape(means[0].shape)
     stated = np.sqrt(np.mean(spread, axis=0) + best.sigma**2)

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lipcore.arm.arm import KINDS
-from lipcore.arm.problem import NOISE_WIDTH, Point, Problem
+from lipcore.arm.problem import NOISE_WIDTH, Point, Problem, root_of
 from lipcore.kernels.compiled.arm import PARAMETERS
 from lipcore.samples import Array
 
@@ -99,7 +99,7 @@ class _Evidence:
         right = std * (precision @ self.rights - gram @ self.mean)
         total = gram * np.outer(std, std)
         total.flat[:: len(total) + 1] += 1.0
-        root = np.linalg.inv(np.linalg.cholesky(total))
+        root = np.linalg.inv(root_of(total))
         covariance = root.T @ root
         deviation = covariance @ right
         weights = self.mean + std * deviation

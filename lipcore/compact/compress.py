@@ -7,14 +7,17 @@ from dataclasses import asdict, dataclass, replace
 import torch
 from torch import Tensor
 
+from lipcore.calibration import Calibration
 from lipcore.compact.basis import Basis, split
 from lipcore.compact.pivots import Pivots, pivots
 from lipcore.compact.posterior import CompactPosterior
 from lipcore.compact.statistics import collect
+from lipcore.fit_options import FitOptions
 from lipcore.kernels.base import Params, SumKernel, TorqueKernel
 from lipcore.linalg import cholesky
 from lipcore.motion import Motion
 from lipcore.posterior import ExactPosterior, Prediction
+from lipcore.samples import Samples
 from lipcore.selection import spread_out
 
 QUERIES = 200
@@ -70,6 +73,16 @@ class Compression:
         basis = self.posterior.basis
         sizes = {"inducing_outputs": len(basis.outputs), "inducing_samples": len(basis.inducing), "weights": len(basis)}
         return {**sizes, "tolerance": self.tolerance, "tolerance_reached": self.reached, **asdict(self.deviation)}
+
+
+def compressed(
+    kernel: TorqueKernel, params: Params, samples: Samples, options: FitOptions, calibration: Calibration
+) -> tuple[Compression, float]:
+    """The compact posterior of all these samples, and the jitter, (N·m)², that the exact one took."""
+    exact = ExactPosterior.fit(kernel, params, samples.motion(), samples.torque())
+    exact = replace(exact, std_factor=calibration.function_std_factor)
+    compression = compress(exact, samples.torque(), options.compact_tolerance, options.max_inducing_outputs)
+    return compression, exact.factor.jitter
 
 
 def compress(exact: ExactPosterior, tau: Tensor, tolerance: float, most: int, seed: int = 0) -> Compression:
