@@ -28,7 +28,7 @@ from lipcore.arm.scales import rescale
 from lipcore.arm.search import Found, Pool, search
 from lipcore.fit_options import FitOptions
 from lipcore.fitting import Cancelled, FitCancelledError, FitProgress, Progress
-from lipcore.kernels.compiled.arm import PARAMETERS, arm_torques
+from lipcore.kernels.compiled.arm import PARAMETERS
 from lipcore.kernels.friction import FRICTION_TERMS, friction_features
 from lipcore.samples import Array, Samples
 from lipcore.selection import spread_out
@@ -385,10 +385,3 @@ class _Watch:
 
     def stop(self) -> bool:
         return self.cancelled is not None and self.cancelled()
-
-
-def torque_of(arm: Arm, motions: Array) -> Array:
-    """Torque of the bodies of an arm alone, (N, n) N·m in the order of the data: motions (N, 3, n)."""
-    out = np.zeros((len(motions), arm.n_joints))
-    arm_torques(arm.geometry.constants, arm.geometry.gravity, arm.parameters, arm.order, motions, out)
-    return out
