@@ -200,7 +200,8 @@ def _check_parameters(name: str, value: Any, n: int) -> None:
         if "rotor" in value:
             check_rotor(value["rotor"], n)
         if "geometry" in value:
-            read_geometry(value["geometry"], n)
+            for plausible in (False, True):
+                read_geometry(value["geometry"], n, plausible)
     except ValueError as error:
         raise ModelFormatError(f"{name}.{error}") from None
 

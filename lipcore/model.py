@@ -203,7 +203,8 @@ def fitted(
         # not the noise: what rigid bodies leave of the torque is what the other term is there for
         known = {} if learnt is None else learnt.params
         start = {name: value for name, value in known.items() if name != "noise.log_std"}
-        found = fit(chosen.kernel, samples, options, on_progress, cancelled, stretches, start)
+        fewer = options if learnt is None else _independent(options, learnt)
+        found = fit(chosen.kernel, samples, fewer, on_progress, cancelled, stretches, start)
         used = samples.rows(found.rows)
         exact = ExactPosterior.fit(chosen.kernel, found.params, used.motion(), used.torque())
         exact = replace(exact, std_factor=calibration.function_std_factor)
@@ -224,6 +225,16 @@ def fitted(
         compression.report(),
         robot,
         calibration,
+    )
+
+
+def _independent(options: FitOptions, learnt: Learnt) -> FitOptions:
+    """Options for no more samples than the recording holds independent ones, as the arm's residuals say."""
+    most = max(MIN_SAMPLES, round(learnt.weight * len(learnt.rows)))
+    return replace(
+        options,
+        hyperparameter_samples=min(options.hyperparameter_samples, most),
+        posterior_samples=min(options.posterior_samples, most),
     )
 
 

@@ -31,7 +31,7 @@ STEPS = ("turn 1", "turn 2", "shift 1", "shift 2")
 """Names of a joint's numbers of geometry: about, and along, the two vectors across its axis."""
 UNDETERMINED = 0.5
 """Torque does not tell what is still as uncertain as this share of what was expected beforehand."""
-LEAST_VARIANCE = 1e-10
+LEAST_VARIANCE = 1e-12
 """Smallest posterior variance relative to the prior's that rounding leaves meaningful."""
 
 BARRIERS = tuple(10.0**power for power in range(3, -4, -1))
@@ -122,13 +122,19 @@ def inertial_parameters(posterior: CompactPosterior, estimator: Estimator) -> In
     geometry = _geometry(term, weights.mean)
     if all(is_plausible(body) for body in mean):
         return InertialParameters(mean, std, scale, mean, True, geometry, np.zeros(term.n_joints))
-    # masses alone, where the geometry is; or masses and geometry together, to first order in the latter
+    # masses for the geometry that the arm is linearised at, where the torque is exactly linear in them; or masses and
+    # geometry together, to first order in the latter
     start = term.arm.centre[term.arm.place]
     alone = weights.mean.copy()
-    alone[:size] = nearest_plausible(conditional(weights, size), term.n_joints, start)
+    metric = precision(posterior, term)
+    part, steps = slice(0, size), term.steps
+    alone[steps] = 0.0
+    moved = np.linalg.solve(metric[part, part], metric[part, steps] @ (weights.mean / weights.scale)[steps])
+    given = weights.mean[part] + moved * weights.scale[part]
+    alone[part] = nearest_plausible(given, weights.scale[part], metric[part, part], term.n_joints, start)
     options = [alone]
     if term.arm.steps:
-        options.append(nearest_plausible(weights, term.n_joints, start))
+        options.append(nearest_plausible(weights.mean, weights.scale, metric, term.n_joints, start))
     asked = checks(posterior.basis.inducing, 0)
     torque = posterior.predict(asked, term).mean.numpy()
     errors = [np.sqrt(np.mean((_torque(term, option, asked) - torque) ** 2, axis=0)) for option in options]
@@ -150,13 +156,18 @@ def _torque(term: ArmKernel, weights: Array, motion: Motion) -> Array:
     return np.asarray(out + weights[PARAMETERS * n : (PARAMETERS + 1) * n] * motion.ddq.numpy())
 
 
-def conditional(weights: WeightPosterior, count: int) -> WeightPosterior:
-    """Posterior of the first `count` weights where the others have their mean."""
+def precision(posterior: CompactPosterior, term: LinearKernel) -> Array:
+    """Posterior precision of a term's weights, all others at their mean, in units of their prior deviations: (p, p).
+
+    From the statistics, I + A, where there are any: a covariance has lost what is known to more than eight digits.
+    """
+    rows = posterior.basis.rows(term)
+    if posterior.statistics is not None:
+        return _numpy(posterior.statistics.a[rows, rows]) + np.eye(rows.stop - rows.start)
+    weights = weight_posterior(posterior, term)
     scaled = weights.covariance / np.outer(weights.scale, weights.scale)
     values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
-    precision = ((vectors / np.maximum(values, LEAST_VARIANCE)) @ vectors.T)[:count, :count]
-    scale = weights.scale[:count]
-    return WeightPosterior(weights.mean[:count], np.linalg.inv(precision) * np.outer(scale, scale), scale)
+    return np.asarray((vectors / np.maximum(values, LEAST_VARIANCE)) @ vectors.T)
 
 
 def report(posterior: CompactPosterior, estimator: Estimator, joint_names: Sequence[str]) -> dict[str, Any]:
@@ -260,26 +271,23 @@ def is_plausible(body: Array) -> bool:
     return bool(np.linalg.eigvalsh(pseudo_inertia(body))[0] > 0)
 
 
-def nearest_plausible(weights: WeightPosterior, n: int, start: Array | None = None) -> Array:
-    """Weights (p,) nearest to the posterior mean, in its covariance's metric, whose first 10 n are plausible bodies.
+def nearest_plausible(mean: Array, scale: Array, metric: Array, n: int, start: Array | None = None) -> Array:
+    """Weights (p,) nearest to a mean (p,) whose first 10 n are plausible bodies.
 
-    A convex problem: ½ |w − μ|² in the posterior's metric, subject to each body's pseudo-inertia being at least that of
-    a tiny real one. Newton's method along the central path of a barrier, −t Σ log det, as in Boyd & Vandenberghe, § 11.
+    metric: (p, p), of weights in units of `scale` (p,). A convex problem: ½ |w − μ|² in that metric, subject to each
+    body's pseudo-inertia being at least that of a tiny real one. Newton's method along the central path of a barrier,
+    −t Σ log det, as in Boyd & Vandenberghe, § 11.
     start: (n, 10), a plausible guess; balls where it is none.
     """
     size = PARAMETERS * n
     given = np.zeros((n, PARAMETERS)) if start is None else start
-    total = max(float(weights.mean[:size:PARAMETERS].sum()), float(given[:, 0].sum()), 1e-3)
+    total = max(float(mean[:size:PARAMETERS].sum()), float(given[:, 0].sum()), 1e-3)
     least = LEAST_MASS * total * np.diag([LEAST_EXTENT**2, LEAST_EXTENT**2, LEAST_EXTENT**2, 1.0])
-    # in units of the prior: posterior variances span many orders of magnitude
-    scaled = weights.covariance / np.outer(weights.scale, weights.scale)
-    values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
-    metric = (vectors / np.maximum(values, LEAST_VARIANCE)) @ vectors.T
-    centre = weights.mean / weights.scale
+    centre = mean / scale
     basis = np.array([pseudo_inertia(unit) for unit in np.eye(PARAMETERS)])
 
     def matrices(point: Array) -> Array:
-        bodies = (point * weights.scale)[:size].reshape(n, PARAMETERS)
+        bodies = (point * scale)[:size].reshape(n, PARAMETERS)
         return np.asarray(np.einsum("nk,kij->nij", bodies, basis) - least)
 
     def value(point: Array, barrier: float) -> float:
@@ -290,19 +298,19 @@ def nearest_plausible(weights: WeightPosterior, n: int, start: Array | None = No
         return float(0.5 * off @ metric @ off - barrier * logs.sum())
 
     point = centre.copy()
-    point[:size] = np.concatenate([_real(body, total / n, least) for body in given]) / weights.scale[:size]
+    point[:size] = np.concatenate([_real(body, total / n, least) for body in given]) / scale[:size]
     for barrier in BARRIERS:
         for _ in range(NEWTON_STEPS):
             inverse = np.linalg.inv(matrices(point))
             turned = np.einsum("nij,kjl->nkil", inverse, basis)  # P⁻¹ E_k
-            slope = np.einsum("nkii->nk", turned).reshape(-1) * weights.scale[:size]
+            slope = np.einsum("nkii->nk", turned).reshape(-1) * scale[:size]
             bend = np.einsum("nkij,nlji->nkl", turned, turned)
             gradient = metric @ (point - centre)
             gradient[:size] -= barrier * slope
             hessian = metric.copy()
             for body in range(n):
                 part = slice(PARAMETERS * body, PARAMETERS * (body + 1))
-                hessian[part, part] += barrier * bend[body] * np.outer(weights.scale[part], weights.scale[part])
+                hessian[part, part] += barrier * bend[body] * np.outer(scale[part], scale[part])
             step = -np.linalg.solve(hessian, gradient)
             slack, length, now = float(-gradient @ step), 1.0, value(point, barrier)
             while length > SHORTEST and value(point + length * step, barrier) > now - 0.1 * length * slack:
@@ -312,7 +320,7 @@ def nearest_plausible(weights: WeightPosterior, n: int, start: Array | None = No
             point = point + length * step
             if slack < 1e-3 * barrier:
                 break
-    return np.asarray(point * weights.scale)
+    return np.asarray(point * scale)
 
 
 def _real(body: Array, usual_mass: float, least: Array) -> Array:

@@ -126,7 +126,7 @@ def _learn(
     correlation = residual_correlation(residual, contiguous)
     weight = min(1.0, len(samples) / correlation / len(rows))
     problem = replace(problem, counts=np.full(len(rows), weight))
-    ends = [problem.at(each.geometry, each.sigma) for each in ends]
+    ends = sorted((problem.at(each.geometry, each.sigma) for each in ends), key=lambda each: each.value)
     best, others, problem = _refined(problem, ends, watch)
     watch.step("posterior", best.value, 0.95)
     report: dict[str, float | int | bool | str] = {"geometry": mode, "search_objective": ends[0].value}
@@ -140,6 +140,7 @@ def _learn(
         "samples_hyperparameters": len(rows),
         "samples_posterior": len(rows),
         "row_correlation": correlation,
+        "motion_dimensions": motion_dimensions(samples.dq),
         "seconds": time.monotonic() - watch.began,
         "device": "cpu",
     }
@@ -218,6 +219,20 @@ def residual_correlation(residual: Array, samples: Samples) -> float:
             break
         total += 2 * level
     return total
+
+
+def motion_dimensions(dq: Array) -> float:
+    """How many joints' worth of independent motion velocities (N, n) hold: 1 where all move together, n where each
+    moves by itself.
+
+    The participation ratio (Σ λ)² / Σ λ² of their correlation matrix's eigenvalues.
+    """
+    spread = dq.std(axis=0)
+    moving = spread > 1e-9
+    if not moving.any():
+        return 0.0
+    values = np.linalg.eigvalsh(np.atleast_2d(np.corrcoef(dq[:, moving].T)))
+    return float(values.sum() ** 2 / np.square(values).sum())
 
 
 def _expected(

@@ -26,7 +26,9 @@ LARGEST = 1e12
 
 def check_inertia(inertia: Any, n: int) -> None:
     """Raise ValueError unless this is the entry `inertia` of n bodies; the message names what is wrong."""
-    _check_keys("inertia", inertia, ("mean_is_plausible", "bodies"))
+    _check_keys("inertia", inertia, ("mean_is_plausible", "bodies"), ("plausible_deviation",))
+    if "plausible_deviation" in inertia:
+        numbers("inertia.plausible_deviation", inertia["plausible_deviation"], (n,))
     for index, body in enumerate(_list("inertia.bodies", inertia["bodies"], n)):
         where = f"inertia.bodies[{index}]"
         _check_keys(where, body, BODY, ("undetermined",))
@@ -44,8 +46,11 @@ def check_rotor(rotor: Any, n: int) -> None:
         numbers(f"rotor.{key}", rotor[key], (n,))
 
 
-def read_geometry(entry: Any, n: int) -> tuple[Geometry, list[int]]:
-    """The geometry of the entry `geometry`, and the data's joint at each place of the chain; raise ValueError."""
+def read_geometry(entry: Any, n: int, plausible: bool = False) -> tuple[Geometry, list[int]]:
+    """The geometry of the entry `geometry`, and the data's joint at each place of the chain; raise ValueError.
+
+    plausible: the one that the plausible bodies are meant for, where it is another one.
+    """
     _check_keys("geometry", entry, GEOMETRY)
     if entry["mode"] not in MODES:
         raise _wrong("geometry.mode", entry["mode"], f"one of {', '.join(MODES)}")
@@ -55,12 +60,13 @@ def read_geometry(entry: Any, n: int) -> tuple[Geometry, list[int]]:
     joints = _list("geometry.joints", entry["joints"], n)
     for place, joint in enumerate(joints):
         _check_joint(f"geometry.joints[{place}]", joint)
+    placed = [{**joint, **(joint.get("plausible", {}) if plausible else {})} for joint in joints]
     shapes = {"rotation": (3, 3), "translation": (3,), "axis": (3,)}
     try:
         geometry = Geometry(
             joint_types=tuple(joint["type"] for joint in joints),
             gravity=gravity,
-            **{key: np.array([numbers(key, joint[key], shape) for joint in joints]) for key, shape in shapes.items()},
+            **{key: np.array([numbers(key, joint[key], shape) for joint in placed]) for key, shape in shapes.items()},
         )
     except ValueError as error:
         raise ValueError(f"geometry: {error}") from None
@@ -91,7 +97,11 @@ def _check_numbers(name: str, value: Any, shape: Sequence[int]) -> None:
 
 
 def _check_joint(where: str, joint: Any) -> None:
-    _check_keys(where, joint, JOINT)
+    _check_keys(where, joint, JOINT, ("plausible",))
+    if "plausible" in joint:
+        _check_keys(f"{where}.plausible", joint["plausible"], ("rotation", "translation"))
+        numbers(f"{where}.plausible.rotation", joint["plausible"]["rotation"], (3, 3))
+        numbers(f"{where}.plausible.translation", joint["plausible"]["translation"], (3,))
     if joint["type"] not in JOINT_TYPES:
         raise _wrong(f"{where}.type", joint["type"], f"one of {', '.join(JOINT_TYPES)}")
     for key, shape in (("rotation", (3, 3)), ("translation", (3,)), ("axis", (3,)), ("across", (2, 3))):

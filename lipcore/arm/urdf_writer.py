@@ -122,7 +122,7 @@ def urdf_of_parameters(
     if "geometry" not in parameters:
         raise ValueError("the model does not hold where its joints lie: train it again to have a URDF written of it")
     n = len(joint_names)
-    geometry, order = read_geometry(parameters["geometry"], n)
+    geometry, order = read_geometry(parameters["geometry"], n, plausible=True)
     places, bodies = parameters["geometry"]["joints"], parameters["inertia"]["bodies"]
     friction, ranges = parameters["friction"], training_range
     rotor = parameters["rotor"]["mean"] if "rotor" in parameters else [0.0] * n
