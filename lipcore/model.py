@@ -221,8 +221,8 @@ def fitted(
         )
     else:
         # not the noise: what rigid bodies leave of the torque is what the other term is there for
-        known = {} if learnt is None else learnt.params
-        start = {name: value for name, value in known.items() if name != "noise.log_std"}
+        params = {} if learnt is None else learnt.params
+        start = {name: value for name, value in params.items() if name != "noise.log_std"}
         fewer = options if learnt is None else _independent(options, learnt)
         found = fit(chosen.kernel, samples, fewer, on_progress, cancelled, stretches, start)
         used = samples.rows(found.rows)

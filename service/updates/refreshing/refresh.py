@@ -196,8 +196,8 @@ def _reasons(settings: Settings, published: Published) -> Iterator[Reason]:
     errors = published.linearisation or (0.0,)
     if max(errors) > settings.linearisation_error:
         text = f"the arm of {named} has moved from where its torque is linear: {max(errors):.0%} of the stated error"
-        figures = {"linearisation_error": list(errors), "threshold": settings.linearisation_error}
-        yield Reason("linearisation", text, {**revision, **figures})
+        by_joint = {"linearisation_error": list(errors), "threshold": settings.linearisation_error}
+        yield Reason("linearisation", text, {**revision, **by_joint})
 
 
 def _alarms(model: str, kind: AlarmKind) -> Select[int]:
