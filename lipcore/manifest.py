@@ -21,6 +21,7 @@ FORMAT_VERSION = 3
 MANIFEST, TENSORS, ROBOT = "manifest.json", "model.safetensors", "robot.urdf"
 MATCHINGS = ("name", "order", "list")
 MAX_NAME = 100
+MOST_WARNINGS, MOST_SENTENCE = 20, 4000
 MAX_CANDIDATES = 10
 LARGEST = 1e12
 """No motion or torque in SI units is larger."""
@@ -210,6 +211,13 @@ def _check_parameters(name: str, value: Any, n: int) -> None:
         raise ModelFormatError(f"{name}.{error}") from None
 
 
+def _check_warnings(name: str, value: Any, n: int) -> None:
+    if not isinstance(value, list) or len(value) > MOST_WARNINGS:
+        raise _fail(name, value, f"a list of at most {MOST_WARNINGS} sentences")
+    for index, each in enumerate(value):
+        _check_text(f"{name}[{index}]", each, MOST_SENTENCE)
+
+
 def _check_hyperparameters(name: str, value: Any, n: int) -> None:
     if not isinstance(value, dict) or len(value) > 1000:
         raise _fail(name, value, "an object of at most 1000 entries")
@@ -296,6 +304,7 @@ REQUIRED: dict[str, Check] = {
 }
 OPTIONAL: dict[str, Check] = {
     "parameters": _check_parameters,
+    "warnings": _check_warnings,
     "hyperparameters": _check_hyperparameters,
     "robot": _check_robot,
     "selection": _check_selection,

@@ -181,13 +181,13 @@ def fitted(
     robot: RigidBody | None = None,
     stretches: Samples | None = None,
     learnt: Learnt | None = None,
-    known: Sequence[Geometry] = (),
+    geometries: Sequence[Geometry] = (),
 ) -> TorqueModel:
     """Train as `train` does, on the chosen samples alone: where there are too many for memory, on a thinned table.
 
     stretches: contiguous samples of the same recordings, which tell the white noise of signals; the samples themselves
-    where None; learnt: what these samples have told of the rigid bodies, where that is known already; known:
-    geometries, base to tip, that the search for one looks at first, as of an earlier version.
+    where None; learnt: what these samples have told of the rigid bodies, where that is known already;
+    geometries: base to tip, that the search for one looks at first, as of an earlier version.
     """
     options = options or FitOptions()
     types = check_joint_types(joint_types)
@@ -210,7 +210,7 @@ def fitted(
 
         return choose(samples, types, options, torque_convention, on_progress, cancelled, robot, stretches)
     if learnt is None and estimator in ROBOT_ESTIMATORS:
-        arms = (*known, *(() if robot is not None else known_geometries(types, gravity)))
+        arms = (*geometries, *(() if robot is not None else known_geometries(types, gravity)))
         learnt = learn(samples, types, options, gravity, robot, arms, on_progress, cancelled, stretches)
     chosen = make_estimator(estimator, types, options.tied, None if learnt is None else learnt.arm)
     calibration = calibrate(estimator)

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from lipcore.arm.arm import Arm
 from lipcore.arm.storing import arm_tensors, is_of_arm, read_arm, read_mode
+from lipcore.arm.warning import warnings
 from lipcore.calibration import Calibration
 from lipcore.compact.statistics import Statistics
 from lipcore.manifest import (
@@ -68,6 +69,7 @@ def encode(model: TorqueModel, lineage: Mapping[str, Any] | None = None) -> tupl
         tensors[FLOOR] = model.posterior.floor
     if model.arm is not None:
         tensors |= arm_tensors(model.arm)
+    parameters = report(model.posterior, model.estimator, model.joint_names)
     payload = save_tensors({name: value.contiguous() for name, value in tensors.items()})
     manifest = {
         "format": FORMAT,
@@ -81,7 +83,8 @@ def encode(model: TorqueModel, lineage: Mapping[str, Any] | None = None) -> tupl
         "fit": model.fit,
         "compact": {**model.compact, "data_samples": round(statistics.samples)},
         "calibration": asdict(model.calibration),
-        "parameters": report(model.posterior, model.estimator, model.joint_names),
+        "parameters": parameters,
+        "warnings": warnings(model, parameters),
         "hyperparameters": {name: value.tolist() for name, value in model.posterior.params.items()},
         "training_range": model.training_range,
         "lineage": dict(lineage or {}),

@@ -286,6 +286,8 @@ def _print_version(shown: VersionRecord) -> None:
         out.print(figures_table(f"on {held['samples']} samples held out", shown.joint_names, held))
     else:
         say("  nothing was held out of its data: `lipserve evaluate` on a recording it has not seen tells how good")
+    for warning in shown.warnings:
+        out.print(f"[yellow]careful:[/yellow] {escape(warning)}", highlight=False)
     arm = shown.arm
     if arm is not None:
         from service.cli.tables import arm_tables  # noqa: PLC0415 - as above

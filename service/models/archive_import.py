@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from lipcore import persistence, strict_json
+from lipcore.arm.warning import warnings
 from lipcore.manifest import MANIFEST, ROBOT, TENSORS, Limits, ModelFormatError, read_manifest_bytes
 from lipcore.parameters import report
 from lipcore.probing import probe
@@ -178,6 +179,7 @@ def _checked(files: Mapping[str, bytes], settings: Settings) -> dict[str, Any]:
         model = persistence.decode(files, limits)
         probe(model)
         manifest["parameters"] = report(model.posterior, model.estimator, model.joint_names)
+        manifest["warnings"] = warnings(model, manifest["parameters"])
         manifest["hyperparameters"] = {name: value.tolist() for name, value in model.posterior.params.items()}
         read_manifest_bytes(persistence.manifest_bytes(manifest), limits)
     except ModelFormatError as error:

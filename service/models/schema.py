@@ -73,6 +73,9 @@ class Version(BaseModel):
     hyperparameters: dict[str, Any] | None = Field(
         None, description="Hyperparameters by name, mostly logarithms; null for versions of earlier releases"
     )
+    warnings: list[str] = Field(
+        [], description="What to be careful with: what the recording leaves open of a learnt arm, and how its fit ended"
+    )
     lineage: dict[str, Any] = Field(
         description="Data sets with their hashes, when and with which `software` it was trained, and how well it fits "
         "them (`training_metrics`); of an imported version also where it comes from (`imported`)"

@@ -39,7 +39,8 @@ class Material:
     sets' rows to learn from; logged: what the model has observed, with weights (N,), None where that is nothing; rows:
     how many both are; lineage: where they come from; seen: number of the newest
     event of the model's log when it was read; held_out: samples that the version is evaluated on and does not learn
-    from, and how many they stand for; None where that is nothing; known: geometries that an earlier version has learnt.
+    from, and how many they stand for; None where that is nothing; geometries: of an arm, as an earlier version has
+    learnt them.
     """
 
     samples: Samples
@@ -51,7 +52,7 @@ class Material:
     logged: tuple[Samples, Array] | None = None
     seen: int = 0
     held_out: tuple[Samples, int] | None = None
-    known: tuple[Geometry, ...] = ()
+    geometries: tuple[Geometry, ...] = ()
 
     @property
     def rows(self) -> int:

@@ -108,6 +108,7 @@ class Version(schema.Version):
     def __str__(self) -> str:
         joints = f"{len(self.joint_names)} joints: {', '.join(self.joint_names)}"
         title = f"{self.model} version {self.version}: {self.estimator}, {joints}"
+        title = "\n".join([title, *(f"careful: {each}" for each in self.warnings)])
         return title if self.arm is None else f"{title}\n\n{self.arm}"
 
 

@@ -186,7 +186,7 @@ def _reasons(settings: Settings, published: Published) -> Iterator[Reason]:
     share = published.novel_share
     if share > settings.novelty_share:
         text = f"{share:.0%} of the last {settings.novelty_rows} samples lie beyond what {named} can learn"
-        figures = {
+        figures: dict[str, Any] = {
             "novel_share": share,
             "threshold": settings.novelty_share,
             "rows": settings.novelty_rows,

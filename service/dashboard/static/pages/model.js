@@ -4,6 +4,7 @@ import { get, pages, path, put } from "../api.js";
 import { h, refresh, replace } from "../dom.js";
 import { when } from "../format.js";
 import { badge, button, errorBox, facts, heading, link, loading, notice, tabs } from "../ui.js";
+import { warned } from "./data/prose.js";
 import { accuracy } from "./model/accuracy.js";
 import { arm } from "./model/arm.js";
 import { ask } from "./model/ask.js";
@@ -107,7 +108,7 @@ function header(state, reload) {
       ["Answers now", `version ${serving}`],
       ["You look at", `version ${shown}, ${version.estimator}, made ${when(version.created_at)}`],
       ...(names.length ? [["Aliases", names.join(", ")]] : []),
-    ]));
+    ]), warned(version.warnings));
   };
   return [h("div", {}, heading(name, actions), about), update];
 }

@@ -3,7 +3,7 @@
 import { h } from "../../dom.js";
 import { count, number, percent, seconds, shortNames, when } from "../../format.js";
 import { badge, card, facts, table } from "../../ui.js";
-import { prose, sentences } from "./prose.js";
+import { prose, sentences, warned } from "./prose.js";
 
 const CONVENTIONS = { gravity_included: "gravity included", gravity_compensated: "gravity compensated: added to what holds the arm" };
 const PARTIAL = "This report was made by an older release of LIPServe: it has no advice and no figures beyond those shown.";
@@ -13,9 +13,7 @@ export function summary(dataset) {
   const { report } = dataset;
   const judged = report.excitation !== null;
   return [
-    report.warnings.length
-      ? h("section", { class: "banner", "aria-label": "Warnings" }, h("strong", {}, "Warnings"), sentences(report.warnings))
-      : null,
+    warned(report.warnings),
     card(
       "What to record next, or to correct",
       report.advice.length ? sentences(report.advice) : h("p", {}, judged ? "Nothing was found that calls for more." : PARTIAL),

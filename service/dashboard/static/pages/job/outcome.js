@@ -4,6 +4,7 @@ import { get, path } from "../../api.js";
 import { h, replace } from "../../dom.js";
 import { count, number, percent, scientific, shortNames } from "../../format.js";
 import { card, link, table } from "../../ui.js";
+import { warned } from "../data/prose.js";
 import { selectionCard } from "../model/selection.js";
 
 /** Share of samples in the 95 % band below which it is said to be too narrow. */
@@ -41,6 +42,7 @@ async function judged(job, signal) {
   const made = card(
     "What it made",
     h("p", {}, more, job.refresh ? ", which has to prove better before it answers." : ", which answers from now on where no other version is chosen."),
+    warned(version.warnings),
     held?.nmse
       ? figures(`On ${count(held.samples)} samples that were held out`, held, version)
       : h("p", { class: "banner" }, "Nothing was held out: how well it predicts is not known. Evaluate it on a recording that it has not seen."),
