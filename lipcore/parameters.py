@@ -37,6 +37,8 @@ LEAST_VARIANCE = 1e-12
 BARRIERS = tuple(10.0**power for power in range(3, -4, -1))
 """Weights of the barrier: the last leaves at most 4 n times as much of the squared distance to gain."""
 NEWTON_STEPS, SHORTEST = 30, 1e-8
+ROUNDING = 1e-12
+"""Added to the unit diagonal of a step's matrix, which rounding may leave singular."""
 
 
 @dataclass(frozen=True)
@@ -311,7 +313,10 @@ def nearest_plausible(mean: Array, scale: Array, metric: Array, n: int, start: A
             for body in range(n):
                 part = slice(PARAMETERS * body, PARAMETERS * (body + 1))
                 hessian[part, part] += barrier * bend[body] * np.outer(scale[part], scale[part])
-            step = -np.linalg.solve(hessian, gradient)
+            unit = 1 / np.sqrt(hessian.diagonal())
+            hessian *= np.outer(unit, unit)  # near its bound, a body's part is many orders above the rest
+            hessian.flat[:: len(hessian) + 1] += ROUNDING
+            step = -unit * np.linalg.solve(hessian, unit * gradient)
             slack, length, now = float(-gradient @ step), 1.0, value(point, barrier)
             while length > SHORTEST and value(point + length * step, barrier) > now - 0.1 * length * slack:
                 length *= 0.5
