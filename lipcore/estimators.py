@@ -19,7 +19,7 @@ from lipcore.kernels.lse import LagrangianSEKernel
 from lipcore.kernels.se import SquaredExponentialKernel
 from lipcore.motion import Motion, check_joint_types
 from lipcore.urdf import JointMismatchError, RigidBody
-from lipcore.vocabulary import ROBOT_ESTIMATORS, JointType
+from lipcore.vocabulary import AUTO, CHOICES, ROBOT_ESTIMATORS, JointType
 
 
 class UnknownEstimatorError(ValueError):
@@ -98,20 +98,20 @@ def check_estimator(
     Raise UnknownEstimatorError, MissingRobotError where a robot is given in vain, ValueError where `options.geometry`
     needs one and there is none, JointMismatchError where its joints are not those of the data or in another order.
     """
-    if name not in ESTIMATORS:
-        raise UnknownEstimatorError(f"estimator is {name!r}, expected one of {', '.join(ESTIMATORS)}")
+    if name not in CHOICES:
+        raise UnknownEstimatorError(f"estimator is {name!r}, expected one of {', '.join(CHOICES)}")
     types = check_joint_types(joint_types)
     if robot is None:
-        if name in ROBOT_ESTIMATORS and options is not None and options.geometry in ("calibrate", "fixed"):
+        if name in (AUTO, *ROBOT_ESTIMATORS) and options is not None and options.geometry in ("calibrate", "fixed"):
             raise MissingRobotError(
                 f"geometry is {options.geometry!r}, which needs a robot: a profile such as panda, or a URDF"
             )
         return
-    if name not in ROBOT_ESTIMATORS:
-        raise MissingRobotError(f"estimator {name!r} takes no robot, only {' and '.join(ROBOT_ESTIMATORS)} do")
+    if name not in (AUTO, *ROBOT_ESTIMATORS):
+        raise MissingRobotError(f"estimator {name!r} takes no robot, only {', '.join(ROBOT_ESTIMATORS)} and {AUTO} do")
     if robot.joint_types != types:
         raise JointMismatchError(f"robot {robot.name!r} has joints {robot.joint_types}, the data have {types}")
-    if name != "rigid-body" and robot.order != tuple(range(robot.n_joints)):
+    if name == "rigid-body+lip-chain" and robot.order != tuple(range(robot.n_joints)):
         order = [robot.joint_names[robot.order.index(place)] for place in range(robot.n_joints)]
         raise JointMismatchError(
             f"estimator {name!r} needs joints from base to tip, {', '.join(order)}; the data have "

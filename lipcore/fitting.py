@@ -40,7 +40,8 @@ class FitCancelledError(RuntimeError):
 
 @dataclass(frozen=True)
 class FitProgress:
-    """stage: `hyperparameters` or `posterior`; objective: penalised −log evidence, nats; fraction: 0..1 of the work."""
+    """stage: `geometry`, `hyperparameters` or `posterior`; objective: penalised −log evidence, nats; fraction: 0..1 of
+    the work; estimator: the one at work, where `auto` trains several."""
 
     stage: str
     iteration: int
@@ -48,6 +49,7 @@ class FitProgress:
     objective: float
     fraction: float
     elapsed: float
+    estimator: str | None = None
 
 
 @dataclass(frozen=True)

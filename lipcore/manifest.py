@@ -9,6 +9,7 @@ from typing import Any
 
 from lipcore import strict_json
 from lipcore.arm.report import check_inertia, check_rotor, read_geometry
+from lipcore.auto.table import MOST_TEXT, Candidate, HeldOut, Selection
 from lipcore.calibration import Calibration
 from lipcore.fit_options import FitOptions
 from lipcore.kernels.friction import FRICTION_TERMS
@@ -20,6 +21,7 @@ FORMAT_VERSION = 3
 MANIFEST, TENSORS, ROBOT = "manifest.json", "model.safetensors", "robot.urdf"
 MATCHINGS = ("name", "order", "list")
 MAX_NAME = 100
+MAX_CANDIDATES = 10
 LARGEST = 1e12
 """No motion or torque in SI units is larger."""
 
@@ -71,6 +73,8 @@ def read_manifest_bytes(payload: bytes, limits: Limits = DEFAULT_LIMITS) -> dict
     for name, check in {**REQUIRED, **OPTIONAL}.items():
         if name in manifest:
             check(name, manifest[name], len(names))
+    if "selection" in manifest and manifest["selection"]["chosen"] != manifest["estimator"]:
+        raise _fail("selection.chosen", manifest["selection"]["chosen"], f"the estimator, {manifest['estimator']!r}")
     return manifest
 
 
@@ -216,6 +220,38 @@ def _check_lineage(name: str, value: Any, n: int) -> None:
         raise _fail(name, value, "an object")
 
 
+def _check_selection(name: str, value: Any, n: int) -> None:
+    _check_keys(name, value, Selection.__annotations__)
+    for key in ("asked", "chosen"):
+        _check_text(f"{name}.{key}", value[key])
+    _check_text(f"{name}.reason", value["reason"], MOST_TEXT)
+    held = value["held_out"]
+    _check_keys(f"{name}.held_out", held, HeldOut.__annotations__)
+    for key in ("rows", "blocks"):
+        _check_number(f"{name}.held_out.{key}", held[key], 0, LARGEST)
+    if not isinstance(held["repeats"], bool):
+        raise _fail(f"{name}.held_out.repeats", held["repeats"], "true or false")
+    if not isinstance(value["table"], list) or not 1 <= len(value["table"]) <= MAX_CANDIDATES:
+        raise _fail(f"{name}.table", value["table"], f"a list of 1 to {MAX_CANDIDATES}")
+    for index, row in enumerate(value["table"]):
+        _check_candidate(f"{name}.table[{index}]", row, n)
+
+
+def _check_candidate(name: str, row: Any, n: int) -> None:
+    _check_keys(name, row, Candidate.__annotations__)
+    _check_text(f"{name}.estimator", row["estimator"])
+    _check_number(f"{name}.seconds", row["seconds"], 0, LARGEST)
+    if row["error"] is not None:
+        _check_text(f"{name}.error", row["error"], MOST_TEXT)
+    for key in ("log_density", "difference", "standard_error"):
+        if row[key] is not None:
+            _check_number(f"{name}.{key}", row[key])
+    for key in ("nmse", "coverage"):
+        for joint, each in enumerate(() if row[key] is None else _check_list(f"{name}.{key}", row[key], n)):
+            if each is not None:
+                _check_number(f"{name}.{key}[{joint}]", each, 0)
+
+
 def _check_file(name: str, value: Mapping[str, Any], file: str) -> None:
     if value["file"] != file:
         raise _fail(f"{name}.file", value["file"], repr(file))
@@ -262,4 +298,5 @@ OPTIONAL: dict[str, Check] = {
     "parameters": _check_parameters,
     "hyperparameters": _check_hyperparameters,
     "robot": _check_robot,
+    "selection": _check_selection,
 }

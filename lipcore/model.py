@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
 from lipcore.arm.arm import Arm
+from lipcore.arm.geometry import Geometry
 from lipcore.arm.known import known_geometries
 from lipcore.arm.learning import Learnt, learn
 from lipcore.calibration import NO_CALIBRATION, Calibration, calibrate
 from lipcore.compact.basis import Basis
-from lipcore.compact.compress import compress, linear
+from lipcore.compact.compress import compressed, linear
 from lipcore.compact.posterior import CompactPosterior
 from lipcore.compact.statistics import Statistics
 from lipcore.estimators import Estimator, check_estimator, make_estimator
@@ -24,10 +27,19 @@ from lipcore.fit_options import FitOptions
 from lipcore.fitting import Cancelled, Progress, fit
 from lipcore.kernels.arm import ArmKernel
 from lipcore.motion import Motion, check_finite, check_joint_types, motion_arrays
-from lipcore.posterior import ExactPosterior
 from lipcore.samples import Array, Samples
 from lipcore.urdf import JointMismatchError, RigidBody
-from lipcore.vocabulary import DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS, TORQUE_CONVENTIONS, JointType, TorqueConvention
+from lipcore.vocabulary import (
+    AUTO,
+    DEFAULT_ESTIMATOR,
+    ROBOT_ESTIMATORS,
+    TORQUE_CONVENTIONS,
+    JointType,
+    TorqueConvention,
+)
+
+if TYPE_CHECKING:
+    from lipcore.auto.table import Selection
 
 MIN_SAMPLES = 10
 
@@ -55,7 +67,8 @@ class TorqueModel:
     """Fitted inverse dynamics of one robot: immutable, safe to share between threads.
 
     fit: what the fit reported, compact: how near the compact posterior comes to the exact one, both for the manifest;
-    robot: the rigid bodies of an estimator that has them; calibration: how the posterior's deviations are corrected.
+    robot: the rigid bodies of an estimator that has them; calibration: how the posterior's deviations are corrected;
+    selection: how `auto` has chosen the estimator, None where it was named.
     """
 
     estimator: Estimator
@@ -69,6 +82,7 @@ class TorqueModel:
     compact: dict[str, float | int | bool]
     robot: RigidBody | None = None
     calibration: Calibration = NO_CALIBRATION
+    selection: Selection | None = None
 
     @property
     def n_joints(self) -> int:
@@ -140,7 +154,8 @@ def train(
 ) -> TorqueModel:
     """Train a model on samples; see `lipcore.fitting.fit` for progress and cancellation.
 
-    robot: for estimators of rigid bodies, built for the joints of the samples.
+    estimator: one of `lipcore.estimators.ESTIMATORS`, or `auto`, which chooses (`lipcore.auto`); robot: for estimators
+    of rigid bodies, built for the joints of the samples.
     Raise ValueError for bad arguments, FitCancelledError, or NotPositiveDefiniteError.
     """
     from lipcore import conditioning  # noqa: PLC0415 - it imports this module
@@ -149,6 +164,7 @@ def train(
     options = options or FitOptions()
     model = fitted(samples, joint_types, estimator, options, torque_convention, on_progress, cancelled, robot)
     weights = spacing.recorded(samples.t, samples.episode)
+    weights = np.minimum(weights, 1.0 / float(model.fit.get("row_correlation", 1.0)))  # errors that last count once
     if not conditioning.wanted(options, len(samples), float(weights.sum())):
         return model
     return conditioning.condition(model, samples, weights, cancelled)
@@ -164,11 +180,14 @@ def fitted(
     cancelled: Cancelled | None = None,
     robot: RigidBody | None = None,
     stretches: Samples | None = None,
+    learnt: Learnt | None = None,
+    known: Sequence[Geometry] = (),
 ) -> TorqueModel:
     """Train as `train` does, on the chosen samples alone: where there are too many for memory, on a thinned table.
 
     stretches: contiguous samples of the same recordings, which tell the white noise of signals; the samples themselves
-    where None.
+    where None; learnt: what these samples have told of the rigid bodies, where that is known already; known:
+    geometries, base to tip, that the search for one looks at first, as of an earlier version.
     """
     options = options or FitOptions()
     types = check_joint_types(joint_types)
@@ -186,9 +205,12 @@ def fitted(
         )
     gravity = torque_convention == "gravity_included"
     check_estimator(estimator, types, robot, options)
-    learnt: Learnt | None = None
-    if estimator in ROBOT_ESTIMATORS:
-        arms = () if robot is not None else known_geometries(types, gravity)
+    if estimator == AUTO:
+        from lipcore.auto.choosing import choose  # noqa: PLC0415 - it imports this module
+
+        return choose(samples, types, options, torque_convention, on_progress, cancelled, robot, stretches)
+    if learnt is None and estimator in ROBOT_ESTIMATORS:
+        arms = (*known, *(() if robot is not None else known_geometries(types, gravity)))
         learnt = learn(samples, types, options, gravity, robot, arms, on_progress, cancelled, stretches)
     chosen = make_estimator(estimator, types, options.tied, None if learnt is None else learnt.arm)
     calibration = calibrate(estimator)
@@ -201,15 +223,13 @@ def fitted(
         )
     else:
         # not the noise: what rigid bodies leave of the torque is what the other term is there for
-        known = {} if learnt is None else learnt.params
-        start = {name: value for name, value in known.items() if name != "noise.log_std"}
+        params = {} if learnt is None else learnt.params
+        start = {name: value for name, value in params.items() if name != "noise.log_std"}
         fewer = options if learnt is None else _independent(options, learnt)
         found = fit(chosen.kernel, samples, fewer, on_progress, cancelled, stretches, start)
         used = samples.rows(found.rows)
-        exact = ExactPosterior.fit(chosen.kernel, found.params, used.motion(), used.torque())
-        exact = replace(exact, std_factor=calibration.function_std_factor)
-        compression = compress(exact, used.torque(), options.compact_tolerance, options.max_inducing_outputs)
-        report = {**asdict(found.report), "jitter": exact.factor.jitter}
+        compression, jitter = compressed(chosen.kernel, found.params, used, options, calibration)
+        report = {**asdict(found.report), "jitter": jitter}
         if learnt is not None:
             seconds = float(learnt.report["seconds"]) + found.report.seconds
             report = {**learnt.report, **report, "seconds": seconds}
@@ -262,6 +282,7 @@ def restore(
     robot: RigidBody | None = None,
     calibration: Calibration = NO_CALIBRATION,
     arm: Arm | None = None,
+    selection: Selection | None = None,
 ) -> TorqueModel:
     """Rebuild a model from its parts: hyperparameters, inducing outputs (see `Basis`) and statistics.
 
@@ -296,4 +317,5 @@ def restore(
         compact,
         robot,
         calibration,
+        selection,
     )

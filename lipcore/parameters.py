@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,14 +11,12 @@ import torch
 from torch import Tensor
 
 from lipcore.arm.geometry import Geometry
-from lipcore.arm.learning import torque_of
 from lipcore.compact.compress import checks
 from lipcore.compact.posterior import CompactPosterior
 from lipcore.estimators import Estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.base import LinearKernel
 from lipcore.kernels.friction import FRICTION_TERMS, FrictionKernel
-from lipcore.motion import Motion
 from lipcore.posterior import Posterior
 from lipcore.samples import Array
 from lipcore.urdf import PARAMETERS
@@ -37,8 +35,6 @@ LEAST_VARIANCE = 1e-12
 BARRIERS = tuple(10.0**power for power in range(3, -4, -1))
 """Weights of the barrier: the last leaves at most 4 n times as much of the squared distance to gain."""
 NEWTON_STEPS, SHORTEST = 30, 1e-8
-ROUNDING = 1e-12
-"""Added to the unit diagonal of a step's matrix, which rounding may leave singular."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +117,7 @@ def inertial_parameters(posterior: CompactPosterior, estimator: Estimator) -> In
     term = _arm_kernel(estimator)
     weights, size = weight_posterior(posterior, term), PARAMETERS * term.n_joints
     mean, std, scale = (part[:size].reshape(-1, PARAMETERS) for part in (weights.mean, weights.std, weights.scale))
-    geometry = _geometry(term, weights.mean)
+    geometry = term.geometry(weights.mean)
     if all(is_plausible(body) for body in mean):
         return InertialParameters(mean, std, scale, mean, True, geometry, np.zeros(term.n_joints))
     # masses for the geometry that the arm is linearised at, where the torque is exactly linear in them; or masses and
@@ -139,23 +135,10 @@ def inertial_parameters(posterior: CompactPosterior, estimator: Estimator) -> In
         options.append(nearest_plausible(weights.mean, weights.scale, metric, term.n_joints, start))
     asked = checks(posterior.basis.inducing, 0)
     torque = posterior.predict(asked, term).mean.numpy()
-    errors = [np.sqrt(np.mean((_torque(term, option, asked) - torque) ** 2, axis=0)) for option in options]
+    errors = [np.sqrt(np.mean((term.torque(option, asked) - torque) ** 2, axis=0)) for option in options]
     best = int(np.argmin([np.mean(error / np.maximum(torque.std(0), 1e-12)) for error in errors]))
     plausible = options[best][:size].reshape(-1, PARAMETERS)
-    return InertialParameters(mean, std, scale, plausible, False, _geometry(term, options[best]), errors[best])
-
-
-def _geometry(term: ArmKernel, weights: Array) -> Geometry:
-    """The arm's geometry with its steps as these weights have them, (p,)."""
-    return term.arm.geometry.moved(weights[term.steps]) if term.arm.steps else term.arm.geometry
-
-
-def _torque(term: ArmKernel, weights: Array, motion: Motion) -> Array:
-    """Torque of an arm of these weights, (p,), not linearised: (N, n) N·m. Alternative arms are left out."""
-    arm, n = term.arm, term.n_joints
-    bodies = np.ascontiguousarray(weights[: PARAMETERS * n].reshape(n, PARAMETERS)[arm.order])
-    out = torque_of(replace(arm, geometry=_geometry(term, weights), parameters=bodies), motion.arrays())
-    return np.asarray(out + weights[PARAMETERS * n : (PARAMETERS + 1) * n] * motion.ddq.numpy())
+    return InertialParameters(mean, std, scale, plausible, False, term.geometry(options[best]), errors[best])
 
 
 def precision(posterior: CompactPosterior, term: LinearKernel) -> Array:
@@ -206,7 +189,7 @@ def _of_arm(posterior: Posterior, term: ArmKernel, joint_names: Sequence[str], p
     weights, arm = weight_posterior(posterior, term), term.arm
     n = term.n_joints
     rotors = slice(PARAMETERS * n, (PARAMETERS + 1) * n)
-    geometry, step_std = _geometry(term, weights.mean), weights.std[term.steps]
+    geometry, step_std = term.geometry(weights.mean), weights.std[term.steps]
     joints, at = [], 0
     for place, count in enumerate(geometry.screws):
         std = step_std[at : at + count] if arm.steps else np.zeros(0)
@@ -313,10 +296,10 @@ def nearest_plausible(mean: Array, scale: Array, metric: Array, n: int, start: A
             for body in range(n):
                 part = slice(PARAMETERS * body, PARAMETERS * (body + 1))
                 hessian[part, part] += barrier * bend[body] * np.outer(scale[part], scale[part])
-            unit = 1 / np.sqrt(hessian.diagonal())
-            hessian *= np.outer(unit, unit)  # near its bound, a body's part is many orders above the rest
-            hessian.flat[:: len(hessian) + 1] += ROUNDING
-            step = -unit * np.linalg.solve(hessian, unit * gradient)
+            try:
+                step = -np.linalg.solve(hessian, gradient)
+            except np.linalg.LinAlgError:  # at the boundary, but for rounding: the point is plausible all the same
+                break
             slack, length, now = float(-gradient @ step), 1.0, value(point, barrier)
             while length > SHORTEST and value(point + length * step, barrier) > now - 0.1 * length * slack:
                 length *= 0.5

@@ -87,6 +87,8 @@ def encode(model: TorqueModel, lineage: Mapping[str, Any] | None = None) -> tupl
         "lineage": dict(lineage or {}),
         "tensors": {"file": TENSORS, "bytes": len(payload), "sha256": sha256(payload)},
     }
+    if model.selection is not None:
+        manifest["selection"] = model.selection
     files = {TENSORS: payload}
     if model.robot is not None:
         files[ROBOT] = model.robot.urdf.encode()
@@ -262,6 +264,7 @@ def _restore(manifest: Mapping[str, Any], tensors: dict[str, Tensor], robot: Rig
         robot,
         Calibration(**manifest["calibration"]),
         arm,
+        manifest.get("selection"),
     )
     stated = manifest.get("hyperparameters")
     if stated is not None and stated != {name: value.tolist() for name, value in params.items()}:

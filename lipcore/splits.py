@@ -92,14 +92,19 @@ def split(episode: Numbers, t: Array, how: Split) -> Parts:
     if len(t) < 2:
         raise SplitError("rows", len(t), "at least 2, one for each side")
     order = np.lexsort((t, episode))
-    held = _HELD[how.kind](episode[order], how)
-    near = _near_other_side(episode[order], t[order], held, how.guard_s)
-    parts = Parts(np.empty(len(t), dtype=bool), np.empty(len(t), dtype=bool))
-    parts.train[order], parts.held_out[order] = ~held & ~near, held & ~near
+    parts = guarded(episode, t, order, _HELD[how.kind](episode[order], how), how.guard_s)
     for side, found in (("held out", parts.held_out), ("to train on", parts.train)):
         if not found.any():
             expected = f"fewer: no row {side} is further than {how.guard_s:g} s from the other side"
             raise SplitError("guarded rows", parts.guarded, expected)
+    return parts
+
+
+def guarded(episode: Numbers, t: Array, order: Numbers, held: Mask, guard_s: float) -> Parts:
+    """Both sides without the rows next to the other one. order: (N,), of the rows; held: (N,), in that order."""
+    near = _near_other_side(episode[order], t[order], held, guard_s)
+    parts = Parts(np.empty(len(t), dtype=bool), np.empty(len(t), dtype=bool))
+    parts.train[order], parts.held_out[order] = ~held & ~near, held & ~near
     return parts
 
 

@@ -84,6 +84,11 @@ class Arm:
         return self.geometry.n_joints
 
     @property
+    def geometries(self) -> tuple[Geometry, ...]:
+        """Its geometry, then those of the alternatives."""
+        return (self.geometry, *(each.geometry for each in self.alternatives[1:]))
+
+    @property
     def steps(self) -> int:
         """Numbers of the geometry that are learnt: none where it is fixed."""
         return len(self.widths)

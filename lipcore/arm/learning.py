@@ -28,7 +28,7 @@ from lipcore.arm.scales import rescale
 from lipcore.arm.search import Found, Pool, search
 from lipcore.fit_options import FitOptions
 from lipcore.fitting import Cancelled, FitCancelledError, FitProgress, Progress
-from lipcore.kernels.compiled.arm import PARAMETERS, arm_torques
+from lipcore.kernels.compiled.arm import PARAMETERS
 from lipcore.kernels.friction import FRICTION_TERMS, friction_features
 from lipcore.samples import Array, Samples
 from lipcore.selection import spread_out
@@ -73,17 +73,22 @@ def learn(
     on_progress: Progress | None = None,
     cancelled: Cancelled | None = None,
     stretches: Samples | None = None,
+    begin: Sequence[Geometry] = (),
+    seed: int = 0,
 ) -> Learnt:
     """Learn the arm that moved so.
 
     gravity: whether torques contain it; robot: a URDF's bodies, which geometry and masses are expected around, as
     `options.geometry` and `options.prior` say; known: geometries to look at, too, where none is given; stretches:
-    contiguous samples that tell the white noise, where `samples` are thinned.
+    contiguous samples that tell the white noise, where `samples` are thinned; begin: geometries from base to tip that
+    other samples of the same arm have told, which are followed from there, without a search; seed: of the search.
 
     Raise FitCancelledError when `cancelled` answers true, ValueError for samples that no arm can be learnt from.
     """
     with threadpool_limits(1):  # matrices are small: more threads would take longer
-        return _learn(samples, joint_types, options, gravity, robot, known, on_progress, cancelled, stretches)
+        return _learn(
+            samples, joint_types, options, gravity, robot, known, on_progress, cancelled, stretches, begin, seed
+        )
 
 
 def _learn(
@@ -96,29 +101,31 @@ def _learn(
     on_progress: Progress | None,
     cancelled: Cancelled | None,
     stretches: Samples | None,
+    begin: Sequence[Geometry],
+    seed: int,
 ) -> Learnt:
     watch = _Watch(on_progress, cancelled, time.monotonic(), options.max_iterations)
     mode = mode_of(options, robot)
     rows = spread_out(samples.motion(), options.posterior_samples).numpy()
     problem, order = make_problem(samples.rows(rows), joint_types, options, gravity, robot, samples)
     found: Found | None = None
-    if mode == "learn":
+    if mode == "learn" and not begin:
         few = spread_out(samples.rows(rows).motion(), max(SEARCH_ROWS, ROWS_PER_JOINT * len(joint_types)))
         types = tuple(joint_types[joint] for joint in order)
         signals = samples if stretches is None else stretches
         sensor = noise_level([signals.tau[part][:, order] for part in signals.episodes()])
         found = search(
-            problem.rows(few.numpy()), types, gravity, sensor, options.search_seconds, 0, known, watch.searching
+            problem.rows(few.numpy()), types, gravity, sensor, options.search_seconds, seed, known, watch.searching
         )
-        polished = Pool(problem.recombined(CHECKS))
-        for each in found.points[:POLISHED]:
-            polished.add(problem.descend(each.geometry, each.sigma, POLISHING, watch.stop))
-        ends = polished.points
+        starts = [(each.geometry, each.sigma) for each in found.points[:POLISHED]]
     else:
-        if robot is None:
-            raise ValueError(f"geometry is {mode!r}, which needs a robot: a profile such as panda, or a URDF")
-        begin = Geometry.from_robot(robot, gravity)
-        ends = [problem.descend(begin, noise.start(samples)[order], POLISHING, watch.stop)]
+        if robot is not None and (mode == "fixed" or not begin):
+            begin = [Geometry.from_robot(robot, gravity)]
+        starts = [(each, noise.start(samples)[order]) for each in begin]
+    polished = Pool(problem.recombined(CHECKS))
+    for geometry, sigma in starts:
+        polished.add(problem.descend(geometry, sigma, POLISHING, watch.stop))
+    ends = polished.points
     watch.step("hyperparameters", ends[0].value, 0.85)
     contiguous = (samples if stretches is None else stretches).rows(slice(0, CORRELATED))
     every, _ = make_problem(contiguous, joint_types, options, gravity, robot)
@@ -378,10 +385,3 @@ class _Watch:
 
     def stop(self) -> bool:
         return self.cancelled is not None and self.cancelled()
-
-
-def torque_of(arm: Arm, motions: Array) -> Array:
-    """Torque of the bodies of an arm alone, (N, n) N·m in the order of the data: motions (N, 3, n)."""
-    out = np.zeros((len(motions), arm.n_joints))
-    arm_torques(arm.geometry.constants, arm.geometry.gravity, arm.parameters, arm.order, motions, out)
-    return out

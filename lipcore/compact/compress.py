@@ -7,14 +7,17 @@ from dataclasses import asdict, dataclass, replace
 import torch
 from torch import Tensor
 
+from lipcore.calibration import Calibration
 from lipcore.compact.basis import Basis, split
 from lipcore.compact.pivots import Pivots, pivots
 from lipcore.compact.posterior import CompactPosterior
 from lipcore.compact.statistics import collect
+from lipcore.fit_options import FitOptions
 from lipcore.kernels.base import Params, SumKernel, TorqueKernel
 from lipcore.linalg import cholesky
 from lipcore.motion import Motion
 from lipcore.posterior import ExactPosterior, Prediction
+from lipcore.samples import Samples
 from lipcore.selection import spread_out
 
 QUERIES = 200
@@ -72,6 +75,16 @@ class Compression:
         return {**sizes, "tolerance": self.tolerance, "tolerance_reached": self.reached, **asdict(self.deviation)}
 
 
+def compressed(
+    kernel: TorqueKernel, params: Params, samples: Samples, options: FitOptions, calibration: Calibration
+) -> tuple[Compression, float]:
+    """The compact posterior of all these samples, and the jitter, (N·m)², that the exact one took."""
+    exact = ExactPosterior.fit(kernel, params, samples.motion(), samples.torque())
+    exact = replace(exact, std_factor=calibration.function_std_factor)
+    compression = compress(exact, samples.torque(), options.compact_tolerance, options.max_inducing_outputs)
+    return compression, exact.factor.jitter
+
+
 def compress(exact: ExactPosterior, tau: Tensor, tolerance: float, most: int, seed: int = 0) -> Compression:
     """Smallest compact posterior within `tolerance` of the exact one, or the best with `most` inducing outputs.
 
@@ -113,7 +126,7 @@ def linear(
     return Compression(posterior, Deviation(0.0, 0.0, 0.0, 0), tolerance, True)
 
 
-def checks(motion: Motion, seed: int) -> Motion:
+def checks(motion: Motion, seed: int, queries: int = QUERIES) -> Motion:
     """Motions to compare posteriors at: half of them training samples, half recombined from several.
 
     A recombined motion takes position, velocity and acceleration from three samples: it lies where the robot has been,
@@ -121,8 +134,8 @@ def checks(motion: Motion, seed: int) -> Motion:
     """
     generator = torch.Generator().manual_seed(seed)
     size = len(motion)
-    seen = torch.randperm(size, generator=generator)[: QUERIES // 2]
-    rows = torch.randint(size, (3, QUERIES - len(seen)), generator=generator)
+    seen = torch.randperm(size, generator=generator)[: queries // 2]
+    rows = torch.randint(size, (3, queries - len(seen)), generator=generator)
     parts = ((motion.q, rows[0]), (motion.dq, rows[1]), (motion.ddq, rows[2]))
     return Motion(*(torch.cat([values[seen], values[each]]) for values, each in parts))
 

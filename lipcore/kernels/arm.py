@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from lipcore.arm.arm import KINDS, Arm
+from lipcore.arm.geometry import Geometry
 from lipcore.kernels.base import LinearKernel, Params
 from lipcore.kernels.compiled.arm import (
     PARAMETERS,
@@ -16,6 +17,7 @@ from lipcore.kernels.compiled.arm import (
     arm_energies,
     arm_features,
     arm_query,
+    arm_torques,
 )
 from lipcore.kernels.compiled.views import Memory
 from lipcore.kernels.friction import friction_features
@@ -62,6 +64,18 @@ class ArmKernel(LinearKernel):
         """Places of the geometry's steps among the weights."""
         first = (PARAMETERS + 1) * self.n_joints
         return slice(first, first + self.arm.steps)
+
+    def geometry(self, weights: Array) -> Geometry:
+        """The arm's geometry with its steps as these weights, (p,), have them."""
+        return self.arm.geometry.moved(weights[self.steps]) if self.arm.steps else self.arm.geometry
+
+    def torque(self, weights: Array, motion: Motion) -> Array:
+        """Y(θ + δθ) π + r ∘ ddq of these weights, (p,), not linearised: (N, n) N·m. Alternative arms are left out."""
+        n, geometry = self.n_joints, self.geometry(weights)
+        bodies = np.ascontiguousarray(weights[: PARAMETERS * n].reshape(n, PARAMETERS)[self.arm.order])
+        out = np.zeros((len(motion), n))
+        arm_torques(geometry.constants, geometry.gravity, bodies, self.arm.order, motion.arrays(), out)
+        return np.asarray(out + weights[PARAMETERS * n : (PARAMETERS + 1) * n] * motion.ddq.numpy())
 
     def features(self, x: Motion) -> Tensor:
         """Φ at each sample: (N, n, p)."""

@@ -34,7 +34,8 @@ def long(server):
     return upload(server.client, stream("panda", 200, seed=81))["id"]
 
 
-ENDLESSLY = [part for name, value in ENDLESS.items() for part in ("--option", f"{name}={value}")]
+ENDLESSLY = ["--estimator", "lip-chain"]
+ENDLESSLY += [part for name, value in ENDLESS.items() for part in ("--option", f"{name}={value}")]
 
 
 def test_ctrl_c_in_train_cancels_the_job(lipserve, server, long, interrupted):

@@ -1,0 +1,226 @@
+"""The estimator `auto`: what it holds out, what it chooses, and what it says of that."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lipcore.auto import contest
+from lipcore.auto.unseen import LEAST_ROWS, hold_out
+from lipcore.estimators import MissingRobotError, check_estimator
+from lipcore.fit_options import FitOptions
+from lipcore.fitting import FitCancelledError
+from lipcore.linalg import NotPositiveDefiniteError
+from lipcore.manifest import ModelFormatError, read_manifest_bytes
+from lipcore.model import train
+from lipcore.persistence import load, manifest_bytes, save
+from lipcore.robots import load_robot
+from lipcore.samples import Samples
+from lipcore.simulation import Stream, simulate
+from lipcore.splits import SplitError
+from lipcore.urdf import RigidBody
+
+ARM = "finger-edu"
+TYPES = ("revolute",) * 3
+OPTIONS = FitOptions(
+    hyperparameter_samples=30, posterior_samples=100, max_iterations=12, starts=1, device="cpu", search_seconds=2.0
+)
+NAMES = ["rigid-body", "lip-chain", "rigid-body+lip-chain"]
+
+
+def recorded(rows=200, seed=3, speed=4.0):
+    return simulate(load_robot(ARM), Stream(rows, rate=10.0, speed=speed, noise=0.0005, coulomb=0.005), seed)
+
+
+def periodic(rows=400, period=5.03):
+    """A motion of two harmonics, over and over."""
+    t = np.arange(rows) / 10.0
+    phase = 2 * np.pi / period * np.outer([1.0, 2.0], t)[:, :, None] + np.arange(3)
+    rate = (2 * np.pi / period * np.array([1.0, 2.0]))[:, None, None]
+    q, dq, ddq = np.sin(phase).sum(0), (rate * np.cos(phase)).sum(0), (-(rate**2) * np.sin(phase)).sum(0)
+    return replace(recorded(rows), q=q, dq=dq, ddq=ddq)
+
+
+@pytest.fixture(scope="module")
+def chosen():
+    seen = []
+    model = train(recorded(), TYPES, options=OPTIONS, on_progress=seen.append)
+    return model, seen
+
+
+def test_of_a_rigid_arm_the_rigid_body_is_chosen(chosen):
+    model, _ = chosen
+    found = model.selection
+    assert (found["asked"], found["chosen"]) == ("auto", "rigid-body")
+    assert model.estimator.name == "rigid-body"
+    assert [row["estimator"] for row in found["table"]] == NAMES
+    best = max(row["log_density"] for row in found["table"])
+    for row in found["table"]:
+        assert row["error"] is None
+        assert len(row["nmse"]) == len(row["coverage"]) == 3
+        assert row["difference"] == pytest.approx(row["log_density"] - best)
+    assert found["held_out"] == {"rows": found["held_out"]["rows"], "blocks": 3, "repeats": False}
+    assert 0.15 * 200 < found["held_out"]["rows"] < 0.3 * 200
+
+
+def test_the_chosen_one_has_learnt_all_samples(chosen):
+    model, _ = chosen
+    samples = recorded()
+    assert model.fit["samples_given"] == len(samples)
+    assert "search_hops" in model.fit
+    unseen = recorded(seed=8)
+    error = model.predict(unseen.q, unseen.dq, unseen.ddq).tau - unseen.tau
+    assert (np.mean(error**2, axis=0) < 0.05 * unseen.tau.var(axis=0)).all()
+
+
+def test_progress_never_falls_and_names_the_estimator_at_work(chosen):
+    _, seen = chosen
+    fractions = [each.fraction for each in seen]
+    assert fractions == sorted(fractions)
+    assert 0 <= fractions[0] <= fractions[-1] <= 1
+    assert [*dict.fromkeys(each.estimator for each in seen)] == ["rigid-body", "rigid-body+lip-chain", "lip-chain"]
+    elapsed = [each.elapsed for each in seen]
+    assert elapsed == sorted(elapsed)
+
+
+def test_the_choice_is_saved_and_loaded(chosen, tmp_path):
+    model, _ = chosen
+    manifest = save(model, tmp_path / "model")
+    assert manifest["selection"] == model.selection
+    assert load(tmp_path / "model").selection == model.selection
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: s.pop("table"), "selection lacks table"),
+        (lambda s: s.update(more=1), "selection has the entry 'more'"),
+        (lambda s: s.update(chosen="lip"), "selection.chosen is 'lip', expected the estimator, 'rigid-body'"),
+        (lambda s: s.update(reason="x" * 301), "selection.reason is"),
+        (lambda s: s.update(table=[]), "selection.table is"),
+        (lambda s: s["held_out"].update(repeats=1), "selection.held_out.repeats is 1, expected true or false"),
+        (lambda s: s["held_out"].update(rows=-1), "selection.held_out.rows is -1"),
+        (lambda s: s["table"][1].update(nmse=[1.0]), r"selection.table\[1\].nmse is .* expected a list of 3"),
+        (lambda s: s["table"][0].update(log_density="good"), r"selection.table\[0\].log_density is 'good'"),
+        (lambda s: s["table"][0].update(error=""), r"selection.table\[0\].error is"),
+    ],
+)
+def test_a_malformed_choice_is_refused(chosen, tmp_path, change, message):
+    manifest = save(chosen[0], tmp_path / "model")
+    manifest["selection"] = deepcopy(manifest["selection"])  # it is the model's
+    change(manifest["selection"])
+    with pytest.raises(ModelFormatError, match=message):
+        read_manifest_bytes(manifest_bytes(manifest))
+
+
+def test_of_an_arm_with_springs_the_chain_is_chosen():
+    samples = recorded(300, speed=8.0)
+    # of the energy 0.1 sin²q₂ sin q₃: gravity has no second harmonic
+    _, second, third = samples.q.T
+    spring = [0 * second, np.sin(2 * second) * np.sin(third), np.sin(second) ** 2 * np.cos(third)]
+    options = replace(OPTIONS, hyperparameter_samples=50, max_iterations=40)
+    model = train(replace(samples, tau=samples.tau + 0.1 * np.stack(spring, axis=1)), TYPES, options=options)
+    assert model.selection["chosen"] == model.estimator.name == "lip-chain", model.selection
+    rows = {row["estimator"]: row for row in model.selection["table"]}
+    assert rows["rigid-body"]["difference"] < -2 * rows["rigid-body"]["standard_error"] < 0
+    assert model.fit["samples_posterior"] == len(samples)
+
+
+def test_one_that_fails_is_in_the_table_and_the_others_go_on(monkeypatch):
+    def fails(self, samples, place, before=None, search=True):
+        raise NotPositiveDefiniteError("nothing can be\nlearnt")
+
+    monkeypatch.setattr(contest.Work, "learn", fails)
+    model = train(recorded(), TYPES, options=OPTIONS)
+    assert model.selection["chosen"] == model.estimator.name == "lip-chain"
+    assert model.selection["reason"] == "no other could be trained"
+    rows = {row["estimator"]: row for row in model.selection["table"]}
+    assert rows["rigid-body"]["error"] == "NotPositiveDefiniteError: nothing can be learnt"
+    assert rows["rigid-body"]["log_density"] is None
+    assert rows["rigid-body+lip-chain"]["error"] is not None
+    assert rows["lip-chain"]["error"] is None
+
+    monkeypatch.setattr(contest, "fitted", lambda *given: (_ for _ in ()).throw(ValueError("neither")))
+    with pytest.raises(NotPositiveDefiniteError, match="nothing can be"):
+        train(recorded(), TYPES, options=OPTIONS)
+
+
+def test_few_rows_are_not_held_out():
+    model = train(recorded(LEAST_ROWS - 10), TYPES, options=OPTIONS)
+    found = model.selection
+    assert found["chosen"] == model.estimator.name == "rigid-body"
+    assert found["reason"].startswith("too little to hold some out and judge by: rows is 50, expected at least 60")
+    assert found["held_out"] == {"rows": 0, "blocks": 0, "repeats": False}
+    assert [row["estimator"] for row in found["table"]] == ["rigid-body"]
+
+
+def test_a_robot_is_for_those_that_have_a_use_for_it():
+    samples = recorded()
+    robot = RigidBody.from_profile(ARM, samples.joint_names, TYPES)
+    model = train(samples, TYPES, options=OPTIONS, robot=robot)
+    assert all(row["error"] is None for row in model.selection["table"])
+    assert model.robot is (None if model.estimator.name == "lip-chain" else robot)
+    assert model.arm is None or model.arm.mode == "calibrate"
+    with pytest.raises(MissingRobotError, match="geometry is 'fixed', which needs a robot"):
+        check_estimator("auto", TYPES, options=FitOptions(geometry="fixed"))
+
+
+@pytest.mark.parametrize("after", [0, 3, 60])
+def test_it_can_be_cancelled(after):
+    seen = []
+    with pytest.raises(FitCancelledError):
+        train(recorded(), TYPES, options=OPTIONS, on_progress=seen.append, cancelled=lambda: len(seen) >= after)
+
+
+def test_the_search_is_taken_up_again_where_the_chain_leads(monkeypatch):
+    searches = []
+    learn = contest.learn
+
+    def counted(*given):
+        searches.append(given[-1])  # the seed
+        return learn(*given)
+
+    monkeypatch.setattr(contest, "learn", counted)
+    monkeypatch.setattr(contest.Contest, "_chain_leads", lambda self: True)
+    train(recorded(), TYPES, options=OPTIONS)
+    assert searches[:2] == [0, 1]
+
+
+def test_motion_that_is_seen_nowhere_else_is_held_out():
+    once, again = recorded(200, seed=5), periodic(400)
+    both = Samples.concatenate([replace(again, t=again.t), replace(once, t=once.t + 40.0)])
+    found = hold_out(replace(both, episode=np.zeros(len(both), np.int64)), TYPES)
+    assert not found.repeats
+    assert (np.flatnonzero(found.parts.held_out) >= 400 - 30).all()
+    assert not (found.parts.held_out & found.parts.train).any()
+
+
+def test_a_recording_that_repeats_itself_is_known():
+    found = hold_out(periodic(), TYPES)
+    assert found.repeats
+    held = np.flatnonzero(np.diff(found.parts.held_out.astype(int)) == 1)
+    assert found.blocks == 5 == len(held)
+    assert np.diff(held).min() > 60  # they are spread over it
+    noisy = periodic()
+    rng = np.random.default_rng(0)
+    noisy = replace(noisy, ddq=noisy.ddq + 0.1 * noisy.ddq.std(0) * rng.standard_normal(noisy.ddq.shape))
+    assert hold_out(noisy, TYPES).repeats
+    assert not hold_out(recorded(), TYPES).repeats
+
+
+def test_what_is_held_out_does_not_depend_on_the_order_of_rows():
+    samples = recorded()
+    found, order = hold_out(samples, TYPES), np.random.default_rng(1).permutation(len(samples))
+    other = hold_out(samples.rows(order), TYPES)
+    assert (found.parts.held_out[order] == other.parts.held_out).all()
+
+
+def test_too_little_cannot_be_divided():
+    with pytest.raises(SplitError, match="rows is 59, expected at least 60"):
+        hold_out(recorded(59), TYPES)
+    fast = recorded(200)
+    with pytest.raises(SplitError, match=r"seconds is 0\.199, expected at least 4 to hold some out"):
+        hold_out(replace(fast, t=fast.t / 100), TYPES)
