@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 import torch
 from safetensors.torch import load as load_tensors
@@ -14,7 +15,6 @@ from safetensors.torch import save as save_tensors
 
 from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, dynamics, load, persistence, save, train
 from lipcore.arm.arm import Alternative, Arm
-from lipcore.arm.learning import torque_of
 from lipcore.compact.compress import linear
 from lipcore.compact.statistics import collect, merge
 from lipcore.estimators import make_estimator
@@ -28,7 +28,7 @@ from lipcore.parameters import inertial_parameters, report, weight_posterior
 from lipcore.robots import load_robot
 from lipcore.simulation import Stream, simulate
 from lipcore.urdf import RigidBody
-from tests.lipcore.arm_oracles import arm, motions, recorded
+from tests.lipcore.arm_oracles import arm, as_robot, motions, recorded
 from tests.lipcore.arms import random_bodies
 
 OPTIONS = FitOptions(device="cpu", search_seconds=2.0, statistics="chosen")
@@ -165,7 +165,9 @@ def test_a_choice_of_arms_has_the_moments_of_their_mixture(learnt: TorqueModel, 
     terms = friction_features(query.dq).numpy().transpose(1, 2, 0)
     torques = []
     for each in found.alternatives:
-        bodies = torque_of(replace(found, geometry=each.geometry, parameters=each.parameters), asked)
+        model_of, flat = as_robot(each.geometry, random_bodies(3, 0)).model, each.parameters.reshape(-1)
+        data = model_of.createData()  # (the regressor of Pinocchio, since learnt bodies may be none that exist)
+        bodies = np.array([pin.computeJointTorqueRegressor(model_of, data, *motion) @ flat for motion in asked])
         torques.append(bodies + each.rotor * asked[:, 2] + (terms * each.friction).sum(-1))
     more, shares = np.array(torques) - torques[0], np.array([each.probability for each in found.alternatives])
     mean = np.einsum("k,kni->ni", shares, more)
@@ -226,7 +228,6 @@ def test_components_of_a_learnt_arm(learnt: TorqueModel, unseen: Samples) -> Non
     motion, tau = unseen.motion()[:10], unseen.torque()[:10]
     found = dynamics.components(learnt, motion, dynamics.COMPONENTS, tau)
     robot, data = arm("RPR", 51)[2], arm("RPR", 51)[2].model.createData()
-    pin = pytest.importorskip("pinocchio")
     for k, estimate in enumerate(found["gravity"].mean.numpy()):
         expected = pin.computeGeneralizedGravity(robot.model, data, unseen.q[k])
         np.testing.assert_allclose(estimate, expected, rtol=0, atol=0.02 * np.abs(unseen.tau).max())
