@@ -74,7 +74,7 @@ def test_ctrl_c_in_follow_leaves_the_job(lipserve, asked, server, long, interrup
 def test_a_job_is_queued_followed_and_listed(lipserve, asked, server, tmp_path):
     path = tmp_path / "arm.npz"
     recordings.write(path, stream(seed=82))
-    job = asked("train", path, "--model", "cli-queued", "--no-wait", "--estimator", "se", *QUICKLY, "--json")["id"]
+    job = asked("train", path, "--model", "cli-queued", "--no-wait", *QUICKLY, "--estimator", "se", "--json")["id"]
     assert "cli-queued (se): succeeded, version 1" in asked("jobs", "follow", job)
     assert asked("jobs", "show", job, "--json")["state"] == "succeeded"
     assert job in [each["id"] for each in asked("jobs", "list", "--json")]

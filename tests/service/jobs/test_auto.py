@@ -46,7 +46,8 @@ def test_a_refresh_keeps_the_chosen_estimator(api, made):
 
 def test_the_choice_goes_with_an_archive(api, made):
     archive = api.get("/v1/models/chosen/export", params={"version": made["version"]})
-    answer = api.post("/v1/models/import", content=archive.content, params={"name": "carried"})
+    headers = {"content-type": "application/x-tar"}
+    answer = api.post("/v1/models/import", content=archive.content, headers=headers, params={"name": "carried"})
     assert answer.status_code == 201, answer.text
     version = api.get(f"/v1/models/carried/versions/{answer.json()['version']}").json()
     assert version["selection"] == api.get(f"/v1/models/chosen/versions/{made['version']}").json()["selection"]
