@@ -1,4 +1,4 @@
-"""Recordings that tell little of an arm, or what none has: a model or a clear refusal, never a hang."""
+"""Recordings that tell little of an arm, or something else than they should: a model or a clear refusal."""
 
 from __future__ import annotations
 
@@ -10,11 +10,18 @@ import numpy as np
 import pytest
 
 from lipcore import FitOptions, Samples, load, save, train
+from lipcore.arm import search
 from lipcore.linalg import NotPositiveDefiniteError
 from tests.lipcore.arm_oracles import arm, recorded
 
-OPTIONS = FitOptions(device="cpu", search_seconds=3.0, posterior_samples=80)
+OPTIONS = FitOptions(device="cpu", search_seconds=0.3, posterior_samples=60)
 KINDS = {"R": "revolute", "P": "prismatic"}
+
+
+@pytest.fixture(autouse=True)
+def fewer_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is found does not matter here."""
+    monkeypatch.setattr(search, "SCREENED", 40)
 
 
 def samples(kinds: str = "RRR", size: int = 60, noise: float = 0.01) -> Samples:
@@ -49,15 +56,24 @@ CASES: dict[str, tuple[str, Callable[[], Samples]]] = {
 }
 
 
-@pytest.mark.parametrize("convention", ["gravity_included", "gravity_compensated"])
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    ("name", "convention"),
+    [
+        *((name, "gravity_included") for name in CASES),
+        *((name, "gravity_compensated") for name in ("no joint moves", "no torque", "ten samples", "one joint")),
+    ],
+)
 def test_it_ends_in_a_model_or_a_clear_refusal(name: str, convention: str, tmp_path: Path) -> None:
     kinds, make = CASES[name]
     data = make()
     try:
         model = train(data, [KINDS[kind] for kind in kinds], "rigid-body", OPTIONS, convention)
     except (ValueError, NotPositiveDefiniteError) as error:
-        assert len(str(error)) > 20, error  # noqa: PT017 - either outcome will do
+        said = str(error)
+    else:
+        said = ""
+    if said:
+        assert len(said) > 20, said
         return
     answer = model.predict(data.q, data.dq, data.ddq, covariance=True)
     for part in (answer.tau, answer.tau_std, answer.covariance, answer.noise_std):
@@ -75,7 +91,7 @@ def test_it_ends_in_a_model_or_a_clear_refusal(name: str, convention: str, tmp_p
 @pytest.mark.parametrize("name", ["no joint moves", "no torque", "ten samples", "free of noise"])
 def test_energies_beside_the_arm_do_not_fail_either(name: str) -> None:
     kinds, make = CASES[name]
-    options = replace(OPTIONS, hyperparameter_samples=20, max_iterations=5, starts=1, search_seconds=1.0)
+    options = replace(OPTIONS, hyperparameter_samples=20, max_iterations=5, starts=1)
     data = make()
     model = train(data, [KINDS[kind] for kind in kinds], "rigid-body+lip-chain", options)
     assert np.isfinite(model.predict(data.q, data.dq, data.ddq).tau).all()
