@@ -18,7 +18,7 @@ from lipcore.robots import ROBOTS, SimulationUnavailableError
 from service.cli.consoles import print_json
 from service.cli.options import Json
 from service.reproduce import figures, report, table
-from service.reproduce.experiment import Cell, Experiment
+from service.reproduce.experiment import YARDSTICK, Cell, Experiment
 from service.reproduce.results import FILE, Results
 from service.reproduce.running import ReproductionError, run
 
@@ -68,7 +68,7 @@ def reproduce(
         test_sets=test_sets or (4 if quick else 16),
         test_stride=test_stride or (5 if quick else 2),
     )
-    speeds, estimators = list(dict.fromkeys(speed or [1.0])), list(dict.fromkeys(estimator or ESTIMATORS))
+    speeds, estimators = list(dict.fromkeys(speed or [1.0])), list(dict.fromkeys(estimator or [*ESTIMATORS, YARDSTICK]))
     sizes = _sizes(size, QUICK_SIZES if quick else SIZES, samples)
     _check(experiment, speeds)
     joint_names = experiment.check(estimators).joint_names

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
@@ -22,7 +22,7 @@ from lipcore.robots import Robot, load_robot
 from lipcore.samples import Array, Samples
 from lipcore.simulation import Stream, inverse_dynamics, simulate
 from lipcore.urdf import RigidBody
-from lipcore.vocabulary import ROBOT_ESTIMATORS
+from lipcore.vocabulary import JointType
 from service.reproduce.memory import peak_mb, reset_peak
 
 FIRST_TEST_SEED = 1000
@@ -94,6 +94,10 @@ def _sources(folder: Traversable) -> list[tuple[str, bytes]]:
     return found
 
 
+YARDSTICK = "rigid-body (URDF)"
+"""The arm whose geometry is that of the URDF, which is the simulator's own; its masses are learnt."""
+
+
 @dataclass(frozen=True)
 class Experiment:
     """What all cells of one folder share. Streams are the paper's but for what is said here; see lipcore.simulation.
@@ -149,16 +153,21 @@ class Experiment:
         """Load the robot and check each estimator; raise what a cell would raise, before any work."""
         robot = load_robot(self.robot)
         for name in estimators:
-            check_estimator(name, robot.joint_types, rigid_body(self.robot, name), self.options)
+            check_estimator(*self.training(name, robot.joint_types))
         return robot
 
+    def training(
+        self, estimator: str, joint_types: tuple[JointType, ...]
+    ) -> tuple[str, tuple[JointType, ...], RigidBody | None, FitOptions]:
+        """Estimator, joint types, robot and options that a name in the tables is trained with.
 
-def rigid_body(robot: str, estimator: str) -> RigidBody | None:
-    """The robot's URDF for estimators that have a use for it."""
-    if estimator not in ROBOT_ESTIMATORS:
-        return None
-    loaded = load_robot(robot)
-    return RigidBody.from_profile(robot, loaded.joint_names, loaded.joint_types)
+        Arms of rigid bodies are learnt from torque alone; YARDSTICK is told where the joints lie.
+        """
+        if estimator != YARDSTICK:
+            return estimator, joint_types, None, self.options
+        loaded = load_robot(self.robot)
+        body = RigidBody.from_profile(self.robot, loaded.joint_names, loaded.joint_types)
+        return "rigid-body", joint_types, body, replace(self.options, geometry="fixed")
 
 
 def run_cell(experiment: Experiment, cell: Cell) -> CellResult:
@@ -172,11 +181,11 @@ def run_cell(experiment: Experiment, cell: Cell) -> CellResult:
 def _run(experiment: Experiment, cell: Cell) -> CellResult:
     started = time.monotonic()
     types = load_robot(experiment.robot).joint_types
-    robot = rigid_body(experiment.robot, cell.estimator)
+    estimator, types, robot, options = experiment.training(cell.estimator, types)
     training = experiment.training_set(cell)
     reset_peak()
     began = time.monotonic()
-    model = lipcore.train(training, types, cell.estimator, experiment.options, robot=robot)
+    model = lipcore.train(training, types, estimator, options, robot=robot)
     fit_s = time.monotonic() - began
     tests, curves, predict_s, compared = [], [], 0.0, 0
     for seed in experiment.test_seeds():

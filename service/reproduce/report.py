@@ -13,9 +13,8 @@ import numpy as np
 
 from lipcore.samples import Array
 from lipcore.simulation import FUNDAMENTAL, MIDDLE_AMPLITUDE
-from lipcore.vocabulary import ROBOT_ESTIMATORS
 from service.reproduce import table
-from service.reproduce.experiment import CellResult, Experiment
+from service.reproduce.experiment import YARDSTICK, CellResult, Experiment
 from service.reproduce.table import Row, Summary
 
 _PACKAGES = ("lipserve", "numpy", "scipy", "torch", "numba", "pin", "example-robot-data", "matplotlib")
@@ -85,15 +84,12 @@ def _introduction(run: Run) -> str:
         "variance (`nmse_noisy` in the CSV is against the measured one). Coverage is the share of *measured* torques "
         "inside the interval, noise included. Medians, means and lowest values are over training sets × test sets.",
     ]
-    if any(name in ROBOT_ESTIMATORS for name in run.estimators):
+    if any(name.startswith("rigid-body") for name in run.estimators):
         parts.append(
-            "The estimators with `rigid-body` know the URDF's kinematics, which are the simulator's own. Their prior "
-            "of "
-            + (
-                "the inertial parameters is around zero: of these they know only the scale of each body."
-                if e.options.prior == "zero"
-                else "the inertial parameters is around the URDF's, which are the simulator's own: this flatters them."
-            )
+            f"`rigid-body` learns the arm from torque alone: geometry, masses and friction. `{YARDSTICK}` is the "
+            "yardstick: it knows where the joints lie, which is as the simulator has it, and of the masses only the "
+            "scale of each body. (The search for a geometry also looks at those of installed URDFs, of which the "
+            "robot's own is one; `python docs/learnt_arm.py rows` does without.)"
         )
     if run.failed:
         parts.append(
