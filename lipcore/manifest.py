@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from lipcore import strict_json
+from lipcore.arm.report import check_inertia, check_rotor, read_geometry
 from lipcore.auto.table import MOST_TEXT, Candidate, HeldOut, Selection
 from lipcore.calibration import Calibration
 from lipcore.fit_options import FitOptions
@@ -197,9 +198,16 @@ def _check_parameters(name: str, value: Any, n: int) -> None:
         for key, numbers in figures.items():
             for joint, each in enumerate(_check_list(f"{name}.friction.{term}.{key}", numbers, n)):
                 _check_number(f"{name}.friction.{term}.{key}[{joint}]", each)
-    if "inertia" in value:
-        _check_keys(f"{name}.inertia", value["inertia"], ("mean_is_plausible", "bodies"))
-        _check_list(f"{name}.inertia.bodies", value["inertia"]["bodies"], n)
+    try:
+        if "inertia" in value:
+            check_inertia(value["inertia"], n)
+        if "rotor" in value:
+            check_rotor(value["rotor"], n)
+        if "geometry" in value:
+            for plausible in (False, True):
+                read_geometry(value["geometry"], n, plausible)
+    except ValueError as error:
+        raise ModelFormatError(f"{name}.{error}") from None
 
 
 def _check_hyperparameters(name: str, value: Any, n: int) -> None:

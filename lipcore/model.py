@@ -7,11 +7,13 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
 from lipcore.arm.arm import Arm
+from lipcore.arm.geometry import Geometry
 from lipcore.arm.known import known_geometries
 from lipcore.arm.learning import Learnt, learn
 from lipcore.calibration import NO_CALIBRATION, Calibration, calibrate
@@ -162,6 +164,7 @@ def train(
     options = options or FitOptions()
     model = fitted(samples, joint_types, estimator, options, torque_convention, on_progress, cancelled, robot)
     weights = spacing.recorded(samples.t, samples.episode)
+    weights = np.minimum(weights, 1.0 / float(model.fit.get("row_correlation", 1.0)))  # errors that last count once
     if not conditioning.wanted(options, len(samples), float(weights.sum())):
         return model
     return conditioning.condition(model, samples, weights, cancelled)
@@ -178,11 +181,13 @@ def fitted(
     robot: RigidBody | None = None,
     stretches: Samples | None = None,
     learnt: Learnt | None = None,
+    known: Sequence[Geometry] = (),
 ) -> TorqueModel:
     """Train as `train` does, on the chosen samples alone: where there are too many for memory, on a thinned table.
 
     stretches: contiguous samples of the same recordings, which tell the white noise of signals; the samples themselves
-    where None; learnt: what these samples have told of the rigid bodies, where that is known already.
+    where None; learnt: what these samples have told of the rigid bodies, where that is known already; known:
+    geometries, base to tip, that the search for one looks at first, as of an earlier version.
     """
     options = options or FitOptions()
     types = check_joint_types(joint_types)
@@ -205,8 +210,8 @@ def fitted(
 
         return choose(samples, types, options, torque_convention, on_progress, cancelled, robot, stretches)
     if learnt is None and estimator in ROBOT_ESTIMATORS:
-        known = () if robot is not None else known_geometries(types, gravity)
-        learnt = learn(samples, types, options, gravity, robot, known, on_progress, cancelled, stretches)
+        arms = (*known, *(() if robot is not None else known_geometries(types, gravity)))
+        learnt = learn(samples, types, options, gravity, robot, arms, on_progress, cancelled, stretches)
     chosen = make_estimator(estimator, types, options.tied, None if learnt is None else learnt.arm)
     calibration = calibrate(estimator)
     if learnt is not None and estimator == "rigid-body":
@@ -217,8 +222,11 @@ def fitted(
             chosen.kernel, learnt.params, used.motion(), used.torque(), weights, options.compact_tolerance
         )
     else:
-        start = {} if learnt is None else learnt.params
-        found = fit(chosen.kernel, samples, options, on_progress, cancelled, stretches, start)
+        # not the noise: what rigid bodies leave of the torque is what the other term is there for
+        params = {} if learnt is None else learnt.params
+        start = {name: value for name, value in params.items() if name != "noise.log_std"}
+        fewer = options if learnt is None else _independent(options, learnt)
+        found = fit(chosen.kernel, samples, fewer, on_progress, cancelled, stretches, start)
         used = samples.rows(found.rows)
         compression, jitter = compressed(chosen.kernel, found.params, used, options, calibration)
         report = {**asdict(found.report), "jitter": jitter}
@@ -237,6 +245,16 @@ def fitted(
         compression.report(),
         robot,
         calibration,
+    )
+
+
+def _independent(options: FitOptions, learnt: Learnt) -> FitOptions:
+    """Options for no more samples than the recording holds independent ones, as the arm's residuals say."""
+    most = max(MIN_SAMPLES, round(learnt.weight * len(learnt.rows)))
+    return replace(
+        options,
+        hyperparameter_samples=min(options.hyperparameter_samples, most),
+        posterior_samples=min(options.posterior_samples, most),
     )
 
 

@@ -80,6 +80,10 @@ class Motion:
         """Device of the tensors."""
         return self.q.device
 
+    def arrays(self) -> Array:
+        """q, dq and ddq as one C-contiguous array (N, 3, n), which compiled code reads."""
+        return np.ascontiguousarray(np.stack([part.cpu().numpy() for part in (self.q, self.dq, self.ddq)], axis=1))
+
     def to(self, device: torch.device | str) -> Motion:
         """Return the same motion on `device`."""
         return Motion(self.q.to(device), self.dq.to(device), self.ddq.to(device))

@@ -10,28 +10,31 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lipcore.arm.geometry import Geometry
+from lipcore.compact.compress import checks
+from lipcore.compact.posterior import CompactPosterior
 from lipcore.estimators import Estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.base import LinearKernel
 from lipcore.kernels.friction import FRICTION_TERMS, FrictionKernel
 from lipcore.posterior import Posterior
-from lipcore.robots import pinocchio
 from lipcore.samples import Array
 from lipcore.urdf import PARAMETERS
 
-LEAST_MASS, MOST_MASS = 1e-4, 1e2
-"""Mass of a plausible body, as a share of the whole arm's: the search must neither vanish nor run away."""
-LEAST_EXTENT, MOST_EXTENT = 1e-3, 1e2
-"""Spread of a plausible body's mass along each axis, m: no real body is a point."""
+LEAST_MASS = 1e-4
+"""Smallest mass of a plausible body, as a share of the arm's."""
+LEAST_EXTENT, RADIUS = 1e-3, 0.05
+"""Smallest spread of a plausible body's mass along each axis, m: no real body is a point; radius of a usual one, m."""
 STEPS = ("turn 1", "turn 2", "shift 1", "shift 2")
 """Names of a joint's numbers of geometry: about, and along, the two vectors across its axis."""
 UNDETERMINED = 0.5
 """Torque does not tell what is still as uncertain as this share of what was expected beforehand."""
-LEAST_VARIANCE = 1e-10
+LEAST_VARIANCE = 1e-12
 """Smallest posterior variance relative to the prior's that rounding leaves meaningful."""
 
-SEARCH: dict[str, Any] = {"x_scale": "jac", "ftol": 1e-4, "max_nfev": 1000}
-"""Ends within a few percent of the least squared distance; the rest would take ten times as long."""
+BARRIERS = tuple(10.0**power for power in range(3, -4, -1))
+"""Weights of the barrier: the last leaves at most 4 n times as much of the squared distance to gain."""
+NEWTON_STEPS, SHORTEST = 30, 1e-8
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,8 @@ class InertialParameters:
     posterior; many are known from torques only in combinations, which std shows. scale: standard deviations
     beforehand. plausible: the physically possible
     parameters nearest to the mean in the posterior's metric; mean_is_plausible: whether the mean is possible itself.
+    geometry: that the plausible parameters are meant for; deviation: (n,) N·m, root mean square by which their torque
+    misses the model's where the robot has been.
     """
 
     mean: Array
@@ -78,6 +83,8 @@ class InertialParameters:
     scale: Array
     plausible: Array
     mean_is_plausible: bool
+    geometry: Geometry
+    deviation: Array
 
 
 def weight_posterior(posterior: Posterior, term: LinearKernel) -> WeightPosterior:
@@ -105,19 +112,50 @@ def friction_coefficients(posterior: Posterior, estimator: Estimator) -> Frictio
     return Friction(**named)
 
 
-def inertial_parameters(posterior: Posterior, estimator: Estimator) -> InertialParameters:
+def inertial_parameters(posterior: CompactPosterior, estimator: Estimator) -> InertialParameters:
     """Inertial parameters of each body; raise ValueError for an estimator without rigid bodies."""
     term = _arm_kernel(estimator)
-    every = weight_posterior(posterior, term)
-    size = PARAMETERS * term.n_joints
-    weights = WeightPosterior(every.mean[:size], every.covariance[:size, :size], every.scale[:size])
-    mean, std = (part.reshape(-1, PARAMETERS) for part in (weights.mean, weights.std))
-    plausible = all(is_plausible(body) for body in mean)
-    nearest = mean if plausible else nearest_plausible(weights, term.arm.centre[term.arm.place])
-    return InertialParameters(mean, std, weights.scale.reshape(-1, PARAMETERS), nearest, plausible)
+    weights, size = weight_posterior(posterior, term), PARAMETERS * term.n_joints
+    mean, std, scale = (part[:size].reshape(-1, PARAMETERS) for part in (weights.mean, weights.std, weights.scale))
+    geometry = term.geometry(weights.mean)
+    if all(is_plausible(body) for body in mean):
+        return InertialParameters(mean, std, scale, mean, True, geometry, np.zeros(term.n_joints))
+    # masses for the geometry that the arm is linearised at, where the torque is exactly linear in them; or masses and
+    # geometry together, to first order in the latter
+    start = term.arm.centre[term.arm.place]
+    alone = weights.mean.copy()
+    metric = precision(posterior, term)
+    part, steps = slice(0, size), term.steps
+    alone[steps] = 0.0
+    moved = np.linalg.solve(metric[part, part], metric[part, steps] @ (weights.mean / weights.scale)[steps])
+    given = weights.mean[part] + moved * weights.scale[part]
+    alone[part] = nearest_plausible(given, weights.scale[part], metric[part, part], term.n_joints, start)
+    options = [alone]
+    if term.arm.steps:
+        options.append(nearest_plausible(weights.mean, weights.scale, metric, term.n_joints, start))
+    asked = checks(posterior.basis.inducing, 0)
+    torque = posterior.predict(asked, term).mean.numpy()
+    errors = [np.sqrt(np.mean((term.torque(option, asked) - torque) ** 2, axis=0)) for option in options]
+    best = int(np.argmin([np.mean(error / np.maximum(torque.std(0), 1e-12)) for error in errors]))
+    plausible = options[best][:size].reshape(-1, PARAMETERS)
+    return InertialParameters(mean, std, scale, plausible, False, term.geometry(options[best]), errors[best])
 
 
-def report(posterior: Posterior, estimator: Estimator, joint_names: Sequence[str]) -> dict[str, Any]:
+def precision(posterior: CompactPosterior, term: LinearKernel) -> Array:
+    """Posterior precision of a term's weights, all others at their mean, in units of their prior deviations: (p, p).
+
+    From the statistics, I + A, where there are any: a covariance has lost what is known to more than eight digits.
+    """
+    rows = posterior.basis.rows(term)
+    if posterior.statistics is not None:
+        return _numpy(posterior.statistics.a[rows, rows]) + np.eye(rows.stop - rows.start)
+    weights = weight_posterior(posterior, term)
+    scaled = weights.covariance / np.outer(weights.scale, weights.scale)
+    values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
+    return np.asarray((vectors / np.maximum(values, LEAST_VARIANCE)) @ vectors.T)
+
+
+def report(posterior: CompactPosterior, estimator: Estimator, joint_names: Sequence[str]) -> dict[str, Any]:
     """All parameters of an estimator as plain numbers, for a manifest."""
     friction = friction_coefficients(posterior, estimator)
     out: dict[str, Any] = {
@@ -130,6 +168,7 @@ def report(posterior: Posterior, estimator: Estimator, joint_names: Sequence[str
         inertia = inertial_parameters(posterior, estimator)
         out["inertia"] = {
             "mean_is_plausible": inertia.mean_is_plausible,
+            "plausible_deviation": inertia.deviation.tolist(),
             "bodies": [
                 {
                     "joint": name,
@@ -141,17 +180,16 @@ def report(posterior: Posterior, estimator: Estimator, joint_names: Sequence[str
                 for j, name in enumerate(joint_names)
             ],
         }
-        out |= _of_arm(posterior, _arm_kernel(estimator), joint_names)
+        out |= _of_arm(posterior, _arm_kernel(estimator), joint_names, inertia.geometry)
     return out
 
 
-def _of_arm(posterior: Posterior, term: ArmKernel, joint_names: Sequence[str]) -> dict[str, Any]:
-    """Rotor inertias and the geometry as the posterior has it."""
+def _of_arm(posterior: Posterior, term: ArmKernel, joint_names: Sequence[str], plausible: Geometry) -> dict[str, Any]:
+    """Rotor inertias and the geometry as the posterior has it; plausible: that of the plausible bodies."""
     weights, arm = weight_posterior(posterior, term), term.arm
     n = term.n_joints
     rotors = slice(PARAMETERS * n, (PARAMETERS + 1) * n)
-    steps, step_std = weights.mean[term.steps], weights.std[term.steps]
-    geometry = arm.geometry if arm.mode == "fixed" else arm.geometry.moved(steps)
+    geometry, step_std = term.geometry(weights.mean), weights.std[term.steps]
     joints, at = [], 0
     for place, count in enumerate(geometry.screws):
         std = step_std[at : at + count] if arm.steps else np.zeros(0)
@@ -165,6 +203,10 @@ def _of_arm(posterior: Posterior, term: ArmKernel, joint_names: Sequence[str]) -
                 "translation": geometry.translation[place].tolist(),
                 "axis": geometry.axis[place].tolist(),
                 "across": geometry.across[place].tolist(),
+                "plausible": {
+                    "rotation": plausible.rotation[place].tolist(),
+                    "translation": plausible.translation[place].tolist(),
+                },
                 "turn_std": std[:2].tolist(),
                 "shift_std": std[2:].tolist(),
                 "undetermined": [
@@ -214,57 +256,67 @@ def is_plausible(body: Array) -> bool:
     return bool(np.linalg.eigvalsh(pseudo_inertia(body))[0] > 0)
 
 
-def nearest_plausible(weights: WeightPosterior, start: Array) -> Array:
-    """Plausible parameters (n, 10) nearest to the posterior mean in the posterior's metric.
+def nearest_plausible(mean: Array, scale: Array, metric: Array, n: int, start: Array | None = None) -> Array:
+    """Weights (p,) nearest to a mean (p,) whose first 10 n are plausible bodies.
 
-    Least squares over the log-Cholesky coordinates of each pseudo-inertia (Rucker & Wensing 2022), which no implausible
-    body has; start: (n, 10), from which the search starts, made plausible where it is not.
+    metric: (p, p), of weights in units of `scale` (p,). A convex problem: ½ |w − μ|² in that metric, subject to each
+    body's pseudo-inertia being at least that of a tiny real one. Newton's method along the central path of a barrier,
+    −t Σ log det, as in Boyd & Vandenberghe, § 11.
+    start: (n, 10), a plausible guess; balls where it is none.
     """
-    log_cholesky = pinocchio().LogCholeskyParameters
-    n = len(start)
-    total = max(float(weights.mean.reshape(n, PARAMETERS)[:, 0].sum()), float(start[:, 0].sum()), 1e-3)
-    # whitened by the prior first: posterior variances span many orders of magnitude
-    scaled = weights.covariance / np.outer(weights.scale, weights.scale)
-    values, vectors = np.linalg.eigh(scaled)
-    metric = (vectors / np.sqrt(np.maximum(values, LEAST_VARIANCE))).T / weights.scale
-    low, high = np.full((2, n, PARAMETERS), MOST_EXTENT) * np.array([-1, 1])[:, None, None]
-    low[:, 0], high[:, 0] = 0.5 * np.log([LEAST_MASS * total, MOST_MASS * total])
-    low[:, 1:4], high[:, 1:4] = np.log([LEAST_EXTENT, MOST_EXTENT])
+    size = PARAMETERS * n
+    given = np.zeros((n, PARAMETERS)) if start is None else start
+    total = max(float(mean[:size:PARAMETERS].sum()), float(given[:, 0].sum()), 1e-3)
+    least = LEAST_MASS * total * np.diag([LEAST_EXTENT**2, LEAST_EXTENT**2, LEAST_EXTENT**2, 1.0])
+    centre = mean / scale
+    basis = np.array([pseudo_inertia(unit) for unit in np.eye(PARAMETERS)])
 
-    def residual(flat: Array) -> Array:
-        bodies = [log_cholesky(part).toDynamicParameters() for part in flat.reshape(n, PARAMETERS)]
-        return np.asarray(metric @ (np.concatenate(bodies) - weights.mean))
+    def matrices(point: Array) -> Array:
+        bodies = (point * scale)[:size].reshape(n, PARAMETERS)
+        return np.asarray(np.einsum("nk,kij->nij", bodies, basis) - least)
 
-    def jacobian(flat: Array) -> Array:
-        out = np.empty((n * PARAMETERS, n * PARAMETERS))
-        for index, part in enumerate(flat.reshape(n, PARAMETERS)):
-            columns = slice(index * PARAMETERS, (index + 1) * PARAMETERS)
-            out[:, columns] = metric[:, columns] @ log_cholesky(part).calculateJacobian()
-        return out
+    def value(point: Array, barrier: float) -> float:
+        signs, logs = np.linalg.slogdet(matrices(point))
+        if (signs <= 0).any() or (np.linalg.eigvalsh(matrices(point))[:, 0] <= 0).any():
+            return np.inf
+        off = point - centre
+        return float(0.5 * off @ metric @ off - barrier * logs.sum())
 
-    from scipy.optimize import least_squares  # noqa: PLC0415 - serving does without it
+    point = centre.copy()
+    point[:size] = np.concatenate([_real(body, total / n, least) for body in given]) / scale[:size]
+    for barrier in BARRIERS:
+        for _ in range(NEWTON_STEPS):
+            inverse = np.linalg.inv(matrices(point))
+            turned = np.einsum("nij,kjl->nkil", inverse, basis)  # P⁻¹ E_k
+            slope = np.einsum("nkii->nk", turned).reshape(-1) * scale[:size]
+            bend = np.einsum("nkij,nlji->nkl", turned, turned)
+            gradient = metric @ (point - centre)
+            gradient[:size] -= barrier * slope
+            hessian = metric.copy()
+            for body in range(n):
+                part = slice(PARAMETERS * body, PARAMETERS * (body + 1))
+                hessian[part, part] += barrier * bend[body] * np.outer(scale[part], scale[part])
+            try:
+                step = -np.linalg.solve(hessian, gradient)
+            except np.linalg.LinAlgError:  # at the boundary, but for rounding: the point is plausible all the same
+                break
+            slack, length, now = float(-gradient @ step), 1.0, value(point, barrier)
+            while length > SHORTEST and value(point + length * step, barrier) > now - 0.1 * length * slack:
+                length *= 0.5
+            if length <= SHORTEST:
+                break
+            point = point + length * step
+            if slack < 1e-3 * barrier:
+                break
+    return np.asarray(point * scale)
 
-    limits = (low.reshape(-1), high.reshape(-1))
-    begin = np.array([_log_cholesky(body, total / n) for body in start])
-    begin = np.clip(begin, low + 1e-3, high - 1e-3)
-    found = least_squares(residual, begin.reshape(-1), jacobian, bounds=limits, **SEARCH)
-    return np.array([log_cholesky(part).toDynamicParameters() for part in found.x.reshape(n, PARAMETERS)])
 
-
-def _log_cholesky(body: Array, usual_mass: float) -> Array:
-    """Log-Cholesky coordinates [α, d1, d2, d3, s12, s23, s13, t1, t2, t3] of a body, of a small ball where it is none.
-
-    Its pseudo-inertia is U Uᵀ with U = e^α [[e^d1, s12, s13, t1], [0, e^d2, s23, t2], [0, 0, e^d3, t3], [0, 0, 0, 1]].
-    """
-    if not is_plausible(body):
-        radius = 0.05
-        ball = 0.4 * usual_mass * radius**2
-        body = np.array([usual_mass, 0, 0, 0, ball, 0, ball, 0, 0, ball])
-    flip = np.eye(4)[::-1]
-    upper = flip @ np.linalg.cholesky(flip @ pseudo_inertia(body) @ flip) @ flip
-    unit = upper / upper[3, 3]
-    logs = np.log([upper[3, 3], unit[0, 0], unit[1, 1], unit[2, 2]])
-    return np.concatenate([logs, [unit[0, 1], unit[1, 2], unit[0, 2]], unit[:3, 3]])
+def _real(body: Array, usual_mass: float, least: Array) -> Array:
+    """A body, or a ball of the usual mass where it is none that can exist."""
+    if np.linalg.eigvalsh(pseudo_inertia(body) - 2 * least)[0] > 0:
+        return body
+    ball = 0.4 * usual_mass * RADIUS**2
+    return np.array([usual_mass, 0, 0, 0, ball, 0, ball, 0, 0, ball])
 
 
 def _body(values: Array) -> dict[str, Any]:

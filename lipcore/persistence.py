@@ -19,7 +19,8 @@ import numpy as np
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
-from lipcore.arm.storing import arm_tensors, read_arm
+from lipcore.arm.arm import Arm
+from lipcore.arm.storing import arm_tensors, is_of_arm, read_arm, read_mode
 from lipcore.calibration import Calibration
 from lipcore.compact.statistics import Statistics
 from lipcore.manifest import (
@@ -244,12 +245,9 @@ def _restore(manifest: Mapping[str, Any], tensors: dict[str, Tensor], robot: Rig
     params = {name.removeprefix(PARAMS): value for name, value in tensors.items() if name.startswith(PARAMS)}
     compact = dict(manifest["compact"])
     statistics = Statistics(unpack_symmetric(A, tensors[A]), tensors[B], float(compact.pop("data_samples")))
-    arm = None
-    if manifest["estimator"] in ROBOT_ESTIMATORS:
-        try:
-            arm = read_arm(tensors, manifest["joint_types"], manifest["fit"].get("geometry"))
-        except ValueError as error:
-            raise ModelFormatError(str(error), TENSORS) from None
+    arm = _arm(manifest, tensors) if manifest["estimator"] in ROBOT_ESTIMATORS else None
+    if arm is None and (strange := next(filter(is_of_arm, tensors), None)) is not None:
+        raise ModelFormatError(f"{TENSORS} has the tensor {strange!r}, but the estimator has no rigid bodies", TENSORS)
     model = restore(
         manifest["estimator"],
         manifest["joint_names"],
@@ -276,6 +274,17 @@ def _restore(manifest: Mapping[str, Any], tensors: dict[str, Tensor], robot: Rig
     if FLOOR in tensors:
         model = replace(model, posterior=replace(model.posterior, floor=tensors[FLOOR]))
     return model
+
+
+def _arm(manifest: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Arm:
+    try:
+        mode = read_mode(manifest["fit"].get("geometry"))
+    except ValueError as error:
+        raise ModelFormatError(str(error)) from None
+    try:
+        return read_arm(tensors, manifest["joint_types"], mode)
+    except ValueError as error:
+        raise ModelFormatError(str(error), TENSORS) from None
 
 
 def _said(error: Exception) -> str:

@@ -164,6 +164,9 @@ class Settings(BaseSettings):
         0.2, gt=0, le=1, description="Share of samples beyond the basis at which a version is refreshed."
     )
     novelty_rows: Count = Field(2000, description="Samples that share is taken over.")
+    linearisation_error: float = Field(
+        0.5, gt=0, description="Error of a learnt arm's linearisation at which it is refreshed; 1: as large as stated."
+    )
     refresh_pause_s: float = Field(600.0, ge=0, description="Shortest time between two automatic refreshes, s.")
     max_refresh_samples: Count = Field(200_000, description="Most logged samples that a refresh learns from.")
     promotion_rows: Count = Field(2000, description="Samples on which a refreshed version must be better.")

@@ -23,12 +23,12 @@ from lipcore.arm.arm import (
     widths_of,
 )
 from lipcore.arm.geometry import Geometry
-from lipcore.arm.problem import Expected, Point, Problem
+from lipcore.arm.problem import Expected, Point, Problem, root_of
 from lipcore.arm.scales import rescale
 from lipcore.arm.search import Found, Pool, search
 from lipcore.fit_options import FitOptions
 from lipcore.fitting import Cancelled, FitCancelledError, FitProgress, Progress
-from lipcore.kernels.compiled.arm import PARAMETERS, arm_torques
+from lipcore.kernels.compiled.arm import PARAMETERS
 from lipcore.kernels.friction import FRICTION_TERMS, friction_features
 from lipcore.samples import Array, Samples
 from lipcore.selection import spread_out
@@ -133,7 +133,7 @@ def _learn(
     correlation = residual_correlation(residual, contiguous)
     weight = min(1.0, len(samples) / correlation / len(rows))
     problem = replace(problem, counts=np.full(len(rows), weight))
-    ends = [problem.at(each.geometry, each.sigma) for each in ends]
+    ends = sorted((problem.at(each.geometry, each.sigma) for each in ends), key=lambda each: each.value)
     best, others, problem = _refined(problem, ends, watch)
     watch.step("posterior", best.value, 0.95)
     report: dict[str, float | int | bool | str] = {"geometry": mode, "search_objective": ends[0].value}
@@ -142,10 +142,12 @@ def _learn(
     report |= {
         "objective": best.value,
         "iterations": watch.iteration,
+        "converged": found is None or found.ended == "idle",
         "samples_given": len(samples),
         "samples_hyperparameters": len(rows),
         "samples_posterior": len(rows),
         "row_correlation": correlation,
+        "motion_dimensions": motion_dimensions(samples.dq),
         "seconds": time.monotonic() - watch.began,
         "device": "cpu",
     }
@@ -226,6 +228,20 @@ def residual_correlation(residual: Array, samples: Samples) -> float:
     return total
 
 
+def motion_dimensions(dq: Array) -> float:
+    """How many joints' worth of independent motion velocities (N, n) hold: 1 where all move together, n where each
+    moves by itself.
+
+    The participation ratio (Σ λ)² / Σ λ² of their correlation matrix's eigenvalues.
+    """
+    spread = dq.std(axis=0)
+    moving = spread > 1e-9
+    if not moving.any():
+        return 0.0
+    values = np.linalg.eigvalsh(np.atleast_2d(np.corrcoef(dq[:, moving].T)))
+    return float(values.sum() ** 2 / np.square(values).sum())
+
+
 def _expected(
     types: tuple[JointType, ...], gravity: bool, robot: RigidBody | None, mode: GeometryMode
 ) -> Expected | None:
@@ -292,7 +308,7 @@ def _arm(
         return arm, params
     chosen = [best, *differing[:3]]
     values = np.array([problem.laplace(each) for each in chosen])
-    odds = np.exp(values.min() - values)
+    odds = np.exp(np.maximum(values.min() - values, -2 * NEAR))  # (none of zero: their covariance is to be factored)
     shares = odds / odds.sum()
     alternatives = tuple(
         _alternative(problem, each, place, float(share)) for each, share in zip(chosen, shares, strict=True)
@@ -313,7 +329,7 @@ def _differs(problem: Problem, best: Point, other: Point) -> bool:
     asked = problem.recombined(CHECKS)
     means = [asked.mean(point) for point in (best, other)]
     hessian, _, _ = problem.normal(best)
-    root = np.linalg.cholesky(hessian)
+    root = root_of(hessian)
     both = asked.all_features(best)
     spread = np.square(np.linalg.solve(root, both.reshape(-1, both.shape[2]).T)).sum(0).reshape(means[0].shape)
     stated = np.sqrt(np.mean(spread, axis=0) + best.sigma**2)
@@ -369,10 +385,3 @@ class _Watch:
 
     def stop(self) -> bool:
         return self.cancelled is not None and self.cancelled()
-
-
-def torque_of(arm: Arm, motions: Array) -> Array:
-    """Torque of the bodies of an arm alone, (N, n) N·m in the order of the data: motions (N, 3, n)."""
-    out = np.zeros((len(motions), arm.n_joints))
-    arm_torques(arm.geometry.constants, arm.geometry.gravity, arm.parameters, arm.order, motions, out)
-    return out

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.linalg import LinAlgError
-from scipy.linalg import cho_factor, cho_solve, lapack, solve_triangular
+from scipy.linalg import cho_solve, lapack, solve_triangular
 
 from lipcore.arm.geometry import Geometry
 from lipcore.kernels.compiled.arm import PARAMETERS, arm_masses, arm_shapes
@@ -151,12 +151,10 @@ class Problem:
         scaled, target = self._scaled(features, sigma)
         precision = scaled.T @ scaled
         precision.flat[:: len(precision) + 1] += 1.0
-        lower, failed = lapack.dpotrf(precision, lower=1, overwrite_a=1)
-        if failed:
-            raise LinAlgError("the precision of the weights is not positive definite")
-        right = scaled.T @ target
-        weights = cho_solve((lower, True), right)
-        value = 0.5 * (target @ target - right @ weights) + np.log(lower.diagonal()).sum()
+        lower = root_of(precision)
+        weights = cho_solve((lower, True), scaled.T @ target, check_finite=False)
+        left = target - scaled @ weights  # (not target² − …: where the noise is small, that leaves no digit)
+        value = 0.5 * (left @ left + weights @ weights) + np.log(lower.diagonal()).sum()
         value += self.counts.sum() * np.log(sigma).sum()
         value += 0.0 if self.expected is None else self.expected.value(geometry)
         value += 0.5 * np.sum((np.log(sigma / self.noise) / NOISE_WIDTH) ** 2)
@@ -166,7 +164,7 @@ class Problem:
         """−log p(τ | σ), nats, of all geometries near a point: its value and half the log determinant of what is left
         of the precision of θ once w is integrated out, without the prior's own constant."""
         hessian, _, k = self.normal(point)
-        roots = np.linalg.cholesky(hessian).diagonal()  # those of w come first
+        roots = root_of(hessian).diagonal()  # those of w come first
         return point.value + float(np.log(roots[k:]).sum())
 
     def residual(self, point: Point) -> Array:
@@ -206,7 +204,7 @@ class Problem:
                 damped = hessian.copy()
                 shape = np.arange(k, len(damped))
                 damped[shape, shape] *= 1 + damping
-                step = cho_solve(cho_factor(damped, lower=True, check_finite=False), gradient)[k:]
+                step = cho_solve((root_of(damped), True), gradient, check_finite=False)[k:]
                 step /= max(1.0, float(np.abs(step / largest).max(initial=0.0)))
                 moved = point.geometry.moved(step)
                 if self.expected is not None and self.expected.around is None:
@@ -251,3 +249,19 @@ class Problem:
             target = target - features[:, :, :k] @ (self.centre / self.scale)
         scaled = features * weight[:, :, None]
         return scaled.reshape(-1, features.shape[2]), (target * weight).reshape(-1)
+
+
+def root_of(precision: Array) -> Array:
+    """Lower L, L Lᵀ = precision, of a matrix whose eigenvalues are one at least: a Gram matrix plus the prior's part.
+
+    Rounding may make some of them negative, where noise is small and features are alike: those are taken for one.
+    Raise LinAlgError for numbers that are not finite.
+    """
+    lower, failed = lapack.dpotrf(precision, lower=1)
+    if not failed and np.isfinite(lower[-1, -1]):
+        return np.asarray(lower)
+    if not np.isfinite(precision).all():
+        raise LinAlgError("the precision of the weights holds a number that is not finite")
+    values, vectors = np.linalg.eigh(precision)
+    upper = np.asarray(np.linalg.qr((vectors * np.sqrt(np.maximum(values, 1.0))).T, mode="r"))
+    return np.ascontiguousarray((upper * np.where(upper.diagonal() < 0, -1.0, 1.0)[:, None]).T)

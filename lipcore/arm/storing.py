@@ -10,6 +10,8 @@ from torch import Tensor
 
 from lipcore.arm.arm import Alternative, Arm
 from lipcore.arm.geometry import Geometry
+from lipcore.kernels.friction import FRICTION_TERMS
+from lipcore.strict_json import quote
 from lipcore.vocabulary import GEOMETRY_MODES, GeometryMode, JointType
 
 PREFIX = "arm/"
@@ -39,14 +41,19 @@ def arm_tensors(arm: Arm) -> dict[str, Tensor]:
     return {f"{PREFIX}{name}": torch.from_numpy(np.array(value, np.float64)) for name, value in parts.items()}
 
 
-def read_arm(tensors: Mapping[str, Tensor], joint_types: Sequence[JointType], mode: object) -> Arm:
+def read_mode(mode: object) -> GeometryMode:
+    """How the geometry of a stored arm was come by; raise ValueError for what is no such way."""
+    if mode not in GEOMETRY_MODES:
+        raise ValueError(f"fit.geometry is {quote(mode)}, expected one of {', '.join(GEOMETRY_MODES)}")
+    kind: GeometryMode = mode
+    return kind
+
+
+def read_arm(tensors: Mapping[str, Tensor], joint_types: Sequence[JointType], mode: GeometryMode) -> Arm:
     """The arm that `arm_tensors` stored; joint_types: in the order of the data; mode: how its geometry was come by.
 
     Raise ValueError for tensors that are missing or do not fit together.
     """
-    if mode not in GEOMETRY_MODES:
-        raise ValueError(f"fit.geometry is {mode!r}, expected one of {', '.join(GEOMETRY_MODES)}")
-    kind: GeometryMode = mode
     try:
         parts = {name: tensors[f"{PREFIX}{name}"].numpy() for name in (*_GEOMETRY, *_ARM, "order")}
     except KeyError as error:
@@ -56,7 +63,7 @@ def read_arm(tensors: Mapping[str, Tensor], joint_types: Sequence[JointType], mo
         raise ValueError(f"tensor 'arm/order' is {order.tolist()}, expected each joint once")
     types = tuple(joint_types[joint] for joint in order)
     geometry = Geometry(types, *(parts.pop(name) for name in _GEOMETRY))
-    return Arm(geometry, order, kind, alternatives=_alternatives(tensors, geometry), **parts)
+    return Arm(geometry, order, mode, alternatives=_alternatives(tensors, geometry), **parts)
 
 
 def _alternatives(tensors: Mapping[str, Tensor], geometry: Geometry) -> tuple[Alternative, ...]:
@@ -68,15 +75,15 @@ def _alternatives(tensors: Mapping[str, Tensor], geometry: Geometry) -> tuple[Al
         )
     except KeyError as error:
         raise ValueError(f"tensor {error} is missing") from None
-    n, count = geometry.n_joints, len(probability)
+    n, count = geometry.n_joints, probability.size
     for name, value, shape in (
         ("parameters", parameters, (count, n, 10)),
-        ("linear", linear, (count, n, linear.shape[-1] if linear.ndim else 0)),
+        ("linear", linear, (count, n, 1 + len(FRICTION_TERMS))),
         ("rotation", rotation, (count, n, 3, 3)),
         ("translation", translation, (count, n, 3)),
         ("probability", probability, (count,)),
     ):
-        if value.shape != shape:
+        if value.shape != shape or not count:
             raise ValueError(f"tensor 'arm/other/{name}' has shape {value.shape}, expected {shape}")
     if not ((probability > 0) & (probability < 1)).all():
         raise ValueError("tensor 'arm/other/probability' holds a number that is none between 0 and 1")

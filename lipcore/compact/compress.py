@@ -126,7 +126,7 @@ def linear(
     return Compression(posterior, Deviation(0.0, 0.0, 0.0, 0), tolerance, True)
 
 
-def checks(motion: Motion, seed: int) -> Motion:
+def checks(motion: Motion, seed: int, queries: int = QUERIES) -> Motion:
     """Motions to compare posteriors at: half of them training samples, half recombined from several.
 
     A recombined motion takes position, velocity and acceleration from three samples: it lies where the robot has been,
@@ -134,8 +134,8 @@ def checks(motion: Motion, seed: int) -> Motion:
     """
     generator = torch.Generator().manual_seed(seed)
     size = len(motion)
-    seen = torch.randperm(size, generator=generator)[: QUERIES // 2]
-    rows = torch.randint(size, (3, QUERIES - len(seen)), generator=generator)
+    seen = torch.randperm(size, generator=generator)[: queries // 2]
+    rows = torch.randint(size, (3, queries - len(seen)), generator=generator)
     parts = ((motion.q, rows[0]), (motion.dq, rows[1]), (motion.ddq, rows[2]))
     return Motion(*(torch.cat([values[seen], values[each]]) for values, each in parts))
 

@@ -33,6 +33,7 @@ class _Scratch(threading.local):
         self.memory = np.zeros(groups * WIDTH * (queries * anchors + ROWS))
         self.std = np.zeros((queries, n))
         self.covariance = np.zeros((queries, n, n))
+        self.of_one = self.motions, self.blocks, self.features, self.covariance, self.memory, self.std
 
 
 class Evaluator:
@@ -85,6 +86,7 @@ class Evaluator:
             raise ValueError(f"floor has shape {self._floor.shape}, expected ({n},)")
         sizes = samples, len(self._outputs) + len(means), len(means), n
         self._one, self._many = _Scratch(1, *sizes), _Scratch(QUERIES, *sizes)
+        self._rows = [(rows.start, rows.stop, regressor.fill) for rows, regressor in self._regressors]
 
     @property
     def packed(self) -> Array:
@@ -107,10 +109,28 @@ class Evaluator:
 
         Neither shape nor finiteness is checked. The same numbers as of `many`, to the last bit.
         """
-        scratch, tau = self._one, np.empty((1, self.n_joints))
-        scratch.motions[0] = motion
-        deviation = np.empty((1, self.n_joints)) if std else scratch.std
-        self._answer(scratch, 1, STD if std else MEAN, tau, deviation, scratch.covariance)
+        scratch = self._one
+        query, blocks, features, covariance, memory, own = scratch.of_one  # slicing takes as long as the arithmetic
+        query[0] = motion
+        if self._cross is not None:
+            self._cross.fill_many(query, blocks)
+        for first, last, fill in self._rows:
+            fill(query[0], features[0, first:last])
+        tau = np.empty((1, self.n_joints))
+        deviation = np.empty((1, self.n_joints)) if std else own
+        answer(
+            self._fixed,
+            self._outputs,
+            blocks,
+            features,
+            self._std_factor,
+            self._floor,
+            STD if std else MEAN,
+            memory,
+            tau,
+            deviation,
+            covariance,
+        )
         return tau[0], deviation[0] if std else None
 
     def many(self, q: Array, dq: Array, ddq: Array, covariance: bool = False) -> tuple[Array, Array, Array | None]:

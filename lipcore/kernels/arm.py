@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import threading
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from lipcore.arm.arm import KINDS, Arm
+from lipcore.arm.geometry import Geometry
 from lipcore.kernels.base import LinearKernel, Params
 from lipcore.kernels.compiled.arm import (
     PARAMETERS,
@@ -17,8 +16,10 @@ from lipcore.kernels.compiled.arm import (
     arm_differences,
     arm_energies,
     arm_features,
-    arm_rows,
+    arm_query,
+    arm_torques,
 )
+from lipcore.kernels.compiled.views import Memory
 from lipcore.kernels.friction import friction_features
 from lipcore.kernels.regressor import Regressor
 from lipcore.motion import Motion
@@ -64,13 +65,25 @@ class ArmKernel(LinearKernel):
         first = (PARAMETERS + 1) * self.n_joints
         return slice(first, first + self.arm.steps)
 
+    def geometry(self, weights: Array) -> Geometry:
+        """The arm's geometry with its steps as these weights, (p,), have them."""
+        return self.arm.geometry.moved(weights[self.steps]) if self.arm.steps else self.arm.geometry
+
+    def torque(self, weights: Array, motion: Motion) -> Array:
+        """Y(θ + δθ) π + r ∘ ddq of these weights, (p,), not linearised: (N, n) N·m. Alternative arms are left out."""
+        n, geometry = self.n_joints, self.geometry(weights)
+        bodies = np.ascontiguousarray(weights[: PARAMETERS * n].reshape(n, PARAMETERS)[self.arm.order])
+        out = np.zeros((len(motion), n))
+        arm_torques(geometry.constants, geometry.gravity, bodies, self.arm.order, motion.arrays(), out)
+        return np.asarray(out + weights[PARAMETERS * n : (PARAMETERS + 1) * n] * motion.ddq.numpy())
+
     def features(self, x: Motion) -> Tensor:
         """Φ at each sample: (N, n, p)."""
         for seen, features in self._recent:
             if seen.q is x.q and seen.dq is x.dq and seen.ddq is x.ddq:
                 return features
         out = np.zeros((len(x), self.size, self.n_joints))
-        motions, first = _motions(x), self.steps.stop
+        motions, first = x.arrays(), self.steps.stop
         arm = self.arm
         arm_features(arm.geometry.constants, arm.geometry.gravity, arm.parameters, arm.order, motions, out[:, :first])
         if arm.alternatives:
@@ -107,7 +120,7 @@ class ArmKernel(LinearKernel):
             arm.geometry.gravity,
             arm.parameters,
             arm.order,
-            _motions(x),
+            x.arrays(),
             out[:, :, : self.steps.stop],
         )
         return torch.from_numpy(out).to(x.device)
@@ -118,29 +131,18 @@ class ArmRegressor(Regressor):
 
     def __init__(self, arm: Arm, size: int) -> None:
         self.n_joints, self.size = arm.n_joints, size
-        self._arm = (arm.geometry.constants, arm.geometry.gravity, arm.parameters, arm.order.astype(np.int64))
+        self._order = arm.order.astype(np.int64)
         self._first = (PARAMETERS + 1) * arm.n_joints + arm.steps
         self._others = _stacked(arm) if arm.alternatives else None
-        self._memory = _Workspace(arm.n_joints)
+        fixed = arm.geometry.constants, arm.geometry.gravity, arm.parameters
+        self._memory = Memory(fixed, (arm.n_joints + 1) * WORK + TABLE)
 
     def fill(self, motion: Array, out: Array) -> None:
         """Write Φᵀ of the query, (p, n)."""
-        memory = self._memory
-        arm_rows(*self._arm, motion, memory.work, memory.table, out[: self._first])
+        arm_query(self._memory.flat, self._order, motion, out[: self._first])
         if self._others is not None:
             motions = motion[None]
-            arm_differences(*self._others, self._arm[3], motions, _linear_features(motions), out[None, self._first :])
-
-
-class _Workspace(threading.local):
-    """One thread's memory."""
-
-    def __init__(self, joints: int) -> None:
-        self.work, self.table = np.zeros((joints + 1, WORK)), np.zeros(TABLE)
-
-
-def _motions(x: Motion) -> Array:
-    return np.ascontiguousarray(np.stack([part.cpu().numpy() for part in (x.q, x.dq, x.ddq)], axis=1))
+            arm_differences(*self._others, self._order, motions, _linear_features(motions), out[None, self._first :])
 
 
 def _in_data(arm: Arm) -> Array:

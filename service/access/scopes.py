@@ -47,6 +47,7 @@ TABLE: dict[tuple[str, str], str] = {
     ("GET", "/v1/models/{model}"): READ,
     ("DELETE", "/v1/models/{model}"): ADMIN,
     ("GET", "/v1/models/{model}/export"): READ,
+    ("GET", "/v1/models/{model}/urdf"): READ,
     ("GET", "/v1/models/{model}/versions/{version}"): READ,
     ("DELETE", "/v1/models/{model}/versions/{version}"): ADMIN,
     ("GET", "/v1/models/{model}/aliases"): READ,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,9 +19,9 @@ from service.cli.options import Alias, Data, Json, Limit, Model, Url, Version, Y
 from service.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
+    from service.client.results import Version as VersionRecord
     from service.models.alias_schema import Alias as AliasRecord
     from service.models.schema import Selection
-    from service.models.schema import Version as VersionRecord
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -199,6 +200,13 @@ def export_(
         say(f"{written}: {written.stat().st_size:,} bytes; `lipserve models import {written}` reads it")
 
 
+@app.command()
+def urdf(model: Model, version: Version = None, alias: Alias = None, url: Url = DEFAULT_URL) -> None:
+    """Print the arm that a version has learnt as a URDF: `lipserve models urdf NAME > arm.urdf`."""
+    with connected(url) as client:
+        sys.stdout.write(client.urdf(model, version, alias))
+
+
 @app.command("import")
 def import_(
     path: Annotated[Path, typer.Argument(help="Archive that was exported.", exists=True, dir_okay=False)],
@@ -278,3 +286,12 @@ def _print_version(shown: VersionRecord) -> None:
         out.print(figures_table(f"on {held['samples']} samples held out", shown.joint_names, held))
     else:
         say("  nothing was held out of its data: `lipserve evaluate` on a recording it has not seen tells how good")
+    arm = shown.arm
+    if arm is not None:
+        from service.cli.tables import arm_tables  # noqa: PLC0415 - as above
+        from service.client.results.arm import LIMITS  # noqa: PLC0415
+
+        for table in arm_tables(arm):
+            out.print(table)
+        for text in LIMITS:
+            say(text)

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from rich.markup import escape
 from rich.table import Table
 
-from service.client.results import Comparison, Evaluation, Prediction
+from service.client.results import Arm, Comparison, Evaluation, Prediction
 from service.models.schema import Selection
 
 
@@ -106,3 +106,14 @@ def comparison_table(found: Comparison) -> Table:
         ]
         table.add_row(joint, *cells)
     return table
+
+
+def arm_tables(arm: Arm) -> list[Table]:
+    """Where the joints of an arm lie, what they carry and their friction, a row a joint from base to tip."""
+    tables = []
+    for title, columns in arm.tables().items():
+        table = Table(*columns, title=title)
+        for row in zip(*columns.values(), strict=True):
+            table.add_row(*map(escape, row))
+        tables.append(table)
+    return tables

@@ -126,6 +126,7 @@ class AsyncClient:
     remove_alias = _async(calls.models.remove_alias)
     rollback_alias = _async(calls.models.rollback_alias)
     export = _async(calls.models.export)
+    urdf = _async(calls.models.urdf)
     import_model = _async(calls.models.import_model)
 
     predict = _async(calls.inference.predict)

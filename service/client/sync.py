@@ -129,6 +129,7 @@ class Client:
     remove_alias = _sync(calls.models.remove_alias)
     rollback_alias = _sync(calls.models.rollback_alias)
     export = _sync(calls.models.export)
+    urdf = _sync(calls.models.urdf)
     import_model = _sync(calls.models.import_model)
 
     predict = _sync(calls.inference.predict)

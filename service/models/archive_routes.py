@@ -1,4 +1,4 @@
-"""Routes that take a version to another service: export and import."""
+"""Routes that take a version elsewhere: export and import, and its arm as a URDF."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from service.errors import (
     responses,
 )
 from service.limits.upload import Kinds, receive_to
-from service.models import archive_import
+from service.models import archive_import, urdf
 from service.models.archive import MEDIA_TYPE
 from service.models.export import export
 from service.models.schema import AliasName, ModelName, Version, VersionNumber
@@ -43,6 +43,9 @@ _BODY: dict[str, Any] = {
         },
     }
 }
+
+WhichVersion = Annotated[VersionNumber | None, Query(description="The version that serves by default")]
+WhichAlias = Annotated[AliasName | None, Query(description="An alias, instead of a version's number")]
 
 router = APIRouter(prefix="/v1/models", tags=["models"], responses=responses(InvalidRequestError), route_class=Route)
 
@@ -83,11 +86,34 @@ async def import_version(
 async def export_version(
     service: ServiceDep,
     model: str,
-    version: Annotated[VersionNumber | None, Query(description="The version that serves by default")] = None,
-    alias: Annotated[AliasName | None, Query(description="An alias, instead of a version's number")] = None,
+    version: WhichVersion = None,
+    alias: WhichAlias = None,
     learnt: Annotated[bool, Query(description="With what it has learnt online; false: as it was trained")] = True,
 ) -> StreamingResponse:
     """One archive with all that another service needs to answer alike; `export.json` in it says what it holds."""
     found = await to_thread.run_sync(export, service, model, version, alias, learnt, limiter=service.archives)
     headers = {"Content-Length": str(found.size), "Content-Disposition": f'attachment; filename="{found.name}"'}
     return StreamingResponse(found.pieces, media_type=MEDIA_TYPE, headers=headers)
+
+
+@router.get(
+    "/{model}/urdf",
+    summary="The arm that a version has learnt, as a URDF",
+    response_class=Response,
+    responses={
+        **responses(NotFoundError, InvalidRequestError),
+        200: {
+            "description": "A URDF",
+            "content": {urdf.MEDIA_TYPE: {"schema": {"type": "string"}, "example": urdf.EXAMPLE}},
+        },
+    },
+)
+def version_urdf(service: ServiceDep, model: str, version: WhichVersion = None, alias: WhichAlias = None) -> Response:
+    """Links, joints, physically possible masses and friction, as they were trained, for simulators and planners.
+
+    Of estimators with rigid bodies whose geometry is known; the others answer 422. Comments in the text say what a URDF
+    has no place for, and what torque does not tell.
+    """
+    name, text = urdf.write(service, model, version, alias)
+    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+    return Response(text, media_type=urdf.MEDIA_TYPE, headers=headers)

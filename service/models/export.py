@@ -37,9 +37,7 @@ def export(service: Service, model: str, version: int | None, alias: str | None,
     NotFoundError, InvalidRequestError for both a version and an alias, UnreadableVersionError for damaged files,
     StorageFullError.
     """
-    if version is not None and alias is not None:
-        raise invalid_request("version or alias", "both", "one of the two at most")
-    row = _find(service, model, version, alias)
+    row = find(service, model, version, alias)
     try:
         files, revision = _files(service, row, learnt)
     except ModelFormatError as error:
@@ -66,7 +64,13 @@ def export(service: Service, model: str, version: int | None, alias: str | None,
     return Exported(f"{row.model}-v{row.version}{suffix}.tar", size, archive.stream(kept))
 
 
-def _find(service: Service, model: str, version: int | None, alias: str | None) -> VersionRow:
+def find(service: Service, model: str, version: int | None, alias: str | None) -> VersionRow:
+    """Return the version of a number or of an alias, the one that serves where both are None.
+
+    Raise NotFoundError, InvalidRequestError for both.
+    """
+    if version is not None and alias is not None:
+        raise invalid_request("version or alias", "both", "one of the two at most")
     if alias is not None:
         version = service.loaded.newest(model, alias)
         if version is None and alias != SERVING:

@@ -82,7 +82,10 @@ class Version(BaseModel):
     )
     robot: dict[str, Any] | None = Field(None, description="The URDF of an estimator with rigid bodies, and its prior")
     parameters: dict[str, Any] | None = Field(
-        None, description="Friction coefficients and, of rigid bodies, inertial parameters, with standard deviations"
+        None,
+        description="`friction`; of rigid bodies also `inertia`, `rotor` and `geometry`, with standard deviations and "
+        "with what torque does not tell (`undetermined`). `geometry.joints` run from base to tip, `geometry.order` "
+        "names the model's joint at each place; all else is in the order of the model's joints",
     )
 
 

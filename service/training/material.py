@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import select
 
+from lipcore.arm.geometry import Geometry
 from lipcore.online import spacing
 from lipcore.samples import Array, Samples
 from lipcore.urdf import RigidBody
@@ -38,7 +39,7 @@ class Material:
     sets' rows to learn from; logged: what the model has observed, with weights (N,), None where that is nothing; rows:
     how many both are; lineage: where they come from; seen: number of the newest
     event of the model's log when it was read; held_out: samples that the version is evaluated on and does not learn
-    from, and how many they stand for; None where that is nothing.
+    from, and how many they stand for; None where that is nothing; known: geometries that an earlier version has learnt.
     """
 
     samples: Samples
@@ -50,6 +51,7 @@ class Material:
     logged: tuple[Samples, Array] | None = None
     seen: int = 0
     held_out: tuple[Samples, int] | None = None
+    known: tuple[Geometry, ...] = ()
 
     @property
     def rows(self) -> int:
@@ -121,6 +123,7 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
         weighted,
         seen,
         _held_out(settings, parts, divided),
+        () if base.arm is None else (base.arm.geometry, *(each.geometry for each in base.arm.alternatives[1:])),
     )
 
 

@@ -133,8 +133,9 @@ class Refresh(BaseModel):
 
     version: int = Field(description="The version that is refreshed")
     through: int = Field(description="Last event of the model's log that it learns from")
-    trigger: Literal["novelty", "asked"] = Field(
-        description="Why: much of the motion was beyond what the version knows, or somebody asked for it"
+    trigger: Literal["novelty", "linearisation", "asked"] = Field(
+        description="Why: much of the motion was beyond what the version knows, its learnt arm had left where its "
+        "torque is linear, or somebody asked for it"
     )
 
 

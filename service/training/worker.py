@@ -152,6 +152,7 @@ def _fit(settings: Settings, claim: Claim, material: Material, pulse: Pulse) -> 
         cancelled=pulse.cancelled,
         robot=material.robot,
         stretches=material.stretches,
+        known=material.known,
     )
     trained = replace(trained, fit={**trained.fit, "samples_given": material.rows})
     if not every:

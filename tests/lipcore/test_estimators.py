@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from lipcore import FitOptions, Samples, TorqueModel, train
+from lipcore.arm.arm import Arm, arm_of_robot
 from lipcore.estimators import ESTIMATORS, UnknownEstimatorError, make_estimator
 from lipcore.evidence import negative_log_evidence
 from lipcore.metrics import evaluate
@@ -30,6 +31,11 @@ def recorded(noise: float = 0.002, seed: int = 1) -> Samples:
 
 def robot_of(name: str, samples: Samples) -> RigidBody | None:
     return RigidBody.from_profile(ROBOT, samples.joint_names, TYPES) if name in ROBOT_ESTIMATORS else None
+
+
+def arm_of(name: str, samples: Samples, prior: str = "urdf", mode: str = "fixed") -> Arm | None:
+    robot = robot_of(name, samples)
+    return None if robot is None else arm_of_robot(robot, prior=prior, mode=mode)
 
 
 def trained(name: str, samples: Samples, options: FitOptions = OPTIONS) -> TorqueModel:
@@ -93,11 +99,16 @@ def test_awkward_data_end_in_a_model(name: str, data: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "prior"), [*((n, "urdf") for n in ESTIMATORS), *((n, "zero") for n in ROBOT_ESTIMATORS)]
+    ("name", "prior", "mode"),
+    [
+        *((name, "urdf", "fixed") for name in ESTIMATORS),
+        *((name, "zero", "fixed") for name in ROBOT_ESTIMATORS),
+        *((name, "urdf", "calibrate") for name in ROBOT_ESTIMATORS),
+    ],
 )
-def test_gradient_of_the_evidence_equals_finite_differences(name: str, prior: str) -> None:
+def test_gradient_of_the_evidence_equals_finite_differences(name: str, prior: str, mode: str) -> None:
     samples = recorded().rows(np.arange(7))
-    kernel = make_estimator(name, TYPES, robot=robot_of(name, samples), prior=prior).kernel
+    kernel = make_estimator(name, TYPES, arm=arm_of(name, samples, prior, mode)).kernel
     motion, tau, rng = samples.motion(), samples.torque(), np.random.default_rng(3)
     params = kernel.initial(motion, tau)
     params = {key: value + 0.3 * torch.tensor(rng.standard_normal(value.shape)) for key, value in params.items()}
@@ -121,7 +132,7 @@ def test_gradient_of_the_evidence_equals_finite_differences(name: str, prior: st
 def test_every_kernel_names_its_hyperparameters() -> None:
     samples = recorded()
     for name in ESTIMATORS:
-        kernel = make_estimator(name, TYPES, robot=robot_of(name, samples)).kernel
+        kernel = make_estimator(name, TYPES, arm=arm_of(name, samples)).kernel
         start = kernel.initial(samples.motion(), samples.torque())
         assert kernel.names() == list(start), name
         assert kernel.prior_std().keys() <= start.keys(), name

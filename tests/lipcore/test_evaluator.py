@@ -12,11 +12,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from lipcore.arm.arm import arm_of_robot
 from lipcore.evaluator import Evaluator
 from lipcore.evaluator.evaluator import QUERIES
+from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.base import LinearKernel, PairKernel, SumKernel
 from lipcore.kernels.friction import FrictionKernel
-from lipcore.kernels.rigid_body import RigidBodyKernel
 from lipcore.motion import Motion
 from lipcore.robots import load_robot
 from lipcore.urdf import RigidBody
@@ -68,12 +69,12 @@ class Case:
         return mean.numpy(), prior.variance(self.params, query).numpy(), explained.numpy()
 
 
-def rigid_body(name: str, order: tuple[int, ...] | None = None, **options: object) -> RigidBodyKernel:
+def rigid_body(name: str, order: tuple[int, ...] | None = None, **options: object) -> ArmKernel:
     """Kernel of a robot whose data name the joints in another order."""
     robot = load_robot(name)
     order = order or tuple(range(robot.n_joints))
     names, types = (tuple(parts[i] for i in order) for parts in (robot.joint_names, robot.joint_types))
-    return RigidBodyKernel(RigidBody.from_profile(name, names, types), **options)
+    return ArmKernel(arm_of_robot(RigidBody.from_profile(name, names, types), **options))
 
 
 def case(
@@ -126,11 +127,14 @@ CASES: dict[str, Callable[[], Case]] = {
     "rigid-body": lambda: case(PANDA, None, (rigid_body("panda"), FrictionKernel(7))),
     "rigid-body alone, from zero": lambda: case(PANDA, None, (rigid_body("panda", prior="zero", gravity=False),)),
     "rigid-body and chain": lambda: case(PANDA, "chain", (rigid_body("panda"), FrictionKernel(7))),
+    "rigid-body with geometry": lambda: case(PANDA, None, (rigid_body("panda", mode="calibrate"), FrictionKernel(7))),
     "unbounded joints in another order": lambda: case(
         KINOVA, "chain", (rigid_body("kinova", (3, 0, 5, 1, 4, 2)), FrictionKernel(6))
     ),
     "prismatic rigid body in another order": lambda: case(
-        TIAGO[1:] + TIAGO[:1], None, (rigid_body("tiago", (1, 2, 3, 4, 5, 6, 7, 0)), FrictionKernel(8))
+        TIAGO[1:] + TIAGO[:1],
+        None,
+        (rigid_body("tiago", (1, 2, 3, 4, 5, 6, 7, 0), mode="calibrate"), FrictionKernel(8)),
     ),
     **{
         f"{n} joints": lambda n=n: case((("revolute", "prismatic") * 5)[:n], "chain", friction(n))

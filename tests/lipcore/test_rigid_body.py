@@ -13,11 +13,13 @@ import pytest
 import torch
 
 from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, copy_model, load, save, train
+from lipcore.arm.arm import arm_of_robot
 from lipcore.estimators import make_estimator
-from lipcore.kernels.rigid_body import RigidBodyKernel
+from lipcore.kernels.arm import ArmKernel
 from lipcore.metrics import evaluate
 from lipcore.motion import Motion
 from lipcore.parameters import (
+    WeightPosterior,
     friction_coefficients,
     inertial_parameters,
     is_plausible,
@@ -30,7 +32,13 @@ from lipcore.simulation import Stream, simulate
 from lipcore.urdf import JointMismatchError, RigidBody
 
 VISCOUS, COULOMB = 0.5, 0.3
-OPTIONS = FitOptions(hyperparameter_samples=80, max_iterations=60, device="cpu")
+BODIES = 70
+"""Weights of the masses of seven bodies; the rotors' and the geometry's follow."""
+OPTIONS = FitOptions(hyperparameter_samples=80, max_iterations=60, device="cpu", geometry="fixed")
+
+
+def kernel_of(robot: RigidBody, gravity: bool = True, mode: str = "fixed") -> ArmKernel:
+    return ArmKernel(arm_of_robot(robot, gravity, mode=mode))
 
 
 def permuted(samples: Samples, order: tuple[int, ...]) -> Samples:
@@ -83,8 +91,8 @@ def test_features_times_the_parameters_of_the_urdf_are_its_dynamics(name: str) -
     for order in (tuple(range(robot.n_joints)), tuple(np.random.default_rng(0).permutation(robot.n_joints))):
         data = permuted(samples, order)
         body = RigidBody.from_profile(name, data.joint_names, tuple(robot.joint_types[i] for i in order))
-        kernel = RigidBodyKernel(body)
-        assert kernel.features(data.motion()).shape == (20, robot.n_joints, 10 * robot.n_joints)
+        kernel = kernel_of(body)
+        assert kernel.features(data.motion()).shape == (20, robot.n_joints, 11 * robot.n_joints)
         torque = kernel.mean(data.motion()).numpy()
         assert np.allclose(torque, data.tau, rtol=0, atol=1e-10 * np.abs(data.tau).max())
 
@@ -93,7 +101,7 @@ def test_compensated_torques_hold_no_gravity(panda: RigidBody) -> None:
     robot = load_robot("panda")
     q = 0.3 * torch.ones((3, 7), dtype=torch.float64)
     motion, rest = Motion(q, q, 2 * q), Motion(q, 0 * q, 0 * q)
-    kernel = RigidBodyKernel(panda, gravity=False)
+    kernel = kernel_of(panda, gravity=False)
     assert torch.count_nonzero(kernel.mean(rest)) == 0
     data, x = robot.model.createData(), q[0].numpy()
     gravity = pin.computeGeneralizedGravity(robot.model, data, x)
@@ -102,20 +110,20 @@ def test_compensated_torques_hold_no_gravity(panda: RigidBody) -> None:
 
 
 def test_remembered_features_are_those_of_the_motion_asked_for(panda: RigidBody) -> None:
-    kernel = RigidBodyKernel(panda)
+    kernel = kernel_of(panda)
     motions = [Motion(*torch.full((3, 2, 7), 0.1 * k, dtype=torch.float64)) for k in range(7)]
     for motion in [*motions, *motions[::-1]]:
-        assert torch.equal(kernel.features(motion), RigidBodyKernel(panda).features(motion))
+        torch.testing.assert_close(kernel.features(motion), kernel_of(panda).features(motion), rtol=1e-12, atol=1e-12)
 
 
 def test_gradient_of_the_prior_scales(panda: RigidBody) -> None:
-    kernel, rng = RigidBodyKernel(panda), np.random.default_rng(5)
+    kernel, rng = kernel_of(panda, mode="calibrate"), np.random.default_rng(5)
     motion = Motion.from_arrays(*rng.uniform(-1, 1, (3, 2, 7)))
     weight = torch.from_numpy(rng.standard_normal((14, 14)))
-    params = {"rigid_body.log_scale": torch.tensor([-1.0, 0.5, -2.0], dtype=torch.float64)}
+    params = {"rigid_body.log_scale": torch.tensor([-1.0, 0.5, -2.0, 1.0], dtype=torch.float64)}
     slope = kernel.gradient(params, motion, weight + weight.T)["rigid_body.log_scale"]
-    for index in range(3):
-        step = torch.zeros(3, dtype=torch.float64)
+    for index in range(4):
+        step = torch.zeros(4, dtype=torch.float64)
         step[index] = 1e-5
         value = [
             float(((weight + weight.T) * kernel.gram({"rigid_body.log_scale": at}, motion, motion)).sum())
@@ -128,10 +136,12 @@ def test_robot_without_mass_needs_the_prior_around_zero(panda: RigidBody) -> Non
     massless = re.sub(r"<inertial>.*?</inertial>", "", panda.urdf, flags=re.DOTALL)
     body = RigidBody.from_urdf(massless, panda.joint_names, panda.joint_types)
     with pytest.raises(ValueError, match="no mass in its URDF, expected inertial parameters or prior 'zero'"):
-        RigidBodyKernel(body)
-    assert RigidBodyKernel(body, "zero").prior_weights() is None
+        arm_of_robot(body)
+    centre = ArmKernel(arm_of_robot(body, prior="zero")).prior_weights()
+    assert centre is not None
+    assert torch.count_nonzero(centre) == 0
     with pytest.raises(ValueError, match="prior is 'flat', expected one of urdf, zero"):
-        RigidBodyKernel(body, "flat")
+        FitOptions(prior="flat")
 
 
 def test_rigid_body_motion_is_learnt_from_a_wrong_urdf_and_from_none(model: TorqueModel, unseen: Samples) -> None:
@@ -142,7 +152,7 @@ def test_rigid_body_motion_is_learnt_from_a_wrong_urdf_and_from_none(model: Torq
     figures = evaluate(unseen.tau, answer.mean.numpy(), answer.std.numpy(), 0 * noise)
     assert (figures.nmse[:6] < 1e-4).all(), figures.nmse
     assert figures.nmse[6] < 2e-3
-    wrong = RigidBodyKernel(model.robot).mean(unseen.motion()).numpy()
+    wrong = kernel_of(model.robot).mean(unseen.motion()).numpy()
     assert (evaluate(unseen.tau, wrong, answer.std.numpy(), noise).nmse > 10 * figures.nmse).all()
 
 
@@ -169,7 +179,7 @@ def test_inertial_parameters_are_plausible_and_as_good(model: TorqueModel, recor
     assert inertia.mean.shape == inertia.std.shape == inertia.plausible.shape == (7, 10)
     assert all(np.linalg.eigvalsh(pseudo_inertia(body))[0] > 0 for body in inertia.plausible)
     assert inertia.mean_is_plausible == all(is_plausible(body) for body in inertia.mean)
-    features = model.estimator.terms["rigid_body"].features(recorded.motion()).numpy()
+    features = model.estimator.terms["rigid_body"].features(recorded.motion()).numpy()[:, :, :BODIES]
     moved = features @ (inertia.plausible - inertia.mean).reshape(-1)
     assert (np.sqrt(np.mean(moved**2, axis=0)) < 0.02 * recorded.tau.std(axis=0)).all()
 
@@ -184,9 +194,10 @@ def test_pseudo_inertia_is_that_of_pinocchio(panda: RigidBody) -> None:
 
 def test_plausible_mean_is_its_own_nearest(model: TorqueModel, panda: RigidBody) -> None:
     weights = weight_posterior(model.posterior, model.estimator.terms["rigid_body"])
-    true = replace(weights, mean=panda.parameters().reshape(-1))
-    found = nearest_plausible(true, model.robot.parameters()).reshape(-1)
-    distance = np.abs(found - true.mean) / weights.std
+    bodies = weights.covariance[:BODIES, :BODIES], weights.scale[:BODIES]
+    true = WeightPosterior(panda.parameters().reshape(-1), *bodies)
+    found = nearest_plausible(true, panda.n_joints, model.robot.parameters())
+    distance = np.abs(found - true.mean) / true.std
     assert distance.max() < 0.5, distance.max()
 
 
@@ -223,13 +234,19 @@ def test_changed_robot_of_a_saved_model_is_refused(model: TorqueModel, tmp_path:
         load(tmp_path / "model")
 
 
-def test_model_that_lost_its_robot_is_refused(model: TorqueModel, tmp_path: Path) -> None:
+def test_model_whose_manifest_has_no_robot_answers_from_its_tensors(
+    model: TorqueModel, unseen: Samples, tmp_path: Path
+) -> None:
     save(model, tmp_path / "model")
     path = tmp_path / "model" / "manifest.json"
     manifest = json.loads(path.read_text())
     path.write_text(json.dumps({name: value for name, value in manifest.items() if name != "robot"}))
-    with pytest.raises(ModelFormatError, match="'rigid-body' needs a robot"):
-        load(tmp_path / "model")
+    (tmp_path / "model" / "robot.urdf").unlink()
+    again = load(tmp_path / "model")
+    assert again.robot is None
+    before, after = (each.predict(unseen.q, unseen.dq, unseen.ddq) for each in (model, again))
+    np.testing.assert_allclose(after.tau, before.tau, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(after.tau_std, before.tau_std, rtol=1e-9)
 
 
 def test_robot_of_other_joints_is_refused(panda: RigidBody, recorded: Samples) -> None:
@@ -273,7 +290,7 @@ def test_energies_take_what_rigid_bodies_leave(tmp_path: Path) -> None:
 
 def test_residual_energies_start_small(panda: RigidBody, recorded: Samples) -> None:
     motion, tau = recorded.motion(), recorded.torque()
-    both = make_estimator("rigid-body+lip-chain", panda.joint_types, robot=panda).terms["energy"]
+    both = make_estimator("rigid-body+lip-chain", panda.joint_types, arm=arm_of_robot(panda)).terms["energy"]
     alone = make_estimator("lip-chain", panda.joint_types).terms["energy"]
     small, large = (
         float(k.variance(k.initial(motion, tau), motion[:20]).diagonal(dim1=1, dim2=2).mean()) for k in (both, alone)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lipcore.estimators import MissingRobotError, UnknownEstimatorError, make_estimator
+from lipcore import FitOptions
+from lipcore.arm.arm import arm_of_robot
+from lipcore.estimators import MissingRobotError, UnknownEstimatorError, check_estimator, make_estimator
 from lipcore.robots import ROBOTS, UnknownRobotError, load_robot, profile_urdf
 from lipcore.urdf import MAX_LINKS, JointMismatchError, RigidBody, UrdfError, describe
 
@@ -176,21 +178,39 @@ def test_coupled_joints_are_refused() -> None:
     assert describe(text).joint_names == ("j1", "j3")
 
 
-def test_estimator_needs_a_robot_exactly_where_it_has_rigid_bodies() -> None:
+def test_estimator_takes_a_robot_exactly_where_it_has_rigid_bodies() -> None:
     body = RigidBody.from_urdf(ARM, ("j1", "j2"), TWO)
-    assert list(make_estimator("rigid-body", TWO, robot=body).terms) == ["rigid_body", "friction"]
-    both = make_estimator("rigid-body+lip-chain", TWO, robot=body)
-    assert list(both.terms) == ["rigid_body", "energy", "friction"]
-    with pytest.raises(MissingRobotError, match="'rigid-body' needs a robot: a profile such as panda, or a URDF"):
-        make_estimator("rigid-body", TWO)
+    arm = arm_of_robot(body)
+    assert list(make_estimator("rigid-body", TWO, arm=arm).terms) == ["rigid_body", "friction"]
+    assert list(make_estimator("rigid-body+lip-chain", TWO, arm=arm).terms) == ["rigid_body", "energy", "friction"]
+    for name, given in (("rigid-body", None), ("lip-chain", arm)):
+        with pytest.raises(ValueError, match=r"expected an arm for rigid-body and rigid-body\+lip-chain, and for no"):
+            make_estimator(name, TWO, arm=given)
+    with pytest.raises(JointMismatchError, match="the arm has joints"):
+        make_estimator("rigid-body", ("revolute", "prismatic"), arm=arm)
+    for name in ("rigid-body", "rigid-body+lip-chain"):
+        check_estimator(name, TWO, body)
     with pytest.raises(MissingRobotError, match="'lip-chain' takes no robot, only rigid-body and"):
-        make_estimator("lip-chain", TWO, robot=body)
-    with pytest.raises(UnknownEstimatorError, match=r"lip-chain.*rigid-body, rigid-body\+lip-chain"):
-        make_estimator("newton", TWO)
+        check_estimator("lip-chain", TWO, body)
+    for known in (make_estimator, check_estimator):
+        with pytest.raises(UnknownEstimatorError, match=r"lip-chain.*rigid-body, rigid-body\+lip-chain"):
+            known("newton", TWO)
+
+
+@pytest.mark.parametrize("geometry", ["fixed", "calibrate", "learn", "auto"])
+def test_a_geometry_that_is_not_learnt_needs_a_robot(geometry: str) -> None:
+    options = FitOptions(geometry=geometry)
+    if geometry in ("fixed", "calibrate"):
+        with pytest.raises(MissingRobotError, match=f"geometry is '{geometry}', which needs a robot: a profile"):
+            check_estimator("rigid-body", TWO, None, options)
+    else:
+        check_estimator("rigid-body", TWO, None, options)
+    check_estimator("lip-chain", TWO, None, options)
 
 
 def test_energies_need_the_joints_from_base_to_tip() -> None:
     crossed = RigidBody.from_urdf(ARM, ("j2", "j1"), TWO)
     with pytest.raises(JointMismatchError, match="from base to tip, j1, j2; the data have j2, j1"):
-        make_estimator("rigid-body+lip-chain", TWO, robot=crossed)
-    assert make_estimator("rigid-body", TWO, robot=crossed).kernel.n_joints == 2
+        check_estimator("rigid-body+lip-chain", TWO, crossed)
+    check_estimator("rigid-body", TWO, crossed)
+    assert make_estimator("rigid-body", TWO, arm=arm_of_robot(crossed)).kernel.n_joints == 2

@@ -190,7 +190,10 @@ def test_jobs_whose_robot_does_not_fit(api, pendulum):
     other = added(api, urdf(joints=("shoulder", "elbow")))["id"]
     sliding = added(api, urdf(kind="prismatic"))["id"]
     for request, messages in (
-        ({"estimator": "rigid-body"}, ["'rigid-body' needs a robot: a profile such as panda, or a URDF"]),
+        (
+            {"options": {**QUICK, "geometry": "fixed"}},
+            ["geometry is 'fixed', which needs a robot: a profile such as panda, or a URDF"],
+        ),
         ({"robot": "panda"}, [*ROBOTS["panda"].free, "joint1, joint2"]),
         ({"robot": other}, ["shoulder, elbow; the data have joint1, joint2"]),
         ({"robot": sliding}, ["joint 'joint1' is revolute in the data", "is prismatic"]),

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.kernels.compiled.compile import compiled
+from lipcore.kernels.compiled.views import plane
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -54,10 +55,13 @@ def _cross(a: Array, i: int, b: Array, j: int, out: Array, k: int) -> None:
 @compiled
 def _moving_cross(a: Array, i: int, b: Array, j: int, out: Array, k: int) -> None:
     """Write a × b of two motions (ω, v)."""
-    out[k : k + 6] = 0.0
-    _cross(a, i, b, j, out, k)
-    _cross(a, i, b, j + 3, out, k + 3)
-    _cross(a, i + 3, b, j, out, k + 3)
+    x, y, z, u, v, w = b[j], b[j + 1], b[j + 2], b[j + 3], b[j + 4], b[j + 5]
+    out[k] = a[i + 1] * z - a[i + 2] * y
+    out[k + 1] = a[i + 2] * x - a[i] * z
+    out[k + 2] = a[i] * y - a[i + 1] * x
+    out[k + 3] = a[i + 1] * w - a[i + 2] * v + a[i + 4] * z - a[i + 5] * y
+    out[k + 4] = a[i + 2] * u - a[i] * w + a[i + 5] * x - a[i + 3] * z
+    out[k + 5] = a[i] * v - a[i + 1] * u + a[i + 3] * y - a[i + 4] * x
 
 
 @compiled
@@ -290,15 +294,14 @@ def shapes(constants: Array, order: Indices, work: Array, out: Array) -> None:
             _screw(row, number)
             _moving_cross(before, V, row, _SCREW, row, _PSI)
             _moving_cross(before, V, row, _PSI, row, _PSI2)
-            spare = row[_SPARE + 1 : _SPARE + 7]
-            _moving_cross(before, A, row, _SCREW, spare, 0)
+            _moving_cross(before, A, row, _SCREW, row, _SPARE + 1)
             for c in range(6):
-                row[_PSI2 + c] += spare[c]
+                row[_PSI2 + c] += row[_SPARE + 1 + c]
             _momentum(row, row, _PSI2, row, _FORCE)
             for c in range(3):
                 row[_FORCE + c] += _dot(row, N + 3 * c, row, _PSI, 3)
-                spare[c] = 2 * row[P + c]
-            _cross(row, _PSI, spare, 0, row, _FORCE + 3)
+                row[_SPARE + 1 + c] = 2 * row[P + c]
+            _cross(row, _PSI, row, _SPARE + 1, row, _FORCE + 3)
             _force_cross(row, _SCREW, row, F, row, _FORCE)
             for i in range(j):
                 out[at, order[i]] = _dot(work[i], S, row, _FORCE, 6)
@@ -343,6 +346,26 @@ def arm_rows(
     if out.shape[0] > first + n:
         bodies(constants, parameters, work)
         shapes(constants, order, work, out[first + n :])
+
+
+@compiled
+def arm_query(memory: Array, order: Indices, motion: Array, out: Array) -> None:
+    """`arm_rows` of one query, with one array for all that taking over nine costs time: `Memory` of constants, gravity
+    and parameters, with (n + 1) WORK + TABLE elements to work in."""
+    n = order.shape[0]
+    place = n * CONSTANTS
+    bodies = place + 3
+    work = bodies + n * PARAMETERS
+    arm_rows(
+        plane(memory, 0, n, CONSTANTS),
+        memory[place:bodies],
+        plane(memory, bodies, n, PARAMETERS),
+        order,
+        motion,
+        plane(memory, work, n + 1, WORK),
+        memory[work + (n + 1) * WORK :],
+        out,
+    )
 
 
 @compiled

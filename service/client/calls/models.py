@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from service.client.call import Answer, Call, Page, Route, given, nothing, page, record, route
+from service.client.results.arm import Version
 from service.models.alias_schema import Alias, AliasList
-from service.models.schema import Model, Version
+from service.models.schema import Model
 
 ARCHIVE_TIMEOUT = 600.0
 """Longest wait for an archive to be packed or checked, s."""
@@ -32,7 +33,7 @@ def delete_model(at: Route, model: str) -> Call[None]:
 
 @route("GET", "/v1/models/{model}/versions/{version}")
 def version(at: Route, model: str, version: int) -> Call[Version]:
-    """One version of a model."""
+    """One version of a model; its `arm` is what it has learnt of its robot, and `print` shows that."""
     return at(record(Version), names={"model": model, "version": version})
 
 
@@ -82,6 +83,15 @@ def export(
 
     params = given(version=version, alias=alias) | {"learnt": learnt}
     return at(read, names={"model": model}, params=params, save_to=path, timeout=ARCHIVE_TIMEOUT)
+
+
+@route("GET", "/v1/models/{model}/urdf")
+def urdf(at: Route, model: str, version: int | None = None, alias: str | None = None) -> Call[str]:
+    """The arm that a version has learnt, as the text of a URDF; raise ApiError for an estimator without rigid bodies.
+
+    The version that serves, unless one is named.
+    """
+    return at(lambda answer: answer.body.decode(), names={"model": model}, params=given(version=version, alias=alias))
 
 
 @route("POST", "/v1/models/import")

@@ -1,5 +1,6 @@
 """Results whose numbers are arrays."""
 
+from service.client.results.arm import Arm, Frames, Version
 from service.client.results.evaluation import Comparison, Evaluation, Interval, Reliability, VersionFigures
 from service.client.results.live import Live, LivePart, LiveRows
 from service.client.results.prediction import Component, Prediction
@@ -7,9 +8,11 @@ from service.client.results.preview import Preview, PreviewColumn
 from service.client.results.trace import Trace
 
 __all__ = [
+    "Arm",
     "Comparison",
     "Component",
     "Evaluation",
+    "Frames",
     "Interval",
     "Live",
     "LivePart",
@@ -19,5 +22,6 @@ __all__ = [
     "PreviewColumn",
     "Reliability",
     "Trace",
+    "Version",
     "VersionFigures",
 ]

@@ -18,9 +18,9 @@ class LivePart(Plain):
     """Rows of one stream that were judged since the last event, predicted by one revision before it learnt them.
 
     rows: all that were judged; counts: what became of them, by code; worst: (n) largest |tau - mean| of all of them in
-    standard deviations of a measurement, NaN where none could be predicted. Of the rows shown, K of them: time: (K)
-    Unix seconds; tau: (K, n) measured; mean: predicted; std: of the function, noise_std: (n) of a measurement around
-    it, N·m; code: what became of each; NaN for what there is none of.
+    standard deviations of a measurement, NaN where none could be predicted; q: (n) positions of the newest row shown,
+    rad (m). Of the rows shown, K of them: time: (K) Unix seconds; tau: (K, n) measured; mean: predicted; std: of the
+    function, noise_std: (n) of a measurement around it, N·m; code: what became of each. NaN for what there is none of.
     """
 
     stream_id: str
@@ -30,6 +30,7 @@ class LivePart(Plain):
     counts: dict[str, int]
     worst: Array
     noise_std: Array
+    q: Array
     time: Array
     tau: Array
     mean: Array
@@ -78,6 +79,7 @@ def _part(said: dict[str, Any]) -> LivePart:
         counts=said["counts"],
         worst=array(said["worst"]),
         noise_std=noise_std,
+        q=array(said["q"] or [None] * len(noise_std)),
         time=array(said["time"]),
         tau=tau,
         mean=mean,

@@ -54,6 +54,11 @@ class LearningStatus(BaseModel):
     novel_share: float | None = Field(
         description="Share of the latest samples that lie beyond the basis; null until some are learnt"
     )
+    linearisation_error: list[float] | None = Field(
+        None,
+        description="Error of taking the torque of a learnt arm as linear around the arm as trained, root mean square "
+        "of each joint in units of √(tau_std² + noise_std²); null without such an arm, and until something is learnt",
+    )
     failure: str | None = Field(description="Why the version does not learn, where it should; it is tried again")
     held: Held | None
     candidate: Candidate | None
@@ -97,7 +102,7 @@ class Alarm(BaseModel):
     """Something about a learning model that its owner should know."""
 
     id: int
-    kind: Literal["change", "novelty", "refresh", "promotion"]
+    kind: Literal["change", "novelty", "linearisation", "refresh", "promotion"]
     at: str
     message: str
     evidence: dict[str, Any]

@@ -32,6 +32,7 @@ def show(service: Service, model: str) -> Learning:
             lag_events=max(events - start - served.revision, 0),
             events=events,
             novel_share=novel_share(said),
+            linearisation_error=_linearisation(said),
             failure=None if said.failed is None else said.failed.error,
             held=None if held is None else Held(at=held["at"], evidence=held["evidence"]),
             candidate=_candidate(session, model, version),
@@ -49,6 +50,11 @@ def novel_share(said: Status) -> float | None:
     """Share of the latest samples beyond the basis of a version, None where the learner has not said."""
     published = said.published
     return None if published is None else published.novel_share
+
+
+def _linearisation(said: Status) -> list[float] | None:
+    published = said.published
+    return None if published is None or published.linearisation is None else list(published.linearisation)
 
 
 def _candidate(session: Session, model: str, serving: int) -> Candidate | None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from sqlalchemy.exc import DBAPIError
 
+from lipcore.arm.linearisation import linearisation_error
 from lipcore.model import TorqueModel
 from lipcore.online import state
 from lipcore.online.batch import Rows
@@ -58,6 +59,7 @@ class Follower:
         self.due = 0.0
         self._solved: tuple[OnlineModel, Array] | None = None
         self._revision: Revision | None = None
+        self._linearisation: tuple[float, ...] | None = None
         self._published = self.start
         self._stored, self._stored_at = self.known.number, time.monotonic()
         self._snapshot: str | None = None
@@ -104,6 +106,7 @@ class Follower:
             novel_share=self.novelty.share,
             seconds=self._seconds + ended - began,
             at=time.time(),
+            linearisation=self._linearisation,
         )
         self._published, self._seconds = self.number, 0.0
         # at most half of the time goes into solving
@@ -173,6 +176,8 @@ class Follower:
         if self._revision is None or self._solved is None or not self._is_solved(online, floor):
             self.answering = online.model(floor)
             self._revision, self._solved = Revision.of(self.answering), (online, floor)
+            error = linearisation_error(self.answering)
+            self._linearisation = None if error is None else tuple(error.tolist())
         return self._revision
 
     def _is_solved(self, online: OnlineModel, floor: Array) -> bool:

@@ -33,6 +33,7 @@ class LivePart(BaseModel):
     )
     noise_std: list[float] = Field(description="Of each joint, N·m")
     time: Nullable = Field(description="Event times of the rows shown, Unix seconds")
+    q: Nullable = Field(description="Positions of the newest row shown, rad (m); empty where none is shown")
     tau: list[Nullable] = Field(description="Measured, N·m; null where it was not a finite number")
     mean: list[Nullable] = Field(description="Predicted before it was learnt, N·m; null where it could not be")
     std: list[Nullable] = Field(description="Of the learnt function, N·m: a measurement scatters by noise_std besides")

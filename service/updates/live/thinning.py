@@ -81,6 +81,7 @@ def _part(group: Sequence[Judged], most: int, total: int) -> tuple[LivePart, Sho
         worst=_worst(rows.tau - mean, np.sqrt(std**2 + noise**2)),
         noise_std=noise.tolist(),
         time=np.round(shown.rows.time, DECIMALS).tolist(),
+        q=np.round(shown.rows.q[shown.rows.time.argmax()], DECIMALS).tolist() if len(shown.rows) else [],
         tau=np.round(shown.rows.tau, DECIMALS).tolist(),
         mean=np.round(shown.mean, DECIMALS).tolist(),
         std=np.round(shown.std, DECIMALS).tolist(),

@@ -1,9 +1,11 @@
-"""Refreshing the version that serves: asked for, or because motion has left what it can learn."""
+"""Refreshing the version that serves: asked for, or because motion, or its arm, has left what it can learn."""
 
 from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Iterator
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Literal
 
@@ -28,8 +30,17 @@ from service.updates.storage.alarms import AlarmKind
 
 logger = logging.getLogger(__name__)
 
-Trigger = Literal["novelty", "asked"]
+Trigger = Literal["novelty", "linearisation", "asked"]
 MOST_DOUBLINGS = 10
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why a version is to be refreshed by itself, in words and in figures."""
+
+    trigger: Literal["novelty", "linearisation"]
+    text: str
+    evidence: dict[str, Any]
 
 
 def ask(
@@ -57,13 +68,14 @@ def ask(
 
 
 def consider(settings: Settings, database: Database, queue: JobQueue, published: Published) -> Job | None:
-    """Queue a refresh, with an alarm, where much of what comes lies beyond the version that serves; None where not.
+    """Queue a refresh, with an alarm, where there is a reason for one; None where not.
 
     Not while learning is held, a refresh is under way or a candidate in contest, and not before a pause has passed
     since the last one, which doubles with every refresh of the same version. Where it is impossible, or its owner does
     not want it, an alarm says so once a version. Not for the event loop.
     """
-    if published.novel_share <= settings.novelty_share:
+    reasons = list(_reasons(settings, published))
+    if not reasons:
         return None
     model = published.model
     with database.session() as session:
@@ -73,21 +85,21 @@ def consider(settings: Settings, database: Database, queue: JobQueue, published:
     with database.transaction() as session:
         if not _is_due(session, settings, published):  # another thread may have been faster
             return None
-        evidence = _evidence(settings, published)
-        said = f"{published.novel_share:.0%} of the last {settings.novelty_rows} samples lie beyond what version "
-        said += f"{version.version} of model {model!r} can learn"
         if not learning.options(session, model).auto_refresh:
-            _raise_once(session, model, "novelty", f"{said}: a refresh would help", evidence)
+            for each in reasons:
+                _raise_once(session, model, each.trigger, f"{each.text}: a refresh would help", each.evidence)
             return None
+        why = reasons[0]
         try:
-            job = _queue(session, settings, version, "novelty")
+            job = _queue(session, settings, version, why.trigger)
         except ConflictError as error:
-            _raise_once(session, model, "refresh", f"{said}, but it cannot be refreshed: {error.message}", evidence)
+            text = f"{why.text}, but it cannot be refreshed: {error.message}"
+            _raise_once(session, model, "refresh", text, why.evidence)
             return None
         except BusyError as error:
             logger.warning("model %s is to be refreshed, but %s", model, error.message)
             return None
-        alarms.raise_alarm(session, model, "novelty", f"{said}: it is refreshed", {**evidence, "job": job.id})
+        alarms.raise_alarm(session, model, why.trigger, f"{why.text}: it is refreshed", {**why.evidence, "job": job.id})
     queue.submit(job.id)
     return jobs.shown(job)
 
@@ -167,15 +179,25 @@ def _raise_once(session: Session, model: str, kind: AlarmKind, message: str, evi
         alarms.raise_alarm(session, model, kind, message, evidence)
 
 
-def _evidence(settings: Settings, published: Published) -> dict[str, Any]:
-    return {
-        "version": published.version,
-        "revision": published.revision,
-        "novel_share": published.novel_share,
-        "threshold": settings.novelty_share,
-        "rows": settings.novelty_rows,
-        "novel_rows_since_start": published.novel_rows,
-    }
+def _reasons(settings: Settings, published: Published) -> Iterator[Reason]:
+    """What the revision shows that a refresh mends: motion beyond the basis, an arm that has left its linearisation."""
+    named = f"version {published.version} of model {published.model!r}"
+    revision = {"version": published.version, "revision": published.revision}
+    share = published.novel_share
+    if share > settings.novelty_share:
+        text = f"{share:.0%} of the last {settings.novelty_rows} samples lie beyond what {named} can learn"
+        figures = {
+            "novel_share": share,
+            "threshold": settings.novelty_share,
+            "rows": settings.novelty_rows,
+            "novel_rows_since_start": published.novel_rows,
+        }
+        yield Reason("novelty", text, {**revision, **figures})
+    errors = published.linearisation or (0.0,)
+    if max(errors) > settings.linearisation_error:
+        text = f"the arm of {named} has moved from where its torque is linear: {max(errors):.0%} of the stated error"
+        by_joint = {"linearisation_error": list(errors), "threshold": settings.linearisation_error}
+        yield Reason("linearisation", text, {**revision, **by_joint})
 
 
 def _alarms(model: str, kind: AlarmKind) -> Select[int]:

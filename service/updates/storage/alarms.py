@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 from service.database import AlarmRow, now
 from service.pages import Page, newest
 
-AlarmKind = Literal["change", "novelty", "refresh", "promotion"]
+AlarmKind = Literal["change", "novelty", "linearisation", "refresh", "promotion"]
 
 
 def raise_alarm(session: Session, model: str, kind: AlarmKind, message: str, evidence: dict[str, Any]) -> AlarmRow:

@@ -239,7 +239,7 @@ MANIFEST_ATTACKS = [
     (("joint_types",), ["revolute", "ball"], "joint_types[1]"),
     (("joint_types",), ["revolute", ["revolute"]], "joint_types[1]"),
     (("estimator",), "oracle", "estimator"),
-    (("estimator",), "rigid-body", "robot"),
+    (("estimator",), "rigid-body", "fit.geometry is None, expected one of learn, calibrate, fixed"),
     (("torque_convention",), {}, "torque_convention"),
     (("noise_std",), [0.1], "noise_std"),
     (("noise_std",), [0.1, "0.1"], "noise_std[1]"),

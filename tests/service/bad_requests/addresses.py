@@ -19,7 +19,7 @@ from tests.service.bad_requests.bad import (
     get,
 )
 
-MODELS, EXPORT = "/v1/models", "/v1/models/panda-sim/export"
+MODELS, EXPORT, URDF = "/v1/models", "/v1/models/panda-sim/export", "/v1/models/panda-sim/urdf"
 NO_ROUTES = (
     "/dashboard",
     "/dashboard/%2e%2e/routes.py",
@@ -103,7 +103,7 @@ PATHS = [
     get(f"{JOBS}/job_0/events", "job", 404, "not_found"),
     *(
         get(f"{MODELS}/nobody/{part}", "model", 404, "not_found")
-        for part in ("aliases", "export", "alarms", "quality", "live")
+        for part in ("aliases", "export", "urdf", "alarms", "quality", "live")
     ),
     Bad("DELETE", f"{MODELS}/nobody", 404, "not_found", "model"),
     Bad("DELETE", f"{MODELS}/panda-sim/versions/99", 404, "not_found", "version"),
@@ -146,6 +146,10 @@ PARAMETERS = [
     *(get(f"{EXPORT}?version={value}", "version") for value in ("0", "x", "", "1.5", "2147483648")),
     *(get(f"{EXPORT}?alias={value}", "alias") for value in ("", "A", "a%00", "1")),
     get(f"{EXPORT}?learnt=perhaps", "learnt"),
+    *(get(f"{URDF}?{asked}", field) for asked, field in (("version=0", "version"), ("alias=A", "alias"), ("v=1", "v"))),
+    get(f"{URDF}?version=1&alias=serving", "version or alias"),
+    get(f"{URDF}?version=99", "version", 404, "not_found"),
+    get(f"{URDF}?alias=nobody", "alias", 404, "not_found"),
     get(f"{EXPORT}?version=1&alias=serving", "version or alias"),
     get(f"{EXPORT}?version=99", "version", 404, "not_found"),
     get(f"{EXPORT}?alias=nobody", "alias", 404, "not_found"),

@@ -6,6 +6,7 @@ import pytest
 
 from service import cli
 from tests.service.data import QUICK, stream, train, upload
+from tests.service.models.arms import NO_BODIES, publish_arm_at
 
 QUICKLY = ["--estimator", "lip-chain"]
 QUICKLY += [part for name, value in QUICK.items() for part in ("--option", f"{name}={value}")]
@@ -45,3 +46,11 @@ def arm(server):
     for seed in (1, 2):
         train(server.client, "cli-arm", dataset, estimator="se", options={**QUICK, "starts": seed})
     return "cli-arm", dataset
+
+
+@pytest.fixture(scope="session")
+def robot_arm(server):
+    """Two versions in the shared service, the second without rigid bodies; the name of their model."""
+    publish_arm_at(server.home, "cli-robot-arm")
+    publish_arm_at(server.home, "cli-robot-arm", **NO_BODIES)
+    return "cli-robot-arm"

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from lipcore.urdf import describe
+from tests.service.models.arms import JOINTS
+
 
 def test_models_are_listed_and_shown(asked, arm):
     name, _ = arm
@@ -55,6 +58,28 @@ def test_an_archive_is_written_read_and_deleted(asked, arm, lipserve, server, tm
     asked("models", "delete", "cli-imported", "--yes")
     code, _, err = lipserve("models", "show", "cli-imported", "--url", server.url)
     assert (code, "no model 'cli-imported'" in err) == (1, True)
+
+
+def test_what_a_version_has_learnt_of_its_arm_is_shown(asked, robot_arm):
+    text = asked("models", "show", robot_arm, "--version", 1)
+    for part in (
+        "where the joints lie",
+        "rotor kg·m²",
+        "mass, first moment",
+        "shift 2",
+        "mirror image",
+        "-0.05 ± 0.01",
+    ):
+        assert part in text
+    assert "mirror image" not in asked("models", "show", robot_arm)
+
+
+def test_an_arm_is_printed_as_a_urdf(asked, lipserve, server, robot_arm):
+    text = asked("models", "urdf", robot_arm, "--version", 1)
+    assert describe(text).joint_names == JOINTS
+    code, text, err = lipserve("models", "urdf", robot_arm, "--url", server.url)
+    assert (code, text) == (1, "")
+    assert "has no rigid bodies" in err
 
 
 @pytest.mark.parametrize(

@@ -37,8 +37,8 @@ def cancel(pupil, job):
     assert pupil.client.post(f"/v1/jobs/{job['id']}/cancel").status_code == 200
 
 
-def published(pupil, share=0.5, version=1):
-    return Published(pupil.model, version, 3, 3, None, 30.0, 900, share, 0.1, time.time())
+def published(pupil, share=0.5, version=1, errors=None):
+    return Published(pupil.model, version, 3, 3, None, 30.0, 900, share, 0.1, time.time(), errors)
 
 
 def consider(school, pupil, **changes):
@@ -81,6 +81,17 @@ def log_end(school, pupil):
 def test_little_novelty_or_another_version_leads_to_nothing(ready, changes):
     assert consider(*ready, **changes) is None
     assert alarms(ready[1]) == []
+
+
+def test_an_arm_that_has_left_its_linearisation_is_refreshed(ready):
+    assert consider(*ready, share=0.0, errors=(0.1, 0.4)) is None
+    job = consider(*ready, share=0.0, errors=(0.1, 0.8))
+    assert job.refresh.trigger == "linearisation"
+    [alarm] = ready[1].get("alarms")["items"]
+    assert alarm["kind"] == "linearisation"
+    assert "80% of the stated error" in alarm["message"]
+    assert alarm["evidence"]["linearisation_error"] == [0.1, 0.8]
+    assert alarm["evidence"]["job"] == job.id
 
 
 def test_a_model_that_is_held_is_not_refreshed(ready):
@@ -134,6 +145,13 @@ def test_novelty_is_told_once_where_refreshes_are_not_wanted(waiting, pupil):
     for _ in range(2):
         assert consider(waiting, pupil) is None
     assert [kind for kind, _ in alarms(pupil)] == ["novelty"]
+
+
+def test_every_reason_is_told_once_where_refreshes_are_not_wanted(waiting, pupil):
+    pupil.teach(0, 1, 2)
+    for _ in range(2):
+        assert consider(waiting, pupil, errors=(0.6, 0.0)) is None
+    assert sorted(kind for kind, _ in alarms(pupil)) == ["linearisation", "novelty"]
 
 
 def test_an_owner_who_was_told_of_a_better_version_is_not_offered_more(ready):

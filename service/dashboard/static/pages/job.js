@@ -130,6 +130,8 @@ async function named(names, signal) {
   );
 }
 
+const TRIGGERS = { asked: "as asked for", novelty: "as much was novel", linearisation: "as its arm had moved" };
+
 function asked(job, names) {
   const sets = job.datasets.map((id, index) => [index ? ", " : "", link(names.get(id), `#/data/${id}`)]);
   return facts([
@@ -138,7 +140,7 @@ function asked(job, names) {
     ["Robot", job.robot ?? "none needed"],
     ["Data sets", sets.length ? sets : "–"],
     ["Held out", heldOut(job.holdout)],
-    ...(job.refresh ? [["Refresh of", `version ${job.refresh.version}, ${job.refresh.trigger === "asked" ? "as asked for" : "as much was novel"}`]] : []),
+    ...(job.refresh ? [["Refresh of", `version ${job.refresh.version}, ${TRIGGERS[job.refresh.trigger]}`]] : []),
     ...(job.retry_of ? [["Repeats", link(job.retry_of, `#/jobs/${job.retry_of}`)]] : []),
     ["Asked for", when(job.created_at)],
     ["Started", job.started_at ? when(job.started_at) : "not yet"],

@@ -6,6 +6,7 @@ import { empty, heading, link, offer, select } from "../ui.js";
 import { alarms } from "./live/alarms.js";
 import { follow } from "./live/connection.js";
 import { innovation } from "./live/innovation.js";
+import { moving } from "./live/moving.js";
 import { quiet } from "./live/quiet.js";
 import { Rows, WINDOW_S } from "./live/rows.js";
 import { answersCard, learningCard, qualityCard } from "./live/standing.js";
@@ -50,7 +51,11 @@ async function followed(view, name, models, signal) {
     const joints = status.joint_names;
     if (seen.rows?.joints.join() === joints.join()) return;
     seen.rows = new Rows(joints);
-    plots = [torque(page.torque, joints, status.joint_types, signal), innovation(page.innovation, joints, signal)];
+    plots = [
+      torque(page.torque, joints, status.joint_types, signal),
+      moving(page.arm, name, () => seen.rows.pose(), signal),
+      innovation(page.innovation, joints, signal),
+    ];
     seen.drawn = -1;
   };
   const hear = (event, data) => {
@@ -108,7 +113,7 @@ async function followed(view, name, models, signal) {
 
 /** The places of the page. */
 function parts(name, models) {
-  const page = Object.fromEntries(["state", "about", "quiet", "held", "standing", "alarms", "torque", "innovation"].map((each) => [each, h("div")]));
+  const page = Object.fromEntries(["state", "about", "quiet", "held", "standing", "alarms", "torque", "arm", "innovation"].map((each) => [each, h("div")]));
   page.state = h("p", { role: "status", class: "actions" });
   page.about.className = "hint";
   page.standing.className = "grid";
@@ -117,7 +122,7 @@ function parts(name, models) {
   const choice = select(models.includes(name) ? models : [name, ...models], name, (chosen) => (location.hash = address(chosen)));
   choice.setAttribute("aria-label", "Model to follow");
   choice.style.width = "auto";
-  page.plots = h("div", {}, page.torque, page.innovation);
+  page.plots = h("div", {}, page.torque, page.arm, page.innovation);
   page.all = [
     heading(`${name} live`, choice, page.streams, page.pause),
     page.state,

@@ -5,6 +5,7 @@ import { h, refresh, replace } from "../dom.js";
 import { when } from "../format.js";
 import { badge, button, errorBox, facts, heading, link, loading, notice, tabs } from "../ui.js";
 import { accuracy } from "./model/accuracy.js";
+import { arm } from "./model/arm.js";
 import { ask } from "./model/ask.js";
 import { chooser, firstChoice } from "./model/choice.js";
 import { learning } from "./model/learning.js";
@@ -17,6 +18,7 @@ import { versions } from "./model/versions.js";
 const TABS = [
   ["accuracy", "Accuracy", accuracy, { data: true, version: true }],
   ["parts", "Parts and friction", parts, { data: true, version: true }],
+  ["arm", "Arm", arm, { version: true }],
   ["versions", "Versions", versions, {}],
   ["lineage", "Lineage", lineage, { version: true }],
   ["ask", "Ask", ask, { version: true }],

@@ -31,6 +31,7 @@ export class Rows {
     stream.rate.push({ time: newest, rows: part.rows, shown: part.time.length });
     stream.rate = stream.rate.filter((each) => each.time > newest - RATE_S);
     stream.heard = at;
+    if (part.q.length && !part.q.includes(null)) stream.q = part.q;
     this.came += part.rows;
     this.version += 1;
     if (this.chosen === null || (!this.#picked && this.age() > SILENT_S)) this.chosen = part.stream_id;
@@ -58,6 +59,11 @@ export class Rows {
     return stream ? performance.now() / 1000 - stream.heard : null;
   }
 
+  /** Positions of the chosen stream's newest row that is shown, null where none is known. */
+  pose() {
+    return this.#streams.get(this.chosen)?.q ?? null;
+  }
+
   /** Rows a second of the robot's own time that came and that were shown lately; null: not known yet. */
   rate() {
     const parts = this.#streams.get(this.chosen)?.rate ?? [];
@@ -81,7 +87,7 @@ export class Rows {
   #stream(name) {
     if (!this.#streams.has(name)) {
       if (this.#streams.size >= MOST_STREAMS) this.#streams.delete(this.streams().find((each) => each !== this.chosen));
-      this.#streams.set(name, { rows: [], rate: [], heard: 0 });
+      this.#streams.set(name, { rows: [], rate: [], heard: 0, q: null });
     }
     return this.#streams.get(name);
   }

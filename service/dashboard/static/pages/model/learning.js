@@ -46,6 +46,7 @@ function status({ options, status: at }, name) {
       ["Answers contain", [`revision ${count(at.published)} `, behind]],
       ["Batches logged", count(at.events)],
       ["Beyond what the version can hold", percent(at.novel_share)],
+      ...(at.linearisation_error ? [["Error of the arm as linear", `${percent(Math.max(...at.linearisation_error))} of what is stated`]] : []),
       ["Sources", at.streams.length ? at.streams.map((each) => each.stream_id).join(", ") : "none"],
       ["Candidate", at.candidate ? `version ${at.candidate.version}, has yet to prove better` : "none"],
     ]),

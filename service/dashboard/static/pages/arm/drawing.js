@@ -1,0 +1,161 @@
+// The arm that a version has learnt, drawn in 3-D at a posture: links, joint axes, masses, and how sure it is of them.
+
+import { shortNames } from "../../format.js";
+import { css, plot } from "../../plots.js";
+import { add, centres, frames, scaled, times, upright } from "./kinematics.js";
+
+const AXIS = 0.12; // half an axis' length, of the arm's size
+const ROUND = 24; // corners of a disc
+const MARGIN = 0.15;
+const SMALLEST = 7, LARGEST = 24; // of a mass, px
+
+/** What both pages say beside the drawing. */
+export const CANNOT = "Torque cannot tell an arm from its mirror image, nor where a frame lies along its axis.";
+export const LEGEND = "Coloured segments are joint axes, grey lines run from frame to frame, balls are masses at their centres. A disc across an axis is one standard deviation of where the axis lies, the thin segments one of how it points, both seen from the frame before. Pale discs and hollow balls: torque does not tell.";
+
+/** Whether the browser can draw in 3-D. */
+export function drawable() {
+  return document.createElement("canvas").getContext("webgl") !== null;
+}
+
+/** Draw the arm of a version into an element; at(q) is where to begin. Returns {draw(q)}, which moves it. */
+export async function drawing(element, { joint_names: names, parameters, training_range: range }, q, { height = 460, signal }) {
+  const arm = new Arm(names, parameters, range);
+  const label = `The arm in 3-D, ${names.length} joints from base to tip: ${arm.names.join(", ")}. The tables hold the same in numbers.`;
+  let last = q;
+  const layout = (shown) => ({ ...arm.layout(shown), height });
+  const first = arm.at(last);
+  const made = await plot(element, arm.traces(first), layout(first), { label, signal });
+  const draw = (positions) => {
+    last = positions;
+    const shown = arm.at(last);
+    return made.react(arm.traces(shown), layout(shown));
+  };
+  const again = () => (element.isConnected ? draw(last) : null);
+  document.addEventListener("themechange", again);
+  signal?.addEventListener("abort", () => document.removeEventListener("themechange", again));
+  return { draw };
+}
+
+class Arm {
+  constructor(names, { geometry, inertia }, range) {
+    const short = shortNames(names);
+    const masses = inertia.bodies.map((body) => body.plausible.mass);
+    Object.assign(this, { geometry, bodies: inertia.bodies, masses, centres: centres(inertia), up: upright(geometry.gravity) });
+    this.names = geometry.order.map((joint) => short[joint]);
+    const slide = ({ type }, place) => (type === "prismatic" ? Math.max(...["min", "max"].map((end) => Math.abs(range.q[end][geometry.order[place]]))) : 0);
+    const steps = geometry.joints.map((joint, place) => Math.hypot(...joint.translation) + slide(joint, place));
+    this.size = Math.max(steps.reduce((all, each) => all + each, 0), ...this.centres.map((each) => Math.hypot(...each)), 0.05);
+    this.reach = [[0, 0, 0], [0, 0, 0]];
+  }
+
+  /** Points of all that is drawn, with gravity downwards. */
+  at(q) {
+    const turned = frames(this.geometry, q).map(({ rotation, origin, axis }) => ({
+      origin: times(this.up, origin),
+      axis: times(this.up, axis),
+      out: (vector) => times(this.up, times(rotation, vector)),
+    }));
+    const masses = turned.map(({ origin, out }, place) => add(origin, out(this.centres[this.geometry.order[place]])));
+    for (const point of [...turned.map((each) => each.origin), ...masses]) {
+      this.reach = [this.reach[0].map((low, k) => Math.min(low, point[k])), this.reach[1].map((high, k) => Math.max(high, point[k]))];
+    }
+    return { turned, masses };
+  }
+
+  traces({ turned, masses }) {
+    const { order } = this.geometry;
+    const links = [[0, 0, 0], ...turned.map((each) => each.origin)];
+    const arms = turned.flatMap(({ origin }, place) => [origin, masses[place], null]);
+    const half = AXIS * this.size;
+    const balls = order.map((joint) => this.masses[joint]);
+    const most = Math.max(...balls);
+    const open = (joint) => this.bodies[joint].undetermined?.includes("mass");
+    return [
+      path(links, { name: "links", line: { color: css("muted"), width: 7 }, hoverinfo: "skip" }),
+      path(arms, { name: "to the masses", line: { color: css("line-strong"), width: 2 }, hoverinfo: "skip", connectgaps: false }),
+      ...turned.map(({ origin, axis }, place) => path([add(origin, scaled(axis, -half)), add(origin, scaled(axis, half))], {
+        name: this.names[place], line: { color: css(`joint-${(place % 8) + 1}`), width: 9 }, hovertemplate: `${this.names[place]}, ${this.geometry.joints[place].type}<extra></extra>`,
+      })),
+      {
+        ...points(masses), type: "scatter3d", mode: "markers", name: "masses", showlegend: false,
+        text: order.map((joint, place) => `${this.names[place]} moves ${this.masses[joint].toPrecision(3)} kg${open(joint) ? ", which torque does not tell" : ""}`),
+        hovertemplate: "%{text}<extra></extra>",
+        marker: {
+          size: balls.map((mass) => Math.max(LARGEST * Math.cbrt(mass / most), SMALLEST)),
+          symbol: order.map((joint) => (open(joint) ? "circle-open" : "circle")), color: css("accent"), opacity: 0.7, line: { width: 0 },
+        },
+      },
+      this.#pointing(turned, half),
+      ...[false, true].map((pale) => this.#discs(turned, pale)),
+    ];
+  }
+
+  layout({ turned }) {
+    const span = [0, 1, 2].map((k) => this.reach[1][k] - this.reach[0][k]);
+    const room = Math.max(MARGIN * Math.max(...span), AXIS * this.size);
+    const sides = span.map((each) => each + 2 * room), longest = Math.max(...sides);
+    const [x, y, z] = sides.map((each) => each / longest); // as long as they are, within a cube that the camera sees all of
+    const axis = (k) => ({
+      range: [this.reach[0][k] - room, this.reach[1][k] + room], title: { text: "xyz"[k] + " m" }, color: css("muted"), gridcolor: css("line"),
+      zerolinecolor: css("line-strong"), showbackground: false, showspikes: false, nticks: 5,
+    });
+    return {
+      hovermode: "closest", showlegend: turned.length <= 10, legend: { orientation: "h", y: 0, yanchor: "top" }, margin: { l: 0, r: 0, t: 0, b: 0 }, uirevision: "arm",
+      scene: { aspectmode: "manual", aspectratio: { x, y, z }, uirevision: "arm", xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), camera: { eye: { x: 1.1, y: -1.1, z: 0.5 } } },
+    };
+  }
+
+  /** Axes turned by one standard deviation either way. */
+  #pointing(turned, half) {
+    const ends = turned.flatMap(({ origin, out }, place) => {
+      const { axis, across, turn_std: std } = this.geometry.joints[place];
+      return std.flatMap((angle, k) => [-1, 1].flatMap((side) => {
+        // a turn about one of the two vectors moves the axis along the other
+        const moved = add(axis, scaled(cross(across[k], axis), side * Math.tan(Math.min(angle, 1.2))));
+        const end = out(scaled(moved, half / Math.hypot(...moved)));
+        return [add(origin, scaled(end, -1)), add(origin, end), null];
+      }));
+    });
+    return path(ends, { name: "± std of the axes", showlegend: false, line: { color: faint(css("text"), 0.3), width: 2 }, hoverinfo: "skip", connectgaps: false });
+  }
+
+  /** Discs of one standard deviation across the axes: of all that torque tells, or of the others. */
+  #discs(turned, pale) {
+    const corners = [], triangles = [];
+    turned.forEach(({ origin, out }, place) => {
+      const { across, shift_std: std, undetermined } = this.geometry.joints[place];
+      if (!std.length || undetermined.some((each) => each.startsWith("shift")) !== pale) return;
+      const middle = corners.push(origin) - 1;
+      for (let corner = 0; corner < ROUND; corner += 1) {
+        const angle = (2 * Math.PI * corner) / ROUND;
+        const radii = std.map((each) => Math.min(each, this.size));
+        corners.push(add(origin, out(add(scaled(across[0], radii[0] * Math.cos(angle)), scaled(across[1], radii[1] * Math.sin(angle))))));
+        triangles.push([middle, middle + 1 + corner, middle + 1 + ((corner + 1) % ROUND)]);
+      }
+    });
+    const [i, j, k] = [0, 1, 2].map((corner) => triangles.map((each) => each[corner]));
+    return {
+      ...points(corners), i, j, k, type: "mesh3d", name: "± std of the places", showlegend: false, hoverinfo: "skip", color: css("novel"), opacity: pale ? 0.12 : 0.45, flatshading: true,
+      lighting: { ambient: 1, diffuse: 0, specular: 0 },
+    };
+  }
+}
+
+function path(list, extra) {
+  return { ...points(list), type: "scatter3d", mode: "lines", showlegend: false, ...extra, ...(extra.hovertemplate ? { showlegend: true } : {}) };
+}
+
+function points(list) {
+  const [x, y, z] = [0, 1, 2].map((k) => list.map((point) => (point === null ? null : point[k])));
+  return { x, y, z };
+}
+
+function cross([a, b, c], [x, y, z]) {
+  return [b * z - c * y, c * x - a * z, a * y - b * x];
+}
+
+function faint(colour, opacity) {
+  const [r, g, b] = [1, 3, 5].map((at) => parseInt(colour.slice(at, at + 2), 16));
+  return `rgba(${r},${g},${b},${opacity})`;
+}

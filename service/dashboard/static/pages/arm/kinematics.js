@@ -1,0 +1,61 @@
+// Where the joints and masses of an arm are at a posture. Matrices are lists of rows; joints run from base to tip.
+
+/** Frames of all joints at positions q (of the data's joints), in the base's frame: [{rotation, origin, axis}, …]. */
+export function frames({ order, joints }, q) {
+  let [rotation, origin] = [[[1, 0, 0], [0, 1, 0], [0, 0, 1]], [0, 0, 0]];
+  return joints.map((joint, place) => {
+    origin = add(origin, times(rotation, joint.translation));
+    rotation = product(rotation, joint.rotation);
+    const position = q[order[place]];
+    if (joint.type === "prismatic") origin = add(origin, times(rotation, scaled(joint.axis, position)));
+    else rotation = product(rotation, turn(joint.axis, position));
+    return { rotation, origin, axis: times(rotation, joint.axis) };
+  });
+}
+
+/** Centres of mass of the bodies in their joints' frames, m, by the data's joints: first moment over mass. */
+export function centres(inertia) {
+  return inertia.bodies.map(({ plausible: { mass, first_moment: moment } }) => moment.map((each) => each / mass));
+}
+
+/** Positions in the middle of the training range, by the data's joints. */
+export function middle({ q: { min, max } }) {
+  return min.map((low, joint) => (low + max[joint]) / 2);
+}
+
+/** The shortest turn after which gravity points down the z axis; none where gravity is not known. */
+export function upright(gravity) {
+  const length = Math.hypot(...gravity);
+  if (!length) return turn([0, 0, 1], 0);
+  const [x, y, z] = gravity.map((each) => each / length);
+  const sine = Math.hypot(x, y);
+  if (!sine) return turn([1, 0, 0], z < 0 ? 0 : Math.PI);
+  return turn([-y / sine, x / sine, 0], Math.atan2(sine, -z)); // about gravity × (0, 0, −1)
+}
+
+/** Rotation by an angle, rad, about a unit vector: Rodrigues' formula. */
+export function turn([x, y, z], angle) {
+  const [sin, cos] = [Math.sin(angle), Math.cos(angle)], rest = 1 - cos;
+  return [
+    [cos + x * x * rest, x * y * rest - z * sin, x * z * rest + y * sin],
+    [y * x * rest + z * sin, cos + y * y * rest, y * z * rest - x * sin],
+    [z * x * rest - y * sin, z * y * rest + x * sin, cos + z * z * rest],
+  ];
+}
+
+export function add(a, b) {
+  return a.map((each, index) => each + b[index]);
+}
+
+export function scaled(a, factor) {
+  return a.map((each) => each * factor);
+}
+
+/** A matrix times a vector. */
+export function times(matrix, vector) {
+  return matrix.map((row) => row[0] * vector[0] + row[1] * vector[1] + row[2] * vector[2]);
+}
+
+function product(a, b) {
+  return a.map((row) => [0, 1, 2].map((column) => row[0] * b[0][column] + row[1] * b[1][column] + row[2] * b[2][column]));
+}

@@ -1,0 +1,50 @@
+// The followed model's arm, moving as the newest row of the stream says. Only for versions that hold their geometry.
+
+import { get, path } from "../../api.js";
+import { h, replace } from "../../dom.js";
+import { card } from "../../ui.js";
+import { CANNOT, drawable, drawing } from "../arm/drawing.js";
+
+const HEIGHT = 380;
+
+/** The arm in a place; draw(rows, status) moves it to pose(), the newest positions, where it can be seen. */
+export function moving(place, name, pose, signal) {
+  let made = null, version = null, seen = false, at = null, left = null;
+  const watch = new IntersectionObserver((entries) => (seen = entries.at(-1).isIntersecting), { rootMargin: "200px 0px" });
+  signal.addEventListener("abort", () => {
+    watch.disconnect();
+    left?.abort();
+  });
+  const begin = async (number, q) => {
+    version = number;
+    left?.abort();
+    left = new AbortController();
+    made = null;
+    const found = await shown(name, number, signal);
+    if (!found?.parameters?.geometry || !drawable()) return replace(place);
+    const figure = h("div", { style: `min-height: ${HEIGHT}px` });
+    replace(place, card("The arm", figure, h("p", { class: "hint" }, `At the positions of the newest row. ${CANNOT}`)));
+    watch.disconnect();
+    watch.observe(figure);
+    made = await drawing(figure, found, q, { height: HEIGHT, signal: left.signal });
+  };
+  return {
+    async draw(_rows, status) {
+      const q = pose();
+      if (q === null || signal.aborted) return;
+      if (status.version !== version) await begin(status.version, q);
+      else if (made && seen && q !== at) await made.draw(q);
+      at = q;
+    },
+  };
+}
+
+/** A version, null where it cannot be had: it was deleted meanwhile, or the page was left. */
+async function shown(name, number, signal) {
+  try {
+    return await get(path`/v1/models/${name}/versions/${number}`, {}, signal);
+  } catch (error) {
+    if (error.name === "ApiError" || error.name === "AbortError") return null;
+    throw error;
+  }
+}

@@ -1,0 +1,141 @@
+"""The arm that a version has learnt, drawn: on its model's page, and moving on the live page."""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from lipcore.arm.geometry import Geometry
+from tests.browser.accessibility import audit
+from tests.browser.conftest import Dashboard, Visit
+from tests.browser.looking import expect
+from tests.browser.visitor import PHONE, Visitor
+from tests.lipcore.arms import parameters, random_bodies, random_geometry
+from tests.service.models.arms import NO_BODIES, publish_arm_at
+
+FRAMES = """async ([geometry, q]) => {
+  const { frames } = await import("/dashboard/pages/arm/kinematics.js");
+  return frames(geometry, q).map(({ rotation, origin }) => [rotation, origin]);
+}"""
+UPRIGHT = """async (gravity) => {
+  const { times, upright } = await import("/dashboard/pages/arm/kinematics.js");
+  return times(upright(gravity), gravity);
+}"""
+LINKS = "(plot) => plot.data[0].x"
+"""Of what Plotly draws: where the frames lie, along one axis."""
+
+
+@pytest.fixture(scope="module")
+def arm(dashboard: Dashboard) -> str:
+    """A model whose version holds its geometry."""
+    publish_arm_at(dashboard.server.home, "drawn")
+    return "drawn"
+
+
+def model_of(geometry: Geometry) -> pin.Model:
+    """The same chain in Pinocchio."""
+    model, parent = pin.Model(), 0
+    for place, kind in enumerate(geometry.joint_types):
+        joint = pin.JointModelPrismaticUnaligned if kind == "prismatic" else pin.JointModelRevoluteUnaligned
+        frame = pin.SE3(geometry.rotation[place], geometry.translation[place])
+        parent = model.addJoint(parent, joint(geometry.axis[place]), frame, f"joint{place}")
+    return model
+
+
+@pytest.mark.parametrize("kinds", ["RPRRPR", "RRRRRRR"])
+def test_frames_are_where_pinocchio_has_them(visitor: Visitor, kinds: str) -> None:
+    n, rng = len(kinds), np.random.default_rng(1)
+    geometry, order, q = random_geometry(kinds, 4), rng.permutation(n), rng.uniform(-2, 2, n)
+    report = parameters(geometry, random_bodies(n, 4), [f"j{joint}" for joint in range(n)], order.tolist())
+    drawn = visitor.open("#/train").evaluate(FRAMES, [report["geometry"], q.tolist()])
+    model = model_of(geometry)
+    data = model.createData()
+    pin.forwardKinematics(model, data, q[order])
+    for (rotation, origin), frame in zip(drawn, list(data.oMi)[1:], strict=True):
+        np.testing.assert_allclose(rotation, frame.rotation, atol=1e-12)
+        np.testing.assert_allclose(origin, frame.translation, atol=1e-12)
+
+
+def test_gravity_is_drawn_downwards(visitor: Visitor) -> None:
+    page = visitor.open("#/train")
+    for gravity in ([0, 0, -9.81], [0, 0, 9.81], [9.81, 0, 0], [3.0, -4.0, 5.0], [1e-9, 0, -9.81]):
+        down = page.evaluate(UPRIGHT, gravity)
+        np.testing.assert_allclose(down, [0, 0, -np.linalg.norm(gravity)], atol=1e-9)
+
+
+def test_an_arm_is_drawn_and_moved(visitor: Visitor, arm: str, windows: Visit, dashboard: Dashboard) -> None:
+    page = visitor.open(f"#/models/{arm}?tab=arm")
+    figure = page.get_by_role("img", name=re.compile("The arm in 3-D, 7 joints from base to tip"))
+    expect(figure.locator("canvas").first).to_be_visible()
+    before = figure.evaluate(LINKS)
+    assert len(before) == 8
+    page.get_by_text("Posture: the middle of the training range").click()
+    slider = page.get_by_role("slider", name="Position of panda_joint2")
+    slider.focus()
+    slider.press("End")
+    visitor.until(lambda: figure.evaluate(LINKS) != before)
+    page.get_by_role("button", name="Back to the middle").click()
+    visitor.until(lambda: figure.evaluate(LINKS) == before)
+    joints = page.get_by_role("table", name=re.compile("Where the joints lie"))
+    expect(joints.get_by_role("row").last).to_contain_text("shift 2")
+    expect(page.get_by_role("table", name=re.compile("What the joints carry"))).to_contain_text("mass, first moment")
+    expect(page.get_by_text("cannot tell an arm from its mirror image")).to_be_visible()
+    with page.expect_download() as saved:
+        page.get_by_role("button", name="Save as URDF").click()
+    assert saved.value.suggested_filename == "drawn-v1.urdf"
+    assert audit(page) == []
+    visitor.shot("arm", height=1500)
+    phone = windows(dashboard.server.url, size=PHONE, scheme="dark", touch=True)
+    phone.open(f"#/models/{arm}?tab=arm")
+    expect(phone.page.get_by_role("img", name=re.compile("The arm in 3-D")).locator("canvas").first).to_be_visible()
+    assert phone.overflow() == 0
+    assert audit(phone.page) == []
+    phone.shot("arm-phone", height=1200)
+
+
+def test_a_version_without_a_geometry_says_how_to_get_one(visitor: Visitor, dashboard: Dashboard) -> None:
+    publish_arm_at(dashboard.server.home, "not-drawn", **NO_BODIES)
+    page = visitor.open("#/models/not-drawn?tab=arm")
+    expect(page.get_by_text("train one with the estimator rigid-body")).to_be_visible()
+    assert audit(page) == []
+
+
+@pytest.fixture
+def streamed(dashboard: Dashboard, arm: str) -> Iterator[None]:
+    """A robot that moves its second joint to and fro."""
+    from service.stream.client import StreamClient
+
+    stop = threading.Event()
+
+    def run() -> None:
+        with StreamClient(arm, dashboard.server.url, stream_id="cell") as stream:
+            for row in range(10**6):
+                q = np.zeros(7)
+                q[1] = 0.5 * np.sin(0.05 * row)
+                stream.ask(q, np.zeros(7), np.zeros(7), tau=np.zeros(7))
+                if stop.wait(0.02):
+                    return
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    yield
+    stop.set()
+    thread.join(30)
+
+
+def test_the_arm_moves_as_its_stream_does(visitor: Visitor, arm: str, streamed: None) -> None:
+    page = visitor.open(f"#/live/{arm}")
+    figure = page.get_by_role("img", name=re.compile("The arm in 3-D"))
+    figure.scroll_into_view_if_needed()
+    canvas = figure.locator("canvas").first.element_handle()
+    for _ in range(3):
+        before = figure.evaluate(LINKS)
+        visitor.until(lambda: figure.evaluate(LINKS) != before)  # noqa: B023
+    visitor.shot("arm-live", height=1600)
+    assert canvas.evaluate("(each) => each.isConnected"), "the plot was made anew"
+    assert audit(page) == []

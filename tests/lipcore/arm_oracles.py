@@ -1,0 +1,110 @@
+"""What an arm does, computed another way: by Pinocchio, and from its energies by automatic differentiation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pinocchio as pin
+import torch
+from torch import Tensor
+from torch.func import grad, jvp
+
+from lipcore.arm.geometry import Geometry
+from lipcore.robots import Robot
+from lipcore.samples import Samples
+from lipcore.simulation import Stream, simulate
+from tests.lipcore.arms import random_bodies, random_geometry
+
+
+def as_robot(geometry: Geometry, bodies: np.ndarray) -> Robot:
+    """Pinocchio's model of an arm. bodies: (n, 10), base to tip."""
+    model, last, n = pin.Model(), 0, geometry.n_joints
+    model.gravity.linear[:] = geometry.gravity
+    for j, kind in enumerate(geometry.joint_types):
+        make = pin.JointModelPrismaticUnaligned if kind == "prismatic" else pin.JointModelRevoluteUnaligned
+        place = pin.SE3(geometry.rotation[j], geometry.translation[j])
+        last = model.addJoint(last, make(geometry.axis[j]), place, f"joint{j + 1}")
+        model.appendBodyToJoint(last, pin.Inertia.FromDynamicParameters(bodies[j]), pin.SE3.Identity())
+    reach = np.where(np.array(geometry.joint_types) == "prismatic", 0.4, 2.5)
+    return Robot("arm", model, tuple(model.names)[1:], geometry.joint_types, -reach, reach, np.full(n, 4.0))
+
+
+def arm(kinds: str, seed: int, gravity: bool = True) -> tuple[Geometry, np.ndarray, Robot]:
+    """A random arm of joints `R` and `P`: geometry, bodies and Pinocchio's model."""
+    geometry, bodies = random_geometry(kinds, seed, gravity), random_bodies(len(kinds), seed)
+    return geometry, bodies, as_robot(geometry, bodies)
+
+
+def motions(n: int, seed: int, size: int = 5) -> np.ndarray:
+    """Random q, dq and ddq: (N, 3, n)."""
+    return np.random.default_rng(seed).uniform(-2, 2, (size, 3, n))
+
+
+def recorded(robot: Robot, seed: int, size: int = 120, noise: float = 0.01, viscous: float = 0.2) -> Samples:
+    """Samples of a robot that moves over most of its range."""
+    return simulate(robot, Stream(size, speed=10, noise=noise, viscous=viscous, motion="full"), seed)
+
+
+def energies(geometry: Geometry, bodies: np.ndarray, step: Tensor, q: Tensor, dq: Tensor) -> tuple[Tensor, Tensor]:
+    """Kinetic and potential energy of an arm whose joints lie a step, (g,), away from where the geometry has them.
+
+    The step of a joint displaces its frame as `lipcore.arm.geometry` documents: T ← T exp(turns), and shifts in T.
+    """
+
+    def places(at: Tensor) -> tuple[Tensor, Tensor]:
+        turn, origin, used = torch.eye(3, dtype=at.dtype), torch.zeros(3, dtype=at.dtype), 0
+        turns, origins = [], []
+        for j, (kind, count) in enumerate(zip(geometry.joint_types, geometry.screws, strict=True)):
+            rotation, place, axis = map(tensor, (geometry.rotation[j], geometry.translation[j], geometry.axis[j]))
+            across, part = tensor(geometry.across[j]), step[used : used + count]
+            used += count
+            if count == 4:
+                place = place + rotation @ (part[2:] @ across)
+            if count:
+                rotation = rotation @ torch.linalg.matrix_exp(cross_matrix(part[:2] @ across))
+            origin, turn = origin + turn @ place, turn @ rotation
+            if kind == "revolute":
+                turn = turn @ torch.linalg.matrix_exp(at[j] * cross_matrix(axis))
+            else:
+                origin = origin + turn @ axis * at[j]
+            turns.append(turn)
+            origins.append(origin)
+        return torch.stack(turns), torch.stack(origins)
+
+    (turns, origins), (spins, speeds) = jvp(places, (q,), (dq,))
+    kinetic = potential = torch.zeros((), dtype=q.dtype)
+    for turn, origin, spin, speed, body in zip(turns, origins, spins, speeds, tensor(bodies), strict=True):
+        twist = turn.T @ spin  # of a rotation, Rᵀ dR/dt = ω× in the body's frame
+        omega = torch.stack([twist[2, 1], twist[0, 2], twist[1, 0]])
+        velocity, moment = turn.T @ speed, body[1:4]
+        xx, xy, yy, xz, yz, zz = body[4:]
+        inertia = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).reshape(3, 3)
+        kinetic = kinetic + 0.5 * body[0] * velocity @ velocity + 0.5 * omega @ inertia @ omega
+        kinetic = kinetic + velocity @ torch.linalg.cross(omega, moment)
+        potential = potential - tensor(geometry.gravity) @ (body[0] * origin + turn @ moment)
+    return kinetic, potential
+
+
+def lagrangian_torque(geometry: Geometry, bodies: np.ndarray, step: Tensor, motion: np.ndarray) -> Tensor:
+    """Euler and Lagrange: d/dt ∂L/∂dq − ∂L/∂q at one motion (3, n), a differentiable function of the step: (n,)."""
+    q, dq, ddq = map(tensor, motion)
+
+    def lagrangian(at: Tensor, speed: Tensor) -> Tensor:
+        kinetic, potential = energies(geometry, bodies, step, at, speed)
+        return kinetic - potential
+
+    _, change = jvp(grad(lagrangian, argnums=1), (q, dq), (dq, ddq))
+    return change - grad(lagrangian, argnums=0)(q, dq)
+
+
+def cross_matrix(vector: Tensor) -> Tensor:
+    """The matrix of vector × …"""
+    x, y, z = vector
+    nought = torch.zeros((), dtype=vector.dtype)
+    return torch.stack([nought, -z, y, z, nought, -x, -y, x, nought]).reshape(3, 3)
+
+
+def tensor(values: np.ndarray | Sequence[float]) -> Tensor:
+    """Numbers in double precision."""
+    return torch.as_tensor(np.array(values, np.float64))

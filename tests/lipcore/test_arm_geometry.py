@@ -1,0 +1,194 @@
+"""Where joint axes lie: steps between geometries, what torque cannot tell, and Pinocchio's placements."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from lipcore.arm.geometry import Geometry, aligned, rotation_of, skew, turn_of
+from lipcore.kernels.compiled.arm import arm_masses
+from lipcore.robots import Robot, load_robot
+from lipcore.simulation import inverse_dynamics
+from lipcore.urdf import RigidBody
+from tests.lipcore.arm_oracles import arm, as_robot, motions
+from tests.lipcore.arms import random_geometry
+
+KINDS = ("R", "RPR", "PRR", "RRRR")
+
+
+def placements(robot: Robot, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    data = robot.model.createData()
+    pin.forwardKinematics(robot.model, data, robot.configuration(q))
+    places = list(data.oMi)[1:]
+    return np.array([each.rotation for each in places]), np.array([each.translation for each in places])
+
+
+def regressor(geometry: Geometry, asked: np.ndarray) -> np.ndarray:
+    """∂τ/∂π at motions, all rows below each other: (N n, 10 n)."""
+    n = geometry.n_joints
+    out = np.empty((len(asked), 10 * n, n))
+    arm_masses(geometry.constants, geometry.gravity, np.arange(n), asked, out)
+    return out.transpose(0, 2, 1).reshape(-1, 10 * n)
+
+
+def reaches(features: np.ndarray, torque: np.ndarray) -> float:
+    """What the best weights leave of a torque, as a share of it."""
+    weights = np.linalg.lstsq(features, torque, rcond=None)[0]
+    return float(np.linalg.norm(torque - features @ weights) / np.linalg.norm(torque))
+
+
+@pytest.mark.parametrize("gravity", [True, False])
+@pytest.mark.parametrize("kinds", KINDS)
+def test_a_step_leads_where_it_was_measured(kinds: str, gravity: bool) -> None:
+    geometry = random_geometry(kinds, 1, gravity)
+    step = np.random.default_rng(2).uniform(-0.3, 0.3, geometry.size)
+    other = geometry.moved(step)
+    np.testing.assert_allclose(geometry.towards(other), step, atol=1e-12)
+    np.testing.assert_allclose(geometry.towards(geometry), 0 * step, atol=1e-15)
+    # the way back, as the other one sees it, to first order
+    for size in (1e-2, 1e-3):
+        back = geometry.moved(size * step).towards(geometry)
+        np.testing.assert_allclose(back, -size * step, rtol=0, atol=2 * size**2)
+
+
+def test_how_many_numbers_torque_tells() -> None:
+    for kinds, gravity, expected in (
+        ("R", True, (2,)),
+        ("R", False, (0,)),
+        ("P", True, (2,)),
+        ("RPR", True, (2, 2, 4)),
+        ("PRR", False, (0, 4, 4)),
+    ):
+        geometry = random_geometry(kinds, 3, gravity)
+        assert geometry.screws == expected
+        assert geometry.size == sum(expected) == len(geometry.turns) == len(geometry.shifts())
+        assert geometry.turns.sum() == sum(min(count, 2) for count in expected)
+
+
+@pytest.mark.parametrize("kinds", KINDS)
+def test_across_the_axis_lie_two_unit_vectors(kinds: str) -> None:
+    geometry = random_geometry(kinds, 4)
+    frames = np.concatenate([geometry.across, geometry.axis[:, None]], axis=1)
+    np.testing.assert_allclose(frames @ frames.mT, np.broadcast_to(np.eye(3), frames.shape), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(frames), 1.0)
+
+
+@pytest.mark.parametrize("kinds", KINDS)
+def test_the_canonical_arm_has_the_same_torques(kinds: str) -> None:
+    """Bodies are told relative to their frames, so the same weights do not: but some weights do."""
+    geometry, _, robot = arm(kinds, 5)
+    asked, canonical = motions(len(kinds), 6, size=30), geometry.canonical()
+    torque = inverse_dynamics(robot, *asked.transpose(1, 0, 2)).reshape(-1)
+    assert reaches(regressor(geometry, asked), torque) < 1e-10
+    assert reaches(regressor(canonical, asked), torque) < 1e-10
+    again = canonical.canonical()
+    np.testing.assert_allclose(again.translation, canonical.translation, atol=1e-12)
+    assert not canonical.translation[0].any()
+    for j, kind in enumerate(canonical.joint_types):
+        along = canonical.translation[j] @ canonical.rotation[j] @ canonical.axis[j]
+        assert along == pytest.approx(0.0, abs=1e-12)
+        assert kind == "revolute" or not canonical.translation[j].any()
+    if len(kinds) > 1:  # elsewhere an axis does make a difference
+        assert reaches(regressor(geometry.moved(np.full(geometry.size, 0.1)), asked), torque) > 1e-3
+
+
+@pytest.mark.parametrize("gravity", [True, False])
+def test_steps_cover_all_that_torque_tells(gravity: bool) -> None:
+    """Turned about its own axis, shifted along it, or moved as a whole, an arm can do the same torques."""
+    geometry, _, robot = arm("RRR", 7, gravity)
+    asked = motions(3, 8, size=40)
+    torque = inverse_dynamics(robot, *asked.transpose(1, 0, 2)).reshape(-1)
+    rotation, translation = geometry.rotation.copy(), geometry.translation.copy()
+    translation[0] += [0.3, -0.2, 0.5]
+    translation[2] += rotation[2] @ geometry.axis[2] * 0.7
+    whole = rotation_of(np.array([0.4, -0.8, 0.3]))
+    rotation[0] = whole @ rotation[0]
+    moved = Geometry(geometry.joint_types, rotation, translation, geometry.axis, whole @ geometry.gravity)
+    assert reaches(regressor(moved, asked), torque) < 1e-10
+
+
+def test_a_mirror_image_has_the_same_torque() -> None:
+    geometry, bodies, robot = arm("RPRR", 9)
+    mirror = np.diag([1.0, -1.0, 1.0])
+    axis = np.array([
+        mirror @ each * (1 if kind == "prismatic" else -1)  # what turns is seen to turn the other way
+        for each, kind in zip(geometry.axis, geometry.joint_types, strict=True)
+    ])  # fmt: skip
+    image = Geometry(
+        geometry.joint_types,
+        mirror @ geometry.rotation @ mirror,
+        geometry.translation @ mirror,
+        axis,
+        mirror @ geometry.gravity,
+    )
+    seen = bodies * [1, 1, -1, 1, 1, -1, 1, 1, -1, 1]
+    asked = motions(4, 10).transpose(1, 0, 2)
+    np.testing.assert_allclose(
+        inverse_dynamics(as_robot(image, seen), *asked), inverse_dynamics(robot, *asked), rtol=1e-9, atol=1e-9
+    )
+    features = regressor(image, np.ascontiguousarray(asked.transpose(1, 0, 2)))
+    np.testing.assert_allclose(
+        features @ seen.reshape(-1), inverse_dynamics(robot, *asked).reshape(-1), rtol=1e-9, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("name", ["double-pendulum", "panda", "kinova", "tiago"])
+def test_placements_of_a_robot_are_those_of_pinocchio(name: str) -> None:
+    robot = load_robot(name)
+    body = RigidBody.from_profile(name, robot.joint_names, robot.joint_types)
+    geometry = Geometry.from_robot(body)
+    for q in motions(robot.n_joints, 11)[:, 0]:
+        for found, expected in zip(geometry.placements(q), placements(robot, q), strict=True):
+            np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_array_equal(geometry.gravity, robot.model.gravity.linear)
+    assert not Geometry.from_robot(body, gravity=False).gravity.any()
+
+
+UNALIGNED = """<robot name="odd"><link name="a"/><link name="b">{body}</link><link name="c">{body}</link>
+<link name="d">{body}</link>
+<joint name="one" type="revolute"><origin xyz="0.1 0.2 0.3" rpy="0.1 0.2 0.3"/><parent link="a"/><child link="b"/>
+<axis xyz="1 2 -2"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+<joint name="two" type="prismatic"><origin xyz="0 0.2 0" rpy="1 0 0"/><parent link="b"/><child link="c"/>
+<axis xyz="2 -1 2"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+<joint name="three" type="continuous"><origin xyz="0.3 0 0"/><parent link="c"/><child link="d"/>
+<axis xyz="-3 0 4"/></joint></robot>"""
+BODY = """<inertial><origin xyz="0.1 0 0.2"/><mass value="2"/>
+<inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial>"""
+
+
+def test_axes_that_are_aligned_with_nothing_are_read_from_pinocchio() -> None:
+    types = ("revolute", "prismatic", "revolute")
+    body = RigidBody.from_urdf(UNALIGNED.format(body=BODY), ("one", "two", "three"), types)
+    geometry = Geometry.from_robot(body)
+    np.testing.assert_allclose(geometry.axis, np.array([[1, 2, -2], [2, -1, 2], [-1.8, 0, 2.4]]) / 3, atol=1e-12)
+    robot = Robot("odd", body.model, body.joint_names, types, *np.zeros((3, 3)))
+    for q in motions(3, 12)[:, 0]:
+        for found, expected in zip(geometry.placements(q), placements(robot, q), strict=True):
+            np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_rotations() -> None:
+    for turn in (np.array([0.3, -0.2, 0.9]), np.array([0.0, 0.0, 3.0]), np.zeros(3)):
+        np.testing.assert_allclose(rotation_of(turn), pin.exp3(turn), atol=1e-12)
+        np.testing.assert_allclose(turn_of(rotation_of(turn)), turn, atol=1e-9)
+        np.testing.assert_allclose(skew(turn) @ [1.0, 2.0, 3.0], np.cross(turn, [1.0, 2.0, 3.0]), atol=1e-12)
+    for axis in (*np.eye(3), np.array([2.0, -1.0, 2.0]) / 3):
+        turned = aligned(axis)
+        np.testing.assert_allclose(turned[:, 2], axis)
+        np.testing.assert_allclose(turned @ turned.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(turned) == pytest.approx(1.0)
+
+
+def test_what_is_no_geometry_is_refused() -> None:
+    good = random_geometry("RR", 13)
+    parts = {name: getattr(good, name) for name in ("rotation", "translation", "axis", "gravity")}
+    for name, value, said in (
+        ("rotation", 2 * good.rotation, "no rotation"),
+        ("rotation", good.rotation[:1], "rotation has shape"),
+        ("translation", np.full((2, 3), np.nan), "translation has shape"),
+        ("axis", 3 * good.axis, "not of length one"),
+        ("gravity", np.zeros(2), "gravity has shape"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            Geometry(good.joint_types, **{**parts, name: value})

@@ -1,0 +1,50 @@
+"""Versions whose arm is known, made of the shipped one without training."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from lipcore import persistence
+from lipcore.manifest import MANIFEST, read_manifest_bytes
+from lipcore.robots import load_robot
+from lipcore.urdf import RigidBody
+from service.database import Database
+from service.files import Files, new_id
+from service.models import registry
+from service.settings import Settings, shipped_models
+from tests.lipcore.arms import parameters_of
+
+JOINTS = tuple(f"panda_joint{number}" for number in range(1, 8))
+
+
+NO_BODIES: dict[str, Any] = {"inertia": None, "rotor": None, "geometry": None}
+"""What an estimator without rigid bodies leaves out of its `parameters`."""
+
+
+def panda() -> RigidBody:
+    """The robot that the shipped model was trained on."""
+    return RigidBody.from_profile("panda", JOINTS, load_robot("panda").joint_types)
+
+
+def publish_arm(database: Database, files: Files, model: str, **changed: Any) -> dict[str, Any]:
+    """Add a version to a model: the shipped one, but reporting the geometry of its robot; return its manifest.
+
+    changed: other entries of its `parameters`; None leaves one out.
+    """
+    source, folder = persistence.read_files(shipped_models() / registry.SHIPPED), new_id("mv")
+    manifest = json.loads(source[MANIFEST])
+    report = parameters_of(panda()) | changed
+    manifest["parameters"] = {name: value for name, value in report.items() if value is not None}
+    source[MANIFEST] = persistence.manifest_bytes(manifest)
+    with files.new_version(folder) as target:
+        persistence.write(target, source)
+    with database.transaction() as session:
+        registry.publish(session, model, folder, read_manifest_bytes(source[MANIFEST]), None)
+    return manifest
+
+
+def publish_arm_at(home: Any, model: str, **changed: Any) -> dict[str, Any]:
+    """`publish_arm` in the home of a service that may be running in another process."""
+    settings = Settings(home=home)
+    return publish_arm(Database.of(settings), Files.of(settings), model, **changed)
