@@ -92,7 +92,7 @@ def test_query_that_is_not_finite_is_refused(model: TorqueModel) -> None:
         ({"joint_types": ("revolute",)}, "joint_types has 1 entries, expected 2"),
         ({"joint_types": ("revolute", "spherical")}, r"joint_types\[1\] is 'spherical'"),
         ({"torque_convention": "none"}, "torque_convention is 'none', expected one of gravity_included"),
-        ({"estimator": "oracle"}, "estimator is 'oracle', expected one of lip"),
+        ({"estimator": "oracle"}, "estimator is 'oracle', expected one of auto, lip"),
     ],
     ids=str,
 )
