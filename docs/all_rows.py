@@ -53,7 +53,7 @@ def main() -> None:
                 parts = scene.fleet(episodes, round(rate * SECONDS), rate)
                 samples = lipcore.Samples.concatenate(parts)
                 few = np.linspace(0, len(samples) - 1, min(len(samples), CANDIDATES)).round().astype(np.int64)
-                chosen = lipcore.train(samples.rows(few), scene.arm.joint_types, options=OPTIONS)
+                chosen = lipcore.train(samples.rows(few), scene.arm.joint_types, "lip-chain", OPTIONS)
                 weight = np.concatenate([weights(part.t) for part in parts])
                 timed, full = (condition(chosen, samples, each) for each in (weight, None))
                 found = " | ".join(judge(model, unseen) for model in (chosen, timed, full))

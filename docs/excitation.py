@@ -64,7 +64,7 @@ def train(robot: Robot, motion: Motion, seed: int) -> lipcore.TorqueModel:
     """Measure the motion and train on it with default options."""
     tau = inverse_dynamics(robot, *motion) + NOISE * np.random.default_rng([seed, 1]).standard_normal(motion[0].shape)
     samples = lipcore.Samples(robot.joint_names, T, np.zeros(len(T), dtype=np.int64), *motion, tau)
-    return lipcore.train(samples, robot.joint_types)
+    return lipcore.train(samples, robot.joint_types, "lip-chain")
 
 
 def score(robot: Robot, model: lipcore.TorqueModel, tests: list[Motion]) -> np.ndarray:

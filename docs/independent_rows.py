@@ -40,7 +40,7 @@ def main() -> None:
     print("| speed | independent rows/s | 30 s, before the payload | 5 s after | 30 s after |\n| " + "--- | " * 5)
     for speed in map(float, sys.argv[1:] or ("2", "5", "10")):
         scene = Scene(speed=speed)
-        base = lipcore.train(scene.history(100, 10), scene.arm.joint_types, options=OPTIONS)
+        base = lipcore.train(scene.history(100, 10), scene.arm.joint_types, "lip-chain", OPTIONS)
         live, change = rows_of(scene.live()), round(scene.change_at * scene.rate)
         for rate in RATES:
             rows, found = replace(live, weight=weights(live.time, rate=rate)), []

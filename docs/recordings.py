@@ -45,7 +45,7 @@ def tell(dataset: Dataset, console: Console) -> None:
 
 def judge(client: Client, model: str, dataset: Dataset, holdout: dict[str, Any], console: Console) -> None:
     """Train with part of a data set held out, and print how well that is answered."""
-    job = client.wait(client.train(model, [dataset.id], holdout=holdout).id)
+    job = client.wait(client.train(model, [dataset.id], "lip-chain", holdout=holdout).id)
     if job.state != SUCCEEDED:
         raise RuntimeError(f"job {job.id} has {job.state}: {job.error}")
     found = client.evaluate(model, dataset.id, part="held_out")

@@ -20,7 +20,7 @@ def main() -> None:
         found = {1.0: [], FAST: []}
         for seed in SEEDS:
             samples = lipcore.Samples.concatenate([simulate(robot, Stream(speed=speed), seed) for speed in speeds])
-            model = lipcore.train(samples, robot.joint_types)
+            model = lipcore.train(samples, robot.joint_types, "lip-chain")
             for speed, figures in found.items():
                 for test_seed in TESTS:
                     test = simulate(robot, Stream(speed=speed, n_sinusoids=100), test_seed)

@@ -19,7 +19,7 @@ from lipcore.kernels.lse import LagrangianSEKernel
 from lipcore.kernels.se import SquaredExponentialKernel
 from lipcore.motion import Motion, check_joint_types
 from lipcore.urdf import JointMismatchError, RigidBody
-from lipcore.vocabulary import AUTO, ROBOT_ESTIMATORS, JointType
+from lipcore.vocabulary import AUTO, CHOICES, ROBOT_ESTIMATORS, JointType
 
 
 class UnknownEstimatorError(ValueError):
@@ -63,8 +63,6 @@ ESTIMATORS: dict[str, Maker] = {
     "rigid-body": lambda types, tied: {},
     "rigid-body+lip-chain": lambda types, tied: {"energy": _ResidualChainKernel(types)},
 }
-CHOICES = (AUTO, *ESTIMATORS)
-"""What a user may ask for."""
 
 
 def make_estimator(

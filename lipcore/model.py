@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
@@ -163,6 +164,7 @@ def train(
     options = options or FitOptions()
     model = fitted(samples, joint_types, estimator, options, torque_convention, on_progress, cancelled, robot)
     weights = spacing.recorded(samples.t, samples.episode)
+    weights = np.minimum(weights, 1.0 / float(model.fit.get("row_correlation", 1.0)))  # errors that last count once
     if not conditioning.wanted(options, len(samples), float(weights.sum())):
         return model
     return conditioning.condition(model, samples, weights, cancelled)
@@ -221,8 +223,8 @@ def fitted(
         )
     else:
         # not the noise: what rigid bodies leave of the torque is what the other term is there for
-        known = {} if learnt is None else learnt.params
-        start = {name: value for name, value in known.items() if name != "noise.log_std"}
+        params = {} if learnt is None else learnt.params
+        start = {name: value for name, value in params.items() if name != "noise.log_std"}
         fewer = options if learnt is None else _independent(options, learnt)
         found = fit(chosen.kernel, samples, fewer, on_progress, cancelled, stretches, start)
         used = samples.rows(found.rows)

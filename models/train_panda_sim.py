@@ -33,7 +33,8 @@ def main() -> None:
     model = lipcore.train(samples, robot.joint_types, "rigid-body", on_progress=show)
     print(f"\nspeed  joint  {'nMSE':>9}  {'RMSE N·m':>9}  coverage of 95 %")
     for speed in SPEEDS:
-        tests = [simulate(robot, Stream(speed=speed, n_sinusoids=100, noise=NOISE, motion="full"), seed) for seed in (900, 901, 902)]
+        streams = [Stream(speed=speed, n_sinusoids=100, noise=NOISE, motion="full")] * 3
+        tests = [simulate(robot, stream, seed) for stream, seed in zip(streams, (900, 901, 902), strict=True)]
         test = lipcore.Samples.concatenate(tests)
         answer = model.predict(test.q, test.dq, test.ddq)
         metrics = evaluate(test.tau, answer.tau, answer.tau_std, answer.noise_std)

@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from lipcore.arm.arm import KINDS
 from lipcore.arm.problem import NOISE_WIDTH, Point, Problem, root_of
@@ -99,12 +100,13 @@ class _Evidence:
         right = std * (precision @ self.rights - gram @ self.mean)
         total = gram * np.outer(std, std)
         total.flat[:: len(total) + 1] += 1.0
-        root = np.linalg.inv(root_of(total))
+        lower = root_of(total)
+        root = solve_triangular(lower, np.eye(len(lower)), lower=True, check_finite=False)
         covariance = root.T @ root
         deviation = covariance @ right
         weights = self.mean + std * deviation
         squares = self.squares - 2 * self.rights @ weights + np.einsum("k,jkl,l->j", weights, self.grams, weights)
-        value = 0.5 * (precision @ squares + deviation @ deviation) - np.log(root.diagonal()).sum()
+        value = 0.5 * (precision @ squares + deviation @ deviation) + np.log(lower.diagonal()).sum()
         spread = covariance * np.outer(std, std)
         used = np.einsum("kl,jkl->j", spread, self.grams)
         by_noise = self.count - precision * (squares + used)

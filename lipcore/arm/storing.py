@@ -17,7 +17,7 @@ from lipcore.vocabulary import GEOMETRY_MODES, GeometryMode, JointType
 PREFIX = "arm/"
 _GEOMETRY = ("rotation", "translation", "axis", "gravity")
 _ARM = ("parameters", "centre", "unit", "expected", "widths")
-_OTHERS = ("rotation", "translation", "parameters", "linear", "probability")
+_OTHERS = ("rotation", "translation", "axis", "parameters", "linear", "probability")
 _NAMES = {f"{PREFIX}{name}" for name in (*_GEOMETRY, *_ARM, "order", *(f"other/{name}" for name in _OTHERS))}
 
 
@@ -34,6 +34,7 @@ def arm_tensors(arm: Arm) -> dict[str, Tensor]:
         parts |= {
             "other/rotation": np.stack([one.geometry.rotation for one in each]),
             "other/translation": np.stack([one.geometry.translation for one in each]),
+            "other/axis": np.stack([one.geometry.axis for one in each]),
             "other/parameters": np.stack([one.parameters for one in each]),
             "other/linear": np.stack([np.concatenate([one.rotor[:, None], one.friction], axis=1) for one in each]),
             "other/probability": np.array([one.probability for one in each]),
@@ -70,7 +71,7 @@ def _alternatives(tensors: Mapping[str, Tensor], geometry: Geometry) -> tuple[Al
     if f"{PREFIX}other/probability" not in tensors:
         return ()
     try:
-        rotation, translation, parameters, linear, probability = (
+        rotation, translation, axis, parameters, linear, probability = (
             tensors[f"{PREFIX}other/{name}"].numpy() for name in _OTHERS
         )
     except KeyError as error:
@@ -81,6 +82,7 @@ def _alternatives(tensors: Mapping[str, Tensor], geometry: Geometry) -> tuple[Al
         ("linear", linear, (count, n, 1 + len(FRICTION_TERMS))),
         ("rotation", rotation, (count, n, 3, 3)),
         ("translation", translation, (count, n, 3)),
+        ("axis", axis, (count, n, 3)),
         ("probability", probability, (count,)),
     ):
         if value.shape != shape or not count:
@@ -89,7 +91,7 @@ def _alternatives(tensors: Mapping[str, Tensor], geometry: Geometry) -> tuple[Al
         raise ValueError("tensor 'arm/other/probability' holds a number that is none between 0 and 1")
     return tuple(
         Alternative(
-            Geometry(geometry.joint_types, rotation[k], translation[k], geometry.axis, geometry.gravity),
+            Geometry(geometry.joint_types, rotation[k], translation[k], axis[k], geometry.gravity),
             parameters[k],
             linear[k, :, 0],
             np.ascontiguousarray(linear[k, :, 1:]),

@@ -68,8 +68,11 @@ class ArmJoints:
             raise ValueError(f"lower is {self.lower}, expected at most upper, {self.upper}")
 
 
-def urdf_text(geometry: Geometry, bodies: Array, joints: ArmJoints, name: str = "arm") -> str:
-    """URDF of an arm. bodies: (n, 10), ten parameters each about its joint's frame, base to tip; name: the robot's.
+def urdf_text(
+    geometry: Geometry, bodies: Array, joints: ArmJoints, name: str = "arm", notes: Sequence[str] = ()
+) -> str:
+    """URDF of an arm. bodies: (n, 10), ten parameters each about its joint's frame, base to tip; name: the robot's;
+    notes: comments at its beginning.
 
     With gravity (0, 0, −|g|) in the frame of the root, recursive Newton–Euler on it, plus rotor · ddq and friction, is
     the torque of the arm. Negative friction, which no simulator takes, is written as zero. Raise ValueError for a mass
@@ -82,7 +85,7 @@ def urdf_text(geometry: Geometry, bodies: Array, joints: ArmJoints, name: str = 
         if not mass > 0:
             raise ValueError(f"the mass that joint {joint!r} moves is {mass:g} kg, expected more than zero")
     robot = Element("robot", {"name": name, "xmlns:drake": DRAKE})
-    _comments(robot, [*ABOUT, *_about_gravity(geometry)])
+    _comments(robot, [*ABOUT, *_about_gravity(geometry), *notes])
     parent, reach = BASE, _reach(geometry, bodies, joints)
     line = max(LINE * float(reach[0]), 1e-3)
     upright = _upright(geometry.gravity)
@@ -145,7 +148,13 @@ def urdf_of_parameters(
         rotor=chain(rotor),
         undetermined=undetermined,
     )
-    return urdf_text(geometry, bodies_of(parameters["inertia"])[order], joints, name)
+    inertia, notes = parameters["inertia"], list[str]()
+    if "plausible_deviation" in inertia:
+        off = ", ".join(f"{value:.2g}" for value in chain(inertia["plausible_deviation"]))
+        notes = [
+            f"Torque of these bodies differs from what was learnt by {off} N·m (N), root mean square, base to tip."
+        ]
+    return urdf_text(geometry, bodies_of(inertia)[order], joints, name, notes)
 
 
 def rpy(rotation: Array) -> Array:

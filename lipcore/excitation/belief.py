@@ -22,7 +22,6 @@ from lipcore.robots import Robot
 from lipcore.samples import Array, Samples
 from lipcore.simulation import inverse_dynamics
 from lipcore.urdf import RigidBody
-from lipcore.vocabulary import DEFAULT_ESTIMATOR
 
 PRIOR_MOTIONS = 80
 """Motions whose torques, as the URDF has them, tell a prior's hyperparameters."""
@@ -58,7 +57,7 @@ class Belief:
         robot: Robot,
         limits: Limits,
         noise_std: Array | float | None = None,
-        estimator: str = DEFAULT_ESTIMATOR,
+        estimator: str | None = None,
         bodies: RigidBody | None = None,
         seed: int = 0,
     ) -> Belief:
@@ -67,8 +66,9 @@ class Belief:
         The URDF need not be right: it tells how large and how smooth torques are, not what they are.
 
         noise_std: N·m, of all joints or (n,); NOISE_SHARE of the torque's spread by default. bodies: for estimators
-        of rigid bodies.
+        of rigid bodies. estimator: `rigid-body` with bodies and `lip-chain` without by default.
         """
+        estimator = estimator or ("lip-chain" if bodies is None else "rigid-body")
         motion = draw(limits, PRIOR_MOTIONS, seed)
         tau = inverse_dynamics(robot, motion.q.numpy(), motion.dq.numpy(), motion.ddq.numpy())
         std = NOISE_SHARE * tau.std(0) if noise_std is None else np.broadcast_to(noise_std, tau.shape[1:])

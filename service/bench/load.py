@@ -61,7 +61,7 @@ class TrainingLoad:
         return [f"{share} during the stretches measured under it; {ended}"]
 
     def _start(self) -> None:
-        self.job = self.client.train("bench-load", [self.dataset], options=self.options).id
+        self.job = self.client.train("bench-load", [self.dataset], "lip-chain", options=self.options).id
         end = time.monotonic() + START_SECONDS
         while not (self._runs() and self._seen().progress.stage == "hyperparameters"):
             if self._seen().state not in ACTIVE or time.monotonic() > end:

@@ -52,7 +52,7 @@ def _train(
     name: str, robot: Robot, streams: tuple[Stream, ...], fit: Mapping[str, Any], home: Path, console: Console
 ) -> Workload:
     samples = Samples.concatenate([simulate(robot, stream, TRAIN_SEED) for stream in streams])
-    model = lipcore.train(samples, robot.joint_types, options=lipcore.FitOptions(**fit))
+    model = lipcore.train(samples, robot.joint_types, "lip-chain", lipcore.FitOptions(**fit))
     folder = home / f"motion-{name.replace(' ', '-')}"
     manifest = lipcore.save(model, folder)
     console.print(f"  {name}: {json.dumps(manifest.get('compact', {}))}", highlight=False)

@@ -148,7 +148,7 @@ def _upload(client: Client, samples: Samples, path: Path) -> str:
 
 
 def _train(client: Client, home: Path, dataset: str, robot: Robot, source: Source, console: Console) -> Path:
-    queued = client.train(MODEL, [dataset], joint_types=list(robot.joint_types), options=dict(source.fit))
+    queued = client.train(MODEL, [dataset], "lip-chain", list(robot.joint_types), dict(source.fit))
     job = follow(client, queued, console)
     if job.state != SUCCEEDED:
         raise BenchError(f"the training job has {job.state}: {job.error.message if job.error else ''}")

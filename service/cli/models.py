@@ -21,6 +21,7 @@ from service.settings import DEFAULT_URL
 if TYPE_CHECKING:
     from service.client.results import Version as VersionRecord
     from service.models.alias_schema import Alias as AliasRecord
+    from service.models.schema import Selection
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -258,10 +259,22 @@ def _moved(model: str, moved: AliasRecord, as_json: bool) -> None:
         note(f"`lipserve models rollback {model} --alias {moved.alias}` goes back to version {moved.previous}")
 
 
+def print_selection(found: Selection) -> None:
+    """Print how an estimator was chosen."""
+    from service.cli.tables import selection_table  # noqa: PLC0415 - takes long to import; help needs none
+
+    out.print(selection_table(found))
+    say(f"  {found.chosen} is chosen: {found.reason}")
+    if found.held_out.repeats:
+        say("  all of the motion repeats itself, also what was held out: these figures flatter")
+
+
 def _print_version(shown: VersionRecord) -> None:
     say(f"version {shown.version}: {shown.estimator}, {len(shown.joint_names)} joints: {', '.join(shown.joint_names)}")
     noise = ", ".join(f"{value:.3g}" for value in shown.noise_std)
     say(f"  torque {shown.torque_convention.replace('_', ' ')}, noise of a measurement {noise} N·m")
+    if shown.selection is not None:
+        print_selection(shown.selection)
     lineage: dict[str, Any] = shown.lineage
     sets = [each.get("name") or each.get("id") for each in lineage.get("datasets") or () if isinstance(each, dict)]
     if sets:

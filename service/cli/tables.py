@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from service.client.results import Arm, Comparison, Evaluation, Prediction
+from service.models.schema import Selection
 
 
 def prediction_tables(answer: Prediction) -> list[Table]:
@@ -45,6 +46,32 @@ def figures_table(title: str, joint_names: Sequence[str], figures: Mapping[str, 
     for joint, nmse, rmse, coverage, nlpd in zip(joint_names, *columns, strict=True):
         table.add_row(joint, _figure(nmse, ".2e"), _figure(rmse, ".4f"), _figure(coverage, ".1%"), _figure(nlpd, ".3f"))
     return table
+
+
+def selection_table(found: Selection) -> Table:
+    """How the estimators did that `auto` has chosen from."""
+    held = found.held_out
+    title = "not judged"
+    if held.blocks:
+        title = f"judged on {held.blocks} stretches that the training did not see"
+    table = Table("estimator", "log density nats", "less than the best", "mean nMSE", "coverage of 95%", title=title)
+    for each in found.table:
+        name = f"{each.estimator} (chosen)" if each.estimator == found.chosen else each.estimator
+        if each.error is not None:
+            table.add_row(name, f"failed: {escape(each.error)}", "", "", "")
+            continue
+        error = "" if each.standard_error is None else f" ± {each.standard_error:.2f}"
+        less = None if each.difference is None else 0.0 - each.difference
+        figures = [_mean(each.nmse), _mean(each.coverage)]
+        row = [_figure(each.log_density, ".2f"), _figure(less, ".2f") + error]
+        table.add_row(name, *row, _figure(figures[0], ".2e"), _figure(figures[1], ".1%"))
+    return table
+
+
+def _mean(values: Sequence[float | None] | None) -> float | None:
+    """Of the joints that have a figure."""
+    known = [each for each in values or () if each is not None]
+    return sum(known) / len(known) if known else None
 
 
 def _figure(value: float | None, form: str) -> str:

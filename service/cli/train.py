@@ -8,13 +8,14 @@ from typing import Annotated, Any
 
 import typer
 
-from lipcore.vocabulary import DEFAULT_ESTIMATOR
+from lipcore.vocabulary import CHOICES, DEFAULT_ESTIMATOR
 from service.cli import completion
 from service.cli.connecting import connected, dataset_of
 from service.cli.consoles import note, out, print_json, say
 from service.cli.errors import INTERRUPTED, CommandError
+from service.cli.models import print_selection
 from service.cli.options import Json, Url, names, pairs
-from service.cli.words import ESTIMATORS, HELD_OUT_BY
+from service.cli.words import HELD_OUT_BY
 from service.settings import DEFAULT_URL
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
@@ -36,14 +37,16 @@ def train(
     estimator: Annotated[
         str | None,
         typer.Option(
-            help=f"One of {', '.join(ESTIMATORS)}; {DEFAULT_ESTIMATOR} by default.", autocompletion=lambda: ESTIMATORS
+            help=f"One of {', '.join(CHOICES)}; {DEFAULT_ESTIMATOR} by default, which trains three and takes the one "
+            "that predicts best what it has not seen.",
+            autocompletion=lambda: list(CHOICES),
         ),
     ] = None,
     joint_types: Annotated[
         str | None, typer.Option(help="One a joint, separated by commas; all revolute by default.")
     ] = None,
     robot: Annotated[
-        str | None, typer.Option(help="For rigid bodies: a profile such as panda, the id of a URDF, or a .urdf file.")
+        str | None, typer.Option(help="Of rigid bodies: a profile such as panda, the id of a URDF, or a .urdf file.")
     ] = None,
     prior: Annotated[
         str | None,
@@ -98,7 +101,7 @@ def train(
         interrupted = False
         if wait:
             job, interrupted = watch(client, job, cancels=True)
-        made = client.version(model, job.version) if asked and job.version is not None else None
+        made = None if job.version is None else client.version(model, job.version)
     if as_json:
         print_json(job)
     if interrupted and job.version is None:
@@ -113,7 +116,9 @@ def train(
         say(f"job {job.id} is queued: `lipserve jobs follow {job.id}`")
         return
     say(f"{model} version {job.version} is trained and answers")
-    if made is not None:
+    if made is not None and made.selection is not None:
+        print_selection(made.selection)
+    if made is not None and asked:
         from service.cli.tables import figures_table  # noqa: PLC0415 - as above
 
         held = made.lineage["holdout"]

@@ -8,5 +8,4 @@ ROBOTS = [
     *("pr2-left", "pr2-right", "talos-left", "tiago", "tiago-pro-left", "tiago-pro-right", "double-pendulum"),
     *("asr-twodof", "finger-edu"),
 ]
-ESTIMATORS = ["lip", "lip-chain", "se", "gip", "lse", "rigid-body", "rigid-body+lip-chain"]
 HELD_OUT_BY = ["last", "episodes", "blocks"]

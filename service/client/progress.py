@@ -41,6 +41,7 @@ def job_bar(console: Console | None = None) -> Iterator[Callable[[Job], None]]:
             at = seen.progress
             objective = "" if at.objective is None else f" objective {at.objective:.1f}"
             text = f"{at.stage} {at.iteration}/{at.max_iterations}{objective}" if at.iteration else at.stage
+            text = text if at.estimator is None else f"{at.estimator}: {text}"
             if at.remaining_s:
                 text += f", at most about {at.remaining_s:.0f} s left"
             bar.update(task, description=text, completed=at.fraction)

@@ -19,7 +19,7 @@ from lipcore.profiles import names
 from lipcore.robots import Robot, SimulationUnavailableError
 from lipcore.samples import Array
 from lipcore.simulation import FAST, Stream, sinusoids
-from lipcore.vocabulary import DEFAULT_ESTIMATOR, JointType
+from lipcore.vocabulary import JointType
 from service.cli.consoles import err, print_json
 from service.cli.options import Json
 from service.client import ApiError
@@ -69,7 +69,7 @@ def excite(
     ] = None,
     estimator: Annotated[
         str, typer.Option(help=f"What will be trained, without a model: one of {', '.join(ESTIMATORS)}.")
-    ] = DEFAULT_ESTIMATOR,
+    ] = "rigid-body",
     harmonics: Annotated[
         int | None, typer.Option(min=2, help="Of the Fourier series; by default as the limits allow.")
     ] = None,

@@ -16,6 +16,37 @@ AliasName = Annotated[str, StringConstraints(pattern=ALIAS)]
 """Lower-case letters, digits, dots, underscores and hyphens after a letter: never taken for a version's number."""
 
 
+class SelectionCandidate(BaseModel):
+    """How an estimator did on what was held out to choose by; null where it was not judged."""
+
+    estimator: str
+    log_density: float | None = Field(description="Log predictive density, summed over the joints, nats a sample")
+    difference: float | None = Field(description="Of the log density from that of the best")
+    standard_error: float | None = Field(description="Of that difference")
+    nmse: list[float | None] | None = Field(description="Of each joint; null where its torque does not vary")
+    coverage: list[float | None] | None = Field(description="Share within the 95 % interval, of each joint")
+    seconds: float
+    error: str | None = Field(description="Why it could not be trained")
+
+
+class SelectionHeldOut(BaseModel):
+    """What `auto` held out to choose by; the chosen estimator has learnt it afterwards."""
+
+    rows: int
+    blocks: int = Field(description="Contiguous stretches that these rows are")
+    repeats: bool = Field(description="All motion of the recording repeats other motion of it: figures flatter")
+
+
+class Selection(BaseModel):
+    """How `auto` has chosen the estimator."""
+
+    asked: str
+    chosen: str
+    reason: str
+    held_out: SelectionHeldOut
+    table: list[SelectionCandidate] = Field(description="All that were trained, the simplest first")
+
+
 class Version(BaseModel):
     """An immutable trained version."""
 
@@ -49,9 +80,15 @@ class Version(BaseModel):
         description="Data sets with their hashes, when and with which `software` it was trained, and how well it fits "
         "them (`training_metrics`); of an imported version also where it comes from (`imported`)"
     )
+    selection: Selection | None = Field(
+        None, description="How the estimator was chosen; null where it was named when the training was asked for"
+    )
     robot: dict[str, Any] | None = Field(None, description="The URDF of an estimator with rigid bodies, and its prior")
     parameters: dict[str, Any] | None = Field(
-        None, description="Friction coefficients and, of rigid bodies, inertial parameters, with standard deviations"
+        None,
+        description="`friction`; of rigid bodies also `inertia`, `rotor` and `geometry`, with standard deviations and "
+        "with what torque does not tell (`undetermined`). `geometry.joints` run from base to tip, `geometry.order` "
+        "names the model's joint at each place; all else is in the order of the model's joints",
     )
 
 

@@ -69,6 +69,7 @@ class Pulse:
         changed = at.stage != self._latest["stage"]
         self._latest = {
             "stage": at.stage,
+            "estimator": at.estimator,
             "iteration": at.iteration,
             "max_iterations": at.max_iterations,
             "objective": at.objective,
@@ -90,11 +91,16 @@ class Pulse:
         if done > before:
             self._ends = clock + (clock - began) * (1.0 - done) / (done - before)
         fraction = self._fit_share + (0.98 - self._fit_share) * done
-        self._latest = {**self._latest, "stage": STATISTICS, "fraction": max(fraction, self._latest["fraction"])}
+        self._latest = {
+            **self._latest,
+            "stage": STATISTICS,
+            "estimator": None,
+            "fraction": max(fraction, self._latest["fraction"]),
+        }
 
     def stage(self, name: str) -> None:
         """Say what is done now."""
-        self._latest = {**self._latest, "stage": name}
+        self._latest = {**self._latest, "stage": name, "estimator": None}
         self._wake.set()
 
     def cancelled(self) -> bool:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from lipcore.fitting import FitProgress
 
 SEARCH = "hyperparameters"
+LEAST_FRACTION = 0.05
+"""Share of several fits after which their pace says something."""
 LEAST_ITERATIONS = 3
 """Iterations after which their pace says something."""
 POSTERIOR_ITERATIONS = 1.5
@@ -27,6 +29,10 @@ class Remaining:
 
     def step(self, at: FitProgress, clock: float) -> None:
         """Take a step of the fit. clock: monotonic time, s."""
+        if at.estimator is not None:  # one of several: how long each takes shows in the share of all that is done
+            if at.fraction >= LEAST_FRACTION:
+                self._ends = clock + at.elapsed * (1 - at.fraction) / at.fraction
+            return
         if at.stage == SEARCH:
             if self._first is None:
                 self._first = (clock, at.iteration)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from lipcore.fit_options import MOST_SECONDS, FitOptions, GeometryOption, Standing
-from lipcore.vocabulary import DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS, JointType
+from lipcore.vocabulary import AUTO, CHOICES, DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS, JointType
 from service.models.schema import ModelName
 from service.training.holdout_schema import Holdout
 from service.training.states import JobState
@@ -73,14 +73,19 @@ class JobRequest(BaseModel):
 
     model: ModelName = Field(description="Name of the model; a new version of it is made")
     datasets: list[Annotated[str, Field(max_length=40)]] = Field(min_length=1, description="Ids of data sets")
-    estimator: str = Field(DEFAULT_ESTIMATOR, max_length=40)
+    estimator: str = Field(
+        DEFAULT_ESTIMATOR,
+        max_length=40,
+        description=f"One of {', '.join(CHOICES)}; `auto` trains three and takes the one that predicts best what it "
+        "has not seen",
+    )
     joint_types: list[JointType] | None = Field(
         None, description="One a joint; by default those of the robot that a data set was uploaded with, else revolute"
     )
     robot: str | None = Field(
         None,
         max_length=40,
-        description=f"For {' and '.join(ROBOT_ESTIMATORS)}: a profile such as panda, or the id of an uploaded URDF",
+        description=f"For {', '.join(ROBOT_ESTIMATORS)} and {AUTO}: a profile such as panda, or the id of a URDF",
     )
     options: Options = Field(default_factory=Options)
     holdout: Holdout | None = Field(
@@ -93,8 +98,9 @@ class JobProgress(BaseModel):
     """How far a job is."""
 
     stage: str = Field(
-        description="waiting, loading, hyperparameters, posterior, statistics, evaluating, saving or done"
+        description="waiting, loading, geometry, hyperparameters, posterior, statistics, evaluating, saving or done"
     )
+    estimator: str | None = Field(None, description="The one at work, where `auto` trains several")
     iteration: int = 0
     max_iterations: int = 0
     objective: float | None = Field(None, description="Penalised negative log evidence, nats: falls during the fit")

@@ -16,7 +16,7 @@ from tests.browser.conftest import Dashboard, Visit
 from tests.browser.looking import expect
 from tests.browser.visitor import PHONE, Visitor
 from tests.lipcore.arms import parameters, random_bodies, random_geometry
-from tests.service.models.arms import publish_arm_at
+from tests.service.models.arms import NO_BODIES, publish_arm_at
 
 FRAMES = """async ([geometry, q]) => {
   const { frames } = await import("/dashboard/pages/arm/kinematics.js");
@@ -98,8 +98,9 @@ def test_an_arm_is_drawn_and_moved(visitor: Visitor, arm: str, windows: Visit, d
     phone.shot("arm-phone", height=1200)
 
 
-def test_a_version_without_a_geometry_says_how_to_get_one(visitor: Visitor) -> None:
-    page = visitor.open("#/models/panda-sim?tab=arm")
+def test_a_version_without_a_geometry_says_how_to_get_one(visitor: Visitor, dashboard: Dashboard) -> None:
+    publish_arm_at(dashboard.server.home, "not-drawn", **NO_BODIES)
+    page = visitor.open("#/models/not-drawn?tab=arm")
     expect(page.get_by_text("train one with the estimator rigid-body")).to_be_visible()
     assert audit(page) == []
 
@@ -135,5 +136,6 @@ def test_the_arm_moves_as_its_stream_does(visitor: Visitor, arm: str, streamed: 
     for _ in range(3):
         before = figure.evaluate(LINKS)
         visitor.until(lambda: figure.evaluate(LINKS) != before)  # noqa: B023
+    visitor.shot("arm-live", height=1600)
     assert canvas.evaluate("(each) => each.isConnected"), "the plot was made anew"
     assert audit(page) == []

@@ -101,13 +101,14 @@ def test_lines_break_between_episodes(visitor: Visitor, dashboard: Dashboard) ->
 def test_the_form_offers_the_estimators_there_are(visitor: Visitor) -> None:
     page = visitor.open("#/train")
     assert [each.get_attribute("value") for each in page.get_by_role("radio").all()] == list(
-        dict.fromkeys([*("lip-chain", "rigid-body", "rigid-body+lip-chain"), *ESTIMATORS])
+        dict.fromkeys(["auto", "rigid-body", "lip-chain", "rigid-body+lip-chain", *ESTIMATORS])
     )
     for name in ESTIMATORS:
         page.locator(f'input[type=radio][value="{name}"]').check()
         robot = page.get_by_label("Robot", exact=True)
         expect(robot).to_be_visible() if name in ROBOT_ESTIMATORS else expect(robot).to_be_hidden()
-    page.get_by_role("radio", name="lip-chain (default)").check()
+    page.get_by_role("radio", name="auto (default)").check()
+    expect(page.get_by_label("Robot", exact=True)).to_be_visible()
     page.get_by_label("Name of the model").fill("refused")
     page.get_by_role("button", name="Start training").click()
     expect(page.get_by_role("alert")).to_contain_text("Choose at least one data set")

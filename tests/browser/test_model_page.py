@@ -10,7 +10,7 @@ from tests.browser.accessibility import audit
 from tests.browser.conftest import Dashboard
 from tests.browser.looking import expect
 from tests.browser.visitor import Visitor
-from tests.service.data import stream, train, upload
+from tests.service.data import QUICK, stream, train, upload
 
 pytestmark = pytest.mark.slow
 
@@ -106,3 +106,17 @@ def test_the_tab_in_the_address_is_where_a_link_leads(visitor: Visitor, model: s
     page.get_by_role("tab", name="Learning").press("ArrowLeft")
     expect(page.get_by_role("tab", name="Ask")).to_be_focused()
     expect(page).to_have_url(re.compile("tab=ask$"))
+
+
+def test_how_auto_has_chosen_is_shown_with_the_job_and_with_the_version(visitor: Visitor, dashboard: Dashboard) -> None:
+    dataset = upload(dashboard.client, stream(samples=120, seed=9), name="chosen.npz")
+    options = {**QUICK, "posterior_samples": 100, "search_seconds": 1.0, "starts": 1}
+    job = train(dashboard.client, "chosen", dataset["id"], estimator="auto", options=options)
+    chosen = dashboard.client.get("/v1/models/chosen/versions/1").json()["estimator"]
+    for page in (visitor.open(f"#/jobs/{job['id']}"), visitor.open("#/models/chosen?tab=lineage")):
+        card = page.get_by_role("region", name="How the estimator was chosen")
+        expect(card.get_by_text("Judged on 2 stretches that the training did not see")).to_be_visible()
+        expect(card.locator("tbody tr")).to_have_count(3)
+        expect(card.locator("strong").first).to_have_text(chosen)
+        visitor.settled()
+        assert audit(page) == []

@@ -19,6 +19,8 @@ DESKTOP = (1280, 800)
 PHONE = (390, 844)
 LARGEST_SHOT = 250_000
 """Most bytes of a screenshot."""
+SLOW = ("Canvas2D: Multiple readback operations", "GPU stall due to ReadPixels")
+"""What a browser warns of where plots are drawn in 3-D without a graphics card: that it takes longer."""
 _REFUSED = "Failed to load resource: the server responded with a status of "
 
 
@@ -128,6 +130,8 @@ class Visitor:
     def _said(self, message: ConsoleMessage) -> None:
         text = message.text
         if message.type not in {"error", "warning"}:
+            return
+        if message.type == "warning" and any(each in text for each in SLOW):
             return
         if text.startswith(_REFUSED) and int(text.removeprefix(_REFUSED)[:3]) in self._refusals:
             return

@@ -48,7 +48,7 @@ def made(shared: Shared, trained: Path, *models: str) -> None:
 
 def train(folder: Path) -> Path:
     """A model of a double pendulum, saved below a folder."""
-    lipcore.save(lipcore.train(stream(), ("revolute", "revolute"), options=lipcore.FitOptions(**QUICK)), folder)
+    lipcore.save(lipcore.train(stream(), ("revolute", "revolute"), "lip-chain", lipcore.FitOptions(**QUICK)), folder)
     return folder
 
 

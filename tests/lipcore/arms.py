@@ -72,6 +72,7 @@ def parameters(geometry: Geometry, bodies: np.ndarray, joint_names: Sequence[str
         "rotor": {"mean": (0.1 + 0.01 * numbers).tolist(), "std": [0.002] * n},
         "inertia": {
             "mean_is_plausible": True,
+            "plausible_deviation": (0.001 * (1 + numbers)).tolist(),
             "bodies": [
                 {
                     "joint": joint_names[joint],

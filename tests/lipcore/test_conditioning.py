@@ -31,7 +31,7 @@ def samples():
 @pytest.fixture(scope="module")
 def few(samples):
     """A model that stands on 60 of 200 samples."""
-    return lipcore.train(samples, TWO, options=FitOptions(**QUICK, statistics="chosen"))
+    return lipcore.train(samples, TWO, "lip-chain", FitOptions(**QUICK, statistics="chosen"))
 
 
 def same(one, other):
@@ -45,7 +45,7 @@ def same(one, other):
 
 def test_a_conditioned_model_knows_all_samples(samples):
     """A fit that takes all samples into its posterior knows no more, up to its own compression."""
-    few = lipcore.train(samples, TWO, options=FitOptions(**FEW, posterior_samples=200))
+    few = lipcore.train(samples, TWO, "lip-chain", FitOptions(**FEW, posterior_samples=200))
     again = condition(few, samples)
     query = [getattr(stream(seed=3), name) for name in ("q", "dq", "ddq")]
     np.testing.assert_allclose(again.predict(*query).tau, few.predict(*query).tau, rtol=1e-9, atol=1e-9)
@@ -101,22 +101,22 @@ def test_parts_are_added_to_the_whole(few, samples):
 
 def test_what_is_worth_more_than_the_chosen_ones_is_learnt_whole(samples):
     options = FitOptions(**QUICK)
-    assert same(lipcore.train(samples, TWO, options=options), condition_timed(samples, options))
+    assert same(lipcore.train(samples, TWO, "lip-chain", options), condition_timed(samples, options))
     faster = replace(samples, t=samples.t / 100)  # two tenths of a second: no more than the few that were chosen
-    assert same(lipcore.train(faster, TWO, options=options), chosen(faster, options))
+    assert same(lipcore.train(faster, TWO, "lip-chain", options), chosen(faster, options))
     every = replace(options, statistics="all")
-    assert lipcore.train(faster, TWO, options=every).fit["samples_posterior"] == 200
+    assert lipcore.train(faster, TWO, "lip-chain", every).fit["samples_posterior"] == 200
 
 
 def test_few_samples_are_learnt_as_ever(samples):
     """Where all are chosen there is nothing more to sum up: the same model."""
     part = samples.rows(slice(0, QUICK["posterior_samples"]))
-    models = [lipcore.train(part, TWO, options=FitOptions(**QUICK, statistics=how)) for how in ("all", "chosen")]
+    models = [lipcore.train(part, TWO, "lip-chain", FitOptions(**QUICK, statistics=how)) for how in ("all", "chosen")]
     assert same(*models)
 
 
 def chosen(samples, options):
-    return lipcore.train(samples, TWO, options=replace(options, statistics="chosen"))
+    return lipcore.train(samples, TWO, "lip-chain", replace(options, statistics="chosen"))
 
 
 def condition_timed(samples, options):

@@ -24,7 +24,7 @@ FLOOR = np.array([0.5, 0.0])
 def base() -> TorqueModel:
     samples = simulate(load_robot("double-pendulum"), Stream(n_samples=60, speed=10), seed=1)
     options = FitOptions(hyperparameter_samples=20, max_iterations=4, starts=1, device="cpu")
-    return train(samples, ("revolute",) * 2, options=options)
+    return train(samples, ("revolute",) * 2, "lip-chain", options)
 
 
 @pytest.fixture(scope="module")

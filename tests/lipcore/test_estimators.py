@@ -17,7 +17,7 @@ from lipcore.metrics import evaluate
 from lipcore.robots import load_robot
 from lipcore.simulation import Stream, simulate
 from lipcore.urdf import RigidBody
-from lipcore.vocabulary import DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS
+from lipcore.vocabulary import AUTO, CHOICES, DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS
 
 ROBOT = "double-pendulum"
 TYPES = ("revolute", "revolute")
@@ -140,8 +140,8 @@ def test_every_kernel_names_its_hyperparameters() -> None:
 
 
 def test_default_is_an_estimator_that_needs_no_robot() -> None:
-    assert DEFAULT_ESTIMATOR in ESTIMATORS
-    assert DEFAULT_ESTIMATOR not in ROBOT_ESTIMATORS
+    assert (AUTO, *ESTIMATORS) == CHOICES
+    assert DEFAULT_ESTIMATOR in CHOICES
     assert set(ROBOT_ESTIMATORS) <= set(ESTIMATORS)
 
 

@@ -48,7 +48,7 @@ def samples(robot):
 
 @pytest.fixture(scope="module")
 def model(robot, samples):
-    return lipcore.train(samples, robot.joint_types, options=replace(QUICK, compact_tolerance=1e-6))
+    return lipcore.train(samples, robot.joint_types, "lip-chain", replace(QUICK, compact_tolerance=1e-6))
 
 
 def both(*motions):

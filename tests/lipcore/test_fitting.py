@@ -118,7 +118,7 @@ def test_low_passed_torque_is_not_taken_for_free_of_noise() -> None:
     stream = Stream(n_samples=300, rate=30, speed=10, noise=0.3, viscous=1.0, coulomb=1.0)
     samples = simulate(arm, stream, seed=1)
     samples = replace(samples, tau=low_pass(samples.tau, stream.rate))
-    model = train(samples, arm.joint_types, options=FitOptions(hyperparameter_samples=60, max_iterations=60))
+    model = train(samples, arm.joint_types, "lip-chain", FitOptions(hyperparameter_samples=60, max_iterations=60))
     unseen = simulate(arm, replace(stream, noise=0.0, n_sinusoids=100), seed=101)
     answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
     metrics = evaluate(unseen.tau, answer.tau, answer.tau_std, answer.noise_std)
@@ -187,7 +187,7 @@ def test_fit_on_cuda_agrees_with_the_processor(robot: str) -> None:
     unseen = simulate(arm, Stream(n_samples=50, speed=10, noise=0.0), seed=101)
     # few iterations: rounding differs, and L-BFGS amplifies it with every step
     options = replace(SMALL, max_iterations=5)
-    models = {d: train(samples, arm.joint_types, options=replace(options, device=d)) for d in ("cpu", "cuda")}
+    models = {d: train(samples, arm.joint_types, "lip-chain", replace(options, device=d)) for d in ("cpu", "cuda")}
     assert models["cuda"].fit["device"] == "cuda"
     assert models["cuda"].fit["objective"] == pytest.approx(models["cpu"].fit["objective"], rel=1e-6)
     answers = {d: m.predict(unseen.q, unseen.dq, unseen.ddq) for d, m in models.items()}

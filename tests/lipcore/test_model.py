@@ -25,7 +25,7 @@ def samples() -> Samples:
 
 @pytest.fixture(scope="module")
 def model(samples: Samples) -> TorqueModel:
-    return train(samples, JOINT_TYPES, options=OPTIONS)
+    return train(samples, JOINT_TYPES, "lip-chain", OPTIONS)
 
 
 def test_answer_for_many_is_the_answers_for_each(model: TorqueModel, samples: Samples) -> None:
@@ -53,7 +53,7 @@ def test_model_says_what_it_was_made_of(model: TorqueModel, samples: Samples) ->
 
 
 def test_training_range_is_that_of_the_samples_it_stands_on(samples: Samples) -> None:
-    every = train(samples, JOINT_TYPES, options=replace(OPTIONS, posterior_samples=len(samples), max_iterations=1))
+    every = train(samples, JOINT_TYPES, "lip-chain", replace(OPTIONS, posterior_samples=len(samples), max_iterations=1))
     assert set(every.training_range) == {"q", "dq", "ddq"}
     for name, limits in every.training_range.items():
         values = getattr(samples, name)
@@ -98,7 +98,7 @@ def test_query_that_is_not_finite_is_refused(model: TorqueModel) -> None:
 )
 def test_bad_argument_of_training_is_named(samples: Samples, arguments: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        train(samples, **({"joint_types": JOINT_TYPES, "options": OPTIONS} | arguments))
+        train(samples, **({"joint_types": JOINT_TYPES, "estimator": "lip-chain", "options": OPTIONS} | arguments))
 
 
 @pytest.mark.parametrize("name", ["q", "dq", "ddq", "tau"])
@@ -106,7 +106,7 @@ def test_samples_that_are_not_finite_are_named(samples: Samples, name: str) -> N
     values = getattr(samples, name).copy()
     values[3, 1] = np.nan
     with pytest.raises(ValueError, match=rf"{name}\[3, 1\]"):
-        train(replace(samples, **{name: values}), JOINT_TYPES, options=OPTIONS)
+        train(replace(samples, **{name: values}), JOINT_TYPES, "lip-chain", OPTIONS)
 
 
 def test_unknown_estimator_has_its_own_error(samples: Samples) -> None:
@@ -117,7 +117,7 @@ def test_unknown_estimator_has_its_own_error(samples: Samples) -> None:
 
 def test_a_torque_that_never_changes_is_learnt_as_offset(samples: Samples) -> None:
     constant = replace(samples, tau=np.full_like(samples.tau, 3.0))
-    trained = train(constant, JOINT_TYPES, options=FitOptions(max_iterations=60, device="cpu"))
+    trained = train(constant, JOINT_TYPES, "lip-chain", FitOptions(max_iterations=60, device="cpu"))
     answer = trained.predict(samples.q, samples.dq, samples.ddq)
     assert np.abs(answer.tau - 3.0).max() < 1e-2
     assert trained.fit["jitter"] == 0.0

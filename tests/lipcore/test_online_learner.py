@@ -33,7 +33,7 @@ def recorded(seed: int, **changes: object) -> Samples:
 
 @pytest.fixture(scope="module")
 def base() -> TorqueModel:
-    return train(recorded(1), ("revolute",) * 2, options=OPTIONS)
+    return train(recorded(1), ("revolute",) * 2, "lip-chain", OPTIONS)
 
 
 @pytest.fixture(scope="module")

@@ -69,7 +69,7 @@ class Trained(NamedTuple):
 def trained(request: pytest.FixtureRequest) -> Trained:
     case = CASES[request.param]
     robot = load_robot(case.robot)
-    model = train(simulate(robot, case.train, case.seed), robot.joint_types, options=case.options)
+    model = train(simulate(robot, case.train, case.seed), robot.joint_types, "lip-chain", case.options)
     unseen = simulate(robot, Stream(n_samples=501, n_sinusoids=100, motion="middle", speed=10, noise=0.0), seed=101)
     inertia = dynamics.inertia_matrix(model.posterior, model.estimator.terms["energy"], unseen.motion().q).numpy()
     return Trained(case, robot, model, unseen, inertia)

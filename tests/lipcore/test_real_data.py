@@ -28,7 +28,7 @@ def from_signals(names: tuple[str, ...], rate: float, q: np.ndarray, dq: np.ndar
 
 def learn_and_judge(title: str, training: Samples, held_out: Samples, options: FitOptions) -> Metrics:
     """Metrics on what was held out, printed as a table."""
-    model = train(training, ("revolute",) * training.n_joints, options=options)
+    model = train(training, ("revolute",) * training.n_joints, "lip-chain", options)
     answer = model.predict(held_out.q, held_out.dq, held_out.ddq)
     metrics = evaluate(held_out.tau, answer.tau, answer.tau_std, answer.noise_std)
     fitted = f"hyperparameters on {options.hyperparameter_samples} samples"

@@ -19,11 +19,11 @@ from lipcore.kernels.arm import ArmKernel
 from lipcore.metrics import evaluate
 from lipcore.motion import Motion
 from lipcore.parameters import (
-    WeightPosterior,
     friction_coefficients,
     inertial_parameters,
     is_plausible,
     nearest_plausible,
+    precision,
     pseudo_inertia,
     weight_posterior,
 )
@@ -193,11 +193,11 @@ def test_pseudo_inertia_is_that_of_pinocchio(panda: RigidBody) -> None:
 
 
 def test_plausible_mean_is_its_own_nearest(model: TorqueModel, panda: RigidBody) -> None:
-    weights = weight_posterior(model.posterior, model.estimator.terms["rigid_body"])
-    bodies = weights.covariance[:BODIES, :BODIES], weights.scale[:BODIES]
-    true = WeightPosterior(panda.parameters().reshape(-1), *bodies)
-    found = nearest_plausible(true, panda.n_joints, model.robot.parameters())
-    distance = np.abs(found - true.mean) / true.std
+    term = model.estimator.terms["rigid_body"]
+    weights, true = weight_posterior(model.posterior, term), panda.parameters().reshape(-1)
+    scale, metric = weights.scale[:BODIES], precision(model.posterior, term)[:BODIES, :BODIES]
+    found = nearest_plausible(true, scale, metric, panda.n_joints, model.robot.parameters())
+    distance = np.abs(found - true) / weights.std[:BODIES]
     assert distance.max() < 0.5, distance.max()
 
 

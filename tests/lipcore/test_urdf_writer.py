@@ -9,10 +9,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from lipcore import FitOptions, train
 from lipcore.arm.geometry import Geometry, rotation_of
 from lipcore.arm.urdf_writer import ArmJoints, rpy, urdf_of_parameters, urdf_text
 from lipcore.kernels.compiled.arm import arm_torques
+from lipcore.persistence import encode
 from lipcore.robots import load_robot
+from lipcore.simulation import Stream, simulate
 from lipcore.urdf import RigidBody, describe
 from tests.lipcore.arms import parameters, parameters_of, random_bodies, random_geometry
 
@@ -72,6 +75,20 @@ def test_its_torque_is_the_arms(kinds: str, gravity: bool) -> None:
     for term, feature in (("viscous", motions[:, 1]), ("coulomb", np.sign(motions[:, 1]))):
         expected += np.array(report["friction"][term]["mean"]) * feature
     np.testing.assert_allclose(torque_of_urdf(urdf, names, motions, gravity), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_that_of_a_trained_arm_has_the_torque_that_it_has_learnt() -> None:
+    samples = simulate(load_robot("double-pendulum"), Stream(n_samples=300, speed=5.0), seed=1)
+    options = FitOptions(hyperparameter_samples=80, posterior_samples=200, max_iterations=20, device="cpu")
+    model = train(samples, ["revolute"] * 2, "rigid-body", options)
+    manifest, _ = encode(model)
+    names, report = list(model.joint_names), manifest["parameters"]
+    urdf = urdf_of_parameters(report, names, manifest["training_range"])
+    motions = np.stack([samples.q, samples.dq, samples.ddq], axis=1)[::3]
+    given = torque_of_urdf(urdf, names, motions, gravity=True) + report["friction"]["offset"]["mean"]
+    learnt = model.predict(*motions.transpose(1, 0, 2)).tau
+    # what the text leaves out: rotors and friction below zero, geometry beyond the first order
+    np.testing.assert_array_less(np.sqrt(np.mean((given - learnt) ** 2, axis=0)), 0.05 * learnt.std(axis=0))
 
 
 def test_a_panda_comes_back() -> None:

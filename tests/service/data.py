@@ -72,8 +72,8 @@ def upload(api: Any, samples: Samples, **params: Any) -> dict[str, Any]:
 
 
 def queue(api: Any, model: str, *datasets: str, **request: Any) -> dict[str, Any]:
-    """Queue a training job, a quick one unless options are given; return it."""
-    body = {"model": model, "datasets": list(datasets), "options": QUICK, **request}
+    """Queue a training job, a quick one of `lip-chain` unless told otherwise; return it."""
+    body = {"model": model, "datasets": list(datasets), "estimator": "lip-chain", "options": QUICK, **request}
     answer = api.post("/v1/jobs", json=body)
     assert answer.status_code == 202, answer.text
     return answer.json()

@@ -23,7 +23,7 @@ SHORT = ("--seconds", "6", "--rate", "20", "--iterations", "2", "--budget", "100
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A saved model of a double pendulum, whose joints are called as the robot's."""
-    made = lipcore.train(stream(), ("revolute", "revolute"), options=lipcore.FitOptions(**QUICK, starts=1))
+    made = lipcore.train(stream(), ("revolute", "revolute"), "lip-chain", lipcore.FitOptions(**QUICK, starts=1))
     path = tmp_path_factory.mktemp("excite") / "model"
     lipcore.save(made, path)
     return path
@@ -64,7 +64,7 @@ def test_a_motion_for_a_saved_model_is_written_drawn_and_told(folder, tmp_path):
 def test_without_a_model_a_prior_is_planned_for_within_shares_of_the_limits(tmp_path):
     out = tmp_path / "motion.csv"
     said = excite("--robot", "asr-twodof", *SHORT, "--range", "0.5", "--scale", "0.4", "--noise", "0.1", "--out", out)
-    assert "for what a lip-chain prior does not know" in said
+    assert "for what a rigid-body prior does not know" in said
     _, _, q, dq, ddq = read(out)
     known = profile("asr-twodof")
     assert (np.abs(q - (known.lower + known.upper) / 2) <= 0.5 * (known.upper - known.lower) / 2 * (1 + 1e-9)).all()
@@ -99,7 +99,7 @@ def test_a_served_model_is_fetched_as_it_is(server):
 
 def test_the_robot_is_told_by_the_joints_of_the_model():
     samples = simulate(load_robot("panda"), Stream(n_samples=20), 0)
-    model = lipcore.train(samples, ("revolute",) * 7, options=lipcore.FitOptions(**QUICK, starts=1))
+    model = lipcore.train(samples, ("revolute",) * 7, "lip-chain", lipcore.FitOptions(**QUICK, starts=1))
     found = find(None, model)
     assert found.name == "panda"
     np.testing.assert_array_equal(found.limits.acceleration, profile("panda").acceleration)

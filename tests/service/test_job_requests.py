@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lipcore.estimators import ESTIMATORS
+from lipcore.vocabulary import CHOICES
 from tests.service.data import error, queue, stream, upload
 
 QUICK = {"hyperparameter_samples": 20, "posterior_samples": 40, "max_iterations": 4}
@@ -62,7 +62,7 @@ def test_data_sets_that_do_not_go_together(no_worker, datasets, names, field, me
 
 def test_unknown_estimator_is_refused_with_those_that_are_known(no_worker, datasets):
     said = error(ask(no_worker, datasets, estimator="magic"), 422, "invalid_request")
-    assert said["detail"][0] == {"field": "estimator", "value": "magic", "expected": f"one of {', '.join(ESTIMATORS)}"}
+    assert said["detail"][0] == {"field": "estimator", "value": "magic", "expected": f"one of {', '.join(CHOICES)}"}
 
 
 @pytest.mark.parametrize(

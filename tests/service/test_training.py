@@ -20,7 +20,7 @@ def two_versions(api, pendulum):
 
 
 def test_a_job_is_accepted_and_found_at_its_location(api, pendulum):
-    body = {"model": "located", "datasets": [pendulum["id"]], "options": QUICK}
+    body = {"model": "located", "datasets": [pendulum["id"]], "estimator": "lip-chain", "options": QUICK}
     answer = api.post("/v1/jobs", json=body)
     assert answer.status_code == 202
     accepted = answer.json()

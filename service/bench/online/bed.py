@@ -90,7 +90,7 @@ def serving(home: Path, settings: Mapping[str, Any] | None = None) -> Iterator[B
 def train(samples: Samples, joint_types: tuple[str, ...], fit: Mapping[str, Any]) -> tuple[TorqueModel, float]:
     """Train a model in this process; also return how long it took, s."""
     began = time.monotonic()
-    model = lipcore.train(samples, joint_types, options=lipcore.FitOptions(**fit))
+    model = lipcore.train(samples, joint_types, "lip-chain", lipcore.FitOptions(**fit))
     return model, time.monotonic() - began
 
 

@@ -44,7 +44,7 @@ def run(engines: Engines, trials: int, seed: int, console: Console) -> Part:
 
 
 def _cancel(client: Client, dataset: str) -> float:
-    name = client.train("cancelled", [dataset], joint_types=list(streams.robot().joint_types), options=ENDLESS).id
+    name = client.train("cancelled", [dataset], "lip-chain", list(streams.robot().joint_types), ENDLESS).id
     eventually(lambda: client.job(name).progress.iteration > 0, "the first iteration of a job")
     began = time.monotonic()
     client.cancel(name)

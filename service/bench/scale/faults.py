@@ -215,9 +215,7 @@ def _workers(engines: Engines, faults: int, seed: int, console: Console) -> Tall
         streams.write(path, streams.stream(400, seed + 9, rate=10.0))
         dataset = client.upload(path, joint_names=streams.robot().joint_names).id
         for number in range(faults):
-            name = client.train(
-                f"job-{number}", [dataset], joint_types=list(streams.robot().joint_types), options=JOB
-            ).id
+            name = client.train(f"job-{number}", [dataset], "lip-chain", list(streams.robot().joint_types), JOB).id
             tally.acknowledged += 1
             eventually(partial(_iterates, client, name), "the first iteration", _PATIENCE)
             busy = next(place for place, worker in enumerate(workers) if learners(worker.pid))

@@ -14,7 +14,8 @@ from service.models import schema
 
 LIMITS = (
     "Torque cannot tell an arm from its mirror image, nor where a frame lies along its axis.",
-    "Masses are the physically possible ones nearest to what was learnt; ± is one standard deviation.",
+    "Masses are the physically possible ones nearest to what was learnt; torque off: how far theirs is from it, rms.",
+    "± is one standard deviation.",
 )
 FRICTION = {"viscous": "viscous N·m·s/rad", "coulomb": "Coulomb N·m", "offset": "offset N·m"}
 Columns = dict[str, list[str]]
@@ -41,8 +42,10 @@ class Arm(Plain):
 
     frames: where the joints lie, None where a version does not say; mass, mass_std: (n) kg; centre, centre_std: (n, 3)
     m, centres of mass in the joints' own frames, first moment over mass, their deviations to first order; rotor,
-    rotor_std: (n) kg·m² (kg), NaN where a version does not say; friction: by `viscous`, `coulomb` and `offset` means
-    and standard deviations, (n) each; undetermined: what torque does not tell of each joint and its body.
+    rotor_std: (n) kg·m² (kg), NaN where a version does not say; deviation: (n) N·m (N), root mean square by which the
+    torque of these bodies differs from what was learnt, NaN where a version does not say; friction: by `viscous`,
+    `coulomb` and `offset` means and standard deviations, (n) each; undetermined: what torque does not tell of each
+    joint and its body.
     """
 
     joint_names: tuple[str, ...]
@@ -54,6 +57,7 @@ class Arm(Plain):
     centre_std: Array
     rotor: Array
     rotor_std: Array
+    deviation: Array
     friction: Mapping[str, tuple[Array, Array]]
     undetermined: tuple[tuple[str, ...], ...]
 
@@ -71,11 +75,14 @@ class Arm(Plain):
                 "shift std mm": [_list(1000 * np.array(each)) for each in self.frames.shift_std],
             }
         rotors = {} if np.isnan(self.rotor).all() else {"rotor kg·m²": _pairs(self.rotor, self.rotor_std)}
+        known = not np.isnan(self.deviation).all()
+        deviations = {"torque off N·m": [f"{each:.2g}" for each in self.deviation]} if known else {}
         out["what the joints carry, in their own frames"] = {
             "joint": names,
             "mass kg": _pairs(self.mass, self.mass_std),
             **{f"centre {axis} m": _pairs(self.centre[:, k], self.centre_std[:, k]) for k, axis in enumerate("xyz")},
             **rotors,
+            **deviations,
             "torque does not tell": undetermined,
         }
         terms = {head: _pairs(*self.friction[name]) for name, head in FRICTION.items()}
@@ -128,6 +135,7 @@ def read_arm(version: schema.Version) -> Arm | None:
         centre_std=np.hypot(moment_std, centre * mass_std[:, None]) / mass[:, None],
         rotor=array(rotor["mean"])[order],
         rotor_std=array(rotor["std"])[order],
+        deviation=array(parameters["inertia"].get("plausible_deviation", [np.nan] * len(order)))[order],
         friction={
             name: (
                 array(parameters["friction"][name]["mean"])[order],

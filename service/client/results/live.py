@@ -19,9 +19,8 @@ class LivePart(Plain):
 
     rows: all that were judged; counts: what became of them, by code; worst: (n) largest |tau - mean| of all of them in
     standard deviations of a measurement, NaN where none could be predicted; q: (n) positions of the newest row shown,
-    rad (m), NaN where none is. Of the rows shown, K of them: time: (K)
-    Unix seconds; tau: (K, n) measured; mean: predicted; std: of the function, noise_std: (n) of a measurement around
-    it, N·m; code: what became of each; NaN for what there is none of.
+    rad (m). Of the rows shown, K of them: time: (K) Unix seconds; tau: (K, n) measured; mean: predicted; std: of the
+    function, noise_std: (n) of a measurement around it, N·m; code: what became of each. NaN for what there is none of.
     """
 
     stream_id: str

@@ -130,7 +130,7 @@ def _queue(
         "datasets": [row.id for row in kept],
         "estimator": manifest["estimator"],
         "joint_types": manifest["joint_types"],
-        "robot": None if made_by is None else made_by.request.get("robot"),
+        "robot": made_by.request.get("robot") if made_by is not None and "robot" in manifest else None,
         "options": manifest["options"],
         "refresh": {"version": version.version, "through": through, "trigger": trigger},
     }
@@ -196,8 +196,8 @@ def _reasons(settings: Settings, published: Published) -> Iterator[Reason]:
     errors = published.linearisation or (0.0,)
     if max(errors) > settings.linearisation_error:
         text = f"the arm of {named} has moved from where its torque is linear: {max(errors):.0%} of the stated error"
-        figures = {"linearisation_error": list(errors), "threshold": settings.linearisation_error}
-        yield Reason("linearisation", text, {**revision, **figures})
+        by_joint = {"linearisation_error": list(errors), "threshold": settings.linearisation_error}
+        yield Reason("linearisation", text, {**revision, **by_joint})
 
 
 def _alarms(model: str, kind: AlarmKind) -> Select[int]:

@@ -19,7 +19,7 @@ from tests.service.bad_requests.bad import (
     get,
 )
 
-MODELS, EXPORT = "/v1/models", "/v1/models/panda-sim/export"
+MODELS, EXPORT, URDF = "/v1/models", "/v1/models/panda-sim/export", "/v1/models/panda-sim/urdf"
 NO_ROUTES = (
     "/dashboard",
     "/dashboard/%2e%2e/routes.py",
@@ -146,6 +146,10 @@ PARAMETERS = [
     *(get(f"{EXPORT}?version={value}", "version") for value in ("0", "x", "", "1.5", "2147483648")),
     *(get(f"{EXPORT}?alias={value}", "alias") for value in ("", "A", "a%00", "1")),
     get(f"{EXPORT}?learnt=perhaps", "learnt"),
+    *(get(f"{URDF}?{asked}", field) for asked, field in (("version=0", "version"), ("alias=A", "alias"), ("v=1", "v"))),
+    get(f"{URDF}?version=1&alias=serving", "version or alias"),
+    get(f"{URDF}?version=99", "version", 404, "not_found"),
+    get(f"{URDF}?alias=nobody", "alias", 404, "not_found"),
     get(f"{EXPORT}?version=1&alias=serving", "version or alias"),
     get(f"{EXPORT}?version=99", "version", 404, "not_found"),
     get(f"{EXPORT}?alias=nobody", "alias", 404, "not_found"),

@@ -6,9 +6,10 @@ import pytest
 
 from service import cli
 from tests.service.data import QUICK, stream, train, upload
-from tests.service.models.arms import publish_arm_at
+from tests.service.models.arms import NO_BODIES, publish_arm_at
 
-QUICKLY = [part for name, value in QUICK.items() for part in ("--option", f"{name}={value}")]
+QUICKLY = ["--estimator", "lip-chain"]
+QUICKLY += [part for name, value in QUICK.items() for part in ("--option", f"{name}={value}")]
 """Options of `lipserve train` for a fit that takes a fraction of a second."""
 
 
@@ -49,6 +50,7 @@ def arm(server):
 
 @pytest.fixture(scope="session")
 def robot_arm(server):
-    """A version in the shared service whose arm is known; the name of its model."""
+    """Two versions in the shared service, the second without rigid bodies; the name of their model."""
     publish_arm_at(server.home, "cli-robot-arm")
+    publish_arm_at(server.home, "cli-robot-arm", **NO_BODIES)
     return "cli-robot-arm"

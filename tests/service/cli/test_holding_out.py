@@ -51,7 +51,9 @@ def test_the_client_holds_out_and_evaluates(server, tmp_path):
     recordings.write(unused, stream(samples=60, rate=10.0, seed=14))
     with Client(server.url) as client:
         dataset, other = client.upload(path).id, client.upload(unused).id
-        job = client.wait(client.train("client-held", [dataset], options=QUICK, holdout={"kind": "last"}).id)
+        job = client.wait(
+            client.train("client-held", [dataset], "lip-chain", options=QUICK, holdout={"kind": "last"}).id
+        )
         assert job.holdout is not None
         assert (job.state, job.holdout.share) == ("succeeded", 0.3)
         assert client.evaluate("client-held", dataset, part="held_out").samples == 34

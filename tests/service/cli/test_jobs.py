@@ -34,7 +34,8 @@ def long(server):
     return upload(server.client, stream("panda", 200, seed=81))["id"]
 
 
-ENDLESSLY = [part for name, value in ENDLESS.items() for part in ("--option", f"{name}={value}")]
+ENDLESSLY = ["--estimator", "lip-chain"]
+ENDLESSLY += [part for name, value in ENDLESS.items() for part in ("--option", f"{name}={value}")]
 
 
 def test_ctrl_c_in_train_cancels_the_job(lipserve, server, long, interrupted):
@@ -73,7 +74,7 @@ def test_ctrl_c_in_follow_leaves_the_job(lipserve, asked, server, long, interrup
 def test_a_job_is_queued_followed_and_listed(lipserve, asked, server, tmp_path):
     path = tmp_path / "arm.npz"
     recordings.write(path, stream(seed=82))
-    job = asked("train", path, "--model", "cli-queued", "--no-wait", "--estimator", "se", *QUICKLY, "--json")["id"]
+    job = asked("train", path, "--model", "cli-queued", "--no-wait", *QUICKLY, "--estimator", "se", "--json")["id"]
     assert "cli-queued (se): succeeded, version 1" in asked("jobs", "follow", job)
     assert asked("jobs", "show", job, "--json")["state"] == "succeeded"
     assert job in [each["id"] for each in asked("jobs", "list", "--json")]

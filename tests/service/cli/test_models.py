@@ -61,7 +61,7 @@ def test_an_archive_is_written_read_and_deleted(asked, arm, lipserve, server, tm
 
 
 def test_what_a_version_has_learnt_of_its_arm_is_shown(asked, robot_arm):
-    text = asked("models", "show", robot_arm)
+    text = asked("models", "show", robot_arm, "--version", 1)
     assert f"careful: {WARNING}" in text
     for part in (
         "where the joints lie",
@@ -72,13 +72,13 @@ def test_what_a_version_has_learnt_of_its_arm_is_shown(asked, robot_arm):
         "-0.05 ± 0.01",
     ):
         assert part in text
-    assert "mirror image" not in asked("models", "show", "panda-sim")
+    assert "mirror image" not in asked("models", "show", robot_arm)
 
 
 def test_an_arm_is_printed_as_a_urdf(asked, lipserve, server, robot_arm):
     text = asked("models", "urdf", robot_arm, "--version", 1)
     assert describe(text).joint_names == JOINTS
-    code, text, err = lipserve("models", "urdf", "panda-sim", "--url", server.url)
+    code, text, err = lipserve("models", "urdf", robot_arm, "--url", server.url)
     assert (code, text) == (1, "")
     assert "has no rigid bodies" in err
 

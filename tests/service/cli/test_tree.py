@@ -9,6 +9,7 @@ import pytest
 
 from lipcore.estimators import ESTIMATORS
 from lipcore.robots import ROBOTS
+from lipcore.vocabulary import AUTO, CHOICES
 from service.cli import errors, words
 from service.cli.consoles import plain
 from service.cli.tree import commands
@@ -26,7 +27,7 @@ def test_reference_is_up_to_date():
 
 def test_names_that_help_lists_are_those_that_there_are():
     assert list(ROBOTS) == words.ROBOTS
-    assert list(ESTIMATORS) == words.ESTIMATORS
+    assert [AUTO, *ESTIMATORS] == list(CHOICES)
 
 
 def test_every_command_prints_json_and_has_a_help():

@@ -72,7 +72,15 @@ def test_deviations_of_centres_are_those_of_draws(robot, arm):
 
 def test_text_and_html_show_every_joint_and_what_torque_does_not_tell(arm):
     text = str(arm)
-    for part in (*JOINTS, "mass, first moment", "shift 2", "mirror image", "0.1 ± 0.01", "0.057, 0.11"):
+    for part in (
+        *JOINTS,
+        "mass, first moment",
+        "shift 2",
+        "mirror image",
+        "0.1 ± 0.01",
+        "0.057, 0.11",
+        "torque off N·m",
+    ):
         assert part in text, part
     assert "<td>mass, first moment</td>" in arm._repr_html_()
     assert arm.as_dict()["frames"]["mode"] == "learn"
@@ -85,9 +93,11 @@ def test_text_of_a_version_begins_with_its_warnings(robot):
 
 def test_versions_of_earlier_releases(robot):
     report = parameters_of(robot)
+    del report["inertia"]["plausible_deviation"]
     old = read_arm(version({name: report[name] for name in ("friction", "inertia")}))
     assert old.frames is None
     assert old.joint_names == REVERSED
     assert "rotor" not in str(old)
+    assert "torque off N·m" not in str(old)
     assert read_arm(version({"friction": report["friction"]})) is None
     assert read_arm(version(None)) is None

@@ -33,7 +33,7 @@ def test_from_files_to_torques(streaming, tmp_path):
     async def work(client):
         dataset = await client.upload(tmp_path / "train.npz")
         assert dataset.id in [each.id async for each in client.datasets()]
-        job = await client.train("awaited", [dataset.id], options=QUICK)
+        job = await client.train("awaited", [dataset.id], "lip-chain", options=QUICK)
         states = [each.state async for each in client.job_events(job.id)]
         ended = await client.wait(job)
         assert (ended.state, states[-1]) == ("succeeded", "succeeded")

@@ -57,7 +57,9 @@ def test_from_files_to_torques(client, files):
 
 def test_cancelling(client, files):
     dataset = client.upload(files / "train.csv").id
-    running = client.train("cancelled", [dataset], options={"max_iterations": 10_000, "posterior_samples": 80})
+    running = client.train(
+        "cancelled", [dataset], "lip-chain", options={"max_iterations": 10_000, "posterior_samples": 80}
+    )
     job = client.cancel(running.id)
     assert job.id == running.id
     seen = list(client.job_events(job.id))

@@ -24,7 +24,7 @@ def post(api, key, content=None, **params):
 
 
 def queue(api, key, dataset, model="by-key", **more):
-    request = {"model": model, "datasets": [dataset], "options": QUICK, **more}
+    request = {"model": model, "datasets": [dataset], "estimator": "lip-chain", "options": QUICK, **more}
     return api.post("/v1/jobs", json=request, headers={KEY: key})
 
 

@@ -39,7 +39,7 @@ def test_bytes_pass_the_bar_as_they_are():
 
 
 def test_waiting_shows_how_far_a_job_is(local, pendulum, shown):
-    job = local.train("shown", [pendulum["id"]], options=QUICK)
+    job = local.train("shown", [pendulum["id"]], "lip-chain", options=QUICK)
     assert local.wait(job, progress=True).state == "succeeded"
     assert "done" in shown.getvalue()
     assert "100 %" in shown.getvalue()
@@ -47,14 +47,14 @@ def test_waiting_shows_how_far_a_job_is(local, pendulum, shown):
 
 def test_lines_where_there_is_no_terminal(local, pendulum):
     said = console(False)
-    job = follow(local, local.train("lines", [pendulum["id"]], options=QUICK), said)
+    job = follow(local, local.train("lines", [pendulum["id"]], "lip-chain", options=QUICK), said)
     assert "100%" in said.file.getvalue().splitlines()[-1]
     assert job.state == "succeeded"
 
 
 def test_ctrl_c_cancels(api, local, monkeypatch):
     dataset = upload(api, stream("panda", samples=200))["id"]
-    job = local.train("interrupted", [dataset], options=ENDLESS)
+    job = local.train("interrupted", [dataset], "lip-chain", options=ENDLESS)
     running(api, job.id)
     looks = iter([KeyboardInterrupt])
     ask = local.job

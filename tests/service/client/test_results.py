@@ -155,6 +155,7 @@ def test_live_rows_are_arrays():
         "counts": {"learnt": 49, "contact": 1},
         "worst": [2.0, None],
         "noise_std": [0.3, 0.4],
+        "q": [0.1, -0.2],
         "time": [1.0, None],
         "tau": [[1.0, 2.0], [None, 1.0]],
         "mean": [[0.5, 2.0], [0.0, 1.0]],

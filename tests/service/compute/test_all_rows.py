@@ -50,7 +50,7 @@ def parts(settings):
 
 @pytest.fixture(scope="module")
 def model():
-    return lipcore.train(stream(), ["revolute"] * 2, options=lipcore.FitOptions(**QUICK, statistics="chosen"))
+    return lipcore.train(stream(), ["revolute"] * 2, "lip-chain", lipcore.FitOptions(**QUICK, statistics="chosen"))
 
 
 def masked(part: Part) -> Part:

@@ -36,7 +36,7 @@ SETTINGS = {
 def furnish(home: Path) -> None:
     """Put a model of a double pendulum with two equal versions into a new home; the first one serves and learns."""
     database, files = Database(home), Files(home)
-    trained = lipcore.train(stream(), ["revolute", "revolute"], options=FitOptions(**QUICK))
+    trained = lipcore.train(stream(), ["revolute", "revolute"], "lip-chain", FitOptions(**QUICK))
     for number, candidate in ((1, False), (2, True)):
         manifest = lipcore.save(trained, files.versions / f"mv_arm{number}")
         with database.transaction() as session:

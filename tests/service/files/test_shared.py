@@ -33,7 +33,7 @@ def put(files, samples, dataset="ds_one"):
 def trained(tmp_path_factory):
     """Folder of a small model."""
     folder = tmp_path_factory.mktemp("trained") / "arm"
-    lipcore.save(lipcore.train(stream(), ("revolute", "revolute"), options=lipcore.FitOptions(**QUICK)), folder)
+    lipcore.save(lipcore.train(stream(), ("revolute", "revolute"), "lip-chain", lipcore.FitOptions(**QUICK)), folder)
     return folder
 
 

@@ -136,7 +136,7 @@ def test_data_that_is_larger_once_unpacked_is_refused(api, monkeypatch):
 
 def test_robots_and_jobs_are_refused(api, pendulum, monkeypatch):
     monkeypatch.setattr(service_of(api).disk, "quota", 1)
-    body = {"model": "limits-full", "datasets": [pendulum["id"]], "options": QUICK}
+    body = {"model": "limits-full", "datasets": [pendulum["id"]], "estimator": "lip-chain", "options": QUICK}
     error(api.post("/v1/jobs", json=body), 507, "storage_full")
     answer = api.post("/v1/robots", content=b"<robot/>", headers={"content-type": "application/xml"})
     error(answer, 507, "storage_full")

@@ -19,6 +19,10 @@ WARNING = "Two arms explain it."
 JOINTS = tuple(f"panda_joint{number}" for number in range(1, 8))
 
 
+NO_BODIES: dict[str, Any] = {"inertia": None, "rotor": None, "geometry": None}
+"""What an estimator without rigid bodies leaves out of its `parameters`."""
+
+
 def panda() -> RigidBody:
     """The robot that the shipped model was trained on."""
     return RigidBody.from_profile("panda", JOINTS, load_robot("panda").joint_types)

@@ -10,7 +10,7 @@ from lipcore.urdf import RigidBody
 from service.client import ApiError
 from tests.service.client.conftest import over
 from tests.service.data import service_of
-from tests.service.models.arms import JOINTS, WARNING, panda, publish_arm
+from tests.service.models.arms import JOINTS, NO_BODIES, WARNING, panda, publish_arm
 
 
 @pytest.fixture(scope="module")
@@ -18,6 +18,7 @@ def arm(api) -> str:
     service = service_of(api)
     publish_arm(service.database, service.files, "urdf-arm", geometry=None)
     publish_arm(service.database, service.files, "urdf-arm")
+    publish_arm(service.database, service.files, "urdf-none", **NO_BODIES)
     return "urdf-arm"
 
 
@@ -47,7 +48,7 @@ def test_a_version_is_named_by_number_or_alias(api, arm):
 
 @pytest.mark.parametrize(
     ("model", "version", "reason"),
-    [("urdf-arm", 1, "where its joints lie"), ("panda-sim", 1, "no rigid bodies")],
+    [("urdf-arm", 1, "where its joints lie"), ("urdf-none", 1, "no rigid bodies")],
 )
 def test_a_version_without_an_arm_is_refused(api, arm, model, version, reason):
     error = api.get(f"/v1/models/{model}/urdf", params={"version": version})
@@ -64,7 +65,7 @@ def test_the_client_has_its_text(api, arm):
         assert client.urdf(arm) == client.urdf(arm, 2) == client.urdf(arm, alias="serving")
         assert client.urdf(arm) == api.get(f"/v1/models/{arm}/urdf").text
         with pytest.raises(ApiError, match="no rigid bodies"):
-            client.urdf("panda-sim")
+            client.urdf("urdf-none")
 
 
 def test_the_client_shows_the_arm(api, arm):
@@ -72,5 +73,6 @@ def test_the_client_shows_the_arm(api, arm):
         shown = client.version(arm, 2)
         assert shown.arm.joint_names == JOINTS
         assert "mirror image" in str(shown)
-        assert client.version("panda-sim", 1).arm is None
-        assert str(client.version("panda-sim", 1)).startswith("panda-sim version 1: lip")
+        bare = client.version("urdf-none", 1)
+        assert bare.arm is None
+        assert str(bare) == f"urdf-none version 1: {bare.estimator}, 7 joints: {', '.join(JOINTS)}"

@@ -20,7 +20,7 @@ QUERY: dict[str, Any] = {"q": [0.3, -0.2], "dq": [0.1, 0.4], "ddq": [1.0, -0.5]}
 @cache
 def worse() -> TorqueModel:
     """A model of a pendulum with more friction; always the same object."""
-    return lipcore.train(stream(viscous=2.0), ["revolute"] * 2, options=FitOptions(**QUICK))
+    return lipcore.train(stream(viscous=2.0), ["revolute"] * 2, "lip-chain", FitOptions(**QUICK))
 
 
 def publish(api: Any, model: str, found: TorqueModel | None = None, lineage: Any = None, **arguments: Any) -> int:

@@ -173,7 +173,9 @@ def test_jobs_are_counted_and_timed_by_outcome(jobs):
 def test_jobs_that_wait_are_counted(no_worker):
     before = families(service_of(no_worker).database)[JOBS.name, "queued"]
     dataset = upload(no_worker, stream())["id"]
-    answer = no_worker.post("/v1/jobs", json={"model": "waits-for-metrics", "datasets": [dataset], "options": FEW})
+    answer = no_worker.post(
+        "/v1/jobs", json={"model": "waits-for-metrics", "datasets": [dataset], "estimator": "lip-chain", "options": FEW}
+    )
     assert answer.status_code == 202, answer.text
     assert families(service_of(no_worker).database)[JOBS.name, "queued"] == before + 1
     assert no_worker.post(f"/v1/jobs/{answer.json()['id']}/cancel").json()["state"] == "cancelled"

@@ -125,7 +125,7 @@ def test_a_learner_that_is_gone_for_long_is_found(api, look, clock, monkeypatch)
 def test_jobs_that_nobody_starts_are_found(no_worker, look, clock):
     service = service_of(no_worker)
     dataset = upload(no_worker, stream())["id"]
-    body = {"model": "waits-for-health", "datasets": [dataset], "options": FEW}
+    body = {"model": "waits-for-health", "datasets": [dataset], "estimator": "lip-chain", "options": FEW}
     queued = no_worker.post("/v1/jobs", json=body).json()["id"]
     assert look(service)["training"] == ("ok", "1 jobs wait, 0 run")
     clock.now += START_S + 1.0

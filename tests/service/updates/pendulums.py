@@ -43,7 +43,7 @@ CLOSE = {"rtol": 1e-8, "atol": 1e-8}
 @cache
 def trained() -> TorqueModel:
     """A model of a double pendulum; always the same object."""
-    return lipcore.train(stream(), ["revolute", "revolute"], options=FitOptions(**QUICK))
+    return lipcore.train(stream(), ["revolute", "revolute"], "lip-chain", FitOptions(**QUICK))
 
 
 @cache

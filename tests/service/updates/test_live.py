@@ -33,6 +33,7 @@ def test_rows_are_told_with_what_was_predicted_before_they_were_learnt(school):
         assert places == sorted(set(places))
         for name, expected in (("tau", np.array(sent["tau"])), ("mean", before.tau), ("std", before.tau_std)):
             assert np.allclose(part[name], expected[places], atol=1e-6), name
+        assert np.allclose(part["q"], np.array(sent["q"])[places[-1]], atol=1e-6)
         assert part["noise_std"] == model.noise_std.tolist()
         total = np.sqrt(before.tau_std**2 + model.noise_std**2)
         worst = (np.abs(np.array(sent["tau"]) - before.tau) / total).max(axis=0)

@@ -73,6 +73,7 @@ def test_parts_are_of_one_stream_and_revision_and_count_all_rows():
     parts = thinned(batches, 10)
     said = [(part.stream_id, part.revision, part.rows, len(part.time)) for part, _ in parts]
     assert said == [("one", 0, 40, 4), ("one", 1, 20, 2), ("two", 1, 40, 4)]
+    assert all(np.allclose(part.q, shown.rows.q[-1], atol=1e-6) for part, shown in parts)
     assert parts[0][0].counts == {"learnt": 37, "limit": 1, "contact": 1, "edge": 1}
     assert np.allclose(parts[0][0].worst, 0.5 / np.hypot(0.3, [0.1, 0.2]), atol=1e-3)
     assert sum(len(part.time) for part, _ in thinned(batches, 1000)) == 99

@@ -155,7 +155,7 @@ def test_a_worse_candidate_is_not_promoted(story):
     """The one that serves knows the fast motion, the other one the slow one alone; both learn on."""
     service, pupil = story.school.service, Pupil(story.pupil.client, "steady")
     for number, samples in enumerate((fast(seed=7).rows(slice(0, 4000, 40)), slow()), start=1):
-        model = lipcore.train(samples, ["revolute"] * 2, options=lipcore.FitOptions(**OPTIONS))
+        model = lipcore.train(samples, ["revolute"] * 2, "lip-chain", lipcore.FitOptions(**OPTIONS))
         with service.files.new_version(f"mv_steady{number}") as target:
             manifest = lipcore.save(model, target, {})
         with service.database.transaction() as session:

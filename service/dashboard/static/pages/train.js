@@ -17,19 +17,18 @@ export async function render(view, { query }, { signal, title }) {
     pages("/v1/models", 200, {}, signal),
   ]);
   const known = new Map(models.map((each) => [each.name, each]));
-  const robot = robotSelect({ none: "choose one", withUrdf: true });
-  robot.select.required = true;
-  const withRobot = h("div", {}, field("Robot", robot.select, "Its joints are matched with those of the data by name."), robot.note, robot.add);
-  const needRobot = (needed) => {
-    withRobot.hidden = !needed;
-    robot.select.disabled = !needed;
+  const robot = robotSelect({ none: "none: learn where the axes lie from the torque", withUrdf: true });
+  const withRobot = h("div", {}, field("Robot", robot.select, "Not needed. Where one is chosen, its URDF is where learning begins; its joints are matched with those of the data by name."), robot.note, robot.add);
+  const offerRobot = (taken) => {
+    withRobot.hidden = !taken;
+    robot.select.disabled = !taken;
   };
   let estimator = ESTIMATORS[0][0];
-  const estimators = estimatorChoice((name, needed) => {
+  const estimators = estimatorChoice((name, taken) => {
     estimator = name;
-    needRobot(needed);
+    offerRobot(taken);
   });
-  needRobot(false);
+  offerRobot(ESTIMATORS[0][2]);
 
   const { element: nameField, input: model } = modelName(known, query.get("model"));
   const preselected = (query.get("datasets") ?? "").split(",");
@@ -52,7 +51,7 @@ export async function render(view, { query }, { signal, title }) {
     }
     const request = { model: model.value.trim(), datasets: picked.map((each) => each.id), estimator, options: advanced.values() };
     if (holdout.value()) request.holdout = holdout.value();
-    if (!robot.select.disabled) request.robot = robot.select.value;
+    if (!robot.select.disabled && robot.select.value) request.robot = robot.select.value;
     if (advanced.jointTypes().length) request.joint_types = advanced.jointTypes();
     start.disabled = true;
     replace(problems);

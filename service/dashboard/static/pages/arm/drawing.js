@@ -11,7 +11,7 @@ const SMALLEST = 7, LARGEST = 24; // of a mass, px
 
 /** What both pages say beside the drawing. */
 export const CANNOT = "Torque cannot tell an arm from its mirror image, nor where a frame lies along its axis.";
-export const LEGEND = "Coloured segments are joint axes, grey lines run from frame to frame, balls are masses at their centres. A disc across an axis is one standard deviation of where the axis lies, the thin segments one of how it points, both seen from the frame before; pale: torque does not tell.";
+export const LEGEND = "Coloured segments are joint axes, grey lines run from frame to frame, balls are masses at their centres. A disc across an axis is one standard deviation of where the axis lies, the thin segments one of how it points, both seen from the frame before. Pale discs and hollow balls: torque does not tell.";
 
 /** Whether the browser can draw in 3-D. */
 export function drawable() {
@@ -83,7 +83,7 @@ class Arm {
         hovertemplate: "%{text}<extra></extra>",
         marker: {
           size: balls.map((mass) => Math.max(LARGEST * Math.cbrt(mass / most), SMALLEST)),
-          color: order.map((joint) => faint(css("accent"), open(joint) ? 0.2 : 0.75)), line: { width: 0 },
+          symbol: order.map((joint) => (open(joint) ? "circle-open" : "circle")), color: css("accent"), opacity: 0.7, line: { width: 0 },
         },
       },
       this.#pointing(turned, half),
@@ -93,14 +93,16 @@ class Arm {
 
   layout({ turned }) {
     const span = [0, 1, 2].map((k) => this.reach[1][k] - this.reach[0][k]);
-    const room = MARGIN * Math.max(...span, this.size / 4);
+    const room = Math.max(MARGIN * Math.max(...span), AXIS * this.size);
+    const sides = span.map((each) => each + 2 * room), longest = Math.max(...sides);
+    const [x, y, z] = sides.map((each) => each / longest); // as long as they are, within a cube that the camera sees all of
     const axis = (k) => ({
       range: [this.reach[0][k] - room, this.reach[1][k] + room], title: { text: "xyz"[k] + " m" }, color: css("muted"), gridcolor: css("line"),
       zerolinecolor: css("line-strong"), showbackground: false, showspikes: false, nticks: 5,
     });
     return {
       hovermode: "closest", showlegend: turned.length <= 10, legend: { orientation: "h", y: 0, yanchor: "top" }, margin: { l: 0, r: 0, t: 0, b: 0 }, uirevision: "arm",
-      scene: { aspectmode: "data", uirevision: "arm", xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), camera: { eye: { x: 1.4, y: -1.4, z: 0.7 } } },
+      scene: { aspectmode: "manual", aspectratio: { x, y, z }, uirevision: "arm", xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), camera: { eye: { x: 1.1, y: -1.1, z: 0.5 } } },
     };
   }
 

@@ -32,11 +32,12 @@ export class Objective {
 
   /** Take a job as it is now; true where a point came with it. */
   take(job) {
-    const { objective, iteration } = job.progress;
+    const { objective, iteration, estimator } = job.progress;
     if (objective === null || objective === undefined || !iteration) return false;
     const curves = curvesOf(job.id);
-    if (!curves.has(job.attempts)) curves.set(job.attempts, { x: [], y: [] });
-    const curve = curves.get(job.attempts);
+    const key = JSON.stringify([job.attempts, estimator ?? null]);
+    if (!curves.has(key)) curves.set(key, { attempt: job.attempts, estimator: estimator ?? null, x: [], y: [] });
+    const curve = curves.get(key);
     if (curve.x.at(-1) >= iteration) return false;
     curve.x.push(iteration);
     curve.y.push(objective);
@@ -60,20 +61,24 @@ export class Objective {
   }
 
   async #draw(job) {
-    const curves = [...curvesOf(job.id)];
-    if (this.#signal.aborted || !curves.length) return;
+    const all = [...curvesOf(job.id).values()];
+    if (this.#signal.aborted || !all.length) return;
+    // objectives of different estimators cannot be compared: the one at work is shown, or the last one
+    const { estimator } = all.find((each) => each.estimator === job.progress.estimator) ?? all.at(-1);
+    const curves = all.filter((each) => each.estimator === estimator);
+    const name = estimator ? `objective of ${estimator}` : "objective";
     const markers = { mode: "lines+markers", marker: { size: 5 }, hovertemplate: "%{y:.1f} nats" };
-    const traces = curves.map(([attempt, { x, y }], index) => line([...x], [...y], curves.length > 1 ? `attempt ${attempt}` : "objective", index, markers));
+    const traces = curves.map(({ attempt, x, y }, index) => line([...x], [...y], curves.length > 1 ? `attempt ${attempt}` : name, index, markers));
     const layout = {
       x: "iteration",
-      y: "objective, nats",
+      y: `${name}, nats`,
       height: 300,
       showlegend: curves.length > 1,
       xaxis: { rangemode: "tozero", tickformat: "d", nticks: 12 },
       yaxis: { tickformat: ".1f" },
     };
-    const last = curves.at(-1)[1];
-    const label = `Objective against iteration: ${last.y.at(-1).toFixed(1)} nats at iteration ${last.x.at(-1)}, ${last.y[0].toFixed(1)} at iteration ${last.x[0]}`;
+    const last = curves.at(-1);
+    const label = `${name.replace("o", "O")} against iteration: ${last.y.at(-1).toFixed(1)} nats at iteration ${last.x.at(-1)}, ${last.y[0].toFixed(1)} at iteration ${last.x[0]}`;
     if (this.#drawn) {
       this.#place.setAttribute("aria-label", label);
       await this.#drawn.react(traces, layout);

@@ -5,6 +5,7 @@ import { h, replace } from "../../dom.js";
 import { count, number, percent, scientific, shortNames } from "../../format.js";
 import { card, link, table } from "../../ui.js";
 import { warned } from "../data/prose.js";
+import { selectionCard } from "../model/selection.js";
 
 /** Share of samples in the 95 % band below which it is said to be too narrow. */
 const LEAST_COVERAGE = 0.9;
@@ -38,7 +39,7 @@ async function judged(job, signal) {
   }
   const held = version.lineage.holdout;
   const seen = version.lineage.training_metrics;
-  return card(
+  const made = card(
     "What it made",
     h("p", {}, more, job.refresh ? ", which has to prove better before it answers." : ", which answers from now on where no other version is chosen."),
     warned(version.warnings),
@@ -47,6 +48,7 @@ async function judged(job, signal) {
       : h("p", { class: "banner" }, "Nothing was held out: how well it predicts is not known. Evaluate it on a recording that it has not seen."),
     !held?.nmse && seen?.nmse ? figures(`On ${count(seen.samples)} samples it was trained on: these figures flatter`, seen, version) : null,
   );
+  return [made, selectionCard(version)];
 }
 
 function figures(caption, found, version) {

@@ -8,6 +8,7 @@ export const ACTIVE = new Set(["queued", "running"]);
 const STAGES = {
   waiting: "waiting for its turn",
   loading: "loading the data",
+  geometry: "looking for where the joint axes lie",
   hyperparameters: "fitting hyperparameters",
   posterior: "conditioning and compressing the posterior",
   evaluating: "evaluating what was held out",
@@ -18,7 +19,8 @@ const STAGES = {
 /** The stage of a job's work. */
 export function stage({ progress: at }) {
   if (at.stage === "hyperparameters" && !at.iteration) return "looking where to start the fit";
-  return STAGES[at.stage] ?? at.stage;
+  const doing = STAGES[at.stage] ?? at.stage;
+  return at.estimator ? `${at.estimator}: ${doing}` : doing;
 }
 
 /** What is left of its time, empty where that is not known. */

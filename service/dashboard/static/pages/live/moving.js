@@ -19,9 +19,9 @@ export function moving(place, name, pose, signal) {
     version = number;
     left?.abort();
     left = new AbortController();
-    const found = await get(path`/v1/models/${name}/versions/${number}`, {}, signal);
     made = null;
-    if (!found.parameters?.geometry || !drawable()) return replace(place);
+    const found = await shown(name, number, signal);
+    if (!found?.parameters?.geometry || !drawable()) return replace(place);
     const figure = h("div", { style: `min-height: ${HEIGHT}px` });
     replace(place, card("The arm", figure, h("p", { class: "hint" }, `At the positions of the newest row. ${CANNOT}`)));
     watch.disconnect();
@@ -37,4 +37,14 @@ export function moving(place, name, pose, signal) {
       at = q;
     },
   };
+}
+
+/** A version, null where it cannot be had: it was deleted meanwhile, or the page was left. */
+async function shown(name, number, signal) {
+  try {
+    return await get(path`/v1/models/${name}/versions/${number}`, {}, signal);
+  } catch (error) {
+    if (error.name === "ApiError" || error.name === "AbortError") return null;
+    throw error;
+  }
 }

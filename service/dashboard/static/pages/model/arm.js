@@ -31,7 +31,7 @@ export async function arm(view, { name, version }, { signal }) {
       posture,
       h("div", { class: "actions" }, button("Save as URDF", () => saveUrdf(name, version.version))),
     ),
-    card("In numbers", jointTable(version), massTable(version), h("p", { class: "hint" }, "Masses are the physically possible ones nearest to what was learnt. All is as trained: what was learnt online since is not in it.")),
+    card("In numbers", jointTable(version), massTable(version), h("p", { class: "hint" }, `Masses are the physically possible ones nearest to what was learnt${off(parameters.inertia)}. All is as trained: what was learnt online since is not in it.`)),
   );
   if (figure !== place) return;
   const { draw } = await drawing(place, version, start, { signal });
@@ -41,14 +41,14 @@ export async function arm(view, { name, version }, { signal }) {
 /** A slider a joint, within the training range. move(q) is called with all positions. */
 function sliders({ joint_names: names, joint_types: types, training_range: { q: range } }, start, move) {
   const q = [...start];
-  const said = (joint) => (types[joint] === "prismatic" ? `${number(q[joint])} m` : `${number(q[joint] * DEGREES)}°`);
+  const text = (joint) => (types[joint] === "prismatic" ? `${q[joint].toFixed(3)} m` : `${(q[joint] * DEGREES).toFixed(1)}°`);
   const made = names.map((name, joint) => {
     const [low, high] = [range.min[joint], range.max[joint]];
-    const shown = h("output", { class: "muted" }, said(joint));
+    const shown = h("output", { class: "muted" }, text(joint));
     const input = h("input", { type: "range", min: low, max: high, step: (high - low) / STEPS || "any", value: q[joint], "aria-label": `Position of ${name}` });
     const tell = () => {
-      input.setAttribute("aria-valuetext", said(joint));
-      shown.textContent = said(joint);
+      input.setAttribute("aria-valuetext", text(joint));
+      shown.textContent = text(joint);
     };
     input.addEventListener("input", () => {
       q[joint] = Number(input.value);
@@ -87,6 +87,10 @@ function latest(work) {
       busy = false;
     }
   };
+}
+
+function off({ plausible_deviation: deviation }) {
+  return deviation ? `: their torque differs from it by ${number(Math.max(...deviation), 2)} N·m at most, root mean square of a joint` : "";
 }
 
 function upturned(gravity) {

@@ -3,6 +3,7 @@
 import { h, replace } from "../../dom.js";
 import { bytes, count, number, percent, scientific, seconds, when } from "../../format.js";
 import { badge, card, facts, link, table } from "../../ui.js";
+import { selectionCard } from "./selection.js";
 
 /** The tab of a version's lineage. */
 export async function lineage(view, { version, datasets }) {
@@ -10,6 +11,7 @@ export async function lineage(view, { version, datasets }) {
   replace(
     view,
     card(`Version ${version.version}`, facts(origin(version))),
+    selectionCard(version),
     dataCard(from, datasets),
     figuresCard(version, from),
     card("Fit", facts(fit(version)), version.fit.converged === false ? h("p", { class: "banner" }, "The fit had not converged when it stopped: more iterations may give a better model.") : null),

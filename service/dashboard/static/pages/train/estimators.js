@@ -2,18 +2,19 @@
 
 import { h } from "../../dom.js";
 
-/** [name, what it knows and when to use it, whether it needs a robot's URDF]. */
+/** [name, what it knows and when to use it, whether it can use a robot's URDF]. */
 export const ESTIMATORS = [
-  ["lip-chain", "Knows Lagrange's equations of a serial chain, no URDF needed. Take it unless you know better.", false],
-  ["rigid-body", "Knows your URDF's geometry and learns its inertial parameters. For stiff arms whose URDF is right.", true],
-  ["rigid-body+lip-chain", "Both: the chain learns what the rigid bodies miss. For a URDF, much data, and inertia that is not in it.", true],
+  ["auto", "Trains the next three, holds some of the recording out, and takes the one that predicts that best. It takes two minutes or three.", true],
+  ["rigid-body", "Learns where the joint axes lie, masses and friction: an arm of rigid bodies. For stiff arms.", true],
+  ["lip-chain", "Knows Lagrange's equations of a serial chain. For arms with springs, belts or links that bend.", false],
+  ["rigid-body+lip-chain", "Both: the chain learns what the rigid bodies miss. For much data.", true],
   ["lip", "The kernel of the paper, to get the paper's results.", false],
   ["se", "The paper's baseline: a squared exponential for each joint. To compare with.", false],
   ["gip", "The paper's baseline: a geometrically inspired polynomial. To compare with.", false],
   ["lse", "The paper's baseline: one squared exponential Lagrangian. To compare with.", false],
 ];
 
-/** Radio buttons of the estimators. onchange(name, needsRobot). */
+/** Radio buttons of the estimators. onchange(name, takesRobot). */
 export function estimatorChoice(onchange) {
   return h(
     "fieldset",

@@ -1,0 +1,46 @@
+// How `auto` has chosen a version's estimator: a small table, shown with the version and with the job that made it.
+
+import { h } from "../../dom.js";
+import { count, number, percent, scientific } from "../../format.js";
+import { card, table } from "../../ui.js";
+
+/** The card of a choice; null where the estimator was named. */
+export function selectionCard({ selection }) {
+  if (!selection) return null;
+  const { held_out: held, table: rows } = selection;
+  const failed = rows.filter((each) => each.error);
+  return card(
+    "How the estimator was chosen",
+    h("p", {}, h("strong", {}, selection.chosen), `: ${selection.reason}.`),
+    held.repeats ? h("p", { class: "banner" }, "All motion of this recording repeats itself, also what was held out: these figures flatter.") : null,
+    held.blocks ? judged(selection, held) : null,
+    failed.map((each) => h("p", { class: "hint" }, `${each.estimator} could not be trained: ${each.error}`)),
+    held.blocks ? h("p", { class: "hint" }, "The higher the log density, the better what was predicted, its uncertainty too. Of estimators that differ by no more than chance the simpler one is taken. It has learnt the held-out samples afterwards.") : null,
+  );
+}
+
+function judged({ chosen, table: rows }, held) {
+  const stretches = held.blocks === 1 ? "1 stretch" : `${held.blocks} stretches`;
+  const columns = [
+    { label: "Estimator", cell: (row) => (row.estimator === chosen ? h("strong", {}, row.estimator) : row.estimator) },
+    { label: "Log density, nats a sample", numeric: true, cell: (row) => shown(row.log_density, number) },
+    { label: "Less than the best", numeric: true, cell: (row) => less(row) },
+    { label: "nMSE, mean of the joints", numeric: true, cell: (row) => shown(mean(row.nmse), scientific) },
+    { label: "Within the 95 % band", numeric: true, cell: (row) => shown(mean(row.coverage), percent) },
+  ];
+  return table(columns, rows, { caption: `Judged on ${stretches} that the training did not see: ${count(held.rows)} samples` });
+}
+
+function less({ difference, standard_error: error }) {
+  if (difference === null) return "–";
+  return error === null ? number(-difference || 0) : `${number(-difference)} ± ${number(error, 2)}`;
+}
+
+function mean(values) {
+  const known = (values ?? []).filter((each) => each !== null);
+  return known.length ? known.reduce((sum, each) => sum + each, 0) / known.length : null;
+}
+
+function shown(value, format) {
+  return value === null ? "–" : format(value);
+}

@@ -1,0 +1,279 @@
+"""A model that stands on an arm: stored, judged by its parameters, taught further, and with arms to choose from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import torch
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+
+from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, dynamics, load, persistence, save, train
+from lipcore.arm.arm import Alternative, Arm
+from lipcore.compact.compress import linear
+from lipcore.compact.statistics import collect, merge
+from lipcore.estimators import make_estimator
+from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.friction import friction_features
+from lipcore.metrics import evaluate
+from lipcore.motion import Motion
+from lipcore.online.batch import Rows
+from lipcore.online.learner import OnlineModel
+from lipcore.parameters import inertial_parameters, report, weight_posterior
+from lipcore.robots import load_robot
+from lipcore.simulation import Stream, simulate
+from lipcore.urdf import RigidBody
+from tests.lipcore.arm_oracles import arm, as_robot, motions, recorded
+from tests.lipcore.arms import random_bodies
+
+OPTIONS = FitOptions(device="cpu", search_seconds=2.0, statistics="chosen")
+TYPES = ("revolute", "prismatic", "revolute")
+
+
+@pytest.fixture(scope="module")
+def samples() -> Samples:
+    return recorded(arm("RPR", 51)[2], 1, 100)
+
+
+@pytest.fixture(scope="module")
+def unseen() -> Samples:
+    return recorded(arm("RPR", 51)[2], 2, 60)
+
+
+@pytest.fixture(scope="module")
+def learnt(samples: Samples) -> TorqueModel:
+    return train(samples, TYPES, "rigid-body", OPTIONS)
+
+
+def of_robot(mode: str) -> TorqueModel:
+    """A pendulum whose data have the joints from tip to base."""
+    robot = load_robot("double-pendulum")
+    data = simulate(robot, Stream(80, speed=10, noise=0.002, viscous=0.02), 1)
+    turned = {name: getattr(data, name)[:, ::-1].copy() for name in ("q", "dq", "ddq", "tau")}
+    data = replace(data, joint_names=data.joint_names[::-1], **turned)
+    body = RigidBody.from_profile(robot.name, data.joint_names, ("revolute",) * 2)
+    return train(data, ("revolute",) * 2, "rigid-body", replace(OPTIONS, geometry=mode), robot=body)
+
+
+def with_alternatives(model: TorqueModel, samples: Samples, count: int = 1) -> TorqueModel:
+    """The same arm, which might be one of `count` others."""
+    found = model.arm
+    assert found is not None
+    rng, n = np.random.default_rng(0), found.n_joints
+    shares = np.array([0.6, *np.linspace(0.3, 0.1, count)])
+    shares /= shares.sum()
+    # the frames of another arm may have their axes elsewhere
+    turned = replace(found.geometry, axis=found.geometry.axis[:, [1, 2, 0]])
+    others = [
+        Alternative(
+            turned.moved(0.1 * place * rng.standard_normal(found.geometry.size)) if place else found.geometry,
+            found.parameters + 0.05 * place * random_bodies(n, place),
+            0.01 * rng.random(n),
+            0.1 * rng.random((n, 3)),
+            float(share),
+        )
+        for place, share in enumerate(shares)
+    ]
+    chosen = make_estimator("rigid-body", model.joint_types, arm=replace(found, alternatives=tuple(others)))
+    weights = torch.ones(len(samples), dtype=torch.float64)
+    made = linear(chosen.kernel, model.posterior.params, samples.motion(), samples.torque(), weights, 0.01)
+    return replace(model, estimator=chosen, posterior=made.posterior)
+
+
+def some_model(kind: str, learnt: TorqueModel, samples: Samples) -> TorqueModel:
+    if kind == "learn":
+        return learnt
+    return with_alternatives(learnt, samples, 2) if kind == "alternatives" else of_robot(kind)
+
+
+@pytest.mark.parametrize("kind", ["learn", "calibrate", "fixed", "alternatives"])
+def test_a_saved_arm_comes_back(kind: str, learnt: TorqueModel, samples: Samples, tmp_path: Path) -> None:
+    model = some_model(kind, learnt, samples)
+    manifest = save(model, tmp_path / "model")
+    again = load(tmp_path / "model")
+    asked = motions(model.n_joints, 3).transpose(1, 0, 2)
+    before, after = (each.predict(*asked, covariance=True) for each in (model, again))
+    for name in ("tau", "tau_std", "covariance", "noise_std"):
+        one, other = getattr(before, name), getattr(after, name)
+        np.testing.assert_allclose(other, one, rtol=1e-8, atol=1e-9 * np.abs(one).max())
+    assert (model.arm is None, again.arm is None) == (False, False)
+    assert again.arm.mode == manifest["parameters"]["geometry"]["mode"] == model.arm.mode
+    assert again.arm.order.tolist() == manifest["parameters"]["geometry"]["order"]
+    assert len(again.arm.alternatives) == (3 if kind == "alternatives" else 0)
+    assert (again.robot is None) == (kind in ("learn", "alternatives"))
+    if kind in ("calibrate", "fixed"):
+        assert again.arm.order.tolist() == [1, 0]
+
+
+Edit = Callable[[dict[str, torch.Tensor]], object]
+WRONG: dict[str, tuple[Edit, str]] = {
+    "no rotation": (lambda t: t["arm/rotation"].mul_(2), "no rotation"),
+    "no axis": (lambda t: t["arm/axis"].zero_(), "not of length one"),
+    "missing": (lambda t: t.pop("arm/unit"), "'arm/unit' is missing"),
+    "order": (lambda t: t["arm/order"].zero_(), "expected each joint once"),
+    "order of others": (lambda t: t.update({"arm/order": torch.zeros(2, dtype=torch.float64)}), "each joint once"),
+    "widths": (lambda t: t["arm/widths"].zero_(), "not above zero"),
+    "negative": (lambda t: t["arm/unit"].mul_(-1), "not above zero"),
+    "parameters": (lambda t: t.update({"arm/parameters": t["arm/parameters"][:2].clone()}), "parameters has shape"),
+    "steps": (lambda t: t.update({"arm/expected": t["arm/expected"][:1].clone()}), "expected has shape"),
+    "not finite": (lambda t: t["arm/translation"].fill_(np.nan), "finite"),
+    "coefficients": (
+        lambda t: t.update({"arm/other/linear": t["arm/other/linear"][:, :, :2].clone()}),
+        r"'arm/other/linear' has shape \(3, 3, 2\), expected \(3, 3, 4\)",
+    ),
+    "half an alternative": (lambda t: t.pop("arm/other/rotation"), "'arm/other/rotation' is missing"),
+    "no probability": (lambda t: t["arm/other/probability"].zero_(), "between 0 and 1"),
+    "improbable": (lambda t: t["arm/other/probability"].fill_(0.9), "positive definite|cholesky"),
+    "none": (lambda t: t.update({"arm/other/probability": torch.zeros(0, dtype=torch.float64)}), "has shape"),
+    "unknown": (lambda t: t.update({"arm/shadow": torch.zeros(1, dtype=torch.float64)}), "does not know"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_an_arm_that_does_not_fit_is_refused(name: str, learnt: TorqueModel, samples: Samples) -> None:
+    edit, said = WRONG[name]
+    manifest, files = persistence.encode(with_alternatives(learnt, samples, 2))
+    tensors = load_tensors(files["model.safetensors"])
+    edit(tensors)
+    payload = save_tensors(tensors)
+    manifest["tensors"] |= {"bytes": len(payload), "sha256": persistence.sha256(payload)}
+    changed = {**files, "model.safetensors": payload, "manifest.json": persistence.manifest_bytes(manifest)}
+    with pytest.raises(ModelFormatError, match=said):
+        persistence.decode(changed)
+
+
+def test_a_way_to_come_by_a_geometry_that_there_is_not(learnt: TorqueModel) -> None:
+    for mode in ("guess", 3, None):
+        manifest, files = persistence.encode(learnt)
+        manifest["fit"]["geometry"] = mode
+        with pytest.raises(ModelFormatError, match=r"fit\.geometry is .*, expected one of learn, calibrate, fixed|fit"):
+            persistence.decode({**files, "manifest.json": persistence.manifest_bytes(manifest)})
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_a_choice_of_arms_has_the_moments_of_their_mixture(learnt: TorqueModel, samples: Samples, count: int) -> None:
+    model = with_alternatives(learnt, samples, count)
+    found = model.arm
+    assert found is not None
+    asked = motions(3, 4)
+    query = Motion.from_arrays(*asked.transpose(1, 0, 2))
+    terms = friction_features(query.dq).numpy().transpose(1, 2, 0)
+    torques = []
+    for each in found.alternatives:
+        model_of, flat = as_robot(each.geometry, random_bodies(3, 0)).model, each.parameters.reshape(-1)
+        data = model_of.createData()  # (the regressor of Pinocchio, since learnt bodies may be none that exist)
+        bodies = np.array([pin.computeJointTorqueRegressor(model_of, data, *motion) @ flat for motion in asked])
+        torques.append(bodies + each.rotor * asked[:, 2] + (terms * each.friction).sum(-1))
+    more, shares = np.array(torques) - torques[0], np.array([each.probability for each in found.alternatives])
+    mean = np.einsum("k,kni->ni", shares, more)
+    spread = np.einsum("k,kni,knj->nij", shares, more - mean, more - mean)
+    alone, mixed = ArmKernel(replace(found, alternatives=())), ArmKernel(found)
+    scale = {"rigid_body.log_scale": torch.zeros(4, dtype=torch.float64)}
+    np.testing.assert_allclose((mixed.mean(query) - alone.mean(query)).numpy(), mean, rtol=1e-8, atol=1e-9)
+    added = (mixed.variance(scale, query) - alone.variance(scale, query)).numpy()
+    prior = float(alone.variance(scale, query).abs().max())
+    np.testing.assert_allclose(added, spread, rtol=1e-8, atol=1e-12 * prior)
+
+
+def rows_of(samples: Samples) -> Rows:
+    code = np.zeros(len(samples), np.uint8)
+    return Rows(samples.t, samples.q, samples.dq, samples.ddq, samples.tau, code)
+
+
+def errors(model: TorqueModel, unseen: Samples) -> np.ndarray:
+    answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
+    return np.asarray(evaluate(unseen.tau, answer.tau, answer.tau_std, answer.noise_std).nmse)
+
+
+def heavier(seed: int, size: int) -> Samples:
+    """Another arm of the same kind, at whose tip something hangs."""
+    robot = arm("RPR", 51)[2]
+    tip = robot.model.inertias[3]
+    tip.mass = tip.mass + 0.5
+    robot.model.inertias[3] = tip
+    return recorded(robot, seed, size)
+
+
+def test_an_arm_learns_online_and_unlearns(learnt: TorqueModel, unseen: Samples) -> None:
+    more, asked = heavier(5, 300), heavier(6, 60)
+    first = more.q, more.dq, more.ddq
+    start, rows = OnlineModel.start(learnt, forgetting_s=None), rows_of(more)
+    before = errors(start.model(), asked)
+    told = errors(start.change(-1.0).learn(rows).model(), asked)
+    assert (told < 0.01 * before).all(), (before, told)
+    taught = start.learn(rows)  # a change that nobody told: in between
+    assert (np.abs(taught.model().predict(*first).tau - learnt.predict(*first).tau) > 0.01).any()
+    back = taught.unlearn(rows).model()
+    one, other = (each.predict(unseen.q, unseen.dq, unseen.ddq) for each in (learnt, back))
+    np.testing.assert_allclose(other.tau, one.tau, rtol=0, atol=1e-4 * np.abs(one.tau).max())
+    np.testing.assert_allclose(other.tau_std, one.tau_std, rtol=1e-2)
+
+
+def test_two_halves_of_a_recording_know_together_what_the_whole_tells(learnt: TorqueModel, samples: Samples) -> None:
+    basis, noise = learnt.posterior.basis, torch.exp(2 * learnt.posterior.params["noise.log_std"])
+    motion, left = samples.motion(), samples.torque() - learnt.estimator.kernel.mean(samples.motion())
+    halves = [collect(basis, noise, motion[part], left[part]) for part in (slice(0, 40), slice(40, None))]
+    whole, joined = collect(basis, noise, motion, left), merge(*halves)
+    torch.testing.assert_close(joined.a, whole.a, rtol=1e-9, atol=1e-9 * float(whole.a.abs().max()))
+    torch.testing.assert_close(joined.b, whole.b, rtol=1e-9, atol=1e-9 * float(whole.b.abs().max()))
+    assert joined.samples == whole.samples == len(samples)
+
+
+def test_components_of_a_learnt_arm(learnt: TorqueModel, unseen: Samples) -> None:
+    motion, tau = unseen.motion()[:10], unseen.torque()[:10]
+    found = dynamics.components(learnt, motion, dynamics.COMPONENTS, tau)
+    robot, data = arm("RPR", 51)[2], arm("RPR", 51)[2].model.createData()
+    for k, estimate in enumerate(found["gravity"].mean.numpy()):
+        expected = pin.computeGeneralizedGravity(robot.model, data, unseen.q[k])
+        np.testing.assert_allclose(estimate, expected, rtol=0, atol=0.02 * np.abs(unseen.tau).max())
+    for name in dynamics.COMPONENTS:
+        assert torch.isfinite(found[name].mean).all(), name
+        assert torch.isfinite(found[name].std).all(), name
+    parts = found["inertial"].mean + found["coriolis"].mean + found["gravity"].mean + found["friction"].mean
+    answer = learnt.predict(*(part.numpy() for part in (motion.q, motion.dq, motion.ddq)))
+    np.testing.assert_allclose(parts.numpy(), answer.tau, rtol=1e-6, atol=1e-6 * np.abs(answer.tau).max())
+
+
+def test_what_is_reported_of_a_learnt_arm(learnt: TorqueModel) -> None:
+    said = report(learnt.posterior, learnt.estimator, learnt.joint_names)
+    assert said["geometry"]["mode"] == "learn"
+    joints = said["geometry"]["joints"]
+    assert [joint["type"] for joint in joints] == list(TYPES)
+    assert [len(joint["turn_std"]) for joint in joints] == [2, 2, 2]
+    assert [len(joint["shift_std"]) for joint in joints] == [0, 0, 2]
+    # where the last axis points follows from the torque; turned about gravity as a whole, an arm is the same
+    assert all(0 < std < 0.1 for std in joints[2]["turn_std"])
+    assert joints[0]["undetermined"]
+    for joint in joints:
+        spread = dict(zip(("turn 1", "turn 2"), joint["turn_std"], strict=True))  # of one radian before
+        spread |= dict(zip(("shift 1", "shift 2"), 2 * np.array(joint["shift_std"]), strict=False))  # of half a metre
+        assert joint["undetermined"] == [name for name, share in spread.items() if share > 0.5]
+    assert len(said["rotor"]["mean"]) == len(said["rotor"]["std"]) == 3
+    # of what turns about the first axis, torque does not tell the mass
+    assert "mass" in said["inertia"]["bodies"][0]["undetermined"]
+    inertia = inertial_parameters(learnt.posterior, learnt.estimator)
+    assert inertia.mean.shape == inertia.std.shape == (3, 10)
+    term = learnt.estimator.terms["rigid_body"]
+    assert isinstance(term, ArmKernel)
+    weights = weight_posterior(learnt.posterior, term)
+    np.testing.assert_allclose(inertia.mean.reshape(-1), weights.mean[:30])
+    assert (weights.std <= weights.scale * (1 + 1e-9)).all()
+
+
+def test_what_is_no_arm_is_refused(learnt: TorqueModel) -> None:
+    good = learnt.arm
+    assert good is not None
+    for name, value, said in (
+        ("unit", good.unit[:-1], "unit has shape"),
+        ("widths", good.widths[:-1], "widths has shape"),
+        ("order", np.array([0, 0, 1]), "each joint from 0 to 2 once"),
+        ("unit", 0 * good.unit, "not above zero"),
+        ("centre", np.full_like(good.centre, np.inf), "centre has shape"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            Arm(**{**{each: getattr(good, each) for each in good.__dataclass_fields__}, name: value})
