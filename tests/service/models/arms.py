@@ -37,7 +37,7 @@ def publish_arm(database: Database, files: Files, model: str, **changed: Any) ->
     manifest = json.loads(source[MANIFEST])
     report = parameters_of(panda()) | changed
     manifest["parameters"] = {name: value for name, value in report.items() if value is not None}
-    manifest["warnings"] = [WARNING]
+    manifest["warnings"] = [WARNING] if "geometry" in manifest["parameters"] else []
     source[MANIFEST] = persistence.manifest_bytes(manifest)
     with files.new_version(folder) as target:
         persistence.write(target, source)
