@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from lipcore.urdf import describe
-from tests.service.models.arms import JOINTS
+from tests.service.models.arms import JOINTS, WARNING
 
 
 def test_models_are_listed_and_shown(asked, arm):
@@ -62,6 +62,7 @@ def test_an_archive_is_written_read_and_deleted(asked, arm, lipserve, server, tm
 
 def test_what_a_version_has_learnt_of_its_arm_is_shown(asked, robot_arm):
     text = asked("models", "show", robot_arm, "--version", 1)
+    assert f"careful: {WARNING}" in text
     for part in (
         "where the joints lie",
         "rotor kg·m²",

@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from service.client import results
 from service.client.results.arm import Arm, read_arm
 from service.models.schema import Version
 from tests.lipcore.arms import parameters_of
@@ -83,6 +84,11 @@ def test_text_and_html_show_every_joint_and_what_torque_does_not_tell(arm):
         assert part in text, part
     assert "<td>mass, first moment</td>" in arm._repr_html_()
     assert arm.as_dict()["frames"]["mode"] == "learn"
+
+
+def test_text_of_a_version_begins_with_its_warnings(robot):
+    text = str(results.Version(**version(parameters_of(robot)).model_dump() | {"warnings": ["Two arms explain it."]}))
+    assert text.splitlines()[1] == "careful: Two arms explain it."
 
 
 def test_versions_of_earlier_releases(robot):

@@ -15,6 +15,7 @@ from service.models import registry
 from service.settings import Settings, shipped_models
 from tests.lipcore.arms import parameters_of
 
+WARNING = "Two arms explain it."
 JOINTS = tuple(f"panda_joint{number}" for number in range(1, 8))
 
 
@@ -28,7 +29,7 @@ def panda() -> RigidBody:
 
 
 def publish_arm(database: Database, files: Files, model: str, **changed: Any) -> dict[str, Any]:
-    """Add a version to a model: the shipped one, but reporting the geometry of its robot; return its manifest.
+    """Add a version to a model: the shipped one, with its robot's geometry and WARNING; return its manifest.
 
     changed: other entries of its `parameters`; None leaves one out.
     """
@@ -36,6 +37,7 @@ def publish_arm(database: Database, files: Files, model: str, **changed: Any) ->
     manifest = json.loads(source[MANIFEST])
     report = parameters_of(panda()) | changed
     manifest["parameters"] = {name: value for name, value in report.items() if value is not None}
+    manifest["warnings"] = [WARNING] if "geometry" in manifest["parameters"] else []
     source[MANIFEST] = persistence.manifest_bytes(manifest)
     with files.new_version(folder) as target:
         persistence.write(target, source)

@@ -10,7 +10,7 @@ from lipcore.urdf import RigidBody
 from service.client import ApiError
 from tests.service.client.conftest import over
 from tests.service.data import service_of
-from tests.service.models.arms import JOINTS, NO_BODIES, panda, publish_arm
+from tests.service.models.arms import JOINTS, NO_BODIES, WARNING, panda, publish_arm
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +32,10 @@ def test_it_is_the_robot(api, arm):
     np.testing.assert_allclose(robot.parameters(), panda().parameters(), atol=1e-12)
     expected = Geometry.from_robot(panda()).constants
     np.testing.assert_allclose(Geometry.from_robot(robot).constants, expected, atol=1e-12)
+
+
+def test_its_version_warns_of_what_is_open(api, arm):
+    assert api.get(f"/v1/models/{arm}/versions/2").json()["warnings"] == [WARNING]
 
 
 def test_a_version_is_named_by_number_or_alias(api, arm):

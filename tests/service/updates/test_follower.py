@@ -229,6 +229,14 @@ def test_novelty_is_told_with_what_is_published(arm, follower, monkeypatch):
     assert (message.novel_rows, message.novel_share) == (40, 0.0)
 
 
+def test_the_error_of_a_learnt_arms_linearisation_is_published(arm, follower, monkeypatch):
+    arm.batch(0)
+    assert caught_up(follower).publish().linearisation is None
+    monkeypatch.setattr(following, "linearisation_error", lambda model: np.array([0.1, 0.7]))
+    arm.batch(1)
+    assert caught_up(follower).publish().linearisation == (0.1, 0.7)
+
+
 # several
 
 
