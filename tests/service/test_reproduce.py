@@ -284,7 +284,7 @@ def test_training_and_test_sets_have_other_seeds_and_frequencies():
     ("options", "said"),
     [
         (("--robot", "r2d2"), f"robot is 'r2d2', expected one of {', '.join(ROBOTS)}"),
-        (("--estimator", "magic"), "estimator is 'magic', expected one of lip, lip-chain"),
+        (("--estimator", "magic"), "estimator is 'magic', expected one of auto, lip, lip-chain"),
         (("--speed", "-1"), "--speed is -1, expected a positive number"),
         (("--speed", "nan"), "--speed is nan, expected a positive number"),
         (("--size", 500), "--size is 500, expected from 10 to less than --samples, 500"),
