@@ -225,7 +225,7 @@ def fitted(
         # not the noise: what rigid bodies leave of the torque is what the other term is there for
         params = {} if learnt is None else learnt.params
         start = {name: value for name, value in params.items() if name != "noise.log_std"}
-        fewer = options if learnt is None else _independent(options, learnt)
+        fewer = options if learnt is None else independent(options, learnt)
         found = fit(chosen.kernel, samples, fewer, on_progress, cancelled, stretches, start)
         used = samples.rows(found.rows)
         compression, jitter = compressed(chosen.kernel, found.params, used, options, calibration)
@@ -248,7 +248,7 @@ def fitted(
     )
 
 
-def _independent(options: FitOptions, learnt: Learnt) -> FitOptions:
+def independent(options: FitOptions, learnt: Learnt) -> FitOptions:
     """Options for no more samples than the recording holds independent ones, as the arm's residuals say."""
     most = max(MIN_SAMPLES, round(learnt.weight * len(learnt.rows)))
     return replace(

@@ -15,12 +15,12 @@ from lipcore.auto.unseen import hold_out
 from lipcore.compact.compress import compressed
 from lipcore.fit_options import FitOptions
 from lipcore.fitting import Cancelled, FitProgress, Progress
-from lipcore.model import TorqueModel, training_range
+from lipcore.model import TorqueModel, independent, training_range
 from lipcore.samples import Samples
 from lipcore.selection import spread_out
 from lipcore.splits import SplitError, taken
 from lipcore.urdf import RigidBody
-from lipcore.vocabulary import JointType, TorqueConvention
+from lipcore.vocabulary import ROBOT_ESTIMATORS, JointType, TorqueConvention
 
 
 def choose(
@@ -67,9 +67,11 @@ def _of_all(work: Work, samples: Samples, contest: Contest, chosen: str) -> Torq
         return work.fit(samples, chosen, ALL, replace(learnt, report={**learnt.report, **searched}))
     objective = float(model.fit["objective"])
     work.overall.of(chosen, ALL)(FitProgress("posterior", 0, 0, objective, 0.0, 0.0))
-    used = samples.rows(spread_out(samples.motion(), work.options.posterior_samples).numpy())
+    arm = contest.learnt if chosen in ROBOT_ESTIMATORS else None
+    options = work.options if arm is None else independent(work.options, arm)
+    used = samples.rows(spread_out(samples.motion(), options.posterior_samples).numpy())
     kernel, params = model.estimator.kernel, model.posterior.params
-    compression, jitter = compressed(kernel, params, used, work.options, model.calibration)
+    compression, jitter = compressed(kernel, params, used, options, model.calibration)
     counts = {"samples_given": len(samples), "samples_posterior": len(used), "jitter": jitter}
     return replace(
         model,

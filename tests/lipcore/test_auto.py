@@ -168,11 +168,16 @@ def test_a_robot_is_for_those_that_have_a_use_for_it():
         check_estimator("auto", TYPES, options=FitOptions(geometry="fixed"))
 
 
-@pytest.mark.parametrize("after", [0, 3, 60])
-def test_it_can_be_cancelled(after):
+@pytest.mark.parametrize("at_work", NAMES)
+def test_it_can_be_cancelled(at_work):
     seen = []
+
+    def cancelled():
+        return any(each.estimator == at_work for each in seen)
+
     with pytest.raises(FitCancelledError):
-        train(recorded(), TYPES, options=OPTIONS, on_progress=seen.append, cancelled=lambda: len(seen) >= after)
+        train(recorded(), TYPES, options=OPTIONS, on_progress=seen.append, cancelled=cancelled)
+    assert seen[-1].estimator == at_work
 
 
 def test_the_search_is_taken_up_again_where_the_chain_leads(monkeypatch):
@@ -187,6 +192,16 @@ def test_the_search_is_taken_up_again_where_the_chain_leads(monkeypatch):
     monkeypatch.setattr(contest.Contest, "_chain_leads", lambda self: True)
     train(recorded(), TYPES, options=OPTIONS)
     assert searches[:2] == [0, 1]
+
+
+def test_both_together_stand_on_all_samples_around_the_arm_that_was_learnt(monkeypatch, tmp_path):
+    monkeypatch.setattr(contest.Contest, "verdict", lambda self: ("rigid-body+lip-chain", "it was told to"))
+    model = train(recorded(), TYPES, options=replace(OPTIONS, posterior_samples=300))
+    assert model.selection["chosen"] == model.estimator.name == "rigid-body+lip-chain"
+    assert model.fit["samples_given"] == len(recorded())
+    assert 100 < model.fit["samples_posterior"] <= len(recorded())
+    save(model, tmp_path / "model")
+    assert load(tmp_path / "model").arm is not None
 
 
 def test_motion_that_is_seen_nowhere_else_is_held_out():
