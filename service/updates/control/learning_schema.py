@@ -57,7 +57,8 @@ class LearningStatus(BaseModel):
     linearisation_error: list[float] | None = Field(
         None,
         description="Error of taking the torque of a learnt arm as linear around the arm as trained, root mean square "
-        "of each joint in units of √(tau_std² + noise_std²); null without such an arm, and until something is learnt",
+        "of each joint in units of √(tau_std² + noise_std²); zero for a joint predicted as well as stated, null "
+        "without such an arm and until something is learnt",
     )
     failure: str | None = Field(description="Why the version does not learn, where it should; it is tried again")
     held: Held | None

@@ -177,7 +177,8 @@ class Follower:
             self.answering = online.model(floor)
             self._revision, self._solved = Revision.of(self.answering), (online, floor)
             error = linearisation_error(self.answering)
-            self._linearisation = None if error is None else tuple(error.tolist())
+            # a joint whose errors are no larger than stated needs nothing mended
+            self._linearisation = None if error is None else tuple(np.where(floor > 0, error, 0.0).tolist())
         return self._revision
 
     def _is_solved(self, online: OnlineModel, floor: Array) -> bool:

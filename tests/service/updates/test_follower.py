@@ -234,7 +234,10 @@ def test_the_error_of_a_learnt_arms_linearisation_is_published(arm, follower, mo
     assert caught_up(follower).publish().linearisation is None
     monkeypatch.setattr(following, "linearisation_error", lambda model: np.array([0.1, 0.7]))
     arm.batch(1)
-    assert caught_up(follower).publish().linearisation == (0.1, 0.7)
+    assert caught_up(follower).publish().linearisation == (0.0, 0.0)  # both joints are predicted as well as stated
+    monkeypatch.setattr(following.recent, "floor", lambda *_: np.array([0.0, 0.5]))
+    arm.batch(2)
+    assert caught_up(follower).publish().linearisation == (0.0, 0.7)
 
 
 # several
