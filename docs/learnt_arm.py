@@ -2,6 +2,7 @@
 
     python docs/learnt_arm.py rows [SEEDS]                accuracy and coverage of Panda, UR10, xArm7, Z1, TIAGo's arm
     python docs/learnt_arm.py search [FIRST] [LAST]       random arms: evidence against that of the true geometry
+    python docs/learnt_arm.py answer                      one query of the shipped model, beside Pinocchio's RNEA
 
 Training motions are those of the paper's experiment (50 sinusoids), tests have twice the bandwidth (100). Training
 seeds are 5001, 5002, …; test seeds a hundred more. What is reported are arms 1 to 20 of `search` with three training
@@ -11,6 +12,7 @@ The geometries of installed URDFs are not looked at (`known=()`), so that nothin
 
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -21,8 +23,9 @@ from lipcore import FitOptions, model
 from lipcore.arm.geometry import Geometry
 from lipcore.arm.learning import POLISHING, make_problem
 from lipcore.metrics import evaluate
+from lipcore.motion import motion_arrays
 from lipcore.random_arms import random_arm
-from lipcore.robots import Robot, load_robot
+from lipcore.robots import Robot, load_robot, pinocchio
 from lipcore.samples import Samples
 from lipcore.selection import spread_out
 from lipcore.simulation import Stream, inverse_dynamics, simulate
@@ -113,13 +116,37 @@ def search(first: int, last: int) -> None:
     print(f"best geometry found in {wins} of {total}; lowest coverage of a joint {100 * np.min(covers):.0f} %")
 
 
+def answer() -> None:
+    """Print the median time of an answer in process, µs, and that of Pinocchio's RNEA."""
+    robot, shipped = load_robot("panda"), lipcore.load(Path(__file__).parents[1] / "models/panda-sim")
+    q, dq, ddq = (part[0] for part in motion_arrays(*np.random.default_rng(0).uniform(-1, 1, (3, 7))))
+    motion, data = np.ascontiguousarray(np.stack([q, dq, ddq])), robot.model.createData()
+    shipped.warm_up()
+    for name, ask in (
+        ("with tau_std", lambda: shipped.answer(motion)),
+        ("mean alone", lambda: shipped.answer(motion, std=False)),
+        ("Pinocchio's RNEA", lambda: pinocchio().rnea(robot.model, data, q, dq, ddq)),
+    ):
+        times = []
+        for _ in range(5000):
+            began = time.perf_counter_ns()
+            ask()
+            times.append(time.perf_counter_ns() - began)
+        print(f"{name}: {np.median(times) / 1e3:.1f} µs")
+
+
 def main() -> None:
     """Run what is asked for."""
     torch.set_num_threads(1)
     model.known_geometries = lambda types, gravity: ()  # type: ignore[assignment]
     what, numbers = sys.argv[1], [int(each) for each in sys.argv[2:]]
     with threadpool_limits(1):
-        rows(*(numbers or [5])) if what == "rows" else search(*(numbers or [1, 20]))
+        if what == "answer":
+            answer()
+        elif what == "rows":
+            rows(*(numbers or [5]))
+        else:
+            search(*(numbers or [1, 20]))
 
 
 if __name__ == "__main__":

@@ -2,9 +2,11 @@
 
     python docs/real_recordings.py FOLDER [ESTIMATOR...]
 
-FOLDER holds `panda_exciting_trajectory.db3` (a Franka Panda, BSD-3-Clause, github unisa-acg/inverse-dynamics-solver)
-and `schunk_liu_althoff.npz` (a Schunk arm, CC0-1.0, Liu & Althoff, IROS 2018). Everything is low-passed at 4 Hz without
-delay, training and held-out parts apart, and the acceleration is derived from the velocity.
+FOLDER holds `panda_exciting_trajectory.db3` and `ur10_exciting_trajectory.db3` (a Franka Panda and a UR10,
+BSD-3-Clause, github unisa-acg/inverse-dynamics-solver) and `schunk_liu_althoff.npz` (a Schunk arm, CC0-1.0, Liu &
+Althoff, IROS 2018). Everything is low-passed at 4 Hz without delay, training and held-out parts apart, and the
+acceleration is derived from the velocity. `rigid-body`, `auto` and so on learn the arm from torque alone; `rigid-body
+(URDF)` is calibrated around the URDF of example-robot-data.
 """
 
 import sqlite3
@@ -16,14 +18,18 @@ import torch
 from rosbags.typesys import Stores, get_typestore
 
 import lipcore
+from lipcore.arm.warning import warnings
 from lipcore.estimators import ESTIMATORS
 from lipcore.metrics import evaluate
+from lipcore.parameters import report
 from lipcore.samples import Array, Samples
 from lipcore.signals import differentiate, low_pass
 from lipcore.urdf import RigidBody
-from lipcore.vocabulary import ROBOT_ESTIMATORS
+from lipcore.vocabulary import AUTO
 
-PANDA_RATE, PANDA_SHARE = 30.0, 0.7
+PANDA_RATE, UR10_RATE, SHARE = 30.0, 125.0, 0.7
+UR10 = ("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint")
+WITH_URDF = " (URDF)"
 SCHUNK_LAST, SCHUNK_FOURTH = 70, 4
 KEEP = 20
 """Of the Schunk's 250 Hz every 20th sample: 4 Hz of signal need no more."""
@@ -36,8 +42,11 @@ def from_signals(names: tuple[str, ...], rate: float, q: Array, dq: Array, tau: 
     return Samples(names, t, np.zeros(len(q), dtype=np.int64), q, dq, differentiate(dq, rate), tau)
 
 
-def read_panda(path: Path) -> tuple[Samples, Samples]:
-    """The first 70 % of the trajectory and the rest; read with sqlite3, as there is no metadata.yaml beside it."""
+def read_bag(path: Path, rate: float, joints: tuple[str, ...] | None = None) -> tuple[Samples, Samples]:
+    """The first 70 % of a trajectory and the rest; read with sqlite3, as there is no metadata.yaml beside it.
+
+    joints: their order from base to tip, where that of the messages is another one.
+    """
     store = get_typestore(Stores.ROS2_HUMBLE)
     with sqlite3.connect(f"file:{path}?mode=ro", uri=True) as database:
         rows = database.execute(
@@ -48,8 +57,10 @@ def read_panda(path: Path) -> tuple[Samples, Samples]:
     messages = [store.deserialize_cdr(data, "sensor_msgs/msg/JointState") for (data,) in rows]
     names = tuple(messages[0].name)
     signals = np.array([[getattr(m, key) for m in messages] for key in ("position", "velocity", "effort")])
-    cut = int(PANDA_SHARE * signals.shape[1])
-    first, rest = (from_signals(names, PANDA_RATE, *part) for part in (signals[:, :cut], signals[:, cut:]))
+    if joints is not None:
+        signals, names = signals[:, :, [names.index(joint) for joint in joints]], joints
+    cut = int(SHARE * signals.shape[1])
+    first, rest = (from_signals(names, rate, *part) for part in (signals[:, :cut], signals[:, cut:]))
     return first, rest
 
 
@@ -74,10 +85,14 @@ def judge(title: str, training: Samples, held_out: Samples, estimators: list[str
     print("| estimator | fit s | " + " | ".join(f"joint {j + 1}" for j in range(n)) + " |\n|" + " --- |" * (n + 2))
     types = ("revolute",) * n
     for name in estimators:
-        if name in ROBOT_ESTIMATORS and profile is None:
+        if name.endswith(WITH_URDF) and profile is None:
             continue
-        robot = RigidBody.from_profile(profile, training.joint_names, types) if name in ROBOT_ESTIMATORS else None
-        model = lipcore.train(training, types, name, robot=robot)
+        bodies = RigidBody.from_profile(profile, training.joint_names, types) if name.endswith(WITH_URDF) else None
+        model = lipcore.train(training, types, name.removesuffix(WITH_URDF), robot=bodies)
+        if name == AUTO:
+            print(f"| {AUTO} chose {model.estimator.name} |" + " |" * (n + 1))
+        for warning in warnings(model, report(model.posterior, model.estimator, model.joint_names)):
+            print(f"| {name} warns: {warning} |" + " |" * (n + 1))
         answer = model.predict(held_out.q, held_out.dq, held_out.ddq)
         metrics = evaluate(held_out.tau, answer.tau, answer.tau_std, answer.noise_std)
         for figures, label in (
@@ -93,9 +108,11 @@ def judge(title: str, training: Samples, held_out: Samples, estimators: list[str
 def main() -> None:
     """Judge the estimators named, or all, on both recordings."""
     torch.set_num_threads(1)
-    folder, estimators = Path(sys.argv[1]), sys.argv[2:] or list(ESTIMATORS)
+    folder, estimators = Path(sys.argv[1]), sys.argv[2:] or [AUTO, *ESTIMATORS, "rigid-body" + WITH_URDF]
     panda, schunk = folder / "panda_exciting_trajectory.db3", folder / "schunk_liu_althoff.npz"
-    judge("Franka Panda, last 30 % of 24 s held out", *read_panda(panda), estimators, "panda")
+    ur10 = folder / "ur10_exciting_trajectory.db3"
+    judge("Franka Panda, last 30 % of 24 s held out", *read_bag(panda, PANDA_RATE), estimators, "panda")
+    judge("UR10, last 30 % of 28 s held out", *read_bag(ur10, UR10_RATE, UR10), estimators, "ur10")
     judge("Schunk, last 30 of 100 episodes held out", *read_schunk(schunk, "last"), estimators, None)
     judge("Schunk, every fourth episode held out", *read_schunk(schunk, "fourth"), estimators, None)
 
