@@ -79,7 +79,8 @@ def make_estimator(
     if name not in ESTIMATORS:
         raise UnknownEstimatorError(f"estimator is {name!r}, expected one of {', '.join(ESTIMATORS)}")
     types = check_joint_types(joint_types)
-    terms = {**ESTIMATORS[name](types, tied), "friction": FrictionKernel(len(types))}
+    friction = FrictionKernel(len(types), arm is not None and arm.stribeck)
+    terms = {**ESTIMATORS[name](types, tied), "friction": friction}
     if (name in ROBOT_ESTIMATORS) != (arm is not None):
         raise ValueError(f"estimator {name!r}: expected an arm for {' and '.join(ROBOT_ESTIMATORS)}, and for no other")
     if arm is None:

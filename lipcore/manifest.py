@@ -12,7 +12,7 @@ from lipcore.arm.report import check_inertia, check_rotor, read_geometry
 from lipcore.auto.table import MOST_TEXT, Candidate, HeldOut, Selection
 from lipcore.calibration import Calibration
 from lipcore.fit_options import FitOptions
-from lipcore.kernels.friction import FRICTION_TERMS
+from lipcore.kernels.friction import FRICTION_TERMS, STRIBECK
 from lipcore.strict_json import quote
 from lipcore.vocabulary import JOINT_TYPES, PRIORS, TORQUE_CONVENTIONS
 
@@ -193,7 +193,7 @@ def _check_range(name: str, value: Any, n: int) -> None:
 
 def _check_parameters(name: str, value: Any, n: int) -> None:
     _check_keys(name, value, ("friction",), ("inertia", "rotor", "geometry"))
-    _check_keys(f"{name}.friction", value["friction"], FRICTION_TERMS)
+    _check_keys(f"{name}.friction", value["friction"], FRICTION_TERMS, (STRIBECK,))
     for term, figures in value["friction"].items():
         _check_keys(f"{name}.friction.{term}", figures, ("mean", "std"))
         for key, numbers in figures.items():

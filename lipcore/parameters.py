@@ -16,7 +16,7 @@ from lipcore.compact.posterior import CompactPosterior
 from lipcore.estimators import Estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.base import LinearKernel
-from lipcore.kernels.friction import FRICTION_TERMS, FrictionKernel
+from lipcore.kernels.friction import FrictionKernel, friction_terms
 from lipcore.posterior import Posterior
 from lipcore.samples import Array
 from lipcore.urdf import PARAMETERS
@@ -55,7 +55,8 @@ class WeightPosterior:
 class Friction:
     """Coefficients per joint and their standard deviations, each (n,).
 
-    viscous: N·m·s/rad (N·s/m); coulomb, offset: N·m (N).
+    viscous: N·m·s/rad (N·s/m); coulomb, offset: N·m (N); stribeck: N·m (N), of friction that slow joints have besides,
+    None where that is no part of the model.
     """
 
     viscous: Array
@@ -64,6 +65,8 @@ class Friction:
     coulomb_std: Array
     offset: Array
     offset_std: Array
+    stribeck: Array | None = None
+    stribeck_std: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -105,10 +108,10 @@ def friction_coefficients(posterior: Posterior, estimator: Estimator) -> Frictio
     if not isinstance(term, FrictionKernel):
         raise ValueError(f"estimator {estimator.name!r} has no friction term")
     weights = weight_posterior(posterior, term)
-    shape = (term.n_joints, len(FRICTION_TERMS))
+    shape = (term.n_joints, len(term.terms))
     mean, std = weights.mean.reshape(shape).T, weights.std.reshape(shape).T
-    named = dict(zip(FRICTION_TERMS, mean, strict=True))
-    named |= {f"{name}_std": value for name, value in zip(FRICTION_TERMS, std, strict=True)}
+    named = dict(zip(term.terms, mean, strict=True))
+    named |= {f"{name}_std": value for name, value in zip(term.terms, std, strict=True)}
     return Friction(**named)
 
 
@@ -161,7 +164,7 @@ def report(posterior: CompactPosterior, estimator: Estimator, joint_names: Seque
     out: dict[str, Any] = {
         "friction": {
             name: {"mean": getattr(friction, name).tolist(), "std": getattr(friction, f"{name}_std").tolist()}
-            for name in FRICTION_TERMS
+            for name in friction_terms(friction.stribeck is not None)
         }
     }
     if "rigid_body" in estimator.terms:

@@ -48,7 +48,8 @@ class Arm:
     parameters: (n, 10), base to tip, at which ∂(Y π)/∂θ is taken; centre: (n, 10), prior mean of π, base to tip; unit:
     (11 n,), prior standard deviations of π and of the rotor inertias, in the order of the data's joints; expected:
     (g,), the step from the geometry to its prior mean; widths: (g,), its prior standard deviations, rad and m.
-    alternatives: the arm itself first, then the others; empty where there is no other.
+    stribeck: whether friction has its fourth term; alternatives: the arm itself first, then the others; empty where
+    there is no other.
     """
 
     geometry: Geometry
@@ -59,6 +60,7 @@ class Arm:
     unit: Array
     expected: Array
     widths: Array
+    stribeck: bool = False
     alternatives: tuple[Alternative, ...] = field(default=())
 
     def __post_init__(self) -> None:

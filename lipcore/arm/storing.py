@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lipcore.arm.arm import Alternative, Arm
 from lipcore.arm.geometry import Geometry
-from lipcore.kernels.friction import FRICTION_TERMS
+from lipcore.kernels.friction import friction_terms
 from lipcore.strict_json import quote
 from lipcore.vocabulary import GEOMETRY_MODES, GeometryMode, JointType
 
@@ -18,7 +18,9 @@ PREFIX = "arm/"
 _GEOMETRY = ("rotation", "translation", "axis", "gravity")
 _ARM = ("parameters", "centre", "unit", "expected", "widths")
 _OTHERS = ("rotation", "translation", "axis", "parameters", "linear", "probability")
-_NAMES = {f"{PREFIX}{name}" for name in (*_GEOMETRY, *_ARM, "order", *(f"other/{name}" for name in _OTHERS))}
+_NAMES = {
+    f"{PREFIX}{name}" for name in (*_GEOMETRY, *_ARM, "order", "stribeck", *(f"other/{name}" for name in _OTHERS))
+}
 
 
 def is_of_arm(name: str) -> bool:
@@ -30,6 +32,8 @@ def arm_tensors(arm: Arm) -> dict[str, Tensor]:
     """All numbers of an arm, float64, by name."""
     parts = {name: getattr(arm.geometry, name) for name in _GEOMETRY} | {name: getattr(arm, name) for name in _ARM}
     parts["order"] = arm.order.astype(np.float64)
+    if arm.stribeck:
+        parts["stribeck"] = np.ones(1)
     if each := arm.alternatives:
         parts |= {
             "other/rotation": np.stack([one.geometry.rotation for one in each]),
@@ -64,10 +68,22 @@ def read_arm(tensors: Mapping[str, Tensor], joint_types: Sequence[JointType], mo
         raise ValueError(f"tensor 'arm/order' is {order.tolist()}, expected each joint once")
     types = tuple(joint_types[joint] for joint in order)
     geometry = Geometry(types, *(parts.pop(name) for name in _GEOMETRY))
-    return Arm(geometry, order, mode, alternatives=_alternatives(tensors, geometry), **parts)
+    stribeck = _stribeck(tensors)
+    alternatives = _alternatives(tensors, geometry, len(friction_terms(stribeck)))
+    return Arm(geometry, order, mode, stribeck=stribeck, alternatives=alternatives, **parts)
 
 
-def _alternatives(tensors: Mapping[str, Tensor], geometry: Geometry) -> tuple[Alternative, ...]:
+def _stribeck(tensors: Mapping[str, Tensor]) -> bool:
+    """Whether friction has its fourth term: it has not where nothing is stored."""
+    if (stored := tensors.get(f"{PREFIX}stribeck")) is None:
+        return False
+    if (values := stored.tolist()) not in ([0.0], [1.0]):
+        raise ValueError(f"tensor 'arm/stribeck' is {quote(values)}, expected [0.0] or [1.0]")
+    return bool(values[0])
+
+
+def _alternatives(tensors: Mapping[str, Tensor], geometry: Geometry, terms: int) -> tuple[Alternative, ...]:
+    """terms: of friction."""
     if f"{PREFIX}other/probability" not in tensors:
         return ()
     try:
@@ -79,7 +95,7 @@ def _alternatives(tensors: Mapping[str, Tensor], geometry: Geometry) -> tuple[Al
     n, count = geometry.n_joints, probability.size
     for name, value, shape in (
         ("parameters", parameters, (count, n, 10)),
-        ("linear", linear, (count, n, 1 + len(FRICTION_TERMS))),
+        ("linear", linear, (count, n, 1 + terms)),
         ("rotation", rotation, (count, n, 3, 3)),
         ("translation", translation, (count, n, 3)),
         ("axis", axis, (count, n, 3)),

@@ -1,8 +1,9 @@
 """A URDF of an arm whose geometry was learnt: a link a joint, with its mass, its friction and its rotor.
 
 URDF has no tag for rotor inertia: it is written as Drake reads it, in a `<transmission>` that others skip. The torque
-of a simulator that skips it lacks rotor · ddq. Offset torque is written as a comment. Where gravity does not point down
-the base's z axis, a fixed joint from `world` to `base` turns the base.
+of a simulator that skips it lacks rotor · ddq. Offset torque is written as a comment, friction that only slow joints
+have is left out. Where gravity does not point down the base's z axis, a fixed joint from `world` to `base` turns the
+base.
 """
 
 from __future__ import annotations

@@ -87,7 +87,8 @@ class ArmKernel(LinearKernel):
         arm = self.arm
         arm_features(arm.geometry.constants, arm.geometry.gravity, arm.parameters, arm.order, motions, out[:, :first])
         if arm.alternatives:
-            arm_differences(*_stacked(arm), arm.order, motions, _linear_features(motions), out[:, first:])
+            linear = _linear_features(motions, arm.stribeck)
+            arm_differences(*_stacked(arm), arm.order, motions, linear, out[:, first:])
         features = torch.from_numpy(np.ascontiguousarray(out.transpose(0, 2, 1))).to(x.device)
         self._recent = ((x, features), *self._recent[: REMEMBERED - 1])
         return features
@@ -133,6 +134,7 @@ class ArmRegressor(Regressor):
         self.n_joints, self.size = arm.n_joints, size
         self._order = arm.order.astype(np.int64)
         self._first = (PARAMETERS + 1) * arm.n_joints + arm.steps
+        self._stribeck = arm.stribeck
         self._others = _stacked(arm) if arm.alternatives else None
         fixed = arm.geometry.constants, arm.geometry.gravity, arm.parameters
         self._memory = Memory(fixed, (arm.n_joints + 1) * WORK + TABLE)
@@ -142,7 +144,8 @@ class ArmRegressor(Regressor):
         arm_query(self._memory.flat, self._order, motion, out[: self._first])
         if self._others is not None:
             motions = motion[None]
-            arm_differences(*self._others, self._order, motions, _linear_features(motions), out[None, self._first :])
+            linear = _linear_features(motions, self._stribeck)
+            arm_differences(*self._others, self._order, motions, linear, out[None, self._first :])
 
 
 def _in_data(arm: Arm) -> Array:
@@ -172,7 +175,7 @@ def _stacked(arm: Arm) -> tuple[Array, Array, Array, Array, Array]:
     )
 
 
-def _linear_features(motions: Array) -> Array:
+def _linear_features(motions: Array, stribeck: bool) -> Array:
     """ddq and friction's features of each joint, (N, n, 1 + f), for motions (N, 3, n)."""
-    friction = friction_features(torch.from_numpy(motions[:, 1])).numpy()
+    friction = friction_features(torch.from_numpy(motions[:, 1]), stribeck).numpy()
     return np.ascontiguousarray(np.concatenate([motions[:, 2, :, None], friction.transpose(1, 2, 0)], axis=2))

@@ -1,4 +1,4 @@
-"""Joint friction: viscous, Coulomb and offset torque, independent per joint."""
+"""Joint friction: viscous, Coulomb and offset torque, and more of it at low speed; independent per joint."""
 
 from __future__ import annotations
 
@@ -12,53 +12,66 @@ from lipcore.motion import Motion
 
 SIGN_WIDTH = 0.02
 """Velocity over which the Coulomb sign turns over, rad/s (m/s): tanh(dq / width) avoids a jump at standstill."""
+STRIBECK_SPEED = 0.1
+"""Speed at which the extra friction of slow joints has faded to exp(−1), rad/s (m/s)."""
 FRICTION_TERMS = ("viscous", "coulomb", "offset")
+STRIBECK = "stribeck"
+"""A fourth term, of joints that stick: friction that fades as they speed up."""
 
 
-def friction_features(dq: Tensor) -> Tensor:
-    """[dq, sign(dq) smoothed, 1]: (3, *dq.shape)."""
-    return torch.stack([dq, torch.tanh(dq / SIGN_WIDTH), torch.ones_like(dq)])
+def friction_terms(stribeck: bool) -> tuple[str, ...]:
+    """Names of a joint's features, 3 or 4."""
+    return (*FRICTION_TERMS, STRIBECK) if stribeck else FRICTION_TERMS
+
+
+def friction_features(dq: Tensor, stribeck: bool = False) -> Tensor:
+    """[dq, sign(dq) smoothed, 1], with `stribeck` also that sign times exp(−(dq / STRIBECK_SPEED)²): (3 or 4, *)."""
+    sign = torch.tanh(dq / SIGN_WIDTH)
+    slow = [sign * torch.exp(-((dq / STRIBECK_SPEED) ** 2))] if stribeck else []
+    return torch.stack([dq, sign, torch.ones_like(dq), *slow])
 
 
 class FrictionKernel(LinearKernel):
     """Linear friction model tau_i = f_v dq_i + f_c sign(dq_i) + f_o with independent Gaussian weights.
 
-    Weights joint by joint, FRICTION_TERMS each: (3 n,). Hyperparameter: `friction.log_std` (n, 3).
+    With `stribeck` + f_s sign(dq_i) exp(−(dq_i / STRIBECK_SPEED)²). Weights joint by joint, f = 3 or 4 each, named
+    `terms`: (f n,). Hyperparameter: `friction.log_std` (n, f).
     """
 
-    def __init__(self, n_joints: int) -> None:
-        self.n_joints = n_joints
+    def __init__(self, n_joints: int, stribeck: bool = False) -> None:
+        self.n_joints, self.stribeck = n_joints, stribeck
+        self.terms = friction_terms(stribeck)
 
     def features(self, x: Motion) -> Tensor:
-        """Each joint's three features in its own row: (N, n, 3 n)."""
+        """Each joint's features in its own row: (N, n, f n)."""
         n = self.n_joints
-        features = friction_features(x.dq).permute(1, 2, 0)  # (N, n, 3)
-        out = torch.zeros((len(x), n, n, 3), dtype=x.dq.dtype, device=x.device)
+        features = friction_features(x.dq, self.stribeck).permute(1, 2, 0)  # (N, n, f)
+        out = torch.zeros((len(x), n, n, len(self.terms)), dtype=x.dq.dtype, device=x.device)
         joints = torch.arange(n, device=x.device)
         out[:, joints, joints] = features
-        return out.reshape(len(x), n, 3 * n)
+        return out.reshape(len(x), n, -1)
 
     def regressor(self) -> Regressor:
         """The same features of one query, for serving."""
-        return FrictionRegressor(self.n_joints)
+        return FrictionRegressor(self.n_joints, len(self.terms))
 
     def covariance(self, params: Params) -> Tensor:
-        """Prior variances on the diagonal: (3 n, 3 n)."""
+        """Prior variances on the diagonal: (f n, f n)."""
         return torch.diag(torch.exp(2 * params["friction.log_std"]).reshape(-1))
 
     def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
-        """A tenth of each joint's torque for every feature at the joint's usual speed: log std (n, 3)."""
+        """A tenth of each joint's torque for every feature at the joint's usual speed: log std (n, f)."""
         usual = tau.square().mean(0).sqrt().clamp_min(1e-6) * 0.1
         speed = motion.dq.square().mean(0).sqrt().clamp_min(1e-3)
-        return {"friction.log_std": torch.log(torch.stack([usual / speed, usual, usual], dim=1))}
+        return {"friction.log_std": torch.log(torch.stack([usual / speed, *[usual] * (len(self.terms) - 1)], dim=1))}
 
 
 class FrictionRegressor(Regressor):
     """Features of `FrictionKernel`, compiled."""
 
-    def __init__(self, n_joints: int) -> None:
-        self.n_joints, self.size = n_joints, len(FRICTION_TERMS) * n_joints
+    def __init__(self, n_joints: int, terms: int) -> None:
+        self.n_joints, self.size = n_joints, terms * n_joints
 
     def fill(self, motion: Array, out: Array) -> None:
-        """Write Φᵀ of the query, (3 n, n)."""
-        friction_rows(motion, SIGN_WIDTH, out)
+        """Write Φᵀ of the query, (f n, n)."""
+        friction_rows(motion, SIGN_WIDTH, STRIBECK_SPEED, out)

@@ -126,6 +126,9 @@ CASES: dict[str, Callable[[], Case]] = {
     "frictionless": lambda: case(MIXED, "chain"),
     "rigid-body": lambda: case(PANDA, None, (rigid_body("panda"), FrictionKernel(7))),
     "rigid-body alone, from zero": lambda: case(PANDA, None, (rigid_body("panda", prior="zero", gravity=False),)),
+    "rigid-body with friction of slow joints": lambda: case(
+        PANDA, None, (rigid_body("panda"), FrictionKernel(7, stribeck=True))
+    ),
     "rigid-body and chain": lambda: case(PANDA, "chain", (rigid_body("panda"), FrictionKernel(7))),
     "rigid-body with geometry": lambda: case(PANDA, None, (rigid_body("panda", mode="calibrate"), FrictionKernel(7))),
     "unbounded joints in another order": lambda: case(

@@ -17,7 +17,12 @@ LIMITS = (
     "Masses are the physically possible ones nearest to what was learnt; torque off: how far theirs is from it, rms.",
     "± is one standard deviation.",
 )
-FRICTION = {"viscous": "viscous N·m·s/rad", "coulomb": "Coulomb N·m", "offset": "offset N·m"}
+FRICTION = {
+    "viscous": "viscous N·m·s/rad",
+    "coulomb": "Coulomb N·m",
+    "offset": "offset N·m",
+    "stribeck": "at low speed N·m",
+}
 Columns = dict[str, list[str]]
 
 
@@ -44,8 +49,8 @@ class Arm(Plain):
     m, centres of mass in the joints' own frames, first moment over mass, their deviations to first order; rotor,
     rotor_std: (n) kg·m² (kg), NaN where a version does not say; deviation: (n) N·m (N), root mean square by which the
     torque of these bodies differs from what was learnt, NaN where a version does not say; friction: by `viscous`,
-    `coulomb` and `offset` means and standard deviations, (n) each; undetermined: what torque does not tell of each
-    joint and its body.
+    `coulomb`, `offset` and, where it was learnt, `stribeck` means and standard deviations, (n) each; undetermined: what
+    torque does not tell of each joint and its body.
     """
 
     joint_names: tuple[str, ...]
@@ -85,7 +90,7 @@ class Arm(Plain):
             **deviations,
             "torque does not tell": undetermined,
         }
-        terms = {head: _pairs(*self.friction[name]) for name, head in FRICTION.items()}
+        terms = {head: _pairs(*self.friction[name]) for name, head in FRICTION.items() if name in self.friction}
         out["friction"] = {"joint": names, **terms}
         return out
 
@@ -142,6 +147,7 @@ def read_arm(version: schema.Version) -> Arm | None:
                 array(parameters["friction"][name]["std"])[order],
             )
             for name in FRICTION
+            if name in parameters["friction"]
         },
         undetermined=tuple(
             (*place.get("undetermined", ()), *(word.replace("_", " ") for word in body.get("undetermined", ())))

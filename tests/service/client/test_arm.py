@@ -101,3 +101,13 @@ def test_versions_of_earlier_releases(robot):
     assert "torque off N·m" not in str(old)
     assert read_arm(version({"friction": report["friction"]})) is None
     assert read_arm(version(None)) is None
+
+
+def test_friction_of_slow_joints_is_shown_where_it_was_learnt(robot, arm):
+    parameters = parameters_of(robot)
+    parameters["friction"]["stribeck"] = {"mean": [float(k) for k in range(7)], "std": [0.01] * 7}
+    shown = read_arm(version(parameters))
+    np.testing.assert_allclose(shown.friction["stribeck"][0], range(6, -1, -1))
+    assert list(shown.tables()["friction"])[-1] == "at low speed N·m"
+    assert "stribeck" not in arm.friction
+    assert "low speed" not in str(arm)

@@ -36,6 +36,7 @@ export function massTable({ joint_names: names, joint_types: types, parameters }
     ...(rotor ? [{ label: "Rotor, kg·m²", numeric: true, cell: (joint) => pair(rotor, joint) }] : []),
     { label: "Viscous, N·m·s/rad", numeric: true, cell: (joint) => pair(friction.viscous, joint) },
     { label: "Coulomb, N·m", numeric: true, cell: (joint) => pair(friction.coulomb, joint) },
+    ...(friction.stribeck ? [{ label: "At low speed, N·m", numeric: true, cell: (joint) => pair(friction.stribeck, joint) }] : []),
     { label: "Torque does not tell", cell: (joint) => (inertia.bodies[joint].undetermined ?? []).map((each) => each.replace("_", " ")).join(", ") || "–" },
   ];
   return table(columns, geometry.order, { caption: `What the joints carry, centres in the joints’ own frames; ± one standard deviation${sliding}` });

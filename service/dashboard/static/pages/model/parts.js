@@ -62,6 +62,7 @@ function frictionCard({ joint_names: names, joint_types: types, parameters }) {
     { label: "Viscous, N·m·s/rad", numeric: true, cell: value("viscous") },
     { label: "Coulomb, N·m", numeric: true, cell: value("coulomb") },
     { label: "Offset, N·m", numeric: true, cell: value("offset") },
+    ...(friction.stribeck ? [{ label: "At low speed, N·m", numeric: true, cell: value("stribeck") }] : []),
   ];
   return card(
     "Friction parameters",

@@ -1,0 +1,119 @@
+"""Friction that slow joints have besides: learnt where a recording shows it, and nowhere else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lipcore import FitOptions, Samples, TorqueModel, load, save, train
+from lipcore.arm import learning
+from lipcore.arm.arm import Alternative
+from lipcore.arm.storing import arm_tensors, read_arm
+from lipcore.kernels.arm import ArmKernel
+from lipcore.motion import Motion
+from lipcore.online.learner import OnlineModel
+from lipcore.parameters import friction_coefficients
+from lipcore.random_arms import random_arm
+from lipcore.simulation import Stream, simulate
+from tests.lipcore.test_arm_model import errors, rows_of
+
+ROBOT = random_arm(1, joints=3)
+OPTIONS = FitOptions(device="cpu", search_seconds=2.0, statistics="chosen")
+STREAM = Stream(300, n_sinusoids=30, speed=5.0, noise=0.05, viscous=0.3)
+
+
+def recorded(seed: int, stribeck: float) -> Samples:
+    """Slow motion with Coulomb friction, 0.4 N·m, and more of it at low speed."""
+    samples = simulate(ROBOT, STREAM, seed)
+    fading = 0.4 + stribeck * np.exp(-((samples.dq / 0.1) ** 2))
+    return replace(samples, tau=samples.tau + fading * np.tanh(samples.dq / 0.02))
+
+
+def trained(stribeck: float) -> TorqueModel:
+    return train(recorded(1, stribeck), ROBOT.joint_types, "rigid-body", OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def model() -> TorqueModel:
+    return trained(0.5)
+
+
+def test_it_is_learnt_where_there_is_some(model: TorqueModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert model.fit["friction_terms"] == 4
+    assert float(model.fit["stribeck_nats"]) > 10
+    friction = friction_coefficients(model.posterior, model.estimator)
+    assert friction.stribeck is not None
+    assert friction.stribeck_std is not None
+    assert (np.abs(friction.stribeck - 0.5) < 3 * friction.stribeck_std).all(), (
+        friction.stribeck,
+        friction.stribeck_std,
+    )
+    assert (friction.stribeck_std < 0.1).all()
+    monkeypatch.setattr(learning, "STRIBECK_NATS", np.inf)
+    without, unseen = trained(0.5), recorded(2, 0.5)
+    assert without.fit["friction_terms"] == 3
+    assert errors(model, unseen).mean() < 0.8 * errors(without, unseen).mean()
+
+
+def test_it_is_not_learnt_where_there_is_none() -> None:
+    model = trained(0.0)
+    assert model.fit["friction_terms"] == 3
+    assert float(model.fit["stribeck_nats"]) < 2
+    assert friction_coefficients(model.posterior, model.estimator).stribeck is None
+
+
+def test_it_is_stored(model: TorqueModel, tmp_path: Path) -> None:
+    manifest = save(model, tmp_path / "model")
+    again, asked = load(tmp_path / "model"), recorded(3, 0.5)
+    one, other = (each.predict(asked.q, asked.dq, asked.ddq) for each in (model, again))
+    np.testing.assert_allclose(other.tau, one.tau, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(other.tau_std, one.tau_std, rtol=1e-8)
+    assert list(manifest["parameters"]["friction"]) == ["viscous", "coulomb", "offset", "stribeck"]
+
+
+def test_alternative_arms_have_it_too(model: TorqueModel) -> None:
+    arm = model.arm
+    assert arm is not None
+    rng = np.random.default_rng(0)
+    each = [Alternative(arm.geometry, arm.parameters, rng.random(3), rng.random((3, 4)), share) for share in (0.7, 0.3)]
+    arm = replace(arm, alternatives=tuple(each))
+    again = read_arm(arm_tensors(arm), ROBOT.joint_types, arm.mode)
+    assert again.stribeck
+    np.testing.assert_array_equal(again.alternatives[1].friction, each[1].friction)
+    samples, kernel = recorded(4, 0.5), ArmKernel(again)
+    asked = samples.motion()[:5]
+    regressor = kernel.regressor()
+    out = np.empty((regressor.size, 3))
+    for query, expected in zip(asked.arrays(), kernel.features(asked).numpy(), strict=True):
+        regressor.fill(query, out)
+        np.testing.assert_allclose(out.T, expected, rtol=1e-9, atol=1e-9)
+    dq = torch.tensor([[0.05, -0.05, 0.5]]).double()
+    fading = np.tanh(dq.numpy() / 0.02) * np.exp(-((dq.numpy() / 0.1) ** 2))
+    still = Motion(dq * 0, dq, dq * 0)
+    less = replace(each[1], friction=each[1].friction * [1, 1, 1, 0])
+    other = ArmKernel(replace(arm, alternatives=(each[0], less)))
+    differ = (kernel.mean(still) - other.mean(still)).numpy()
+    np.testing.assert_allclose(differ, 0.3 * fading * each[1].friction[:, 3], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("values", [[0.5], [], [1.0, 1.0], [float("nan")]])
+def test_a_flag_that_is_none_is_refused(model: TorqueModel, values: list[float]) -> None:
+    arm = model.arm
+    assert arm is not None
+    tensors = arm_tensors(arm) | {"arm/stribeck": torch.tensor(values, dtype=torch.float64)}
+    with pytest.raises(ValueError, match="'arm/stribeck' is"):
+        read_arm(tensors, ROBOT.joint_types, arm.mode)
+    assert not read_arm(tensors | {"arm/stribeck": torch.zeros(1)}, ROBOT.joint_types, arm.mode).stribeck
+
+
+def test_it_is_learnt_online(model: TorqueModel) -> None:
+    told = OnlineModel.start(model, forgetting_s=None).change(-1.0).learn(rows_of(recorded(5, 1.0))).model()
+    unseen = recorded(6, 1.0)
+    assert (errors(told, unseen) < errors(model, unseen)).all()
+    friction = friction_coefficients(told.posterior, told.estimator)
+    assert friction.stribeck is not None
+    assert (friction.stribeck > 0.7).all()
