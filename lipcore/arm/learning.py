@@ -48,8 +48,8 @@ DIFFERS = 0.3
 """An alternative arm matters where its torque differs by this share of the spread that is stated anyway."""
 CHECKS = 200
 STRIBECK_NATS = 10.0
-"""What a fourth term of friction has to gain to be kept. On simulated arms without such friction it lost two to seven, a
-sign that turns over at once instead of smoothly gained seven, 0.5 N·m of such friction gained forty."""
+"""What a fourth term of friction has to gain to be kept. On simulated arms without such friction it lost two to seven,
+a sign that turns over at once instead of smoothly gained seven, 0.5 N·m of such friction gained forty."""
 STRIBECK_ROUNDS = 2
 CORRELATED = 20_000
 """Contiguous rows at most that tell how correlated errors are."""
