@@ -15,7 +15,7 @@ from torch import Tensor
 from lipcore.arm.arm import Arm
 from lipcore.arm.geometry import Geometry
 from lipcore.arm.known import known_geometries
-from lipcore.arm.learning import Learnt, learn
+from lipcore.arm.learning import Learnt, learn, motion_dimensions
 from lipcore.calibration import NO_CALIBRATION, Calibration, calibrate
 from lipcore.compact.basis import Basis
 from lipcore.compact.compress import compressed, linear
@@ -239,7 +239,7 @@ def fitted(
         types,
         torque_convention,
         asdict(options),
-        report,
+        {**report, "motion_dimensions": motion_dimensions(samples.dq)},
         replace(compression.posterior, std_factor=calibration.function_std_factor),
         training_range(used.motion()),
         compression.report(),

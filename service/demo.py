@@ -93,7 +93,7 @@ def run(port: int, once: bool, plot: Path | None, console: Console) -> None:
             console.print(f"  {name}: training stream {train[name][0]}, unseen test trajectory {test[name][0]}")
 
         console.print(f"[bold]3. training {MODEL}[/bold]")
-        queued = client.train(MODEL, [dataset for dataset, _ in train.values()], "lip-chain")
+        queued = client.train(MODEL, [dataset for dataset, _ in train.values()])
         job = follow(client, queued, console)
         if job.state != SUCCEEDED or job.version is None:
             raise DemoError(f"the training job has {job.state}: {job.error.message if job.error else ''}")

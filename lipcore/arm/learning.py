@@ -153,7 +153,6 @@ def _learn(
         "samples_hyperparameters": len(rows),
         "samples_posterior": len(rows),
         "row_correlation": correlation,
-        "motion_dimensions": motion_dimensions(samples.dq),
         "seconds": time.monotonic() - watch.began,
         "device": "cpu",
     }

@@ -27,13 +27,18 @@ COUNTS = {2: "Two", 3: "Three", 4: "Four"}
 
 
 def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
-    """Sentences about a model's arm, the gravest first; none for a model without one.
+    """Sentences about a model's arm, the gravest first; of a model without one, about the motion of its recording.
 
     parameters: the report of `lipcore.parameters.report`.
     """
     arm, fit = model.arm, model.fit
+    moved = float(fit.get("motion_dimensions", model.n_joints))
+    together = (
+        f"Its joints moved together, like {moved:.1f} independent ones of {model.n_joints}: torque of other motion may "
+        "be off by more than tau_std says. A recording in which each moves by itself tells more."
+    )
     if arm is None:
-        return []
+        return [together] if moved < TOGETHER * model.n_joints else []
     out = []
     if len(arm.alternatives) > 1:
         out.append(_alternatives(model))
@@ -53,12 +58,8 @@ def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
         listed += "; …" if len(names) > LISTED else ""
         stand = "are the URDF's" if arm.mode == "calibrate" else "are only a guess"
         out.append(f"The recording does not tell {count} numbers of the geometry, which {stand} ({listed}).")
-    moved = float(fit.get("motion_dimensions", model.n_joints))
     if (count > ALWAYS_OPEN or arm.alternatives) and moved < TOGETHER * model.n_joints:
-        out.append(
-            f"Its joints moved together, like {moved:.1f} independent ones of {model.n_joints}: a recording in which "
-            "each moves by itself tells more."
-        )
+        out.append(together)
     return out
 
 

@@ -201,10 +201,16 @@ def export_(
 
 
 @app.command()
-def urdf(model: Model, version: Version = None, alias: Alias = None, url: Url = DEFAULT_URL) -> None:
+def urdf(
+    model: Model, version: Version = None, alias: Alias = None, url: Url = DEFAULT_URL, as_json: Json = False
+) -> None:
     """Print the arm that a version has learnt as a URDF: `lipserve models urdf NAME > arm.urdf`."""
     with connected(url) as client:
-        sys.stdout.write(client.urdf(model, version, alias))
+        text = client.urdf(model, version, alias)
+    if as_json:
+        print_json({"urdf": text})
+    else:
+        sys.stdout.write(text)
 
 
 @app.command("import")

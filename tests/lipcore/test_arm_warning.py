@@ -37,8 +37,15 @@ def parameters(model: TorqueModel) -> dict[str, Any]:
 
 def test_a_good_recording_calls_for_nothing(model: TorqueModel, parameters: dict[str, Any]) -> None:
     assert warnings(model, parameters) == []
-    samples = simulate(ROBOT, Stream(30), seed=1)
+    samples = simulate(ROBOT, Stream(100, speed=10.0), seed=1)
     assert warnings(train(samples, ROBOT.joint_types, "se"), {}) == []
+
+
+def test_joints_that_moved_together_are_told_of_any_estimator() -> None:
+    samples = simulate(ROBOT, Stream(100, speed=10.0), seed=1)
+    together = replace(samples, dq=samples.dq[:, :1] * np.array([1.0, -0.5, 2.0]))
+    [text] = warnings(train(together, ROBOT.joint_types, "se"), {})
+    assert text.startswith("Its joints moved together, like 1.0 independent ones of 3")
 
 
 def test_another_arm_is_told_with_the_motion_that_tells_them_apart(model: TorqueModel) -> None:
