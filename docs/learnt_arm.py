@@ -20,8 +20,8 @@ from threadpoolctl import threadpool_limits
 
 import lipcore
 from lipcore import FitOptions, model
-from lipcore.arm.geometry import Geometry
 from lipcore.arm.learning import POLISHING, make_problem
+from lipcore.kernels.geometry import Geometry
 from lipcore.metrics import evaluate
 from lipcore.motion import motion_arrays
 from lipcore.random_arms import random_arm

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from lipcore.arm.arm import Arm
 from lipcore.fit_options import FitOptions
 from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.arm_prior import Arm
 from lipcore.kernels.base import SumKernel, TorqueKernel
 from lipcore.kernels.chain import ChainKernel
 from lipcore.kernels.friction import FrictionKernel

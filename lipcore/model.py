@@ -12,10 +12,9 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from lipcore.arm.arm import Arm
-from lipcore.arm.geometry import Geometry
 from lipcore.arm.known import known_geometries
-from lipcore.arm.learning import Learnt, learn, motion_dimensions
+from lipcore.arm.learning import Learnt, learn
+from lipcore.arm.recording import motion_dimensions
 from lipcore.calibration import NO_CALIBRATION, Calibration, calibrate
 from lipcore.compact.basis import Basis
 from lipcore.compact.compress import compressed, linear
@@ -26,6 +25,8 @@ from lipcore.evaluator import Evaluator
 from lipcore.fit_options import FitOptions
 from lipcore.fitting import Cancelled, Progress, fit
 from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.arm_prior import Arm
+from lipcore.kernels.geometry import Geometry
 from lipcore.motion import Motion, check_finite, check_joint_types, motion_arrays
 from lipcore.samples import Array, Samples
 from lipcore.urdf import JointMismatchError, RigidBody

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lipcore.arm.geometry import Geometry
 from lipcore.compact.compress import checks
 from lipcore.compact.posterior import CompactPosterior
 from lipcore.estimators import Estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.base import LinearKernel
 from lipcore.kernels.friction import FrictionKernel, friction_terms
+from lipcore.kernels.geometry import Geometry
 from lipcore.posterior import Posterior
 from lipcore.samples import Array
 from lipcore.urdf import PARAMETERS

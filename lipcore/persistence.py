@@ -19,11 +19,11 @@ import numpy as np
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
-from lipcore.arm.arm import Arm
 from lipcore.arm.storing import arm_tensors, is_of_arm, read_arm, read_mode
 from lipcore.arm.warning import warnings
 from lipcore.calibration import Calibration
 from lipcore.compact.statistics import Statistics
+from lipcore.kernels.arm_prior import Arm
 from lipcore.manifest import (
     DEFAULT_LIMITS,
     FORMAT,

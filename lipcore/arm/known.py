@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-from lipcore.arm.geometry import Geometry
+from lipcore.kernels.geometry import Geometry
 from lipcore.robots import ROBOTS, SimulationUnavailableError, UnknownRobotError, installed_profiles, load_robot
 from lipcore.urdf import RigidBody
 from lipcore.vocabulary import JointType

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.linalg import LinAlgError
 from scipy.linalg import cho_solve, lapack, solve_triangular
 
-from lipcore.arm.geometry import Geometry
 from lipcore.kernels.compiled.arm import PARAMETERS, arm_masses, arm_shapes
+from lipcore.kernels.geometry import Geometry
 from lipcore.samples import Array
 
 ANGLE, LENGTH = 1.0, 0.5

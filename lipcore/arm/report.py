@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lipcore.arm.geometry import Geometry
+from lipcore.kernels.geometry import Geometry
 from lipcore.samples import Array
 from lipcore.strict_json import quote
 from lipcore.urdf import PARAMETERS

@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from lipcore.arm.arm import KINDS
 from lipcore.arm.problem import NOISE_WIDTH, Point, Problem, root_of
+from lipcore.kernels.arm_prior import KINDS
 from lipcore.kernels.compiled.arm import PARAMETERS
 from lipcore.samples import Array
 

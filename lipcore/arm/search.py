@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.linalg import LinAlgError
 
-from lipcore.arm.geometry import Geometry
 from lipcore.arm.problem import Point, Problem
 from lipcore.arm.starts import draw, hop
+from lipcore.kernels.geometry import Geometry
 from lipcore.samples import Array
 from lipcore.vocabulary import JointType
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lipcore.arm.geometry import STANDARD_GRAVITY, Geometry, aligned, rotation_of
+from lipcore.kernels.geometry import STANDARD_GRAVITY, Geometry, aligned, rotation_of
 from lipcore.samples import Array
 from lipcore.vocabulary import JointType
 

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lipcore.arm.arm import Alternative, Arm
-from lipcore.arm.geometry import Geometry
+from lipcore.kernels.arm_prior import Alternative, Arm
 from lipcore.kernels.friction import friction_terms
+from lipcore.kernels.geometry import Geometry
 from lipcore.strict_json import quote
 from lipcore.vocabulary import GEOMETRY_MODES, GeometryMode, JointType
 

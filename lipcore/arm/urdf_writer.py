@@ -15,8 +15,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from lipcore.arm.geometry import STANDARD_GRAVITY, Geometry, aligned, rotation_of, skew
 from lipcore.arm.report import bodies_of, read_geometry
+from lipcore.kernels.geometry import STANDARD_GRAVITY, Geometry, aligned, rotation_of, skew
 from lipcore.samples import Array
 
 Element = ElementTree.Element

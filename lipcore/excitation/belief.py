@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lipcore.arm.arm import arm_of_robot
 from lipcore.compact.posterior import CompactPosterior
 from lipcore.estimators import make_estimator
 from lipcore.excitation.limits import Limits
 from lipcore.excitation.reference import draw
 from lipcore.fit_options import FitOptions
 from lipcore.fitting import fit
+from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.base import Params, TorqueKernel
 from lipcore.model import TorqueModel
 from lipcore.motion import Motion

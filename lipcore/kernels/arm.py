@@ -6,8 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lipcore.arm.arm import KINDS, Arm
-from lipcore.arm.geometry import Geometry
+from lipcore.kernels.arm_prior import KINDS, Arm
 from lipcore.kernels.base import LinearKernel, Params
 from lipcore.kernels.compiled.arm import (
     PARAMETERS,
@@ -21,6 +20,7 @@ from lipcore.kernels.compiled.arm import (
 )
 from lipcore.kernels.compiled.views import Memory
 from lipcore.kernels.friction import friction_features
+from lipcore.kernels.geometry import Geometry
 from lipcore.kernels.regressor import Regressor
 from lipcore.motion import Motion
 from lipcore.samples import Array

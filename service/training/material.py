@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import select
 
-from lipcore.arm.geometry import Geometry
+from lipcore.kernels.geometry import Geometry
 from lipcore.online import spacing
 from lipcore.samples import Array, Samples
 from lipcore.urdf import RigidBody

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from lipcore.arm.geometry import Geometry
+from lipcore.kernels.geometry import Geometry
 from tests.browser.accessibility import audit
 from tests.browser.conftest import Dashboard, Visit
 from tests.browser.looking import expect

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.func import grad, jvp
 
-from lipcore.arm.geometry import Geometry
+from lipcore.kernels.geometry import Geometry
 from lipcore.robots import Robot
 from lipcore.samples import Samples
 from lipcore.simulation import Stream, simulate
@@ -49,7 +49,7 @@ def recorded(robot: Robot, seed: int, size: int = 120, noise: float = 0.01, visc
 def energies(geometry: Geometry, bodies: np.ndarray, step: Tensor, q: Tensor, dq: Tensor) -> tuple[Tensor, Tensor]:
     """Kinetic and potential energy of an arm whose joints lie a step, (g,), away from where the geometry has them.
 
-    The step of a joint displaces its frame as `lipcore.arm.geometry` documents: T ← T exp(turns), and shifts in T.
+    The step of a joint displaces its frame as `lipcore.kernels.geometry` documents: T ← T exp(turns), and shifts in T.
     """
 
     def places(at: Tensor) -> tuple[Tensor, Tensor]:

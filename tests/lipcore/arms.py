@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lipcore.arm.geometry import Geometry, rotation_of
+from lipcore.kernels.geometry import Geometry, rotation_of
 from lipcore.urdf import RigidBody
 
 

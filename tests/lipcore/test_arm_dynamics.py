@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch.func import jacrev
 
-from lipcore.arm.arm import Arm, arm_of_robot
-from lipcore.arm.geometry import Geometry
 from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.arm_prior import Arm, arm_of_robot
 from lipcore.kernels.compiled.arm import arm_energies, arm_features, arm_masses, arm_shapes, arm_torques
+from lipcore.kernels.geometry import Geometry
 from lipcore.motion import Motion
 from lipcore.robots import load_robot
 from lipcore.simulation import inverse_dynamics

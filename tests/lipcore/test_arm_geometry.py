@@ -6,8 +6,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from lipcore.arm.geometry import Geometry, aligned, rotation_of, skew, turn_of
 from lipcore.kernels.compiled.arm import arm_masses
+from lipcore.kernels.geometry import Geometry, aligned, rotation_of, skew, turn_of
 from lipcore.robots import Robot, load_robot
 from lipcore.simulation import inverse_dynamics
 from lipcore.urdf import RigidBody

@@ -14,11 +14,11 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
 from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, dynamics, load, persistence, save, train
-from lipcore.arm.arm import Alternative, Arm
 from lipcore.compact.compress import linear
 from lipcore.compact.statistics import collect, merge
 from lipcore.estimators import make_estimator
 from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.arm_prior import Alternative, Arm
 from lipcore.kernels.friction import friction_features
 from lipcore.metrics import evaluate
 from lipcore.motion import Motion

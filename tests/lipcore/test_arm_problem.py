@@ -9,10 +9,11 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from lipcore import FitOptions, Samples
-from lipcore.arm.geometry import Geometry
-from lipcore.arm.learning import make_problem, residual_correlation
+from lipcore.arm.learning import make_problem
 from lipcore.arm.problem import NOISE_WIDTH, Expected, Point, Problem, root_of
+from lipcore.arm.recording import residual_correlation
 from lipcore.arm.scales import _Evidence, rescale
+from lipcore.kernels.geometry import Geometry
 from lipcore.robots import load_robot
 from lipcore.simulation import inverse_dynamics
 from lipcore.urdf import RigidBody

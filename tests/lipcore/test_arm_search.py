@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from lipcore import FitOptions, Samples, TorqueModel, train
-from lipcore.arm.geometry import Geometry
 from lipcore.arm.learning import learn, make_problem
 from lipcore.arm.problem import Problem
 from lipcore.arm.search import Found, search
 from lipcore.fitting import FitCancelledError, FitProgress
+from lipcore.kernels.geometry import Geometry
 from lipcore.metrics import evaluate
 from lipcore.robots import Robot
 from lipcore.signals import noise_level

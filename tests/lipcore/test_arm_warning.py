@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from lipcore import FitOptions, ModelFormatError, TorqueModel, load, save, train
-from lipcore.arm.arm import Alternative
 from lipcore.arm.warning import warnings
 from lipcore.estimators import make_estimator
+from lipcore.kernels.arm_prior import Alternative
 from lipcore.parameters import report
 from lipcore.random_arms import random_arm
 from lipcore.simulation import Stream, simulate

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from lipcore import FitOptions, Samples, TorqueModel, train
-from lipcore.arm.arm import Arm, arm_of_robot
 from lipcore.estimators import ESTIMATORS, UnknownEstimatorError, make_estimator
 from lipcore.evidence import negative_log_evidence
+from lipcore.kernels.arm_prior import Arm, arm_of_robot
 from lipcore.metrics import evaluate
 from lipcore.robots import load_robot
 from lipcore.simulation import Stream, simulate

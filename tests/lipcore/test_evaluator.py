@@ -12,10 +12,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from lipcore.arm.arm import arm_of_robot
 from lipcore.evaluator import Evaluator
 from lipcore.evaluator.evaluator import QUERIES
 from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.base import LinearKernel, PairKernel, SumKernel
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.motion import Motion

@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, copy_model, load, save, train
-from lipcore.arm.arm import arm_of_robot
 from lipcore.estimators import make_estimator
 from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.metrics import evaluate
 from lipcore.motion import Motion
 from lipcore.parameters import (

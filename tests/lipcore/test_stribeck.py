@@ -11,9 +11,9 @@ import torch
 
 from lipcore import FitOptions, Samples, TorqueModel, load, save, train
 from lipcore.arm import learning
-from lipcore.arm.arm import Alternative
 from lipcore.arm.storing import arm_tensors, read_arm
 from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.arm_prior import Alternative
 from lipcore.motion import Motion
 from lipcore.online.learner import OnlineModel
 from lipcore.parameters import friction_coefficients

@@ -10,9 +10,9 @@ import pinocchio as pin
 import pytest
 
 from lipcore import FitOptions, train
-from lipcore.arm.geometry import Geometry, rotation_of
 from lipcore.arm.urdf_writer import ArmJoints, rpy, urdf_of_parameters, urdf_text
 from lipcore.kernels.compiled.arm import arm_torques
+from lipcore.kernels.geometry import Geometry, rotation_of
 from lipcore.persistence import encode
 from lipcore.robots import load_robot
 from lipcore.simulation import Stream, simulate

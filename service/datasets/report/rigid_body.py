@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
 
-from lipcore.arm.arm import arm_of_robot
 from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.friction import FRICTION_TERMS, SIGN_WIDTH
 from lipcore.motion import Motion
 from lipcore.robots import SimulationUnavailableError

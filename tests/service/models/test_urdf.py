@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lipcore.arm.geometry import Geometry
+from lipcore.kernels.geometry import Geometry
 from lipcore.urdf import RigidBody
 from service.client import ApiError
 from tests.service.client.conftest import over

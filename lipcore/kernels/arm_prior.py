@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.arm.geometry import Geometry
 from lipcore.kernels.compiled.arm import PARAMETERS
+from lipcore.kernels.geometry import Geometry
 from lipcore.samples import Array
 from lipcore.urdf import RigidBody
 from lipcore.vocabulary import GeometryMode, Prior
