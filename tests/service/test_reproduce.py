@@ -141,7 +141,7 @@ def test_tables_say_what_the_csv_holds(finished):
             mean = 100 * np.mean([float(row[f"coverage_{level}"]) for row in everything])
             assert float(levels[name][k]) == pytest.approx(mean, abs=0.06)
     # what a reader needs to repeat and to judge it
-    for said in ("lipserve reproduce --robot double-pendulum", "around zero", "every second sample", "torch 2."):
+    for said in ("lipserve reproduce --robot double-pendulum", "from torque alone", "every second sample", "torch 2."):
         assert said in text
 
 
