@@ -53,10 +53,6 @@ class Found:
     seconds: float
 
 
-class Stopped(Exception):  # noqa: N818 - no error: somebody asked
-    """The search is to be given up."""
-
-
 def search(
     problem: Problem,
     joint_types: tuple[JointType, ...],

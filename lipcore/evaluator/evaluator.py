@@ -74,11 +74,11 @@ class Evaluator:
         means, variances = linear_prior(linear, params)
         check(self._outputs, samples * n, weights, root, len(means))
         self._fixed = lay_out(weights, root, means, variances)
-        self._regressors = []
+        self._fills = []
         first = 0
         for kernel in linear:
             regressor = kernel.regressor()
-            self._regressors.append((slice(first, first + regressor.size), regressor))
+            self._fills.append((first, first + regressor.size, regressor.fill))
             first += regressor.size
         self._std_factor = float(std_factor)
         self._floor = np.zeros(n) if floor is None else np.array(floor, np.float64)
@@ -86,7 +86,6 @@ class Evaluator:
             raise ValueError(f"floor has shape {self._floor.shape}, expected ({n},)")
         sizes = samples, len(self._outputs) + len(means), len(means), n
         self._one, self._many = _Scratch(1, *sizes), _Scratch(QUERIES, *sizes)
-        self._rows = [(rows.start, rows.stop, regressor.fill) for rows, regressor in self._regressors]
 
     @property
     def packed(self) -> Array:
@@ -114,7 +113,7 @@ class Evaluator:
         query[0] = motion
         if self._cross is not None:
             self._cross.fill_many(query, blocks)
-        for first, last, fill in self._rows:
+        for first, last, fill in self._fills:
             fill(query[0], features[0, first:last])
         tau = np.empty((1, self.n_joints))
         deviation = np.empty((1, self.n_joints)) if std else own
@@ -159,9 +158,9 @@ class Evaluator:
         motions, blocks, features = scratch.motions[:count], scratch.blocks[:count], scratch.features[:count]
         if self._cross is not None:
             self._cross.fill_many(motions, blocks)
-        for rows, regressor in self._regressors:
+        for first, last, fill in self._fills:
             for motion, target in zip(motions, features, strict=True):
-                regressor.fill(motion, target[rows])
+                fill(motion, target[first:last])
         answer(
             self._fixed,
             self._outputs,
