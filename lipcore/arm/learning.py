@@ -91,74 +91,56 @@ def learn(
     Raise FitCancelledError when `cancelled` answers true, ValueError for samples that no arm can be learnt from.
     """
     with threadpool_limits(1):  # matrices are small: more threads would take longer
-        return _learn(
-            samples, joint_types, options, gravity, robot, known, on_progress, cancelled, stretches, begin, seed
-        )
-
-
-def _learn(
-    samples: Samples,
-    joint_types: tuple[JointType, ...],
-    options: FitOptions,
-    gravity: bool,
-    robot: RigidBody | None,
-    known: Sequence[Geometry],
-    on_progress: Progress | None,
-    cancelled: Cancelled | None,
-    stretches: Samples | None,
-    begin: Sequence[Geometry],
-    seed: int,
-) -> Learnt:
-    watch = _Watch(on_progress, cancelled, time.monotonic(), options.max_iterations)
-    mode = mode_of(options, robot)
-    rows = spread_out(samples.motion(), options.posterior_samples).numpy()
-    problem, order = make_problem(samples.rows(rows), joint_types, options, gravity, robot, samples)
-    found: Found | None = None
-    if mode == "learn" and not begin:
-        few = spread_out(samples.rows(rows).motion(), max(SEARCH_ROWS, ROWS_PER_JOINT * len(joint_types)))
-        types = tuple(joint_types[joint] for joint in order)
-        signals = samples if stretches is None else stretches
-        sensor = noise_level([signals.tau[part][:, order] for part in signals.episodes()])
-        found = search(
-            problem.rows(few.numpy()), types, gravity, sensor, options.search_seconds, seed, known, watch.searching
-        )
-        starts = [(each.geometry, each.sigma) for each in found.points[:POLISHED]]
-    else:
-        if robot is not None and (mode == "fixed" or not begin):
-            begin = [Geometry.from_robot(robot, gravity)]
-        starts = [(each, noise.start(samples)[order]) for each in begin]
-    polished = Pool(problem.recombined(CHECKS))
-    for geometry, sigma in starts:
-        polished.add(problem.descend(geometry, sigma, POLISHING, watch.stop))
-    ends = polished.points
-    watch.step("hyperparameters", ends[0].value, 0.85)
-    contiguous = (samples if stretches is None else stretches).rows(slice(0, CORRELATED))
-    every, _ = make_problem(contiguous, joint_types, options, gravity, robot)
-    residual = every.tau - every.features(ends[0].geometry) @ (problem.weights(ends[0]) / every.scale)
-    correlation = residual_correlation(residual, contiguous)
-    weight = min(1.0, len(samples) / correlation / len(rows))
-    problem = replace(problem, counts=np.full(len(rows), weight))
-    ends = sorted((problem.at(each.geometry, each.sigma) for each in ends), key=lambda each: each.value)
-    best, others, problem, stribeck_nats = _refined(problem, ends, watch)
-    watch.step("posterior", best.value, 0.95)
-    report: dict[str, float | int | bool | str] = {"geometry": mode, "search_objective": ends[0].value}
-    if found is not None:
-        report |= _search_report(found, ends, others)
-    report |= {
-        "objective": best.value,
-        "friction_terms": _terms(problem),
-        "stribeck_nats": stribeck_nats,
-        "iterations": watch.iteration,
-        "converged": found is None or found.ended == "idle",
-        "samples_given": len(samples),
-        "samples_hyperparameters": len(rows),
-        "samples_posterior": len(rows),
-        "row_correlation": correlation,
-        "seconds": time.monotonic() - watch.began,
-        "device": "cpu",
-    }
-    arm, params = _arm(problem, best, others, order, mode)
-    return Learnt(arm, params, rows, weight, report)
+        watch = _Watch(on_progress, cancelled, time.monotonic(), options.max_iterations)
+        mode = mode_of(options, robot)
+        rows = spread_out(samples.motion(), options.posterior_samples).numpy()
+        problem, order = make_problem(samples.rows(rows), joint_types, options, gravity, robot, samples)
+        found: Found | None = None
+        if mode == "learn" and not begin:
+            few = spread_out(samples.rows(rows).motion(), max(SEARCH_ROWS, ROWS_PER_JOINT * len(joint_types)))
+            types = tuple(joint_types[joint] for joint in order)
+            signals = samples if stretches is None else stretches
+            sensor = noise_level([signals.tau[part][:, order] for part in signals.episodes()])
+            found = search(
+                problem.rows(few.numpy()), types, gravity, sensor, options.search_seconds, seed, known, watch.searching
+            )
+            starts = [(each.geometry, each.sigma) for each in found.points[:POLISHED]]
+        else:
+            if robot is not None and (mode == "fixed" or not begin):
+                begin = [Geometry.from_robot(robot, gravity)]
+            starts = [(each, noise.start(samples)[order]) for each in begin]
+        polished = Pool(problem.recombined(CHECKS))
+        for geometry, sigma in starts:
+            polished.add(problem.descend(geometry, sigma, POLISHING, watch.stop))
+        ends = polished.points
+        watch.step("hyperparameters", ends[0].value, 0.85)
+        contiguous = (samples if stretches is None else stretches).rows(slice(0, CORRELATED))
+        every, _ = make_problem(contiguous, joint_types, options, gravity, robot)
+        residual = every.tau - every.features(ends[0].geometry) @ (problem.weights(ends[0]) / every.scale)
+        correlation = residual_correlation(residual, contiguous)
+        weight = min(1.0, len(samples) / correlation / len(rows))
+        problem = replace(problem, counts=np.full(len(rows), weight))
+        ends = sorted((problem.at(each.geometry, each.sigma) for each in ends), key=lambda each: each.value)
+        best, others, problem, stribeck_nats = _refined(problem, ends, watch)
+        watch.step("posterior", best.value, 0.95)
+        report: dict[str, float | int | bool | str] = {"geometry": mode, "search_objective": ends[0].value}
+        if found is not None:
+            report |= _search_report(found, ends, others)
+        report |= {
+            "objective": best.value,
+            "friction_terms": _terms(problem),
+            "stribeck_nats": stribeck_nats,
+            "iterations": watch.iteration,
+            "converged": found is None or found.ended == "idle",
+            "samples_given": len(samples),
+            "samples_hyperparameters": len(rows),
+            "samples_posterior": len(rows),
+            "row_correlation": correlation,
+            "seconds": time.monotonic() - watch.began,
+            "device": "cpu",
+        }
+        arm, params = _arm(problem, best, others, order, mode)
+        return Learnt(arm, params, rows, weight, report)
 
 
 def mode_of(options: FitOptions, robot: RigidBody | None) -> GeometryMode:
