@@ -1,12 +1,12 @@
 """The learnt arm on simulated robots: accuracy, coverage, and how often the search finds the best geometry.
 
     python docs/learnt_arm.py rows [SEEDS]                accuracy and coverage of Panda, UR10, xArm7, Z1, TIAGo's arm
-    python docs/learnt_arm.py search [FIRST] [LAST]       random arms: evidence against that of the true geometry
+    python docs/learnt_arm.py search [FIRST LAST SEEDS]   random arms: evidence against that of the true geometry
     python docs/learnt_arm.py answer                      one query of the shipped model, beside Pinocchio's RNEA
 
 Training motions are those of the paper's experiment (50 sinusoids), tests have twice the bandwidth (100). Training
-seeds are 5001, 5002, …; test seeds a hundred more. What is reported are arms 1 to 20 of `search` with three training
-seeds each, and `rows` with five; nothing was tuned on them, but on arms above 1000.
+seeds are 5001, 5002, …; test seeds a hundred more. What is reported are arms 1 to 20 of `search` and `rows`, with five
+training seeds each; nothing was tuned on them, but on arms above 1000.
 The geometries of installed URDFs are not looked at (`known=()`), so that nothing but torque is used.
 """
 
@@ -87,12 +87,12 @@ def rows(seeds: int) -> None:
         print(f"{np.median(seconds):.1f} s, at most {np.max(seconds):.1f} |", flush=True)
 
 
-def search(first: int, last: int) -> None:
+def search(first: int, last: int, seeds: int) -> None:
     """Print, for each random arm, how much worse the evidence found is than that of the true geometry."""
     options, wins, total, covers = FitOptions(device="cpu"), 0, 0, []
     for number in range(first, last + 1):
         robot = random_arm(number, prismatic=1 if number % 5 == 0 else None)
-        for seed in range(5001, 5004):
+        for seed in range(5001, 5001 + seeds):
             stream = Stream(
                 500, n_sinusoids=50, speed=10.0, motion="full", noise=NOISE, viscous=FRICTION, coulomb=FRICTION
             )
@@ -146,7 +146,7 @@ def main() -> None:
         elif what == "rows":
             rows(*(numbers or [5]))
         else:
-            search(*(numbers or [1, 20]))
+            search(*(numbers or [1, 20, 5]))
 
 
 if __name__ == "__main__":

@@ -63,12 +63,10 @@ class FitOptions:
             raise ValueError(f"statistics is {self.statistics!r}, expected one of {', '.join(get_args(Standing))}")
         if self.device not in ("auto", "cpu", "cuda"):
             raise ValueError(f"device is {self.device!r}, expected auto, cpu or cuda")
-        if not (isinstance(self.compact_tolerance, float) and 0 < self.compact_tolerance <= 1):
-            raise ValueError(f"compact_tolerance is {self.compact_tolerance!r}, expected a number above 0, 1 at most")
-        if not (isinstance(self.search_seconds, float) and 0 < self.search_seconds <= MOST_SECONDS):
-            raise ValueError(
-                f"search_seconds is {self.search_seconds!r}, expected a number above 0, at most {MOST_SECONDS:g}"
-            )
+        for name, most in (("compact_tolerance", 1.0), ("search_seconds", MOST_SECONDS)):
+            number = getattr(self, name)
+            if type(number) not in (int, float) or not 0 < number <= most:
+                raise ValueError(f"{name} is {number!r}, expected a number above 0, at most {most:g}")
         if self.geometry not in ("auto", *GEOMETRY_MODES):
             raise ValueError(f"geometry is {self.geometry!r}, expected auto, {', '.join(GEOMETRY_MODES)}")
         if self.prior not in PRIORS:
