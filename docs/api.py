@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from service.access.scopes import TABLE
 from service.app import create_app
 from service.guide.pages import anchor
-from service.openapi import METHODS
+from service.web.access.scopes import TABLE
+from service.web.openapi import METHODS
 
 TARGET = Path(__file__).parent / "reference/api.md"
 HEAD = """# API reference

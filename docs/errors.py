@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from service.app import create_app
-from service.openapi import error_table
+from service.web.openapi import error_table
 
 HEAD = """# Error codes
 

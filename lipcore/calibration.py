@@ -4,7 +4,7 @@ A posterior with fitted hyperparameters knows what the samples leave open, but t
 certain: it is too sure of itself. The standard deviation of the function is therefore multiplied by a factor, one for
 each estimator, measured on simulated arms with random masses: `lip-chain` on four arms, `lip` on two, the baselines on
 one; slow and fast motion, 60 to 500 samples, judged on trajectories of twice the bandwidth
-(`docs/calibration.py`). It is stored with the model and touches neither mean nor noise.
+(`benchmarks/studies/calibration.py`). It is stored with the model and touches neither mean nor noise.
 """
 
 from __future__ import annotations

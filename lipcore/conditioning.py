@@ -48,10 +48,10 @@ def wanted(options: FitOptions, count: int, worth: float) -> bool:
     """Whether a posterior is to stand on all of `count` samples, which together are `worth` that many independent ones,
     and not on those alone that the fit has chosen.
 
-    Measured (`python docs/all_rows.py panda`) on a simulated Panda with friction that no estimator expresses, of 100
-    to 1000 s at 10 Hz to 1 kHz: where all samples were worth more, their nMSE was 0.58 to 1.04 times that of the 500
-    chosen ones, and 95 % intervals covered 93 to 98 % instead of 93 to 96 %. Counted in full instead of by their time,
-    100 s of slow motion at 1 kHz covered 85 %.
+    Measured (`all_rows.py panda` of benchmarks/studies) on a simulated Panda with friction that no estimator expresses,
+    of 100 to 1000 s at 10 Hz to 1 kHz: where all samples were worth more, their nMSE was 0.58 to 1.04 times that of
+    the 500 chosen ones, and 95 % intervals covered 93 to 98 % instead of 93 to 96 %. Counted in full instead of by
+    their time, 100 s of slow motion at 1 kHz covered 85 %.
     """
     if options.statistics == "chosen" or count <= options.posterior_samples:
         return False

@@ -32,7 +32,7 @@ class FitOptions:
     max_inducing_outputs: where that would take more, the compact posterior deviates more, and answers stay fast;
     statistics: what the posterior of the chosen basis stands on in the end: the samples `chosen` before, or `all`, each
     counted for the time that it stands for (`lipcore.online.spacing`); `auto`: all where together they are worth more
-    than posterior_samples independent ones, which was measured to answer better (docs/all_rows.py).
+    than posterior_samples independent ones, which was measured to answer better (benchmarks/studies/all_rows.py).
     """
 
     hyperparameter_samples: int = 150

@@ -14,47 +14,49 @@ from fastapi_offline import FastAPIOffline
 from starlette.routing import BaseRoute
 from threadpoolctl import threadpool_limits
 
-from service import __version__, errors, health, openapi, storage_errors
-from service.access import openapi as access
-from service.access.keyring import Keyring
-from service.access.local import LocalAccess
-from service.access.middleware import KeyAccess
+from service import __version__
 from service.context import Service
 from service.dashboard import routes as dashboard
-from service.database import Database
 from service.datasets import routes as datasets
-from service.files import Files, sweeping
+from service.foundation import errors
+from service.foundation.settings import Settings
 from service.guide import routes as guide
-from service.home import hold_home
 from service.inference import echo
 from service.inference import routes as inference
 from service.inference.loaded import LoadedModels
-from service.limits import BodyLimit
-from service.limits.disk import Disk
-from service.limits.gate import Gate
-from service.limits.rate import RateLimit
-from service.limits.stopping import Stopping
+from service.learning import routes as observations
+from service.learning.control import routes as control
+from service.learning.live import routes as live
+from service.learning.refreshing import routes as refreshing
+from service.learning.refreshing.wiring import attach
+from service.learning.updates import Updates
 from service.models import archive_routes as archives
 from service.models import registry
 from service.models import routes as models
-from service.observability import routes as metrics
-from service.observability import tracing
-from service.observability.meters import Meters
-from service.observability.request_log import RequestLog
-from service.observability.requests import RequestContext
 from service.oip import routes as oip
 from service.replication.replication import Replication
 from service.robots import routes as robots
-from service.settings import Settings
+from service.storage.database import Database
+from service.storage.files import Files, sweeping
+from service.storage.home import hold_home
 from service.stream import routes as stream
 from service.training import routes as training
 from service.training.queue import queue_of
-from service.updates import routes as observations
-from service.updates.control import routes as control
-from service.updates.live import routes as live
-from service.updates.refreshing import routes as refreshing
-from service.updates.refreshing.wiring import attach
-from service.updates.updates import Updates
+from service.web import health, openapi, storage_errors
+from service.web.access import openapi as access
+from service.web.access.keyring import Keyring
+from service.web.access.local import LocalAccess
+from service.web.access.middleware import KeyAccess
+from service.web.limits import BodyLimit
+from service.web.limits.disk import Disk
+from service.web.limits.gate import Gate
+from service.web.limits.rate import RateLimit
+from service.web.limits.stopping import Stopping
+from service.web.observability import routes as metrics
+from service.web.observability import tracing
+from service.web.observability.meters import Meters
+from service.web.observability.request_log import RequestLog
+from service.web.observability.requests import RequestContext
 
 logger = logging.getLogger(__name__)
 

@@ -8,16 +8,16 @@ from typing import Annotated
 from anyio import CapacityLimiter
 from fastapi import Depends, Request
 
-from service.database import Database
-from service.files import Files
+from service.foundation.settings import Settings
 from service.inference.loaded import LoadedModels
-from service.limits.disk import Disk
-from service.limits.stopping import Stopping
-from service.observability.meters import Meters
-from service.observability.readiness import Readiness
-from service.settings import Settings
+from service.learning.updates import Updates
+from service.storage.database import Database
+from service.storage.files import Files
 from service.training.queue import JobQueue
-from service.updates.updates import Updates
+from service.web.limits.disk import Disk
+from service.web.limits.stopping import Stopping
+from service.web.observability.meters import Meters
+from service.web.observability.readiness import Readiness
 
 
 @dataclass(frozen=True)

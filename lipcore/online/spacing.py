@@ -10,10 +10,10 @@ from lipcore.samples import Array
 INDEPENDENT_HZ = 10.0
 """Rows a second that count as independent.
 
-Measured (`python docs/independent_rows.py 2 5`) on a simulated Panda with friction that no estimator expresses exactly,
-after 30 s at 1 kHz: where every row counted in full, 95 % intervals on an unseen trajectory covered 53 % (slow motion)
-and 82 % (faster), with nMSE 1.4e-1 and 1.5e-2; at ten rows a second 92 % and 95 %, with 2.7e-2 and 1.1e-2; at five no
-more. The best nMSE of the faster motion was 9.3e-3, at fifty.
+Measured (`independent_rows.py 2 5` of benchmarks/studies) on a simulated Panda with friction that no estimator
+expresses exactly, after 30 s at 1 kHz: where every row counted in full, 95 % intervals on an unseen trajectory covered
+53 % (slow motion) and 82 % (faster), with nMSE 1.4e-1 and 1.5e-2; at ten rows a second 92 % and 95 %, with 2.7e-2 and
+1.1e-2; at five no more. The best nMSE of the faster motion was 9.3e-3, at fifty.
 """
 
 

@@ -11,7 +11,7 @@ from urllib.parse import quote
 import typer
 
 from service.cli.asking import ask
-from service.settings import DEFAULT_URL
+from service.foundation.settings import DEFAULT_URL
 
 Names = list[str | tuple[str, str]]
 """What may stand there, with what it is."""

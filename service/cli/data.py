@@ -15,7 +15,7 @@ from service.cli.consoles import out, print_json, say
 from service.cli.options import DatasetId, Json, Limit, Url, Yes, confirm, names, pairs
 from service.datasets.asking import Reading
 from service.datasets.media import SUFFIXES
-from service.settings import DEFAULT_URL
+from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
     from service.datasets.schema import Dataset

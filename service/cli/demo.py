@@ -9,8 +9,8 @@ import typer
 
 from lipcore.robots import SimulationUnavailableError
 from service.cli.consoles import out
+from service.cli.demonstration import DemoError, run
 from service.client import ApiError
-from service.demo import DemoError, run
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 ERRORS = (ApiError, DemoError, SimulationUnavailableError)

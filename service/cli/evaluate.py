@@ -9,7 +9,7 @@ import typer
 from service.cli.connecting import connected, dataset_of
 from service.cli.consoles import out, print_json
 from service.cli.options import Alias, Data, Json, Model, Url, Version
-from service.settings import DEFAULT_URL
+from service.foundation.settings import DEFAULT_URL
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 

@@ -13,7 +13,7 @@ from service.cli.connecting import connected
 from service.cli.consoles import note, out, print_json, say
 from service.cli.errors import INTERRUPTED, CommandError
 from service.cli.options import JobId, Json, Limit, Url
-from service.settings import DEFAULT_URL
+from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
     from service.training.schema import Job

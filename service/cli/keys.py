@@ -12,14 +12,14 @@ import typer
 from rich.markup import escape
 from rich.table import Column, Table
 
-from service.access import keys
-from service.access.scopes import SCOPES
 from service.cli.consoles import note, out, print_json
 from service.cli.options import Json
-from service.database import ApiKeyRow, Database
-from service.errors import InvalidRequestError
-from service.home import HomeError, usable
-from service.settings import Settings
+from service.foundation.errors import InvalidRequestError
+from service.foundation.settings import Settings
+from service.storage.database import ApiKeyRow, Database
+from service.storage.home import HomeError, usable
+from service.web.access import keys
+from service.web.access.scopes import SCOPES
 
 app = typer.Typer(
     no_args_is_help=True,

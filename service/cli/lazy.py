@@ -10,7 +10,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from service.cli.errors import explain, tell
-from service.importing import imported
+from service.foundation.importing import imported
 
 
 class Entry(NamedTuple):

@@ -48,9 +48,8 @@ class Commands(LazyGroup):
         "evaluate": Entry("service.cli.evaluate", "Compare a model with a recording, joint by joint.", ANSWERS),
         "stream": Entry("service.cli.stream", "Play a motion to a model in real time, and teach it.", ANSWERS),
         "simulate": Entry("service.cli.simulate", "Simulate a robot's stream and write it as a recording.", ROBOT),
-        "excite": Entry("service.excite.command", "Plan the motion that tells most of what is not known.", ROBOT),
-        "reproduce": Entry("service.reproduce.command", "Run the paper's experiment: tables and figures.", CHECK),
-        "bench": Entry("service.bench.command", "Measure latency, learning, uploads, and what kills cost.", CHECK),
+        "excite": Entry("service.cli.excite.command", "Plan the motion that tells most of what is not known.", ROBOT),
+        "bench": Entry("service.cli.bench", "Time the answers of a service on this machine.", CHECK),
     }
 
 

@@ -16,7 +16,7 @@ from service.cli.connecting import connected, dataset_of
 from service.cli.consoles import note, out, print_json, say
 from service.cli.errors import CommandError
 from service.cli.options import Alias, Data, Json, Limit, Model, Url, Version, Yes, confirm
-from service.settings import DEFAULT_URL
+from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
     from service.client.results import Version as VersionRecord

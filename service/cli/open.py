@@ -14,7 +14,7 @@ from service.cli.asking import UNIX, ask
 from service.cli.consoles import print_json, say
 from service.cli.errors import START, CommandError
 from service.cli.options import Json, Url
-from service.settings import DEFAULT_URL
+from service.foundation.settings import DEFAULT_URL
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 

@@ -10,7 +10,7 @@ from lipcore.vocabulary import COMPONENTS
 from service.cli.connecting import connected
 from service.cli.consoles import out, print_json
 from service.cli.options import Alias, Json, Model, Url, Version, names, numbers
-from service.settings import DEFAULT_URL
+from service.foundation.settings import DEFAULT_URL
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 

@@ -9,14 +9,14 @@ import typer
 import uvicorn
 from pydantic import ValidationError
 
-from service import sockets
 from service.app import create_app
 from service.cli.errors import CommandError
-from service.home import HomeError, check_home
-from service.limits.connections import guarded
-from service.observability import logs
-from service.settings import Settings
+from service.foundation.settings import Settings
+from service.storage.home import HomeError, check_home
 from service.stream.protocol import StreamProtocol
+from service.web import sockets
+from service.web.limits.connections import guarded
+from service.web.observability import logs
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 ERRORS = (HomeError,)

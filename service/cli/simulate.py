@@ -9,7 +9,7 @@ import typer
 
 from lipcore.robots import ROBOTS, SimulationUnavailableError, load_robot
 from lipcore.simulation import FAST, Payload, Stream, simulate
-from service import recordings
+from service.cli import recordings
 from service.cli.consoles import print_json, say
 from service.cli.options import Json
 

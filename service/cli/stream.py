@@ -14,12 +14,12 @@ from service.cli.consoles import note, out, print_json, say
 from service.cli.errors import INTERRUPTED, CommandError
 from service.cli.options import Alias, Json, Model, Url, Version
 from service.cli.words import ROBOTS
-from service.settings import DEFAULT_URL
+from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
     from service.cli.playing.source import Motion
     from service.cli.playing.tally import Tally
-    from service.stream.client import StreamClient
+    from service.client.stream import StreamClient
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 SECONDS = 60.0

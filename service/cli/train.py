@@ -16,7 +16,7 @@ from service.cli.errors import INTERRUPTED, CommandError
 from service.cli.models import print_selection
 from service.cli.options import Json, Url, names, pairs
 from service.cli.words import HELD_OUT_BY
-from service.settings import DEFAULT_URL
+from service.foundation.settings import DEFAULT_URL
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 

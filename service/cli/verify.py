@@ -5,11 +5,11 @@ from __future__ import annotations
 import typer
 from rich.markup import escape
 
-from service import verification
+from service.cli import verification
 from service.cli.consoles import err, print_json, say
 from service.cli.options import Json
-from service.home import HomeError, usable
-from service.settings import Settings
+from service.foundation.settings import Settings
+from service.storage.home import HomeError, usable
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 ERRORS = (HomeError,)

@@ -9,9 +9,9 @@ import typer
 from pydantic import ValidationError
 
 from service.cli.errors import CommandError
-from service.observability import logs
-from service.settings import Settings
+from service.foundation.settings import Settings
 from service.training.process import THREAD_VARIABLES
+from service.web.observability import logs
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 

@@ -12,19 +12,19 @@ from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 import httpx
 
-from service.access.credentials import headers_of
 from service.client import calls
+from service.client.async_stream import AsyncStreamClient
 from service.client.attempts import RETRIES, Attempts, Reach
 from service.client.call import Answer, Call, Page
 from service.client.errors import ApiError, ServiceUnreachableError
 from service.client.sending import Address, Events, answer_of, draft_of, pieces, request_of
 from service.client.signatures import bound
 from service.client.sync import POLL_SECONDS
-from service.settings import DEFAULT_URL
-from service.stream.async_client import AsyncStreamClient
+from service.foundation.settings import DEFAULT_URL
+from service.foundation.states import ACTIVE
+from service.learning.control.learning_schema import Learning
 from service.training.schema import Job
-from service.training.states import ACTIVE
-from service.updates.control.learning_schema import Learning
+from service.web.access.credentials import headers_of
 
 P = ParamSpec("P")
 T = TypeVar("T")

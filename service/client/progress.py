@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeElapsedColumn, TransferSpeedColumn
 
+from service.foundation.states import ACTIVE
 from service.training.schema import Job
-from service.training.states import ACTIVE
 
 if TYPE_CHECKING:  # which shows its progress with this
     from service.client.sync import Client

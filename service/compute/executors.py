@@ -16,9 +16,9 @@ from functools import partial
 from typing import Any, ParamSpec, TypeVar
 
 from service.compute import remote
-from service.observability import logs
-from service.settings import Settings
+from service.foundation.settings import Settings
 from service.training.process import Place, start_process
+from service.web.observability import logs
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -18,10 +18,10 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.compute import executors
 from service.compute.cluster import GPU, JOB
 from service.compute.executors import GPU_SHARD, SHARD
-from service.database import Database
-from service.errors import ServiceError
-from service.files import Files
-from service.settings import Settings
+from service.foundation.errors import ServiceError
+from service.foundation.settings import Settings
+from service.storage.database import Database
+from service.storage.files import Files
 from service.training import hosting
 
 logger = logging.getLogger(__name__)

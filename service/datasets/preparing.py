@@ -14,8 +14,8 @@ from lipcore.preparation.plan import Plan, plan
 from lipcore.preparation.recipe import Recipe
 from lipcore.samples import Array
 from service.datasets.staging import EPISODE, TIME, Staged, column
-from service.errors import invalid_data
-from service.limits.disk import Disk
+from service.foundation.errors import invalid_data
+from service.web.limits.disk import Disk
 
 FOLDER = "prepared"
 """Of prepared columns: those that were read have the same names."""

@@ -11,8 +11,8 @@ from lipcore.preparation.recipe import Filtering, Form, Recipe
 from lipcore.signals import CUTOFF
 from lipcore.vocabulary import TorqueConvention
 from service.datasets.options import Effort, ReadOptions, UploadOptions
-from service.errors import invalid_request
-from service.route import read_json
+from service.foundation.errors import invalid_request
+from service.web.route import read_json
 
 QUANTITIES = ("t", "episode", "q", "dq", "ddq", "tau")
 MOST_TEXT = 8000

@@ -16,7 +16,7 @@ from service.datasets.preview import MOST_POINTS, Preview
 from service.datasets.query import upload_options
 from service.datasets.schema import Dataset, DatasetPage
 from service.datasets.staging import QUANTITIES
-from service.errors import (
+from service.foundation.errors import (
     ConflictError,
     DamagedDataError,
     InvalidDataError,
@@ -27,11 +27,11 @@ from service.errors import (
     invalid_request,
     responses,
 )
-from service.idempotency import KeyHeader, identity
-from service.limits.upload import Kinds, receive_to
-from service.names import NameForPeople
-from service.pages import PageQuery
-from service.route import Route
+from service.foundation.names import NameForPeople
+from service.web.idempotency import KeyHeader, identity
+from service.web.limits.upload import Kinds, receive_to
+from service.web.pagination import PageQuery
+from service.web.route import Route
 
 KINDS = Kinds(MEDIA_TYPES, SUFFIXES)
 

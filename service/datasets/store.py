@@ -14,9 +14,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from lipcore.profiles import Profile
 from lipcore.samples import Samples
 from lipcore.vocabulary import JointType
-from service import sample_file
 from service.context import Service
-from service.database import Database, DatasetRow, JobRow, now
 from service.datasets.mapping.reading import read
 from service.datasets.options import UploadOptions
 from service.datasets.preparing import prepare
@@ -24,14 +22,16 @@ from service.datasets.preview import Preview, preview_file
 from service.datasets.report.making import make_report
 from service.datasets.schema import Dataset, DatasetPage
 from service.datasets.staging import Staged, column, staging
-from service.errors import ConflictError, not_found
-from service.files import Files, new_id
-from service.idempotency import Identity, done, mark
-from service.pages import Page, newest
+from service.foundation.errors import ConflictError, not_found
+from service.foundation.states import ACTIVE
 from service.robots.store import profile_of
-from service.sample_file import PartOf
-from service.storage_errors import undecided
-from service.training.states import ACTIVE
+from service.storage import sample_file
+from service.storage.database import Database, DatasetRow, JobRow, now
+from service.storage.files import Files, new_id
+from service.storage.sample_file import PartOf
+from service.web.idempotency import Identity, done, mark
+from service.web.pagination import Page, newest
+from service.web.storage_errors import undecided
 
 
 def add(

@@ -13,15 +13,15 @@ from lipcore.metrics import LEVELS, RELIABILITY_LEVELS
 from lipcore.metrics import evaluate as compare
 from lipcore.samples import Samples
 from service.context import Service
-from service.database import DatasetRow
 from service.datasets import store
-from service.errors import InvalidRequestError, invalid_request
+from service.foundation.errors import InvalidRequestError, invalid_request
 from service.inference import checks, components
 from service.inference.loaded import Served
 from service.inference.schema import EvaluateRequest, EvaluateResponse, Interval, PredictRequest, Reliability
 from service.inference.stretches import stretches
 from service.inference.wire import Prediction
 from service.models import registry
+from service.storage.database import DatasetRow
 from service.training import holding_out
 from service.training.holding_out import CannotHoldOutError, SetSplit
 

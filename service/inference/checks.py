@@ -7,7 +7,7 @@ from math import isfinite
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import invalid_request
+from service.foundation.errors import invalid_request
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from lipcore import dynamics
 from lipcore.model import TorqueModel
 from lipcore.motion import Motion
 from lipcore.vocabulary import ComponentName
-from service.errors import invalid_request
+from service.foundation.errors import invalid_request
 from service.inference.schema import PredictRequest
 
 

@@ -7,9 +7,9 @@ from typing import Any
 from fastapi import APIRouter, Request, Response
 from starlette.types import Scope
 
-from service.errors import TooLargeError, responses
-from service.hot import Reply, hot_route
-from service.route import OCTETS, media_type
+from service.foundation.errors import TooLargeError, responses
+from service.web.hot import Reply, hot_route
+from service.web.route import OCTETS, media_type
 
 _CONTENT: dict[str, Any] = {
     "application/json": {"schema": {}, "example": {"q": [0.0, -0.5], "dq": [0.1, 0.0], "ddq": [0.0, 0.5]}},

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Response
 from starlette.types import Scope
 
 from service.context import Service, ServiceDep
-from service.errors import (
+from service.foundation.errors import (
     DamagedDataError,
     InvalidRequestError,
     NotFoundError,
@@ -17,14 +17,14 @@ from service.errors import (
     TooLargeError,
     responses,
 )
-from service.hot import Reply, hot_route
 from service.inference import answer, trace
 from service.inference.schema import EvaluateRequest, EvaluateResponse, PredictRequest, PredictResponse
 from service.inference.served import Served
 from service.inference.trace_schema import TraceRequest, TraceResponse
 from service.inference.waiting import reached
 from service.inference.wire import decode, encode
-from service.route import Route, is_json
+from service.web.hot import Reply, hot_route
+from service.web.route import Route, is_json
 
 _ERRORS = responses(InvalidRequestError, NotFoundError, TooLargeError)
 _LATE = responses(RevisionNotReachedError)

@@ -19,9 +19,9 @@ from pydantic import (
 )
 
 from lipcore.vocabulary import COMPONENTS, ComponentName, TorqueConvention
-from service.errors import invalid_request
+from service.foundation.errors import invalid_request
+from service.foundation.matrices import to_array
 from service.inference import checks
-from service.matrices import to_array
 from service.models.schema import AliasName, VersionNumber
 
 _NUMBERS: dict[str, Any] = {"type": "array", "items": {"type": "number"}}

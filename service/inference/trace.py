@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from lipcore import dynamics
 from lipcore.motion import Motion
 from lipcore.samples import Array, Samples
-from service import sample_file
 from service.context import Service
-from service.errors import invalid_request
+from service.foundation.errors import invalid_request
 from service.inference import answer
 from service.inference.served import Served
 from service.inference.trace_schema import TraceComponent, TraceComponentValues, TraceRequest, TraceResponse
+from service.storage import sample_file
 from service.training.holding_out import CannotHoldOutError
 
 Rows = NDArray[np.int64]

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from lipcore.vocabulary import TorqueConvention
-from service.errors import invalid_request
+from service.foundation.errors import invalid_request
 from service.inference.schema import EvaluateRequest, Part
 
 TraceComponent = Literal["inertial", "coriolis", "gravity", "friction"]

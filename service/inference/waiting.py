@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from anyio import to_thread
 
-from service.errors import RevisionNotReachedError, problem
+from service.foundation.errors import RevisionNotReachedError, problem
 
 if TYPE_CHECKING:
     from service.context import Service

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lipcore.vocabulary import ComponentName, TorqueConvention
 from service.inference.schema import PredictRequest
 from service.models.schema import ALIAS
-from service.route import each_once
+from service.web.route import each_once
 
 Array = NDArray[np.float64]
 _ALIAS = ALIAS.replace("$", r"\Z")  # Python's own expressions let a line end follow

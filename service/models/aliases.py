@@ -6,11 +6,11 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from service.context import Service
-from service.database import AliasMoveRow, AliasRow, ModelRow, VersionRow
-from service.errors import ConflictError, invalid_request, not_found
+from service.foundation.errors import ConflictError, invalid_request, not_found
 from service.models import moves, registry
 from service.models.alias_schema import Alias, AliasList, AliasMove, AliasRequest
 from service.models.moves import SERVING
+from service.storage.database import AliasMoveRow, AliasRow, ModelRow, VersionRow
 
 
 def page(service: Service, model: str) -> AliasList:

@@ -16,15 +16,15 @@ from lipcore.manifest import MANIFEST, ROBOT, TENSORS, Limits, ModelFormatError,
 from lipcore.parameters import report
 from lipcore.probing import probe
 from service.context import Service
-from service.database import LearnerRow, ServingRow, now
-from service.errors import InvalidDataError, invalid_data, problem
-from service.files import new_id
+from service.foundation.errors import InvalidDataError, invalid_data, problem
+from service.foundation.settings import Settings
 from service.models import archive, registry
 from service.models.archive import CHECKSUMS, EXPORT, ArchiveError
 from service.models.schema import ModelName, Version
-from service.settings import Settings
-from service.storage_errors import undecided
+from service.storage.database import LearnerRow, ServingRow, now
+from service.storage.files import new_id
 from service.training.holdout_schema import HoldoutLineage
+from service.web.storage_errors import undecided
 
 logger = logging.getLogger(__name__)
 

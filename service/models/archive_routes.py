@@ -9,7 +9,7 @@ from fastapi import APIRouter, Query, Request, Response, status
 from fastapi.responses import StreamingResponse
 
 from service.context import ServiceDep
-from service.errors import (
+from service.foundation.errors import (
     InvalidDataError,
     InvalidRequestError,
     NotFoundError,
@@ -18,12 +18,12 @@ from service.errors import (
     UnsupportedMediaTypeError,
     responses,
 )
-from service.limits.upload import Kinds, receive_to
 from service.models import archive_import, urdf
 from service.models.archive import MEDIA_TYPE
 from service.models.export import export
 from service.models.schema import AliasName, ModelName, Version, VersionNumber
-from service.route import Route
+from service.web.limits.upload import Kinds, receive_to
+from service.web.route import Route
 
 KINDS = Kinds({MEDIA_TYPE: "tar"}, {".tar": "tar"})
 _BINARY = {"schema": {"type": "string", "format": "binary"}}

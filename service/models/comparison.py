@@ -10,7 +10,7 @@ from lipcore.metrics import evaluate
 from lipcore.paired import Answer, Comparison, Difference
 from lipcore.samples import Array, Samples
 from service.context import Service
-from service.errors import invalid_request
+from service.foundation.errors import invalid_request
 from service.inference.answer import measured
 from service.inference.loaded import Served
 from service.models.comparison_schema import (

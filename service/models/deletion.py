@@ -10,7 +10,10 @@ from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
 from service.context import Service
-from service.database import (
+from service.foundation.errors import ConflictError, not_found
+from service.foundation.states import ACTIVE
+from service.models import moves, registry
+from service.storage.database import (
     AlarmRow,
     AliasMoveRow,
     AliasRow,
@@ -26,10 +29,7 @@ from service.database import (
     VersionRow,
     now,
 )
-from service.errors import ConflictError, not_found
-from service.files import Files
-from service.models import moves, registry
-from service.training.states import ACTIVE
+from service.storage.files import Files
 
 logger = logging.getLogger(__name__)
 

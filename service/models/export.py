@@ -12,13 +12,13 @@ from typing import Any
 from lipcore import persistence
 from lipcore.manifest import MANIFEST, TENSORS, ModelFormatError
 from service.context import Service
-from service.database import VersionRow, now
-from service.errors import UnreadableVersionError, invalid_request, not_found
+from service.foundation.errors import UnreadableVersionError, invalid_request, not_found
+from service.learning.learner import learnt as learning
 from service.models import archive, registry
 from service.models.archive import CHECKSUMS, EXPORT, Part
 from service.models.lineage import software
 from service.models.moves import SERVING
-from service.updates.learner import learnt as learning
+from service.storage.database import VersionRow, now
 
 
 @dataclass(frozen=True)

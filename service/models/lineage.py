@@ -17,7 +17,7 @@ from lipcore.manifest import FORMAT_VERSION
 from lipcore.model import TorqueModel
 from lipcore.samples import Samples
 from service import __version__
-from service.database import DatasetRow
+from service.storage.database import DatasetRow
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 MOST_SAMPLES = 500

@@ -7,7 +7,7 @@ from collections.abc import Collection
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from service.database import AliasMoveRow, AliasRow, Database, ServingRow, now
+from service.storage.database import AliasMoveRow, AliasRow, Database, ServingRow, now
 
 SERVING = "serving"
 """The alias that every model has: the version that answers where none is named."""

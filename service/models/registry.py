@@ -12,7 +12,11 @@ from sqlalchemy.orm import Session
 
 import lipcore
 from lipcore.persistence import checksums, read_manifest
-from service.database import (
+from service.foundation.errors import not_found
+from service.foundation.settings import shipped_models
+from service.models import moves
+from service.models.schema import Model, ModelPage, Version, VersionSummary
+from service.storage.database import (
     AliasRow,
     Database,
     DeletedModelRow,
@@ -23,12 +27,8 @@ from service.database import (
     VersionRow,
     now,
 )
-from service.errors import not_found
-from service.files import Files, new_id
-from service.models import moves
-from service.models.schema import Model, ModelPage, Version, VersionSummary
-from service.pages import Page, newest
-from service.settings import shipped_models
+from service.storage.files import Files, new_id
+from service.web.pagination import Page, newest
 
 logger = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from anyio import to_thread
 from fastapi import APIRouter, Path, status
 
 from service.context import ServiceDep
-from service.errors import (
+from service.foundation.errors import (
     ConflictError,
     DamagedDataError,
     InvalidRequestError,
@@ -20,8 +20,8 @@ from service.models import aliases, comparison, deletion, registry
 from service.models.alias_schema import Alias, AliasList, AliasRequest
 from service.models.comparison_schema import CompareRequest, CompareResponse
 from service.models.schema import AliasName, Model, ModelPage, Version, VersionNumber
-from service.pages import PageQuery
-from service.route import Route
+from service.web.pagination import PageQuery
+from service.web.route import Route
 
 router = APIRouter(prefix="/v1/models", tags=["models"], responses=responses(InvalidRequestError), route_class=Route)
 AliasPath = Annotated[AliasName, Path(description="`serving`, or a name of your own")]

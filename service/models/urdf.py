@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from lipcore.arm.urdf_writer import urdf_of_parameters
 from service.context import Service
-from service.errors import InvalidRequestError, problem
+from service.foundation.errors import InvalidRequestError, problem
 from service.models.export import find
 
 MEDIA_TYPE = "application/xml"

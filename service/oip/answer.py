@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from service.errors import invalid_request
-from service.hot import Reply
+from service.foundation.errors import invalid_request
+from service.foundation.settings import Settings
 from service.inference import checks
 from service.inference.loaded import Served
 from service.oip import outputs, wire
@@ -11,7 +11,7 @@ from service.oip.outputs import Array
 from service.oip.query import Query, read
 from service.oip.schema import AnswerParameters, InferRequest, InferResponse, InferTensor, TensorParameters
 from service.oip.wire import Headers, Message
-from service.settings import Settings
+from service.web.hot import Reply
 
 
 def infer(served: Served, body: bytes, headers: Headers, settings: Settings) -> Reply:

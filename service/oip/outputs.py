@@ -13,7 +13,7 @@ from lipcore.dynamics import available
 from lipcore.model import TorqueModel
 from lipcore.motion import Motion
 from lipcore.vocabulary import COMPONENTS, ComponentName
-from service.errors import invalid_request
+from service.foundation.errors import invalid_request
 
 Array = NDArray[np.float64]
 Shape = tuple[int, ...]

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from lipcore.dynamics import available
 from lipcore.model import TorqueModel
-from service.errors import invalid_request
+from service.foundation.errors import invalid_request
+from service.foundation.settings import Settings
 from service.inference import checks
 from service.oip.outputs import DEFAULT, FORWARD, NEED_TORQUE, PARTS, QUICK, Array, shapes
 from service.oip.schema import BINARY, DATATYPES, INPUTS, TORQUE, InferInput, InferOutput, InferRequest
 from service.oip.wire import HEADER, Message
-from service.settings import Settings
 
 _DTYPES: dict[str, np.dtype[np.floating]] = {"FP64": np.dtype("<f8"), "FP32": np.dtype("<f4")}
 _NO_TENSORS = f"tensors in the body: of the extensions, {BINARY} is supported"

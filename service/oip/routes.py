@@ -8,13 +8,14 @@ from anyio import to_thread
 from fastapi import APIRouter, Request, Response
 from starlette.types import Scope
 
-from service import __version__, health
+from service import __version__
 from service.context import Service, ServiceDep
-from service.hot import Reply, hot_route
 from service.oip import answer, versions, wire
 from service.oip.openapi import MODEL, VERSION, failures, infer_answer, infer_body
 from service.oip.schema import BINARY, ModelMetadata, ModelReady, ServerLive, ServerMetadata, ServerReady
-from service.route import Route
+from service.web import health
+from service.web.hot import Reply, hot_route
+from service.web.route import Route
 
 SMALL = 16 * 1024
 """Bytes of a body that is decoded on the event loop: one query of the largest robot fits many times."""

@@ -8,7 +8,7 @@ from anyio import to_thread
 
 from lipcore.model import TorqueModel
 from service.context import Service
-from service.errors import NotFoundError, NotReadyError, UnreadableVersionError, problem, sentence
+from service.foundation.errors import NotFoundError, NotReadyError, UnreadableVersionError, problem, sentence
 from service.inference.loaded import Served
 from service.models import registry
 from service.models.schema import ALIAS

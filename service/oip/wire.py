@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from service.errors import InvalidRequestError, UnsupportedMediaTypeError, invalid_request, problem, sentence
-from service.hot import Reply
+from service.foundation.errors import InvalidRequestError, UnsupportedMediaTypeError, invalid_request, problem, sentence
 from service.oip.schema import InferRequest, InferResponse
-from service.route import OCTETS
+from service.web.hot import Reply
+from service.web.route import OCTETS
 
 HEADER = "Inference-Header-Content-Length"
 _HEADER, _ENCODING = HEADER.lower().encode(), b"content-encoding"

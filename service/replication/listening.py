@@ -7,8 +7,8 @@ import threading
 from collections.abc import Callable
 from contextlib import closing
 
-from service.database import Database
-from service.database.notices import Notice
+from service.storage.database import Database
+from service.storage.database.notices import Notice
 
 logger = logging.getLogger(__name__)
 

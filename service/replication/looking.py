@@ -8,9 +8,9 @@ from collections.abc import Collection
 from sqlalchemy import func, select
 
 from service.context import Service
-from service.database import EventRow, LearnerRow, VersionRow
-from service.errors import ServiceError
+from service.foundation.errors import ServiceError
 from service.models import moves
+from service.storage.database import EventRow, LearnerRow, VersionRow
 
 logger = logging.getLogger(__name__)
 

@@ -8,9 +8,9 @@ import time
 from collections.abc import Iterable
 
 from service.context import Service
-from service.database.notices import Notice
 from service.replication.listening import Listener
 from service.replication.looking import lagging, look
+from service.storage.database.notices import Notice
 
 logger = logging.getLogger(__name__)
 

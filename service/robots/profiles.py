@@ -7,10 +7,10 @@ import math
 from lipcore import profiles
 from lipcore.motion import Array
 from lipcore.profiles import Profile
-from service.database import Database
-from service.errors import InvalidRequestError, not_found
+from service.foundation.errors import InvalidRequestError, not_found
 from service.robots import store
 from service.robots.schema import ProfileJoint, RobotProfile
+from service.storage.database import Database
 
 
 def every() -> list[RobotProfile]:

@@ -8,7 +8,7 @@ from anyio import to_thread
 from fastapi import APIRouter, Query, Request, Response, status
 
 from service.context import ServiceDep
-from service.errors import (
+from service.foundation.errors import (
     ConflictError,
     InvalidDataError,
     InvalidRequestError,
@@ -17,13 +17,13 @@ from service.errors import (
     UnsupportedMediaTypeError,
     responses,
 )
-from service.limits.upload import Kinds, receive
-from service.names import NameForPeople
-from service.pages import PageQuery
+from service.foundation.names import NameForPeople
 from service.robots import profiles as shown_profiles
 from service.robots import store
 from service.robots.schema import UPLOAD_BODY, ProfileList, Robot, RobotPage, RobotProfile
-from service.route import Route
+from service.web.limits.upload import Kinds, receive
+from service.web.pagination import PageQuery
+from service.web.route import Route
 
 KINDS = Kinds({"application/xml": "urdf", "text/xml": "urdf"}, {".urdf": "urdf", ".xml": "urdf"})
 

@@ -15,13 +15,13 @@ from lipcore.profiles.names import is_number
 from lipcore.profiles.reading import read_limits
 from lipcore.robots import ROBOTS, UnknownRobotError, profile_urdf
 from lipcore.urdf import MOVABLE, RigidBody, UrdfError, describe
-from service.database import Database, JobRow, RobotRow, now
-from service.errors import ConflictError, InvalidDataError, invalid_request, not_found, problem
-from service.files import new_id
-from service.names import LONGEST, for_people
-from service.pages import Page, newest
+from service.foundation.errors import ConflictError, InvalidDataError, invalid_request, not_found, problem
+from service.foundation.names import LONGEST, for_people
+from service.foundation.states import ACTIVE
 from service.robots.schema import Robot, RobotPage
-from service.training.states import ACTIVE
+from service.storage.database import Database, JobRow, RobotRow, now
+from service.storage.files import new_id
+from service.web.pagination import Page, newest
 
 
 def add(database: Database, content: bytes, name: str | None) -> Robot:

@@ -10,9 +10,9 @@ from time import perf_counter
 
 from starlette.types import Message, Receive, Send
 
-from service.access.credentials import subprotocol_of
-from service.settings import Settings
+from service.foundation.settings import Settings
 from service.stream.protocol import StreamProtocol
+from service.web.access.credentials import subprotocol_of
 
 
 class Conversation(ABC):

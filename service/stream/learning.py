@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from service.context import Service
-from service.errors import ErrorBody, ServiceError, invalid_request
+from service.foundation.errors import ErrorBody, ServiceError, invalid_request
 from service.inference.loaded import Served
-from service.storage_errors import translated
+from service.learning.ingest.frames import Frames, FramesResult
 from service.stream.frames import NUMBER, REQUEST
-from service.updates.ingest.frames import Frames, FramesResult
+from service.web.storage_errors import translated
 
 if TYPE_CHECKING:
     from lipcore.samples import Array

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from service.errors import InvalidRequestError, invalid_request
+from service.foundation.errors import InvalidRequestError, invalid_request
 from service.inference import checks
 from service.stream.frames import ASK_LEARN, ASK_STD, NUMBER, REQUEST, request_bytes
 

@@ -13,7 +13,7 @@ from starlette.types import Receive, Scope, Send
 from uvicorn.protocols.utils import ClientDisconnected
 
 from service.context import Service
-from service.errors import BusyError, NotFoundError, NotReadyError, invalid_request
+from service.foundation.errors import BusyError, NotFoundError, NotReadyError, invalid_request
 from service.inference import checks
 from service.inference.waiting import reached
 from service.models.schema import ALIAS

@@ -11,7 +11,7 @@ from anyio import to_thread
 from starlette.types import Message, Receive, Send
 
 from service.context import Service
-from service.errors import ErrorBody, ErrorResponse, ServiceError, invalid_request
+from service.foundation.errors import ErrorBody, ErrorResponse, ServiceError, invalid_request
 from service.inference import checks
 from service.inference.loaded import Served
 from service.models.moves import SERVING

@@ -17,11 +17,11 @@ from service import __version__
 from service.compute import remote
 from service.compute.cluster import Cluster
 from service.compute.executors import ClusterUnavailableError, lost
-from service.database import JobRow
+from service.foundation.states import QUEUED
+from service.storage.database import JobRow
 from service.training import history, hosting
 from service.training.queue import JobQueue
 from service.training.slots import Slot
-from service.training.states import QUEUED
 from service.training.watch import Ended, Hand
 
 logger = logging.getLogger(__name__)

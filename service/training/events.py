@@ -10,9 +10,9 @@ from fastapi import Depends
 from fastapi.sse import ServerSentEvent
 
 from service.context import Service, ServiceDep
-from service.database import JobRow
+from service.foundation.states import ACTIVE
+from service.storage.database import JobRow
 from service.training import jobs
-from service.training.states import ACTIVE
 
 
 def _row(service: ServiceDep, job: str) -> JobRow:

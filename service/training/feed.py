@@ -11,8 +11,8 @@ from contextvars import Context
 from anyio import to_thread
 from sqlalchemy import select
 
-from service.database import Database, JobRow
-from service.errors import BusyError
+from service.foundation.errors import BusyError
+from service.storage.database import Database, JobRow
 
 logger = logging.getLogger(__name__)
 

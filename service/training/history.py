@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from service.database import JobRow, now
-from service.training.states import ACTIVE, QUEUED, JobState
+from service.foundation.states import ACTIVE, QUEUED, JobState
+from service.storage.database import JobRow, now
 
 MOST_ENTRIES = 100
 """Entries that a job keeps: a service may be started and stopped any number of times while one waits."""

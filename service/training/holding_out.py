@@ -14,8 +14,8 @@ import numpy as np
 
 from lipcore.samples import Array
 from lipcore.splits import GUARD_S, Mask, Numbers, Parts, Split, SplitError, choose, split
-from service.database import DatasetRow
-from service.errors import invalid_request
+from service.foundation.errors import invalid_request
+from service.storage.database import DatasetRow
 from service.training.holdout_schema import HeldOutSet, Holdout, HoldoutLineage
 
 UNTIMED_GUARD = 25.0

@@ -11,18 +11,18 @@ from sqlalchemy.orm import Session
 from lipcore.estimators import UnknownEstimatorError, check_estimator
 from lipcore.fit_options import FitOptions
 from lipcore.robots import ROBOTS, SimulationUnavailableError
-from service.database import Database, DatasetRow, JobRow, RobotRow, now
 from service.datasets import store
-from service.errors import BusyError, ConflictError, InvalidRequestError, invalid_request, not_found, problem
-from service.files import new_id
-from service.idempotency import Identity, done, mark
-from service.observability.context import request_id
-from service.pages import Page, newest
+from service.foundation.errors import BusyError, ConflictError, InvalidRequestError, invalid_request, not_found, problem
+from service.foundation.settings import Settings
+from service.foundation.states import ACTIVE, CANCELLED, QUEUED, RUNNING
 from service.robots import store as robots
-from service.settings import Settings
+from service.storage.database import Database, DatasetRow, JobRow, RobotRow, now
+from service.storage.files import new_id
 from service.training import history, holding_out
 from service.training.schema import Job, JobPage, JobRequest, Options
-from service.training.states import ACTIVE, CANCELLED, QUEUED, RUNNING
+from service.web.idempotency import Identity, done, mark
+from service.web.observability.context import request_id
+from service.web.pagination import Page, newest
 
 if TYPE_CHECKING:  # the service learns online too, and that queues jobs
     from service.context import Service

@@ -6,9 +6,9 @@ import logging
 
 from sqlalchemy import select
 
-from service.database import Database, JobRow, VersionRow
-from service.files import Files, new_id
-from service.training.states import ACTIVE
+from service.foundation.states import ACTIVE
+from service.storage.database import Database, JobRow, VersionRow
+from service.storage.files import Files, new_id
 
 logger = logging.getLogger(__name__)
 

@@ -14,17 +14,17 @@ from lipcore.online import spacing
 from lipcore.samples import Array, Samples
 from lipcore.urdf import RigidBody
 from lipcore.vocabulary import TorqueConvention
-from service.database import Database, DatasetRow, VersionRow
-from service.files import Files
+from service.foundation.settings import Settings
+from service.learning.refreshing import material, scope
+from service.learning.storage import log
 from service.models.lineage import named
 from service.robots import store as robots
-from service.settings import Settings
+from service.storage.database import Database, DatasetRow, VersionRow
+from service.storage.files import Files
 from service.training import holding_out
 from service.training.holding_out import Divided
 from service.training.holdout_schema import Holdout, HoldoutLineage
 from service.training.rows import CANDIDATES, Part, Table, opened
-from service.updates.refreshing import material, scope
-from service.updates.storage import log
 
 
 class NothingToLearnError(ValueError):

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from typing import Any, Literal
 
-from service.importing import imported
-from service.observability import logs
-from service.observability.logs import LogOptions
-from service.settings import Settings
+from service.foundation.importing import imported
+from service.foundation.settings import Settings
+from service.web.observability import logs
+from service.web.observability.logs import LogOptions
 
 logger = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from lipcore.fitting import FitProgress
-from service.database import Database, JobRow, now
+from service.storage.database import Database, JobRow, now
 from service.training.remaining import Remaining
 
 logger = logging.getLogger(__name__)

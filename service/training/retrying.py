@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from service.errors import ConflictError, NotFoundError
-from service.idempotency import Identity
+from service.foundation.errors import ConflictError, NotFoundError
+from service.foundation.states import CANCELLED, FAILED
+from service.learning.refreshing import refresh
 from service.training import jobs
 from service.training.schema import Job, JobRequest
-from service.training.states import CANCELLED, FAILED
-from service.updates.refreshing import refresh
+from service.web.idempotency import Identity
 
 if TYPE_CHECKING:
     from service.context import Service

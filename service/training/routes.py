@@ -8,12 +8,19 @@ from fastapi import APIRouter, Response, status
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from service.context import ServiceDep
-from service.errors import BusyError, ConflictError, InvalidRequestError, NotFoundError, TooLargeError, responses
-from service.idempotency import KeyHeader, identity
-from service.pages import PageQuery
-from service.route import Route
+from service.foundation.errors import (
+    BusyError,
+    ConflictError,
+    InvalidRequestError,
+    NotFoundError,
+    TooLargeError,
+    responses,
+)
 from service.training import events, jobs, retrying
 from service.training.schema import Job, JobPage, JobRequest
+from service.web.idempotency import KeyHeader, identity
+from service.web.pagination import PageQuery
+from service.web.route import Route
 
 router = APIRouter(
     prefix="/v1/jobs", tags=["training jobs"], responses=responses(InvalidRequestError), route_class=Route

@@ -15,9 +15,9 @@ from lipcore.conditioning import SHARD
 from lipcore.online import spacing
 from lipcore.samples import Samples
 from lipcore.splits import Mask, Numbers
-from service.database import DatasetRow
-from service.files import Files
-from service.sample_file import Reader
+from service.storage.database import DatasetRow
+from service.storage.files import Files
+from service.storage.sample_file import Reader
 from service.training.holding_out import Clock
 
 CANDIDATES = 20_000

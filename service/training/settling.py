@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 from sqlalchemy import select
 
-from service.database import Database, JobRow
-from service.files import Files
-from service.settings import Settings
+from service.foundation.settings import Settings
+from service.foundation.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED
+from service.storage.database import Database, JobRow
+from service.storage.files import Files
 from service.training import history, leftovers
-from service.training.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED
 from service.training.watch import Ended
 
 logger = logging.getLogger(__name__)

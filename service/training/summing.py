@@ -28,9 +28,9 @@ from lipcore.online import spacing
 from lipcore.samples import Array, Samples
 from service.compute.executors import placed, sent, shard_executor
 from service.compute.shards import summed
-from service.files import PATIENCE_S, Files
-from service.sample_file import Reader
-from service.settings import Settings
+from service.foundation.settings import Settings
+from service.storage.files import PATIENCE_S, Files
+from service.storage.sample_file import Reader
 from service.training.material import Material
 from service.training.rows import Shard, Table
 

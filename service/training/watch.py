@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from service.settings import Settings
-from service.training.states import ACTIVE, RUNNING
+from service.foundation.settings import Settings
+from service.foundation.states import ACTIVE, RUNNING
 
 Why = Literal["returned", "ended", "cancelled", "silent", "too_long", "not_started", "lingering", "refused"]
 LINGER_S = 10.0

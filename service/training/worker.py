@@ -14,25 +14,25 @@ from sqlalchemy.orm import Session
 import lipcore
 from lipcore.conditioning import wanted
 from lipcore.model import TorqueModel, fitted
-from service import storage_errors
 from service.compute.executors import ClusterUnavailableError
-from service.database import Database, JobRow, LearnerRow, now
-from service.errors import ServiceError, StorageFullError, StorageUnavailableError
-from service.files import PATIENCE_S, Files
-from service.limits.disk import Disk
+from service.foundation.errors import ServiceError, StorageFullError, StorageUnavailableError
+from service.foundation.settings import Settings
+from service.foundation.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, JobState
+from service.learning.refreshing import scope
 from service.models import registry
 from service.models.lineage import figures, software, training_metrics
-from service.observability.context import job_id
-from service.settings import Settings
+from service.storage.database import Database, JobRow, LearnerRow, now
+from service.storage.files import PATIENCE_S, Files
 from service.training import history, leftovers
 from service.training.holding_out import CannotHoldOutError
 from service.training.material import Material, observed, recorded
 from service.training.pulse import Pulse, SupersededError
 from service.training.remaining import Remaining
 from service.training.rows import CANDIDATES
-from service.training.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, JobState
 from service.training.summing import all_rows
-from service.updates.refreshing import scope
+from service.web import storage_errors
+from service.web.limits.disk import Disk
+from service.web.observability.context import job_id
 
 logger = logging.getLogger(__name__)
 

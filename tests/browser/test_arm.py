@@ -108,7 +108,7 @@ def test_a_version_without_a_geometry_says_how_to_get_one(visitor: Visitor, dash
 @pytest.fixture
 def streamed(dashboard: Dashboard, arm: str) -> Iterator[None]:
     """A robot that moves its second joint to and fro."""
-    from service.stream.client import StreamClient
+    from service.client.stream import StreamClient
 
     stop = threading.Event()
 

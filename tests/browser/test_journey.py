@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from lipcore.samples import Samples
-from service.stream.client import StreamClient
+from service.client.stream import StreamClient
 from tests.browser.accessibility import audit
 from tests.browser.conftest import Dashboard
 from tests.browser.looking import expect

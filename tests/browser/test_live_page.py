@@ -23,7 +23,7 @@ PAYLOAD = 30.0
 @contextmanager
 def robot(server: Server, model: str) -> Iterator[None]:
     """A simulated robot with a payload that streams until the end of the block."""
-    from service.stream.client import StreamClient
+    from service.client.stream import StreamClient
 
     samples, stop = stream(samples=400, rate=50.0, seed=21, speed=1.0), threading.Event()
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from service.access import keys
-from service.database import Database
+from service.storage.database import Database
+from service.web.access import keys
 from tests.browser.accessibility import audit
 from tests.browser.conftest import Dashboard, Visit
 from tests.browser.looking import expect

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from sqlalchemy import select
 
-from service.database import Database, JobRow
+from service.foundation.states import ACTIVE
+from service.storage.database import Database, JobRow
 from service.training import jobs
-from service.training.states import ACTIVE
 from tests.service.data import eventually
 from tests.service.jobs.conftest import new_row
 

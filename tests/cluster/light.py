@@ -14,7 +14,7 @@ import time
 
 import psycopg
 
-from service.settings import Settings
+from service.foundation.settings import Settings
 
 
 def run(settings: Settings, job: str) -> None:

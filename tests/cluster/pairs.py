@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import lipcore
-from service.database import Database
-from service.files import Files, new_id
 from service.models import registry
+from service.storage.database import Database
+from service.storage.files import Files, new_id
 from tests.cluster.servers import Shared
 from tests.service.data import QUICK, service_of, stream
 from tests.service.updates.lessons import QUERIES, Pupil

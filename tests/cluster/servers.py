@@ -18,8 +18,8 @@ from botocore.session import Session
 from moto.server import ThreadedMotoServer
 from psycopg.sql import SQL, Identifier
 
-from service.database import Database
-from service.settings import Settings
+from service.foundation.settings import Settings
+from service.storage.database import Database
 
 BUCKET = "lipserve"
 _numbers = count(1)

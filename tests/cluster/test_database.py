@@ -8,10 +8,10 @@ from alembic.migration import MigrationContext
 from sqlalchemy import inspect, select, text
 from sqlalchemy.exc import DBAPIError
 
-from service.database import Base, Database, LearningRow, ModelRow, now
-from service.database.migrations import DatabaseVersionError
-from service.errors import StorageUnavailableError
-from service.storage_errors import translated
+from service.foundation.errors import StorageUnavailableError
+from service.storage.database import Base, Database, LearningRow, ModelRow, now
+from service.storage.database.migrations import DatabaseVersionError
+from service.web.storage_errors import translated
 from tests.service.database.starting import check_starts_together
 
 

@@ -11,11 +11,11 @@ from sqlalchemy.exc import SQLAlchemyError
 from typer.testing import CliRunner
 
 from service import cli
-from service.database import Database
-from service.errors import StorageFullError, StorageUnavailableError
-from service.home import HomeError, check_home
-from service.settings import Settings
-from service.storage_errors import translated
+from service.foundation.errors import StorageFullError, StorageUnavailableError
+from service.foundation.settings import Settings
+from service.storage.database import Database
+from service.storage.home import HomeError, check_home
+from service.web.storage_errors import translated
 
 PASSWORD = "correct-horse"
 
@@ -129,7 +129,7 @@ def test_settings_that_are_refused_are_not_shown(shared):
 
 
 def test_a_driver_that_is_not_installed(shared, monkeypatch):
-    monkeypatch.delitem(sys.modules, "service.database.postgresql", raising=False)
+    monkeypatch.delitem(sys.modules, "service.storage.database.postgresql", raising=False)
     monkeypatch.setitem(sys.modules, "psycopg", None)
     with pytest.raises(HomeError, match=r"pip install 'lipserve\[cluster\]'"):
         check_home(shared.settings())

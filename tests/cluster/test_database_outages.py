@@ -11,8 +11,8 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 
 from service.app import create_app
-from service.database import Database, EventRow
-from service.files import Files
+from service.storage.database import Database, EventRow
+from service.storage.files import Files
 from tests.cluster.pairs import Pair, publish, train
 from tests.service.data import ADDRESS, ENDLESS, arrays, ended, error, eventually, npz, queue, running, stream, upload
 from tests.service.data import job as looked

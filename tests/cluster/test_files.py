@@ -13,12 +13,12 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 
 from service.app import create_app
-from service.database import Database, VersionRow
-from service.files import Files, FilesUnreachableError
-from service.home import HomeError, check_home
+from service.cli.verification import verify
 from service.models import registry
 from service.models.archive import MEDIA_TYPE
-from service.verification import verify
+from service.storage.database import Database, VersionRow
+from service.storage.files import Files, FilesUnreachableError
+from service.storage.home import HomeError, check_home
 from tests.cluster.servers import BUCKET, Shared
 from tests.service.data import ADDRESS, arrays, error, npz, post, service_of, stream, upload
 

@@ -9,11 +9,11 @@ from contextlib import closing, suppress
 import pytest
 from sqlalchemy import delete
 
-from service.database import AlarmRow, Database, DeletedModelRow, EventRow, ModelRow, VersionRow, now
-from service.database.notices import Notice, read
+from service.learning.storage import log
 from service.models import moves, registry
 from service.replication.listening import Listener
-from service.updates.storage import log
+from service.storage.database import AlarmRow, Database, DeletedModelRow, EventRow, ModelRow, VersionRow, now
+from service.storage.database.notices import Notice, read
 from tests.cluster.servers import Postgres, Shared
 from tests.service.data import eventually
 from tests.service.updates.batches import MODEL, OTHER, batch

@@ -10,7 +10,7 @@ import httpx
 import numpy as np
 import pytest
 
-from service.database import Database, EventRow
+from service.storage.database import Database, EventRow
 from tests.cluster.pairs import HARMLESS, answers, folder_store, made, train
 from tests.cluster.servers import Shared
 from tests.service.server import Server

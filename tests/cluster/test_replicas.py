@@ -13,10 +13,10 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 
 from service.app import create_app
-from service.database import AlarmRow, EventRow, LearnerRow, ServingRow
+from service.learning.learner.messages import Contested
+from service.learning.refreshing import promotion
 from service.replication import replication
-from service.updates.learner.messages import Contested
-from service.updates.refreshing import promotion
+from service.storage.database import AlarmRow, EventRow, LearnerRow, ServingRow
 from tests.cluster.pairs import Pair, answers, both, publish, train
 from tests.cluster.servers import S3, Postgres, Shared, sharing
 from tests.service.data import ADDRESS, error, eventually, service_of

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from service.database import ReplicaRow
-from service.replicas import alive, identity
+from service.storage.database import ReplicaRow
+from service.storage.replicas import alive, identity
 from service.training import worker
 from service.training.queue import JobQueue
 from tests.cluster import light

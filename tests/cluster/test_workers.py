@@ -10,7 +10,7 @@ import pytest
 from lipcore.fitting import FitCancelledError
 from service.compute.executors import ClusterUnavailableError, Processes, lost, sent, shard_executor
 from service.compute.shards import summed
-from service.settings import Settings
+from service.foundation.settings import Settings
 from tests.cluster.sums import home, once_lost, told
 from tests.cluster.workers import cluster
 

@@ -9,12 +9,12 @@ import os
 import sys
 import traceback
 
-import service.settings
+from service.foundation import settings
 
 
 def main() -> None:
     """Answer every line on standard input."""
-    service.settings.DEFAULT_URL = os.environ["LIPSERVE_URL"]  # the port that a reader's service has is taken here
+    settings.DEFAULT_URL = os.environ["LIPSERVE_URL"]  # the port that a reader's service has is taken here
     namespace = {"__name__": "__main__"}
     for line in sys.stdin:
         printed, error = io.StringIO(), None

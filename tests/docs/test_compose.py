@@ -10,7 +10,7 @@ import pytest
 import yaml
 from distributed.cli.dask_scheduler import main as dask_scheduler
 
-from service.settings import Settings
+from service.foundation.settings import Settings
 from tests.docs.blocks import ROOT
 from tests.docs.test_commands import parse
 

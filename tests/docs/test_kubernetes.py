@@ -11,7 +11,7 @@ import yaml
 from distributed.cli.dask_scheduler import main as dask_scheduler
 
 from service.app import create_app
-from service.settings import Settings
+from service.foundation.settings import Settings
 from tests.docs.blocks import ROOT, blocks
 from tests.docs.test_commands import parse
 

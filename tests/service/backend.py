@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
-from service.settings import Settings
+from service.foundation.settings import Settings
 
 if TYPE_CHECKING:
     from tests.cluster.servers import S3, Postgres

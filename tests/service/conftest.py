@@ -13,8 +13,8 @@ from fastapi.testclient import TestClient
 import lipcore
 from lipcore import Samples, TorqueModel
 from service.app import create_app
+from service.foundation.settings import Settings
 from service.models import registry
-from service.settings import Settings
 from tests.service import backend
 from tests.service.data import ADDRESS, service_of, stream, train, upload
 from tests.service.server import Server

@@ -14,7 +14,7 @@ from lipcore.robots import load_robot
 from lipcore.samples import Samples
 from lipcore.simulation import Stream, simulate
 from service.context import Service
-from service.training.states import ACTIVE
+from service.foundation.states import ACTIVE
 
 QUICK = {"hyperparameter_samples": 20, "posterior_samples": 60, "max_iterations": 4}
 """Options of a fit that takes a fraction of a second."""

@@ -13,10 +13,10 @@ from websockets.sync.client import ClientConnection, connect
 
 import lipcore
 from lipcore import TorqueModel
-from service.database import Database
-from service.files import Files
+from service.foundation.settings import Settings
 from service.models import registry
-from service.settings import Settings
+from service.storage.database import Database
+from service.storage.files import Files
 from tests.service.data import DEADLINE
 from tests.service.server import Server
 

@@ -12,9 +12,9 @@ from lipcore import dynamics
 from lipcore.kernels.se import SquaredExponentialKernel
 from lipcore.motion import Motion
 from service.client import ApiError, Client
+from service.foundation.settings import Settings
 from service.inference import components
 from service.inference.schema import PredictRequest
-from service.settings import Settings
 from tests.service.data import error, service_of
 
 NAMES = [name for name in dynamics.COMPONENTS if name != "forward_dynamics"]

@@ -14,9 +14,9 @@ from service.datasets.mapping.reading import read
 from service.datasets.options import ReadOptions, UploadOptions
 from service.datasets.preparing import prepare
 from service.datasets.staging import staging
-from service.errors import InvalidDataError, TooLargeError
-from service.limits.disk import Disk
-from service.settings import Settings
+from service.foundation.errors import InvalidDataError, TooLargeError
+from service.foundation.settings import Settings
+from service.web.limits.disk import Disk
 from tests.service.data import arrays, columns, csv, npz, stream
 
 SAMPLES = stream(samples=60, rate=50.0)

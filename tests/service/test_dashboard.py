@@ -9,7 +9,7 @@ from fastapi.testclient import TestClient
 
 from service.app import create_app
 from service.dashboard.routes import STATIC
-from service.settings import Settings
+from service.foundation.settings import Settings
 from tests.service.data import ADDRESS
 
 FILES = sorted(path.relative_to(STATIC).as_posix() for path in STATIC.rglob("*") if path.is_file())

@@ -8,8 +8,8 @@ import pytest
 import lipcore
 from lipcore.metrics import evaluate
 from lipcore.samples import Samples
-from service.database import DatasetRow, JobRow
 from service.models import registry
+from service.storage.database import DatasetRow, JobRow
 from service.training.material import recorded
 from tests.service.data import (
     QUICK,

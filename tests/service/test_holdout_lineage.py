@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from service.database import DatasetRow
 from service.models.archive_import import Lineage
 from service.models.lineage import learnt_from, named
+from service.storage.database import DatasetRow
 from service.training.holding_out import CannotHoldOutError, remembered
 
 ENTRY = {"id": "ds_1", "sha256": "s", "whole": False, "guard": 0.25, "guard_unit": "s", "rows": 34, "guarded": 4}

@@ -10,7 +10,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.app import create_app
-from service.settings import Settings
+from service.foundation.settings import Settings
 from tests.service.data import ADDRESS, ENDLESS, ended, eventually, queue, running, stream, train, upload
 from tests.service.server import Server, command
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from service.settings import Settings
+from service.foundation.settings import Settings
 from service.training.process import THREAD_VARIABLES, Place, start_process, training_cpus, training_place
 from tests.service.data import ENDLESS, queue, running, stream, upload
 from tests.service.server import Server

@@ -10,7 +10,7 @@ import pytest
 import lipcore
 from lipcore.robots import ROBOTS, load_robot, profile_urdf
 from service.client import ApiError, Client
-from service.errors import InvalidRequestError
+from service.foundation.errors import InvalidRequestError
 from service.models import registry
 from service.robots import store
 from tests.service.cli.conftest import lipserve  # noqa: F401 - a fixture

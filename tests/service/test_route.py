@@ -10,10 +10,10 @@ from fastapi.routing import APIRoute, iter_route_contexts
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.errors import InvalidRequestError, problem, readable
+from service.foundation.errors import InvalidRequestError, problem, readable
 from service.inference.wire import decode
-from service.route import Route, each_once, read_json
-from service.updates.ingest import wire as observations
+from service.learning.ingest import wire as observations
+from service.web.route import Route, each_once, read_json
 from tests.service.data import error, service_of
 
 VALUES = st.recursive(

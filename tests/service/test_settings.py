@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from service.settings import CHECKOUT_MODELS, Settings, is_loopback, shipped_models
+from service.foundation.settings import CHECKOUT_MODELS, Settings, is_loopback, shipped_models
 
 
 @pytest.fixture(autouse=True)

@@ -10,11 +10,19 @@ from importlib.metadata import entry_points
 import pytest
 
 from service import __version__
-from service.settings import shipped_models
+from service.foundation.settings import shipped_models
 
 NUMERICS = ("numpy", "torch", "scipy", "numba")
 FITTING = ("scipy.optimize", "scipy.signal", "scipy.stats")
-CLIENTS = ("httpx", "service.client", "service.demo", "service.reproduce", "service.bench", "matplotlib", "pandas")
+CLIENTS = (
+    "httpx",
+    "service.client",
+    "service.cli.demonstration",
+    "benchmarks.reproduce",
+    "benchmarks",
+    "matplotlib",
+    "pandas",
+)
 SERVING = ("fastapi", "uvicorn", "sqlalchemy", "pydantic", "service")
 
 

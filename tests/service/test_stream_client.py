@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from websockets.sync.server import serve, unix_serve
 
-from service.stream.client import StreamClient, StreamError
+from service.client.stream import StreamClient, StreamError
 from tests.service.data import DEADLINE
 from tests.service.server import free_port
 from tests.service.streams import MOTION, motions

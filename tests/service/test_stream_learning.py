@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from anyio import to_thread
 
-from service.errors import ConflictError, invalid_request
-from service.observability.meters import Meters
-from service.settings import Settings
+from service.foundation.errors import ConflictError, invalid_request
+from service.foundation.settings import Settings
+from service.learning.ingest.frames import FramesResult
 from service.stream.session import Session
-from service.updates.ingest.frames import FramesResult
+from service.web.observability.meters import Meters
 from tests.service.data import DEADLINE
 from tests.service.streams import ERROR, STD, TAU, frame, read
 

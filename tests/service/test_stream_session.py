@@ -9,10 +9,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from service.observability.meters import Meters
-from service.settings import Settings
+from service.foundation.settings import Settings
 from service.stream.conversation import Echo
 from service.stream.session import Session
+from service.web.observability.meters import Meters
 from tests.service.data import DEADLINE
 from tests.service.streams import ERROR, LATE, STD, frame, read
 

@@ -10,7 +10,7 @@ import threading
 import pytest
 from websockets.sync.server import unix_serve
 
-from service.stream.client import StreamClient, StreamError, StreamRefusal
+from service.client.stream import StreamClient, StreamError, StreamRefusal
 from tests.service.data import DEADLINE
 
 HELLO = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.stream.client import StreamClient
+from service.client.stream import StreamClient
 from tests.service.data import DEADLINE, ended, eventually, queue, stream, train, upload
 from tests.service.streams import ask, dial, frame, hello, motions, read, saved_model
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service import recordings
+from service.cli import recordings
 from service.datasets import store
 from tests.service.data import arrays, columns, csv, npz, post, service_of, stream
 

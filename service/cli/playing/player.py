@@ -11,7 +11,7 @@ from types import FrameType
 
 from service.cli.playing.source import Motion
 from service.cli.playing.tally import Tally
-from service.stream.client import StreamClient, StreamError
+from service.client.stream import StreamClient, StreamError
 
 NAP = 0.05
 """Longest sleep, s: so soon a Ctrl-C is heard."""

@@ -19,9 +19,9 @@ from service.datasets.mapping.reading import read
 from service.datasets.options import UploadOptions
 from service.datasets.preparing import prepare
 from service.datasets.staging import Staged
-from service.errors import ServiceError
-from service.limits.disk import Disk
-from service.settings import Settings
+from service.foundation.errors import ServiceError
+from service.foundation.settings import Settings
+from service.web.limits.disk import Disk
 
 FEWEST = 10
 """Rows of a recording."""

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from service.client.call import Answer, Call, Route, document, given, record, route
 from service.client.results.arrays import Array, array
-from service.health_schema import Live, Ready
 from service.oip.schema import ModelMetadata, ModelReady, ServerLive, ServerMetadata, ServerReady
+from service.web.health_schema import Live, Ready
 
 V2_MODEL, V2_VERSION = "/v2/models/{model}", "/v2/models/{model}/versions/{version}"
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from service.client.call import Answer
 from service.client.results.arrays import Array, Plain, array
-from service.updates.live.schema import LiveLost, LiveStatus
+from service.learning.live.schema import LiveLost, LiveStatus
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,8 @@ import numpy as np
 
 from lipcore.samples import Array
 from service.datasets.formats.table import BLOCK_ROWS
-from service.errors import invalid_data
-from service.settings import Settings
+from service.foundation.errors import invalid_data
+from service.foundation.settings import Settings
 
 BLOCK_BYTES = 16 * 1024 * 1024
 """Largest block: a file of many columns is read fewer rows at a time."""

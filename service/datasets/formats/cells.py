@@ -8,7 +8,7 @@ import pyarrow.compute as pc
 
 from lipcore.samples import Array
 from service.datasets.formats.csv_header import NUMBER
-from service.errors import invalid_data
+from service.foundation.errors import invalid_data
 
 MISSING = ("", "NA", "N/A", "<NA>", "na", "null", "NULL", "None")
 """Cells that say there is no value; `nan` in any case is a number of its own."""

@@ -18,8 +18,8 @@ from service.datasets.formats.cells import MISSING, NumberColumn, StampColumn
 from service.datasets.formats.csv_header import BLANK, Header, not_utf8, read_header
 from service.datasets.formats.table import Table
 from service.datasets.options import ReadOptions
-from service.errors import invalid_data
-from service.settings import Settings
+from service.foundation.errors import invalid_data
+from service.foundation.settings import Settings
 
 LINE_BYTES = 1024 * 1024
 """Longest line, and how much of a file is parsed at a time."""

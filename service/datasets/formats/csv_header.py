@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from service.errors import InvalidDataError, invalid_data, invalid_request
+from service.foundation.errors import InvalidDataError, invalid_data, invalid_request
 
 SAMPLE_CHARACTERS = 256 * 1024
 MAX_HEADER = 64 * 1024

@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 from lipcore.samples import Array
 from service.datasets.formats.cells import since
 from service.datasets.formats.json_shape import SAME
-from service.errors import invalid_data
+from service.foundation.errors import invalid_data
 
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 

@@ -14,8 +14,8 @@ from service.datasets.formats.blocks import left_out
 from service.datasets.formats.json_rows import Rows, decode
 from service.datasets.formats.table import Table
 from service.datasets.options import ReadOptions
-from service.errors import TooLargeError, invalid_data
-from service.settings import Settings
+from service.foundation.errors import TooLargeError, invalid_data
+from service.foundation.settings import Settings
 
 ARRAYS = "an array of objects, or an object of arrays"
 

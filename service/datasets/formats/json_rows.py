@@ -13,8 +13,8 @@ import numpy as np
 from lipcore.samples import Array
 from service.datasets.formats.blocks import block_rows, checked_names, left_out
 from service.datasets.formats.json_shape import Node, Shape, name_of
-from service.errors import InvalidDataError, invalid_data
-from service.settings import Settings
+from service.foundation.errors import InvalidDataError, invalid_data
+from service.foundation.settings import Settings
 
 SAMPLE_ROWS = 1000
 """Rows that tell which columns there are."""

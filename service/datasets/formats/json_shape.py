@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-from service.errors import invalid_data
+from service.foundation.errors import invalid_data
 
 MAX_DEPTH = 10
 SAME = 0.9

@@ -20,8 +20,8 @@ from service.datasets.formats.parquet import ParquetSource
 from service.datasets.formats.table import Table
 from service.datasets.formats.zips import ERRORS, measure, open_zip
 from service.datasets.options import ReadOptions
-from service.errors import ServiceError, TooLargeError, invalid_data
-from service.settings import Settings
+from service.foundation.errors import ServiceError, TooLargeError, invalid_data
+from service.foundation.settings import Settings
 
 INFO = "meta/info.json"
 EXPECTED = "a zip of a LeRobot data set: meta/info.json and data/…parquet"

@@ -19,8 +19,8 @@ from service.datasets.formats.blocks import block_rows, checked_names, left_out,
 from service.datasets.formats.table import Table
 from service.datasets.formats.zips import ERRORS, measure, open_zip
 from service.datasets.options import ReadOptions
-from service.errors import invalid_data
-from service.settings import Settings
+from service.foundation.errors import invalid_data
+from service.foundation.settings import Settings
 
 ARRAYS = {"q": 2, "dq": 2, "ddq": 2, "tau": 2, "t": 1, "episode": 1, "dt": 0, "joint_names": 1}
 """Known arrays and their dimensions: q, dq, ddq, tau (N, n); t, episode (N,); dt (); joint_names (n,)."""

@@ -15,8 +15,8 @@ from service.datasets.formats.parquet import open_parquet
 from service.datasets.formats.sniff import KINDS, foreign, sniff
 from service.datasets.formats.table import Table
 from service.datasets.options import ReadOptions
-from service.errors import invalid_data
-from service.settings import Settings
+from service.foundation.errors import invalid_data
+from service.foundation.settings import Settings
 
 Opener = Callable[[Path, ReadOptions, Settings], AbstractContextManager[Table]]
 OPENERS: dict[str, Opener] = {

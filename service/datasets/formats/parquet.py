@@ -16,8 +16,8 @@ from service.datasets.formats.flattening import Node, plan
 from service.datasets.formats.parquet_pages import check_pages
 from service.datasets.formats.table import Table
 from service.datasets.options import ReadOptions
-from service.errors import invalid_data
-from service.settings import Settings
+from service.foundation.errors import invalid_data
+from service.foundation.settings import Settings
 
 EXPECTED = "a complete Parquet file"
 ERRORS = (pa.ArrowException, OSError, ValueError, EOFError, MemoryError)

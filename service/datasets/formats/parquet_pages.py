@@ -7,8 +7,8 @@ from typing import IO
 
 import pyarrow.parquet as pq
 
-from service.errors import TooLargeError, invalid_data
-from service.settings import Settings
+from service.foundation.errors import TooLargeError, invalid_data
+from service.foundation.settings import Settings
 
 MAGIC = b"PAR1"
 MAX_FOOTER = 16 * 1024 * 1024

@@ -7,8 +7,8 @@ from pathlib import Path
 from service.datasets.formats.json_rows import decode
 from service.datasets.formats.lerobot import root_of
 from service.datasets.formats.zips import open_zip
-from service.errors import ServiceError
-from service.settings import Settings
+from service.foundation.errors import ServiceError
+from service.foundation.settings import Settings
 
 HEAD_BYTES = 64 * 1024
 KINDS = {

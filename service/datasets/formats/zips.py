@@ -10,8 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from service.datasets.formats.blocks import said
-from service.errors import TooLargeError, invalid_data
-from service.settings import Settings
+from service.foundation.errors import TooLargeError, invalid_data
+from service.foundation.settings import Settings
 
 READ_BYTES = 16 * 1024 * 1024
 """Largest single read from the file: no list of members is longer, whatever the archive says."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lipcore.samples import Array
 from service.datasets.mapping.units import TURN
-from service.errors import InvalidDataError, invalid_data
+from service.foundation.errors import InvalidDataError, invalid_data
 
 CONSTANT = 1e-6
 """A joint whose positions span less than this (rad, m) has not moved."""

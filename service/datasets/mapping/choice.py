@@ -20,7 +20,7 @@ from service.datasets.mapping.recognition import (
     unfold,
 )
 from service.datasets.options import UploadOptions
-from service.errors import InvalidDataError, invalid_data, invalid_request
+from service.foundation.errors import InvalidDataError, invalid_data, invalid_request
 
 MOTION = ("dq", "ddq")
 MEANT = {"q": "positions", "dq": "velocities", "ddq": "accelerations", "tau": "torques"}

@@ -11,7 +11,7 @@ from service.datasets.mapping.recognition import AIM, CANONICAL, Family
 from service.datasets.mapping.robot import Robot
 from service.datasets.mapping.units import factor, is_current
 from service.datasets.options import EFFORT_CONVENTIONS, Effort, UploadOptions
-from service.errors import invalid_data, invalid_request
+from service.foundation.errors import invalid_data, invalid_request
 
 MEANINGS: dict[Effort, str] = {
     "measured": "torque as measured, gravity included",

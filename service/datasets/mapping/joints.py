@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from service.datasets.mapping.recognition import JOINT, Family, Key
 from service.datasets.mapping.robot import Robot
 from service.datasets.options import UploadOptions
-from service.errors import InvalidDataError, invalid_data, invalid_request
+from service.foundation.errors import InvalidDataError, invalid_data, invalid_request
 
 MAX_NAME = 100
 _NUMBER = re.compile(r"\d{1,9}")

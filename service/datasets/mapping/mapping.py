@@ -12,7 +12,7 @@ from service.datasets.mapping.recognition import CANONICAL, Family, clocks, is_e
 from service.datasets.mapping.robot import Robot
 from service.datasets.mapping.units import KNOWN, factor
 from service.datasets.options import UploadOptions
-from service.errors import invalid_data, invalid_request
+from service.foundation.errors import invalid_data, invalid_request
 
 LISTED = 8
 """Most columns that a sentence names."""

@@ -20,9 +20,9 @@ from service.datasets.mapping.mapping import ColumnMap, Source, resolve
 from service.datasets.mapping.robot import Robot
 from service.datasets.options import Effort, UploadOptions
 from service.datasets.staging import EPISODE, TIME, Staged, column
-from service.errors import invalid_data
-from service.limits.disk import Disk
-from service.settings import Settings
+from service.foundation.errors import invalid_data
+from service.foundation.settings import Settings
+from service.web.limits.disk import Disk
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from service.datasets.report.schema import (
 )
 from service.datasets.report.timing import Clock, look_at_clock
 from service.datasets.staging import EPISODE, QUANTITIES, Staged, column
-from service.settings import Settings
+from service.foundation.settings import Settings
 
 WARNING = "warning: "
 """What a sentence of the reading begins with that belongs to the warnings."""

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import pytest
 from fastapi.testclient import TestClient
 
-from service.access import keys
-from service.access.scopes import SCOPES
 from service.app import create_app
-from service.database import Database
-from service.settings import Settings
+from service.foundation.settings import Settings
+from service.storage.database import Database
+from service.web.access import keys
+from service.web.access.scopes import SCOPES
 
 REFRESH_S = 0.05
 

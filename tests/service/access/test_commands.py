@@ -8,12 +8,12 @@ from datetime import UTC, datetime, timedelta
 import pytest
 
 from service import cli
-from service.access import keys
-from service.access.credentials import headers_of
-from service.access.keys import digest_of
 from service.client import Client
-from service.database import Database
-from service.settings import Settings
+from service.foundation.settings import Settings
+from service.storage.database import Database
+from service.web.access import keys
+from service.web.access.credentials import headers_of
+from service.web.access.keys import digest_of
 from tests.service.access.conftest import bearer
 from tests.service.data import eventually
 

@@ -9,12 +9,12 @@ from datetime import UTC, datetime, timedelta
 import pytest
 from sqlalchemy import delete, update
 
-from service.access import keyring as keyring_module
-from service.access import keys
-from service.access.keyring import Keyring
-from service.access.scopes import ADMIN, SCOPES
-from service.database import ApiKeyRow
-from service.errors import UnauthorizedError
+from service.foundation.errors import UnauthorizedError
+from service.storage.database import ApiKeyRow
+from service.web.access import keyring as keyring_module
+from service.web.access import keys
+from service.web.access.keyring import Keyring
+from service.web.access.scopes import ADMIN, SCOPES
 from tests.service.access.conftest import REFRESH_S, bearer
 from tests.service.data import error, eventually
 

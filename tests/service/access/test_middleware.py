@@ -6,9 +6,9 @@ import asyncio
 
 import pytest
 
-from service.access import keys
-from service.access.keyring import Keyring
-from service.access.middleware import KEY_ID, KeyAccess
+from service.web.access import keys
+from service.web.access.keyring import Keyring
+from service.web.access.middleware import KEY_ID, KeyAccess
 from tests.service.access.conftest import REFRESH_S
 
 EVENTS = "/v1/jobs/job_1/events"

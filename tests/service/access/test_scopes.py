@@ -6,8 +6,8 @@ import re
 
 import pytest
 
-from service.access.scopes import ADMIN, LASTING, LONGEST_PATH, OPEN, SCOPES, TABLE, WEBSOCKET, rule_of
 from service.stream import routes as stream
+from service.web.access.scopes import ADMIN, LASTING, LONGEST_PATH, OPEN, SCOPES, TABLE, WEBSOCKET, rule_of
 from tests.service.access.conftest import bearer
 from tests.service.data import error, eventually
 

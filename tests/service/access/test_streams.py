@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from service.access import keys
 from service.client import ApiError, Client
-from service.database import Database
-from service.settings import Settings
-from service.stream.client import StreamClient, StreamError
+from service.client.stream import StreamClient, StreamError
+from service.foundation.settings import Settings
+from service.storage.database import Database
+from service.web.access import keys
 from tests.service.access.conftest import bearer
 from tests.service.data import eventually
 from tests.service.server import Server

@@ -13,7 +13,7 @@ from service import __version__
 from service.cli.main import Commands
 from service.datasets.formats.opening import open_table
 from service.datasets.options import ReadOptions
-from service.settings import Settings
+from service.foundation.settings import Settings
 from tests.service.cli.conftest import QUICKLY
 from tests.service.data import arrays, stream
 from tests.service.server import free_port

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from service import recordings
+from service.cli import recordings
 from tests.service.data import stream
 
 

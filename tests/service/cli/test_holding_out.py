@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from service import recordings
+from service.cli import recordings
 from service.client import ApiError, Client
 from tests.service.cli.conftest import QUICKLY
 from tests.service.data import QUICK, stream

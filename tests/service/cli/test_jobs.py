@@ -7,8 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from service import recordings
-from service.cli import watching
+from service.cli import recordings, watching
 from service.client import Client
 from tests.service.cli.conftest import QUICKLY
 from tests.service.data import ENDLESS, ended, queue, stream, upload

@@ -8,10 +8,10 @@ import signal
 import numpy as np
 import pytest
 
-from service import recordings
+from service.cli import recordings
 from service.cli.playing.source import recorded
 from service.cli.playing.tally import Tally
-from service.stream.client import StreamClient
+from service.client.stream import StreamClient
 from service.stream.messages import StreamAnswer
 from tests.service.data import stream, train, upload
 

@@ -8,10 +8,10 @@ import httpx
 import numpy as np
 import pytest
 
-from service import recordings
+from service.cli import recordings
 from service.client import ApiError, AsyncClient, Client, ServiceUnreachableError
-from service.stream.async_client import AsyncStreamClient
-from service.stream.client import StreamError
+from service.client.async_stream import AsyncStreamClient
+from service.client.stream import StreamError
 from tests.service.data import DEADLINE, QUICK, stream
 from tests.service.server import free_port
 from tests.service.streams import MOTION, TAU

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service import recordings
+from service.cli import recordings
 from service.client import ApiError, Client, ServiceUnreachableError
 from tests.service.data import QUICK, stream
 from tests.service.server import free_port

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from service.client import Client
-from service.stream.client import StreamError
+from service.client.stream import StreamError
 from tests.service.data import stream
 from tests.service.streams import MOTION
 

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from service.database import DatasetRow, JobRow
+from service.storage.database import DatasetRow, JobRow
 from tests.service.data import QUICK, arrays, ended, error, npz, service_of, stream, upload
 from tests.service.server import Server
 

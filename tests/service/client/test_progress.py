@@ -7,7 +7,7 @@ import io
 import pytest
 from rich.console import Console
 
-from service import recordings
+from service.cli import recordings
 from service.client import progress
 from service.client.progress import follow, upload_bar
 from tests.service.data import ENDLESS, QUICK, running, stream, upload

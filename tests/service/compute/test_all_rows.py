@@ -14,10 +14,10 @@ from lipcore.online import spacing
 from lipcore.samples import Samples
 from service.compute.executors import Inline, shard_executor
 from service.compute.shards import summed
-from service.database import DatasetRow
-from service.files import Files, new_id
-from service.sample_file import Reader
-from service.settings import Settings
+from service.foundation.settings import Settings
+from service.storage.database import DatasetRow
+from service.storage.files import Files, new_id
+from service.storage.sample_file import Reader
 from service.training.rows import CANDIDATES, STRETCHES, Part, Table, opened
 from service.training.summing import Context, packed, read, shard_told
 from tests.service.data import QUICK, stream

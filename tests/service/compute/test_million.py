@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from lipcore.samples import Samples
-from service.training.states import ACTIVE
+from service.foundation.states import ACTIVE
 from tests.service.data import eventually, job, post, queue, stream
 from tests.service.server import Server
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from lipcore.fitting import FitCancelledError
 from service.compute.executors import Inline, shard_executor
 from service.compute.shards import AHEAD, ShardFailedError, summed
-from service.settings import Settings
+from service.foundation.settings import Settings
 from tests.service.compute.work import dying, numbers
 
 SHARDS = list(range(37))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from service.database import Database
-from service.database.migrations import HEAD, revision
+from service.storage.database import Database
+from service.storage.database.migrations import HEAD, revision
 
 
 def check_starts_together(opens: Callable[[], Database], count: int = 4) -> None:

@@ -11,8 +11,8 @@ from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from sqlalchemy import inspect, select, text
 
-from service.database import Base, Database, JobRow, ModelRow, SnapshotRow, VersionRow, migrations
-from service.database.migrations import HEAD, DatabaseVersionError
+from service.storage.database import Base, Database, JobRow, ModelRow, SnapshotRow, VersionRow, migrations
+from service.storage.database.migrations import HEAD, DatabaseVersionError
 from tests.service.database.starting import check_starts_together
 
 BEFORE = (Path(__file__).parent / "before_migrations.sql").read_text()

@@ -12,10 +12,10 @@ import pytest
 
 import lipcore
 from lipcore import FitOptions
-from service.database import Database, LearningRow
-from service.files import Files
+from service.learning.learning_options import LearningOptions
 from service.models import registry
-from service.updates.learning_options import LearningOptions
+from service.storage.database import Database, LearningRow
+from service.storage.files import Files
 from tests.service.data import DEADLINE, QUICK, eventually, stream
 from tests.service.faults.injection import PATIENCE, Fault, Injector
 from tests.service.faults.ledger import ARM, Ledger

@@ -17,7 +17,7 @@ from lipcore.online import spacing
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.vocabulary import LEARNT
-from service.training.states import ACTIVE
+from service.foundation.states import ACTIVE
 from tests.service.data import eventually, job, stream
 from tests.service.faults.injection import PATIENCE
 

@@ -43,13 +43,13 @@ UPLOADS = [
     Point(
         "upload: half of the file written",
         actions.upload,
-        Fault(RENAME, within="service.files.store:Files.write_samples"),
+        Fault(RENAME, within="service.storage.files.store:Files.write_samples"),
         "nothing",
     ),
     Point(
         "upload: file complete, no row",
         actions.upload,
-        Fault("service.files.store:Files.write_samples", "after"),
+        Fault("service.storage.files.store:Files.write_samples", "after"),
         "nothing",
     ),
     *_around_commit("upload", actions.upload, "service.datasets.store:add"),
@@ -58,7 +58,7 @@ UPLOADS = [
     Point(
         "deletion of a data set: before its file goes",
         actions.delete_dataset,
-        Fault("service.files.store:Files.delete_samples"),
+        Fault("service.storage.files.store:Files.delete_samples"),
         "all",
     ),
 ]
@@ -83,29 +83,31 @@ JOBS = [
     *_around_commit("job cancelled while it runs", actions.cancel, "service.training.jobs:cancel"),
 ]
 POINTED = "service.inference.loaded:LoadedModels.point"
-APPEND = "service.updates.ingest.intake:Ingest.append"
-STORE = "service.updates.storage.snapshots:save"
+APPEND = "service.learning.ingest.intake:Ingest.append"
+STORE = "service.learning.storage.snapshots:save"
 LEARNING = [
     Point(
-        "observation: row made", actions.observe, Fault("service.updates.storage.log:append_batch", "after"), "nothing"
+        "observation: row made", actions.observe, Fault("service.learning.storage.log:append_batch", "after"), "nothing"
     ),
     *_around_commit("observation", actions.observe, APPEND),
-    *_around_commit("unlearning", actions.unlearn, "service.updates.control.undoing:unlearn"),
-    *_both("learner: page read", actions.observe, Fault("service.updates.learner.restore:advance", "before")),
+    *_around_commit("unlearning", actions.unlearn, "service.learning.control.undoing:unlearn"),
+    *_both("learner: page read", actions.observe, Fault("service.learning.learner.restore:advance", "before")),
     *_both(
-        "learner: publication written", actions.observe, Fault("service.updates.learner.publication:write", "after")
+        "learner: publication written", actions.observe, Fault("service.learning.learner.publication:write", "after")
     ),
-    Point("publication: before it is read", actions.observe, Fault("service.updates.learner.publication:read"), "all"),
+    Point("publication: before it is read", actions.observe, Fault("service.learning.learner.publication:read"), "all"),
     *_both("snapshot: half of the file", actions.observe, Fault(RENAME, "before", STORE)),
     *_both(
-        "snapshot: file complete, no row", actions.observe, Fault("service.files.store:Files.write_snapshot", "after")
+        "snapshot: file complete, no row",
+        actions.observe,
+        Fault("service.storage.files.store:Files.write_snapshot", "after"),
     ),
     *_both("snapshot: before the commit", actions.observe, Fault(COMMIT, "before", STORE)),
     *_both("snapshot: after the commit", actions.observe, Fault(COMMIT, "after", STORE)),
     *_both(
         "snapshot: older ones still there",
         actions.observe_on,
-        Fault("service.files.store:Files.delete_snapshot", "before"),
+        Fault("service.storage.files.store:Files.delete_snapshot", "before"),
     ),
 ]
 MOVE = "service.models.aliases:_move"
@@ -113,7 +115,7 @@ MOVES = [
     Point(
         "other version serves: pointer moved", actions.serve, Fault("service.models.registry:serve", "after"), "nothing"
     ),
-    *_around_commit("other version serves", actions.serve, "service.updates.control.undoing:_to_version"),
+    *_around_commit("other version serves", actions.serve, "service.learning.control.undoing:_to_version"),
     Point(
         "other version serves: before it answers",
         actions.serve,
@@ -143,14 +145,14 @@ POINTS = [*UPLOADS, *JOBS, *LEARNING, *MOVES, *ARCHIVES, *DELETIONS]
 RECOVER = "service.training.queue:JobQueue.recover"
 STARTS = {
     "the home is held": Fault("service.app:_open", victim="itself"),
-    "all is swept": Fault("service.files.store:Files.sweep", "after", victim="itself"),
+    "all is swept": Fault("service.storage.files.store:Files.sweep", "after", victim="itself"),
     "before jobs are queued again": Fault(COMMIT, "before", RECOVER, "itself"),
     "jobs are queued again": Fault(COMMIT, "after", RECOVER, "itself"),
 }
 """Points of a start after a kill."""
 INSTALL = "service.models.registry:install_shipped"
 FIRST_STARTS = {
-    "before the tables are committed": Fault("service.database.migrations:_upgrade", "after", victim="itself"),
+    "before the tables are committed": Fault("service.storage.database.migrations:_upgrade", "after", victim="itself"),
     "half of the shipped model": Fault(FSYNC, "before", INSTALL, "itself", skip=1),
     "the shipped model complete, no row": Fault(RENAME, "after", INSTALL, "itself"),
     "before the commit of the shipped model": Fault(COMMIT, "before", INSTALL, "itself"),

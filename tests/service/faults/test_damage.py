@@ -14,9 +14,9 @@ from fastapi.testclient import TestClient
 
 from lipcore.persistence import MANIFEST, TENSORS
 from service.app import create_app
-from service.database.sqlite import FILE
-from service.home import HomeError, check_home
-from service.settings import Settings
+from service.foundation.settings import Settings
+from service.storage.database.sqlite import FILE
+from service.storage.home import HomeError, check_home
 from tests.service.data import ended, error, eventually, queue, stream, upload
 from tests.service.faults.damage import HARM, cut, empty, flip, zero
 from tests.service.faults.house import furnish

@@ -9,13 +9,13 @@ import sys
 
 import pytest
 
-from service.database import Database, LearnerRow
+from service.storage.database import Database, LearnerRow
 from tests.service.faults.house import House
 from tests.service.faults.injection import COMMIT, Fault
 from tests.service.faults.ledger import ARM, predicted, rows
 
 pytestmark = pytest.mark.slow
-DECIDE = "service.updates.refreshing.promotion:decide"
+DECIDE = "service.learning.refreshing.promotion:decide"
 POINTS = {
     "roles are changed": (Fault("service.models.registry:serve", "after", DECIDE, "itself"), False),
     "before the commit": (Fault(COMMIT, "before", DECIDE, "itself"), False),

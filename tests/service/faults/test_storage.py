@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import httpx
 import pytest
 
-from service.database.engine import PATIENCE_S
-from service.stream.client import StreamClient
+from service.client.stream import StreamClient
+from service.storage.database.engine import PATIENCE_S
 from tests.service.data import arrays, error, eventually, npz, stream
 from tests.service.faults.actions import observe, serve, train, unlearn, upload, upload_robot
 from tests.service.faults.house import House

@@ -17,13 +17,13 @@ from sqlalchemy import create_engine, event, text
 from sqlalchemy.exc import DBAPIError
 
 from service.app import create_app
-from service.database import Database
-from service.database.sqlite import FILE
-from service.errors import ServiceError, StorageFullError, StorageUnavailableError
-from service.files import Files
-from service.home import HomeError, check_home
-from service.settings import Settings
-from service.storage_errors import translated
+from service.foundation.errors import ServiceError, StorageFullError, StorageUnavailableError
+from service.foundation.settings import Settings
+from service.storage.database import Database
+from service.storage.database.sqlite import FILE
+from service.storage.files import Files
+from service.storage.home import HomeError, check_home
+from service.web.storage_errors import translated
 from tests.service.data import arrays, error, npz, service_of, stream
 from tests.service.faults.storage import small_disk
 from tests.service.test_robots import urdf

@@ -10,7 +10,7 @@ from unittest.mock import patch
 
 import pytest
 
-from service.files import Files
+from service.storage.files import Files
 from tests.cluster.servers import BUCKET, S3
 
 _prefixes = count(1)

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from service import storage_errors
-from service.errors import StorageFullError, StorageUnavailableError
-from service.files import Files, FilesUnreachableError, objects
-from service.home import HomeError, check_home
-from service.settings import Settings
+from service.foundation.errors import StorageFullError, StorageUnavailableError
+from service.foundation.settings import Settings
+from service.storage.files import Files, FilesUnreachableError, objects
+from service.storage.home import HomeError, check_home
+from service.web import storage_errors
 from tests.service.data import stream
 
 
@@ -52,7 +52,7 @@ def refused(files):
 def quick(monkeypatch):
     """Requests that are sent once: the library's pauses are its own affair."""
     pytest.importorskip("s3fs")
-    monkeypatch.setattr("service.files.bucket.ATTEMPTS", 1)
+    monkeypatch.setattr("service.storage.files.bucket.ATTEMPTS", 1)
 
 
 def test_an_endpoint_that_is_down_is_found_and_found_again(s3, bucket, tmp_path, quick):

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 import lipcore
-from service import sample_file
-from service.errors import DamagedDataError
-from service.files import DamagedFileError, Files, FilesUnreachableError, new_id, shared
-from service.settings import Settings
+from service.foundation.errors import DamagedDataError
+from service.foundation.settings import Settings
+from service.storage import sample_file
+from service.storage.files import DamagedFileError, Files, FilesUnreachableError, new_id, shared
 from tests.service.data import QUICK, stream
 
 ANY_STORE = pytest.mark.parametrize("url", ["folder"], indirect=True)

@@ -13,8 +13,8 @@ import schemathesis
 from fastapi.testclient import TestClient
 
 from service.app import create_app
-from service.observability import readiness
-from service.settings import Settings
+from service.foundation.settings import Settings
+from service.web.observability import readiness
 from tests.service.data import ADDRESS, service_of, stream, upload
 from tests.service.fuzz.document import fitting, narrowed
 from tests.service.test_robots import urdf

@@ -12,15 +12,15 @@ from typer.testing import CliRunner
 from lipcore import ModelFormatError
 from lipcore.online import state
 from service import cli
-from service.database import DatasetRow, EventRow, RobotRow, SnapshotRow, VersionRow
-from service.errors import DamagedDataError
-from service.files import DamagedFileError, Files
+from service.cli.verification import verify
+from service.foundation.errors import DamagedDataError
+from service.foundation.settings import Settings
+from service.learning.learner.restore import restore
+from service.learning.storage import snapshots
 from service.models import registry
-from service.settings import Settings
+from service.storage.database import DatasetRow, EventRow, RobotRow, SnapshotRow, VersionRow
+from service.storage.files import DamagedFileError, Files
 from service.training.material import recorded
-from service.updates.learner.restore import restore
-from service.updates.storage import snapshots
-from service.verification import verify
 from tests.service.data import error, service_of, stream, upload
 from tests.service.updates.pendulums import ARM, Arm
 

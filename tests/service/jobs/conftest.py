@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 
-from service.database import Database, JobRow, now
-from service.settings import Settings
+from service.foundation.settings import Settings
+from service.foundation.states import ACTIVE, QUEUED
+from service.storage.database import Database, JobRow, now
 from service.training import queue
 from service.training.queue import JobQueue
-from service.training.states import ACTIVE, QUEUED
 from tests.service.data import eventually
 
 DATABASE_TIMEOUT_S = 0.2

@@ -9,9 +9,9 @@ from itertools import pairwise
 import pytest
 from sqlalchemy import select
 
-from service.database import Database, JobRow
-from service.errors import BusyError
-from service.settings import Settings
+from service.foundation.errors import BusyError
+from service.foundation.settings import Settings
+from service.storage.database import Database, JobRow
 from service.training import feed
 from service.training.feed import Feed
 from tests.service.data import ENDLESS, error, eventually, queue, service_of, stream, upload

@@ -9,8 +9,8 @@ from sqlalchemy import select
 from sqlalchemy.exc import OperationalError
 
 from lipcore.fitting import FitProgress
-from service.database import Database, JobRow
-from service.settings import Settings
+from service.foundation.settings import Settings
+from service.storage.database import Database, JobRow
 from service.training import pulse
 from service.training.pulse import Pulse, SupersededError
 from tests.service.data import eventually

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from sqlalchemy import select
 
-from service.database import Database, JobRow
-from service.files import Files
-from service.settings import Settings
+from service.foundation.settings import Settings
+from service.storage.database import Database, JobRow
+from service.storage.files import Files
 from service.training import history, leftovers
 from service.training.settling import Settled, Settler
 from service.training.watch import Ended

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.settings import Settings
+from service.foundation.settings import Settings
 from service.training import queue
 from service.training.watch import LINGER_S, Facts, Hand
 

@@ -10,7 +10,7 @@ import signal
 import sqlite3
 import time
 
-from service.settings import Settings
+from service.foundation.settings import Settings
 
 
 def connect(settings: Settings) -> sqlite3.Connection:

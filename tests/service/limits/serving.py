@@ -11,10 +11,10 @@ from typing import Any, Self
 
 import uvicorn
 
-from service.limits.connections import guarded
-from service.limits.stopping import Stopping
-from service.settings import Settings
-from service.sockets import Server
+from service.foundation.settings import Settings
+from service.web.limits.connections import guarded
+from service.web.limits.stopping import Stopping
+from service.web.sockets import Server
 from tests.service.data import DEADLINE, eventually
 from tests.service.server import free_port
 

@@ -9,13 +9,13 @@ from types import SimpleNamespace
 import pytest
 
 import lipcore
-from service.errors import StorageFullError
-from service.files import new_id
-from service.limits import disk as measuring
-from service.limits.disk import Disk, measure
-from service.limits.upload import WRITE_BYTES
+from service.foundation.errors import StorageFullError
+from service.foundation.settings import Settings, shipped_models
 from service.models import registry
-from service.settings import Settings, shipped_models
+from service.storage.files import new_id
+from service.web.limits import disk as measuring
+from service.web.limits.disk import Disk, measure
+from service.web.limits.upload import WRITE_BYTES
 from tests.service.data import QUICK, arrays, error, npz, post, service_of, stream, upload
 
 KiB = 1024
@@ -168,9 +168,9 @@ def test_a_deleted_data_set_makes_room(api, monkeypatch):
 
 
 def test_a_state_without_room_is_not_stored_and_learning_goes_on(monkeypatch, caplog, tmp_path):
-    from service.updates.learner.follower import Follower
+    from service.learning.learner.follower import Follower
 
-    monkeypatch.setattr("service.updates.learner.follower.state.dump", lambda _: bytes(1000))
+    monkeypatch.setattr("service.learning.learner.follower.state.dump", lambda _: bytes(1000))
     follower = Follower.__new__(Follower)
     follower.model, follower.version, follower._stored = "limits", 1, 0
     follower.known = SimpleNamespace(number=5, settled=True, online=None)

@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from service.limits.gate import Gate
+from service.web.limits.gate import Gate
 
 
 class Client:

@@ -7,12 +7,12 @@ import json
 
 import pytest
 
-from service.access.middleware import KEY_ID, KeyAccess
 from service.app import create_app
-from service.limits.body import BodyLimit
-from service.limits.gate import Gate
-from service.limits.rate import OTHERS, Rate, RateLimit, client_of
-from service.settings import Settings
+from service.foundation.settings import Settings
+from service.web.access.middleware import KEY_ID, KeyAccess
+from service.web.limits.body import BodyLimit
+from service.web.limits.gate import Gate
+from service.web.limits.rate import OTHERS, Rate, RateLimit, client_of
 
 
 def test_a_bucket_holds_a_burst_and_fills_at_the_rate():

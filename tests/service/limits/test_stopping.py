@@ -9,8 +9,8 @@ import sys
 import pytest
 from sqlalchemy import select
 
-from service.database import Database, JobRow, SnapshotRow
-from service.settings import Settings
+from service.foundation.settings import Settings
+from service.storage.database import Database, JobRow, SnapshotRow
 from tests.service.data import DEADLINE, ENDLESS, error, eventually, queue, running, stream, upload
 from tests.service.limits.serving import Raw, Serving
 from tests.service.server import Server

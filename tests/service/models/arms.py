@@ -9,10 +9,10 @@ from lipcore import persistence
 from lipcore.manifest import MANIFEST, read_manifest_bytes
 from lipcore.robots import load_robot
 from lipcore.urdf import RigidBody
-from service.database import Database
-from service.files import Files, new_id
+from service.foundation.settings import Settings, shipped_models
 from service.models import registry
-from service.settings import Settings, shipped_models
+from service.storage.database import Database
+from service.storage.files import Files, new_id
 from tests.lipcore.arms import parameters_of
 
 WARNING = "Two arms explain it."

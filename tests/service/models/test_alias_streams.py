@@ -6,7 +6,7 @@ import pytest
 from websockets.exceptions import InvalidStatus
 
 from service.client import ApiError, Client
-from service.stream.client import StreamClient, StreamError
+from service.client.stream import StreamClient, StreamError
 from tests.service.data import train
 from tests.service.streams import MOTION, TAU, ask, dial, frame, hello
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.errors import NotFoundError
+from service.foundation.errors import NotFoundError
 from service.inference.loaded import LoadedModels
 from service.models import registry
 from tests.service.data import error, service_of

@@ -8,7 +8,13 @@ from types import SimpleNamespace
 import pytest
 from sqlalchemy import select, update
 
-from service.database import (
+from service.foundation.errors import ConflictError, NotFoundError, UnreadableVersionError
+from service.foundation.settings import Settings
+from service.foundation.states import CANCELLED, RUNNING
+from service.inference.loaded import LoadedModels
+from service.learning.storage import snapshots
+from service.models import registry
+from service.storage.database import (
     AlarmRow,
     AliasMoveRow,
     AliasRow,
@@ -26,13 +32,7 @@ from service.database import (
     VersionRow,
     now,
 )
-from service.errors import ConflictError, NotFoundError, UnreadableVersionError
-from service.files import Files
-from service.inference.loaded import LoadedModels
-from service.models import registry
-from service.settings import Settings
-from service.training.states import CANCELLED, RUNNING
-from service.updates.storage import snapshots
+from service.storage.files import Files
 from tests.service.data import error, service_of
 from tests.service.models.versions import QUERY, predict, publish
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import lipcore
 from lipcore import FitOptions, TorqueModel
-from service.files import new_id
 from service.models import registry
+from service.storage.files import new_id
 from tests.service.data import QUICK, service_of, stream
 from tests.service.updates.pendulums import trained
 

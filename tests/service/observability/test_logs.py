@@ -11,10 +11,10 @@ from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
-from service.observability import logs
-from service.observability.context import job_id, request_id
-from service.observability.logs import LogOptions
 from service.training.process import Place, start_process
+from service.web.observability import logs
+from service.web.observability.context import job_id, request_id
+from service.web.observability.logs import LogOptions
 
 
 def record(message="said %s", *args, **more):

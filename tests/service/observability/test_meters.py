@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from service.observability.meters import BOUNDS, OTHER, Durations, Kind, Meters, RequestMeter
-from service.observability.metric import MetricKind, merged
+from service.web.observability.meters import BOUNDS, OTHER, Durations, Kind, Meters, RequestMeter
+from service.web.observability.metric import MetricKind, merged
 
 
 def test_a_duration_counts_up_to_its_bound():

@@ -7,9 +7,9 @@ from contextlib import closing
 
 import pytest
 
-from service.observability import readiness
-from service.observability.readiness import KEPT_S, RESTART_S, START_S, Readiness
-from service.updates.learner.process import LearnerProcess
+from service.learning.learner.process import LearnerProcess
+from service.web.observability import readiness
+from service.web.observability.readiness import KEPT_S, RESTART_S, START_S, Readiness
 from tests.service.data import QUICK, error, service_of, stream, upload
 
 FEW = {**QUICK, "posterior_samples": 40}

@@ -10,12 +10,12 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.inference import answer as inference
-from service.observability.context import given_request_id, new_request_id, request_id
-from service.observability.meters import Meters
-from service.observability.request_log import RequestLog
-from service.observability.requests import RequestContext
+from service.learning.ingest.threads import IngestThreads
 from service.training.process import Place
-from service.updates.ingest.threads import IngestThreads
+from service.web.observability.context import given_request_id, new_request_id, request_id
+from service.web.observability.meters import Meters
+from service.web.observability.request_log import RequestLog
+from service.web.observability.requests import RequestContext
 from tests.service.data import ADDRESS
 
 MADE = re.compile(r"[0-9a-f]{12}-[0-9a-f]+")
@@ -97,14 +97,14 @@ def test_an_unexpected_error_is_answered_and_logged_with_its_id(api, monkeypatch
 
     monkeypatch.setattr(inference, "predict", broken)
     handler = Ids()
-    logging.getLogger("service.errors").addHandler(handler)
+    logging.getLogger("service.foundation.errors").addHandler(handler)
     try:
         quiet = TestClient(api.app, ADDRESS, raise_server_exceptions=False)
         answer = quiet.post(
             "/v1/models/panda-sim/predict", json={**QUERY, "components": ["gravity"]}, headers={"x-request-id": "mine"}
         )
     finally:
-        logging.getLogger("service.errors").removeHandler(handler)
+        logging.getLogger("service.foundation.errors").removeHandler(handler)
     assert (answer.status_code, answer.headers["x-request-id"]) == (500, "mine")
     assert seen == [("unexpected error at POST /v1/models/panda-sim/predict", "mine")]
 

@@ -6,10 +6,10 @@ import logging
 
 import pytest
 
-from service.observability import request_log
-from service.observability.context import KEY_ID
-from service.observability.meters import Kind
-from service.observability.request_log import RequestLog
+from service.web.observability import request_log
+from service.web.observability.context import KEY_ID
+from service.web.observability.meters import Kind
+from service.web.observability.request_log import RequestLog
 from tests.service.data import upload
 from tests.service.observability.test_request_ids import QUERY
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from time import perf_counter
 
-from service.settings import Settings
+from service.foundation.settings import Settings
 from tests.service.streams import frame
 from tests.service.test_stream_session import Loaded, Model, reply, session
 

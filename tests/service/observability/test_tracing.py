@@ -12,8 +12,8 @@ from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 
 from service.app import create_app
-from service.observability import logs, tracing
-from service.settings import Settings
+from service.foundation.settings import Settings
+from service.web.observability import logs, tracing
 from tests.service.data import ADDRESS
 
 

@@ -15,7 +15,7 @@ import pytest
 
 from service.datasets.formats.bags.opening import BagKind, open_bag
 from service.datasets.options import ReadOptions
-from service.settings import Settings
+from service.foundation.settings import Settings
 
 typesys = pytest.importorskip("rosbags.typesys", reason="bags are written by `rosbags`, of the extra `dev`")
 rosbag1 = pytest.importorskip("rosbags.rosbag1", reason="bags are written by `rosbags`, of the extra `dev`")

@@ -11,8 +11,8 @@ import pytest
 from service.datasets.formats.opening import open_table
 from service.datasets.formats.table import BLOCK_ROWS
 from service.datasets.options import ReadOptions
-from service.errors import ServiceError
-from service.settings import Settings
+from service.foundation.errors import ServiceError
+from service.foundation.settings import Settings
 
 
 @dataclass

@@ -17,8 +17,8 @@ from service.datasets.preparing import prepare
 from service.datasets.report.making import make_report
 from service.datasets.report.schema import DatasetReport
 from service.datasets.staging import Staged, column
-from service.limits.disk import Disk
-from service.settings import Settings
+from service.foundation.settings import Settings
+from service.web.limits.disk import Disk
 
 
 @dataclass(frozen=True)

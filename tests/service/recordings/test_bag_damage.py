@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from service.datasets.formats.bags.opening import open_bag
 from service.datasets.options import ReadOptions
-from service.errors import InvalidDataError, InvalidRequestError, TooLargeError
-from service.settings import Settings
+from service.foundation.errors import InvalidDataError, InvalidRequestError, TooLargeError
+from service.foundation.settings import Settings
 from tests.service.recordings.bag_writers import (
     SETTINGS,
     bare,

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from service.datasets.formats.bags.joints import choose, holds
 from service.datasets.formats.bags.states import Kind
 from service.datasets.options import ReadOptions
-from service.errors import InvalidDataError
-from service.settings import Settings
+from service.foundation.errors import InvalidDataError
+from service.foundation.settings import Settings
 from tests.service.recordings.bag_writers import START, State, read, states, table_of, write_mcap, write_rosbag1
 
 EVERY = ("position", "velocity", "effort")

@@ -11,7 +11,7 @@ import pytest
 from service.datasets.formats.bags import reading
 from service.datasets.formats.bags.opening import open_bag
 from service.datasets.options import ReadOptions
-from service.settings import Settings
+from service.foundation.settings import Settings
 from tests.service.recordings.bag_writers import (
     JOINT_STATE,
     ROS1,

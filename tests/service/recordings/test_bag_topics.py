@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.datasets.options import ReadOptions
-from service.errors import InvalidDataError, InvalidRequestError
+from service.foundation.errors import InvalidDataError, InvalidRequestError
 from tests.service.recordings.bag_writers import (
     ROS1,
     ROS2,

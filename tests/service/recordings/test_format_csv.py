@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.datasets.options import ReadOptions
-from service.errors import InvalidDataError, InvalidRequestError
+from service.foundation.errors import InvalidDataError, InvalidRequestError
 from tests.service.recordings.reading import read, refused
 
 NAMES = ["t", "q1", "tau1"]

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.errors import InvalidDataError, TooLargeError
+from service.foundation.errors import InvalidDataError, TooLargeError
 from tests.service.recordings.reading import read, refused
 
 LEAVES = st.none() | st.floats(width=64) | st.integers(-(2**70), 2**70)

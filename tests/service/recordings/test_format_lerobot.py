@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from service.errors import InvalidDataError, TooLargeError
+from service.foundation.errors import InvalidDataError, TooLargeError
 from tests.service.recordings.reading import read, refused
 
 JOINTS = ["shoulder_pan", "gripper"]

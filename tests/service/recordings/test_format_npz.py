@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.errors import InvalidDataError, TooLargeError
+from service.foundation.errors import InvalidDataError, TooLargeError
 from tests.service.recordings.reading import read, refused
 
 RNG = np.random.default_rng(2)
@@ -164,7 +164,7 @@ def test_too_many_members(tmp_path):
 def test_the_error_of_who_takes_the_blocks_stays_what_it_is(tmp_path):
     from service.datasets.formats.opening import open_table
     from service.datasets.options import ReadOptions
-    from service.settings import Settings
+    from service.foundation.settings import Settings
 
     path = tmp_path / "upload"
     path.write_bytes(npz(q=Q, tau=TAU))

@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 from service.datasets.formats.sniff import KINDS, sniff
-from service.errors import InvalidDataError, TooLargeError
+from service.foundation.errors import InvalidDataError, TooLargeError
 from tests.service.recordings.reading import read, refused
 from tests.service.recordings.test_format_lerobot import dataset, zipped
 

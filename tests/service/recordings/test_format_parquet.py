@@ -14,8 +14,8 @@ import pytest
 
 from service.datasets.formats import parquet_pages
 from service.datasets.formats.parquet_pages import check_pages
-from service.errors import InvalidDataError, TooLargeError
-from service.settings import Settings
+from service.foundation.errors import InvalidDataError, TooLargeError
+from service.foundation.settings import Settings
 from tests.service.recordings.reading import read, refused
 
 RNG = np.random.default_rng(11)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from service.datasets.mapping.mapping import resolve
 from service.datasets.mapping.recognition import clocks, sightings
-from service.errors import InvalidDataError, InvalidRequestError
+from service.foundation.errors import InvalidDataError, InvalidRequestError
 from tests.service.recordings.mapping_tables import Arm, options
 
 QUANTITIES = ("q", "dq", "ddq", "tau")

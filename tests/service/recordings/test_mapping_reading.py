@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from service.datasets.mapping.reading import read
 from service.datasets.mapping.units import factor
 from service.datasets.staging import staging
-from service.errors import InvalidDataError, StorageFullError
-from service.limits.disk import Disk
-from service.settings import Settings
+from service.foundation.errors import InvalidDataError, StorageFullError
+from service.foundation.settings import Settings
+from service.web.limits.disk import Disk
 from tests.service.recordings.mapping_tables import RATE, Arm, canonical, motion, options, table
 
 

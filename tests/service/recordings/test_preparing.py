@@ -13,9 +13,9 @@ from scipy.signal import butter, sosfiltfilt
 from lipcore.preparation.recipe import Recipe
 from service.datasets.preparing import prepare
 from service.datasets.staging import QUANTITIES, Staged, column
-from service.errors import InvalidDataError
-from service.limits.disk import Disk
-from service.settings import Settings
+from service.foundation.errors import InvalidDataError
+from service.foundation.settings import Settings
+from service.web.limits.disk import Disk
 
 RATE = 90.0
 ROWS = 900

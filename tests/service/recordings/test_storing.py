@@ -12,11 +12,11 @@ import pytest
 from safetensors.numpy import load_file
 from sqlalchemy import select
 
+from benchmarks.ingest import recording
+from benchmarks.ingest import running as ingest
 from lipcore.robots import load_robot
-from service import sample_file
-from service.bench.ingest import recording
-from service.bench.ingest import running as ingest
-from service.database import JobRow
+from service.storage import sample_file
+from service.storage.database import JobRow
 from tests.service.data import arrays, error, npz, post, queue, service_of, stream
 
 SAMPLES = stream(samples=600, rate=100.0, seed=71)

@@ -10,10 +10,10 @@ from sqlalchemy import select
 
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES
-from service.database import Database, EventRow, ModelRow, StreamRow, VersionRow, now
-from service.settings import Settings
-from service.updates.storage import log
-from service.updates.storage.log import NewBatch
+from service.foundation.settings import Settings
+from service.learning.storage import log
+from service.learning.storage.log import NewBatch
+from service.storage.database import Database, EventRow, ModelRow, StreamRow, VersionRow, now
 
 MODEL, OTHER = "arm", "other"
 

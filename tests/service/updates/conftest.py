@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from service.learning.learner import course
 from service.models import registry
-from service.updates.learner import course
 from tests.service.conftest import Trained
 from tests.service.data import service_of
 from tests.service.updates.lessons import School

@@ -7,8 +7,8 @@ from typing import Any
 
 from lipcore import TorqueModel
 from lipcore.online.learner import ForgottenError, OnlineModel
-from service.database import EventRow
-from service.updates.storage.payload import decode
+from service.learning.storage.payload import decode
+from service.storage.database import EventRow
 
 Without = Mapping[int, int]
 

@@ -14,9 +14,9 @@ from fastapi.testclient import TestClient
 import lipcore
 from service.app import create_app
 from service.context import Service
-from service.files import new_id
+from service.foundation.settings import Settings
 from service.models import registry
-from service.settings import Settings
+from service.storage.files import new_id
 from tests.service.data import ADDRESS, error, eventually, service_of, stream
 
 LESSON = 10

@@ -19,16 +19,16 @@ from lipcore.online import state
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.online.record import Record
-from service.database import Database, EventRow
-from service.files import Files
+from service.foundation.settings import Settings
 from service.inference.loaded import LoadedModels
+from service.learning.learner import publication
+from service.learning.learner.messages import Published
+from service.learning.learner.restore import Restored, advance, restore
+from service.learning.storage import log, snapshots
+from service.learning.storage.log import NewBatch
 from service.models import registry
-from service.settings import Settings
-from service.updates.learner import publication
-from service.updates.learner.messages import Published
-from service.updates.learner.restore import Restored, advance, restore
-from service.updates.storage import log, snapshots
-from service.updates.storage.log import NewBatch
+from service.storage.database import Database, EventRow
+from service.storage.files import Files
 from tests.service.data import QUICK, stream
 
 ARM = "arm"

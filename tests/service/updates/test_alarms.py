@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from service.pages import Page
-from service.updates.storage import alarms
+from service.learning.storage import alarms
+from service.web.pagination import Page
 from tests.service.updates.batches import MODEL, OTHER, opened
 
 

@@ -16,17 +16,9 @@ from scipy.stats import norm
 from lipcore.metrics import evaluate
 from lipcore.model import TorquePrediction
 from lipcore.online.batch import Rows
-from service.settings import Settings
-from service.updates.refreshing.contest import (
-    MAX_BLOCKS,
-    MIN_BLOCKS,
-    ROWS_PER_BATCH,
-    Block,
-    Contest,
-    sample,
-    surprise,
-)
-from service.updates.refreshing.duel import TELL_EVERY_S, Duel, Duels
+from service.foundation.settings import Settings
+from service.learning.refreshing.contest import MAX_BLOCKS, MIN_BLOCKS, ROWS_PER_BATCH, Block, Contest, sample, surprise
+from service.learning.refreshing.duel import TELL_EVERY_S, Duel, Duels
 from tests.service.updates.batches import rows
 
 ONE = np.ones(1)

@@ -18,13 +18,13 @@ from sqlalchemy import delete
 import lipcore
 from lipcore.online import state
 from lipcore.online.revision import Revision
-from service.database import Database, SnapshotRow
-from service.files import Files
+from service.learning.learner import course, recent
+from service.learning.learner.course import RewoundError
+from service.learning.learner.restore import advance, restore
+from service.learning.storage import log, snapshots
 from service.models import registry
-from service.updates.learner import course, recent
-from service.updates.learner.course import RewoundError
-from service.updates.learner.restore import advance, restore
-from service.updates.storage import log, snapshots
+from service.storage.database import Database, SnapshotRow
+from service.storage.files import Files
 from tests.service.updates.folding import Fold
 from tests.service.updates.pendulums import ARM, BEGIN, Arm, record, rows, trained
 

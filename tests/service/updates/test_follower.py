@@ -9,14 +9,14 @@ import pytest
 from sqlalchemy import delete, func, select
 
 from lipcore import NotPositiveDefiniteError
-from service.database import LearnerRow, ServingRow, SnapshotRow
-from service.updates.learner import follower as following
-from service.updates.learner import publication
-from service.updates.learner import restore as restoring
-from service.updates.learner.follower import Follower
-from service.updates.learner.messages import Failed, Published
-from service.updates.learner.novelty import Novelty
-from service.updates.learner.worker import Learner
+from service.learning.learner import follower as following
+from service.learning.learner import publication
+from service.learning.learner import restore as restoring
+from service.learning.learner.follower import Follower
+from service.learning.learner.messages import Failed, Published
+from service.learning.learner.novelty import Novelty
+from service.learning.learner.worker import Learner
+from service.storage.database import LearnerRow, ServingRow, SnapshotRow
 from tests.service.updates.pendulums import ARM, QUERIES, Arm, at_once, record, rows, same, trained
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from lipcore.online.gates import Patience
-from service.updates.ingest.contacts import ContactGate
-from service.updates.quality.monitor import Monitor
+from service.learning.ingest.contacts import ContactGate
+from service.learning.quality.monitor import Monitor
 from tests.service.updates.test_changes import PUSH, RATTLE, WATCHFUL, drive
 
 HIDDEN = ("_gates", "_detector", "held", "number")

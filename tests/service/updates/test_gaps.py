@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.errors import BusyError, ConflictError
-from service.updates.storage import gaps, log
-from service.updates.storage.gaps import Gaps
+from service.foundation.errors import BusyError, ConflictError
+from service.learning.storage import gaps, log
+from service.learning.storage.gaps import Gaps
 from tests.service.updates.batches import MODEL, OTHER, batch, live, opened, source, write
 
 

@@ -10,9 +10,9 @@ import pytest
 import lipcore
 from lipcore.urdf import RigidBody
 from lipcore.vocabulary import CODES
-from service.settings import Settings
-from service.updates.ingest.screening import limits
-from service.updates.learning_options import LearningOptions
+from service.foundation.settings import Settings
+from service.learning.ingest.screening import limits
+from service.learning.learning_options import LearningOptions
 from tests.service.updates.lessons import apart
 from tests.service.updates.recordings import codes, learnt_from, logged, part, recording, send
 

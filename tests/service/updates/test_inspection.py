@@ -7,8 +7,8 @@ import pytest
 
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES
-from service.updates.storage import log
-from service.updates.storage.log import NewBatch
+from service.learning.storage import log
+from service.learning.storage.log import NewBatch
 from tests.service.data import error
 from tests.service.updates.lessons import LESSON, lesson
 

@@ -7,10 +7,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from service.bench import table as bench_table
-from service.bench.online import durability
-from service.bench.online.durability import VICTIMS, grids, open_trials, targets
-from service.bench.online.trials import BATCHES, Tally
+from benchmarks.latency import table as bench_table
+from benchmarks.online import durability
+from benchmarks.online.durability import VICTIMS, grids, open_trials, targets
+from benchmarks.online.trials import BATCHES, Tally
 
 TRIALS = 6
 """Kills, of the service and of its learner in turn."""

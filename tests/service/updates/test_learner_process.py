@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 from sqlalchemy import select
 
-from service.database import SnapshotRow
 from service.inference.loaded import LoadedModels
-from service.updates.learner import process as processes
-from service.updates.learner import publication
-from service.updates.learner.messages import Published
-from service.updates.learner.process import LearnerProcess, learner_place
+from service.learning.learner import process as processes
+from service.learning.learner import publication
+from service.learning.learner.messages import Published
+from service.learning.learner.process import LearnerProcess, learner_place
+from service.storage.database import SnapshotRow
 from tests.service.data import DEADLINE, eventually
 from tests.service.updates.pendulums import ARM, Arm, adopt, at_once, same
 

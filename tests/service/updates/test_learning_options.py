@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from pydantic import ValidationError
 
-from service.errors import InvalidRequestError, NotFoundError
-from service.updates import learning
-from service.updates.learning_options import LearningOptions
+from service.foundation.errors import InvalidRequestError, NotFoundError
+from service.learning import learning
+from service.learning.learning_options import LearningOptions
 from tests.service.updates.batches import MODEL, OTHER, batch, everything, opened, roll_back, write
 
 

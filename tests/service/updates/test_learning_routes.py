@@ -6,10 +6,10 @@ import time
 
 import pytest
 
-from service.database import LearnerRow
-from service.updates import learning
-from service.updates.control import decisions
-from service.updates.storage import log, snapshots
+from service.learning import learning
+from service.learning.control import decisions
+from service.learning.storage import log, snapshots
+from service.storage.database import LearnerRow
 from tests.service.data import error
 from tests.service.updates.lessons import LESSON, apart
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.updates.live.schema import LiveRows, LiveStatus
+from service.learning.live.schema import LiveRows, LiveStatus
 from tests.service.data import error, eventually, service_of
 from tests.service.server import Server
 from tests.service.streams import TAU, dial, frame, hello

@@ -11,13 +11,13 @@ import pytest
 
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES
-from service.errors import BusyError, NotFoundError
-from service.settings import Settings
-from service.updates.ingest.screening import Screened
-from service.updates.live import feed, novelty
-from service.updates.live.feed import MOST_UNREAD, Feed, Said
-from service.updates.live.status import at_most
-from service.updates.live.thinning import Judged, pick, thinned
+from service.foundation.errors import BusyError, NotFoundError
+from service.foundation.settings import Settings
+from service.learning.ingest.screening import Screened
+from service.learning.live import feed, novelty
+from service.learning.live.feed import MOST_UNREAD, Feed, Said
+from service.learning.live.status import at_most
+from service.learning.live.thinning import Judged, pick, thinned
 from tests.service.updates.batches import rows
 
 CONTACT, EDGE = CODES.index("contact"), CODES.index("edge")

@@ -8,10 +8,10 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from service.database import LearnerRow
-from service.pages import Page
-from service.updates.storage import log
-from service.updates.storage.payload import decode, encode
+from service.learning.storage import log
+from service.learning.storage.payload import decode, encode
+from service.storage.database import LearnerRow
+from service.web.pagination import Page
 from tests.service.updates.batches import MODEL, OTHER, batch, everything, note, opened, rows, take_back, write
 
 

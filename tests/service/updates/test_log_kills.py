@@ -10,10 +10,10 @@ from contextlib import suppress
 
 import numpy as np
 
-from service.database import Database
-from service.settings import Settings
-from service.updates.storage import log
-from service.updates.storage.payload import encode
+from service.foundation.settings import Settings
+from service.learning.storage import log
+from service.learning.storage.payload import encode
+from service.storage.database import Database
 from tests.service.data import DEADLINE
 from tests.service.updates.batches import MODEL, batch, everything, opened, rows, source
 

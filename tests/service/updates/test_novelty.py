@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import lipcore
+from service.learning.learner import recent
+from service.learning.learner.restore import restore
+from service.learning.storage import log
 from service.models import registry
-from service.updates.learner import recent
-from service.updates.learner.restore import restore
-from service.updates.storage import log
 from tests.service.data import DEADLINE, ended, eventually, train, upload
 from tests.service.updates.lessons import Pupil, School, answered
 from tests.service.updates.lessons import school as opened

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from service.client import Client
-from service.database import Database, EventRow
-from service.settings import Settings
-from service.updates.schema import ObservationResponse
-from service.updates.storage import log
+from service.foundation.settings import Settings
+from service.learning.schema import ObservationResponse
+from service.learning.storage import log
+from service.storage.database import Database, EventRow
 from tests.service.data import error, eventually
 from tests.service.updates import lessons
 from tests.service.updates.lessons import LESSON, apart, lesson

@@ -8,11 +8,11 @@ import pytest
 from sqlalchemy import select
 
 import lipcore
-from service.database import LearnerRow
+from service.learning.learner.messages import Contested
+from service.learning.refreshing import promotion
+from service.learning.storage import log
 from service.models import registry
-from service.updates.learner.messages import Contested
-from service.updates.refreshing import promotion
-from service.updates.storage import log
+from service.storage.database import LearnerRow
 from tests.service.updates.lessons import answered
 
 EVIDENCE = {"rows": 700, "gain": 0.5, "standard_error": 0.1}

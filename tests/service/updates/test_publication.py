@@ -12,10 +12,10 @@ import pytest
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.online.revision import Revision
-from service.files import Files
 from service.inference.loaded import LoadedModels
-from service.updates.learner import learnt, publication
-from service.updates.learner.messages import Published
+from service.learning.learner import learnt, publication
+from service.learning.learner.messages import Published
+from service.storage.files import Files
 from tests.service.updates.pendulums import ARM, QUERIES, adopt, at_once, differ, predicted, rows, same, trained
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from lipcore.online.record import Record
-from service.updates.quality import summary
-from service.updates.quality.windows import Window
+from service.learning.quality import summary
+from service.learning.quality.windows import Window
 from tests.service.data import error
 from tests.service.updates.lessons import lesson
 

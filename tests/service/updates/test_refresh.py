@@ -7,11 +7,11 @@ from itertools import count
 import numpy as np
 import pytest
 
-from service.database import JobRow
+from service.foundation.states import RUNNING
+from service.learning.storage import log
+from service.storage.database import JobRow
 from service.training import worker
 from service.training.material import observed
-from service.training.states import RUNNING
-from service.updates.storage import log
 from tests.service.data import QUICK, arrays, ended, running, stream, train, upload
 from tests.service.server import Server
 from tests.service.updates.lessons import LESSON, Pupil, answered, lesson

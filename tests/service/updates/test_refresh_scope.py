@@ -7,10 +7,10 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from service.database import DatasetRow, now
-from service.updates.refreshing import material, scope
-from service.updates.refreshing.scope import Scope
-from service.updates.storage import log
+from service.learning.refreshing import material, scope
+from service.learning.refreshing.scope import Scope
+from service.learning.storage import log
+from service.storage.database import DatasetRow, now
 from tests.service.updates import batches
 from tests.service.updates.batches import MODEL, everything, note, opened, roll_back, rows, take_back, write
 

@@ -9,12 +9,12 @@ from itertools import count
 import pytest
 
 import lipcore
-from service.database import AlarmRow, JobRow, now
+from service.foundation.states import CANCELLED, FAILED
+from service.learning.learner.messages import Published
+from service.learning.refreshing import refresh
+from service.learning.storage import log
 from service.models import registry
-from service.training.states import CANCELLED, FAILED
-from service.updates.learner.messages import Published
-from service.updates.refreshing import refresh
-from service.updates.storage import log
+from service.storage.database import AlarmRow, JobRow, now
 
 NAMES = (f"considered-{number}" for number in count())
 

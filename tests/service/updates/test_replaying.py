@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.updates.storage import log
-from service.updates.storage.payload import decode
+from service.learning.storage import log
+from service.learning.storage.payload import decode
 from tests.service.updates.lessons import LESSON, apart, lesson
 
 EQUAL = 1e-8

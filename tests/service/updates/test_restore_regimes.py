@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from lipcore.online.learner import OnlineModel
-from service.updates.learner import restore as restoring
-from service.updates.learner.course import RewoundError
-from service.updates.learner.restore import advance
+from service.learning.learner import restore as restoring
+from service.learning.learner.course import RewoundError
+from service.learning.learner.restore import advance
 from tests.service.updates.pendulums import (
     ARM,
     BEGIN,

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.updates.learner import course
-from service.updates.learner import restore as restoring
-from service.updates.learner.course import RewoundError
+from service.learning.learner import course
+from service.learning.learner import restore as restoring
+from service.learning.learner.course import RewoundError
 from tests.service.updates.pendulums import (
     at_once,
     differ,

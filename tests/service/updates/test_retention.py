@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from service.database import LearnerRow, ServingRow, SnapshotRow, now
-from service.settings import Settings
-from service.updates.storage import log, retention
-from service.updates.storage.payload import encode
+from service.foundation.settings import Settings
+from service.learning.storage import log, retention
+from service.learning.storage.payload import encode
+from service.storage.database import LearnerRow, ServingRow, SnapshotRow, now
 from tests.service.updates.batches import MODEL, OTHER, batch, everything, note, opened, rows, source, take_back, write
 
 SIZE = len(encode(rows()))

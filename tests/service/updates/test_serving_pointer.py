@@ -7,11 +7,11 @@ import pytest
 from sqlalchemy import delete
 
 from service.app import create_app
-from service.database import LearnerRow, ServingRow
-from service.errors import NotFoundError
+from service.foundation.errors import NotFoundError
 from service.inference.loaded import LoadedModels
 from service.models import registry
 from service.models.registry import Serving
+from service.storage.database import LearnerRow, ServingRow
 from tests.service.data import ADDRESS
 from tests.service.updates.pendulums import ARM
 

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from sqlalchemy import select
 
 from service.app import create_app
-from service.database import SnapshotRow, VersionRow, now
-from service.files import DamagedFileError, Files
-from service.settings import Settings
-from service.updates.storage import snapshots
-from service.updates.storage.snapshots import thinned
+from service.foundation.settings import Settings
+from service.learning.storage import snapshots
+from service.learning.storage.snapshots import thinned
+from service.storage.database import SnapshotRow, VersionRow, now
+from service.storage.files import DamagedFileError, Files
 from tests.service.updates.batches import MODEL, OTHER, batch, opened, roll_back, take_back, write
 
 

@@ -15,10 +15,10 @@ from sqlalchemy.orm import undefer
 
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
-from service.database import Database, EventRow
-from service.settings import Settings
-from service.stream.client import StreamClient, StreamError
-from service.updates.storage import payload
+from service.client.stream import StreamClient, StreamError
+from service.foundation.settings import Settings
+from service.learning.storage import payload
+from service.storage.database import Database, EventRow
 from tests.service.data import DEADLINE, eventually, stream, train, upload
 from tests.service.server import Server
 from tests.service.streams import STREAM, TAU, dial, frame, hello, read, saved_model

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from service.database import SnapshotRow, now
-from service.updates.storage import log
+from service.learning.storage import log
+from service.storage.database import SnapshotRow, now
 from tests.service.updates.batches import (
     MODEL,
     OTHER,

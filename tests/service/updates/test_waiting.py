@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from service.inference.waiting import Waiting
-from service.updates.learner.process import LearnerProcess
+from service.learning.learner.process import LearnerProcess
 from tests.service.data import error, service_of
 from tests.service.updates.lessons import QUERIES, lesson
 

@@ -15,8 +15,8 @@ import pyarrow as pa
 from service.datasets.formats.bags.container import damaged
 from service.datasets.formats.blocks import said
 from service.datasets.formats.zips import ERRORS, measure, open_zip
-from service.errors import TooLargeError, invalid_data
-from service.settings import Settings
+from service.foundation.errors import TooLargeError, invalid_data
+from service.foundation.settings import Settings
 
 PIECE = 1024 * 1024
 SUFFIXES = (".db3", ".mcap", ".bag", ".db3.zstd", ".mcap.zstd")

@@ -13,8 +13,8 @@ from typing import NamedTuple, Protocol
 
 import pyarrow as pa
 
-from service.errors import InvalidDataError, TooLargeError, invalid_data
-from service.settings import Settings
+from service.foundation.errors import InvalidDataError, TooLargeError, invalid_data
+from service.foundation.settings import Settings
 
 Data = bytes | memoryview
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from service.datasets.formats.bags.states import Kind
-from service.errors import invalid_data, readable
+from service.foundation.errors import invalid_data, readable
 
 MOST_KINDS = 1000
 """Sets of joints that the messages of a channel may tell of."""

@@ -11,7 +11,7 @@ from struct import Struct
 from typing import BinaryIO
 
 from service.datasets.formats.bags.container import Channel, Data, ScannedBag, Unpacking, damaged, type_name
-from service.settings import Settings
+from service.foundation.settings import Settings
 
 MAGIC = b"\x89MCAP0\r\n"
 LATEST = 1 << 63

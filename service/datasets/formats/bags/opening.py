@@ -14,8 +14,8 @@ from service.datasets.formats.bags.reading import read_channel
 from service.datasets.formats.bags.states import ENCODINGS, SOURCES
 from service.datasets.formats.table import Table
 from service.datasets.options import ReadOptions
-from service.errors import InvalidDataError, invalid_data, invalid_request, readable
-from service.settings import Settings
+from service.foundation.errors import InvalidDataError, invalid_data, invalid_request, readable
+from service.foundation.settings import Settings
 
 BagKind = Literal["rosbag1", "rosbag2", "mcap"]
 KINDS = {"rosbag1": "a rosbag of ROS 1", "rosbag2": "a rosbag2: a .db3 file, or a zip of its folder", "mcap": "an MCAP"}

@@ -14,8 +14,8 @@ from service.datasets.formats.bags.joints import MOST_KINDS, choose, describe, h
 from service.datasets.formats.bags.states import Decoder, Form, Kind
 from service.datasets.formats.blocks import checked_names
 from service.datasets.formats.table import BLOCK_ROWS, Table
-from service.errors import invalid_data
-from service.settings import Settings
+from service.foundation.errors import invalid_data
+from service.foundation.settings import Settings
 
 QUANTITIES = ("position", "velocity", "acceleration", "effort")
 BATCH_BYTES = 4 * 1024 * 1024

@@ -10,7 +10,7 @@ from struct import Struct
 from typing import BinaryIO
 
 from service.datasets.formats.bags.container import Channel, Data, ScannedBag, Unpacking, damaged, type_name
-from service.settings import Settings
+from service.foundation.settings import Settings
 
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG_HEADER, CHUNK, CONNECTION = 0x02, 0x03, 0x05, 0x07

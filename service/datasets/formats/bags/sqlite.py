@@ -8,7 +8,7 @@ from contextlib import closing
 from pathlib import Path
 
 from service.datasets.formats.bags.container import Channel, Unpacking, damaged, type_name
-from service.settings import Settings
+from service.foundation.settings import Settings
 
 MAGIC = b"SQLite format 3\x00"
 

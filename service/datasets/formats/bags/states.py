@@ -12,7 +12,7 @@ from lipcore.samples import Array
 from service.datasets.formats.bags.container import Channel
 from service.datasets.formats.bags.definitions import Types, parse, well_known
 from service.datasets.formats.bags.layout import Layout, lay_out
-from service.errors import InvalidDataError, invalid_data
+from service.foundation.errors import InvalidDataError, invalid_data
 
 ENCODINGS = ("cdr", "ros1")
 MOST_LAYOUTS = 64

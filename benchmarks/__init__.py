@@ -1,0 +1,21 @@
+"""What measures us; not in the wheel. `python -m benchmarks --help`, `python -m benchmarks.reproduce --help`."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from service.cli.errors import explain, tell
+
+
+def run(app: typer.Typer, expected: tuple[type[Exception], ...], name: str) -> None:
+    """Run a command line; of errors that a user can act on, `expected` among them, only the words are printed."""
+    try:
+        app(prog_name=name)
+    except Exception as error:
+        words = explain(error, expected)
+        if words is None:
+            raise
+        tell(words)
+        sys.exit(1)

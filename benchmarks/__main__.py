@@ -1,0 +1,7 @@
+"""`python -m benchmarks`: latency, learning, uploads, load, scale, and what kills cost."""
+
+from benchmarks import run
+from benchmarks.command import ERRORS, app
+
+if __name__ == "__main__":
+    run(app, ERRORS, "python -m benchmarks")

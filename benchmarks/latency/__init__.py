@@ -1,0 +1,1 @@
+"""How long answers take: in process, over every transport, beside baselines."""

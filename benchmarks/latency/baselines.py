@@ -1,0 +1,129 @@
+"""What answers are compared with, all in this process: rigid-body dynamics, the exact posterior, GPyTorch."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.timing import Ask
+from benchmarks.workload import Workload
+from lipcore.motion import Motion
+from lipcore.posterior import ExactPosterior
+from lipcore.robots import Robot, pinocchio
+from lipcore.samples import Array, Samples
+from lipcore.selection import spread_out
+
+GPYTORCH_SAID = (
+    "GPyTorch: one independent exact GP a joint, as a batch of n: zero mean, RBF with one lengthscale an input "
+    "(q, dq, ddq: 3n inputs), fixed hyperparameters (lengthscales from the spread of the inputs, so the cost but not "
+    "the accuracy is comparable), float64, Cholesky, eval mode, caches warm; mean and std of the function"
+)
+
+
+def gpytorch_installed() -> bool:
+    """Whether the extra `bench` is there."""
+    return find_spec("gpytorch") is not None
+
+
+def rnea(robot: Robot, queries: Array) -> Ask:
+    """Pinocchio's recursive Newton–Euler with the simulator's own bodies: the torque when everything is known."""
+    pin = pinocchio()
+    algorithm, model, data = pin.rnea, robot.model, robot.model.createData()
+    motions = [(robot.configuration(q), dq.copy(), ddq.copy()) for q, dq, ddq in queries]
+
+    def ask(number: int) -> object:
+        return algorithm(model, data, *motions[number % len(motions)])
+
+    return ask
+
+
+def exact_posterior(workload: Workload) -> ExactPosterior:
+    """The exact Gaussian process with the model's hyperparameters, on the samples that the model stands on."""
+    samples, model = workload.samples, workload.model
+    assert samples is not None
+    motion, tau = samples.motion(), samples.torque()
+    rows = spread_out(motion, int(workload.manifest["options"]["posterior_samples"]))
+    factor = model.calibration.function_std_factor
+    return ExactPosterior.fit(model.estimator.kernel, model.posterior.params, motion[rows], tau[rows], factor)
+
+
+def deviation(workload: Workload, exact: ExactPosterior) -> tuple[float, str]:
+    """How far the model's answers to the queries lie from those of the exact posterior: at most, and in words."""
+    q, dq, ddq = (np.ascontiguousarray(workload.queries[:, part]) for part in range(3))
+    answer, expected = workload.model.predict(q, dq, ddq), exact.predict(Motion.from_arrays(q, dq, ddq))
+    unit = expected.std.numpy()
+    mean, std = (answer.tau - expected.mean.numpy()) / unit, answer.tau_std / unit - 1
+    largest = float(max(np.abs(mean).max(), np.abs(std).max()))
+    return largest, (
+        f"on the {len(q)} queries, an unseen trajectory, the model's mean deviates from the exact GP's by "
+        f"{np.sqrt(np.mean(mean**2)):.2%} (rms) and at most {np.abs(mean).max():.2%} of its standard deviation, the "
+        f"standard deviation by at most {np.abs(std).max():.2%}"
+    )
+
+
+def exact(posterior: ExactPosterior, queries: Array) -> Ask:
+    """The exact posterior, one query with standard deviation."""
+    motions = [Motion(*(torch.from_numpy(part[None].copy()) for part in query)) for query in queries]
+
+    def ask(number: int) -> object:
+        answer = posterior.predict(motions[number % len(motions)])
+        return answer.mean, answer.std
+
+    return ask
+
+
+class GPyTorch:
+    """Exact GPs of GPyTorch on the same samples; see GPYTORCH_SAID."""
+
+    def __init__(self, samples: Samples, noise_std: Array) -> None:
+        import gpytorch  # noqa: PLC0415 - of the extra `bench`
+
+        self._settings = gpytorch.settings
+        inputs, targets = _inputs(samples.motion()), samples.torque().T.contiguous()
+        n = samples.n_joints
+        variance = torch.from_numpy(noise_std)[:, None] ** 2
+        above = gpytorch.constraints.GreaterThan(0.5 * float(variance.min()))  # small joints have less than its 1e-4
+        likelihood = gpytorch.likelihoods.GaussianLikelihood(
+            noise_constraint=above, batch_shape=torch.Size([n])
+        ).double()
+        likelihood.noise = variance
+
+        class _Model(gpytorch.models.ExactGP):  # type: ignore[misc]  # the package has no types
+            def __init__(self) -> None:
+                super().__init__(inputs.expand(n, *inputs.shape), targets, likelihood)
+                batch = torch.Size([n])
+                self.mean_module = gpytorch.means.ZeroMean(batch_shape=batch)
+                base = gpytorch.kernels.RBFKernel(ard_num_dims=inputs.shape[1], batch_shape=batch)
+                self.covar_module = gpytorch.kernels.ScaleKernel(base, batch_shape=batch)
+
+            def forward(self, x: Tensor) -> Any:
+                return gpytorch.distributions.MultivariateNormal(self.mean_module(x), self.covar_module(x))
+
+        model = _Model().double()
+        spread = inputs.std(0).clamp_min(1e-6) * inputs.shape[1] ** 0.5
+        model.covar_module.base_kernel.lengthscale = spread.expand(n, 1, -1)
+        model.covar_module.outputscale = targets.var(1)
+        model.eval()
+        likelihood.eval()
+        self.model = model
+
+    def ask(self, queries: Array, fast_pred_var: bool) -> Ask:
+        """One query with standard deviation; fast_pred_var caches a low-rank form of the variance (LOVE)."""
+        points = [torch.from_numpy(query.reshape(1, -1).copy()) for query in queries]
+        settings, model = self._settings, self.model
+        n = len(model.train_targets)
+
+        def ask(number: int) -> object:
+            with torch.no_grad(), settings.fast_pred_var(fast_pred_var):
+                answer = model(points[number % len(points)].expand(n, 1, -1))
+                return answer.mean, answer.stddev
+
+        return ask
+
+
+def _inputs(motion: Motion) -> Tensor:
+    return torch.cat([motion.q, motion.dq, motion.ddq], dim=1)

@@ -1,0 +1,63 @@
+"""Runs of all subjects, interleaved: what disturbs the machine for a while disturbs them all alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+
+import numpy as np
+
+from benchmarks.latency.loop import RATE, run_slice, summarise
+from benchmarks.latency.results import LoopPair, Results, Row, State
+from benchmarks.latency.subjects import Subject
+from benchmarks.load import TrainingLoad
+from benchmarks.timing import Nanoseconds, Timing, measure, no_collection
+
+PASSES = 4
+"""Times that a run goes round all subjects, measuring a part of each one's queries."""
+SLICE_SECONDS = 1.0
+"""Length of a slice of the control loop, before the other one has its turn."""
+FEWEST = 2
+"""Calls of a slow subject in a pass."""
+
+
+def add_run(
+    results: Results, subjects: Sequence[Subject], state: State, queries: int, load: TrainingLoad | None = None
+) -> None:
+    """Time every subject once more, `queries` queries each, and add the run to the results."""
+    times: dict[str, list[Nanoseconds]] = {subject.key: [] for subject in subjects}
+    with no_collection():
+        for turn in range(PASSES):
+            # from both ends in turn, so that none always follows the same other
+            for subject in subjects if turn % 2 == 0 else reversed(subjects):
+                count = max(FEWEST, round(queries * subject.share / PASSES))
+                with _under(load):
+                    times[subject.key].append(measure(subject.ask, count, turn * count))
+    for subject in subjects:
+        row = results.rows.setdefault(subject.key, Row(subject.key, subject.label, subject.floor))
+        row.runs.setdefault(state, []).append(Timing.of(np.concatenate(times[subject.key]), subject.queries))
+
+
+def control_loop(
+    asked: Subject, floor: Subject, late: Callable[[], int], seconds: float, load: TrainingLoad | None = None
+) -> LoopPair:
+    """Run the control loop for `seconds` on each of two subjects, slice by slice in turn.
+
+    late: the service's own count of late answers so far.
+    """
+    slices: dict[str, list[Nanoseconds]] = {asked.key: [], floor.key: []}
+    left, before = seconds, late()
+    with no_collection():
+        while left > 0:
+            part = min(left, SLICE_SECONDS)
+            left -= part
+            for subject in (asked, floor):
+                with _under(load):
+                    slices[subject.key].append(run_slice(subject.ask, max(1, round(part * RATE))))
+    return LoopPair(summarise(slices[asked.key]), summarise(slices[floor.key]), late() - before)
+
+
+@contextmanager
+def _under(load: TrainingLoad | None) -> Iterator[None]:
+    with nullcontext() if load is None else load.stretch():
+        yield

@@ -1,0 +1,63 @@
+"""How the motion that a model was trained on decides its size, and so how fast it answers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+import lipcore
+from benchmarks import facts
+from benchmarks.latency.results import MotionRow, Results
+from benchmarks.latency.subjects import Subject, in_process
+from benchmarks.latency.targets import p50, single
+from benchmarks.latency.measuring import add_run
+from benchmarks.workload import TRAIN_SEED, Workload
+from lipcore.robots import Robot, load_robot
+from lipcore.samples import Samples
+from lipcore.simulation import FAST, Stream, simulate
+
+SLOW, QUICK = Stream(), Stream(speed=FAST)
+MOTIONS: dict[str, tuple[Stream, ...]] = {
+    "slow": (SLOW,),
+    "fast": (QUICK,),
+    "slow and fast": (SLOW, QUICK),
+    "full range, slow and fast": (Stream(motion="full"), Stream(motion="full", speed=FAST)),
+}
+QUERIES = 1000
+
+
+def compare(
+    robot: str, fit: Mapping[str, Any], runs: int, home: Path, console: Console, queries: int = QUERIES
+) -> list[MotionRow]:
+    """Train a model on each kind of motion in this process and time them in turn; rows as in MOTIONS."""
+    simulator, results = load_robot(robot), Results({}, {}, 0.0, runs, queries)
+    found = {name: _train(name, simulator, streams, fit, home, console) for name, streams in MOTIONS.items()}
+    asked = [_named(subject, name) for name, workload in found.items() for subject in in_process(workload)]
+    for _ in range(runs):
+        add_run(results, asked, "idle", queries)
+    rows = []
+    for name, workload in found.items():
+        mean, std, batch = (single(results.of(f"{name}: {key}"), p50) or np.nan for key in ("mean", "std", "batch"))
+        samples = int(workload.manifest["fit"]["samples_given"])
+        rows.append(MotionRow(name, samples, facts.compact(workload.manifest), mean, std, batch))
+    return rows
+
+
+def _train(
+    name: str, robot: Robot, streams: tuple[Stream, ...], fit: Mapping[str, Any], home: Path, console: Console
+) -> Workload:
+    samples = Samples.concatenate([simulate(robot, stream, TRAIN_SEED) for stream in streams])
+    model = lipcore.train(samples, robot.joint_types, "lip-chain", lipcore.FitOptions(**fit))
+    folder = home / f"motion-{name.replace(' ', '-')}"
+    manifest = lipcore.save(model, folder)
+    console.print(f"  {name}: {json.dumps(manifest.get('compact', {}))}", highlight=False)
+    return Workload.load(folder, robot, samples, streams[-1])
+
+
+def _named(subject: Subject, name: str) -> Subject:
+    return Subject(f"{name}: {subject.key}", subject.label, subject.ask, subject.queries, subject.share)

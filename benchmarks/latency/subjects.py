@@ -1,0 +1,109 @@
+"""What is timed in this process: the model as a controller would hold it, and what it is compared with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.latency import baselines
+from benchmarks.timing import Ask
+from benchmarks.workload import BenchError, Workload
+from lipcore.samples import Array
+
+BATCH = 1000
+"""Queries of a batch."""
+CHECKED = 5
+"""Queries whose answers are compared with the model's own before anything is timed."""
+TOLERANCE = 1e-6
+"""Relative and in N·m: service and bench each rebuild the posterior, and rounding differs with BLAS threads."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """One way to ask.
+
+    ask: asks query number k; queries: answered by one call; share: how many of the queries of a run it is asked, for
+    what takes long; floor: key of the echo of its transport; answer: mean and std of query k, to be checked.
+    """
+
+    key: str
+    label: str
+    ask: Ask
+    queries: int = 1
+    share: float = 1.0
+    floor: str | None = None
+    answer: Callable[[int], tuple[Array, Array | None]] | None = None
+
+    def check(self, workload: Workload) -> None:
+        """Compare its answers with the model's own; raise BenchError where they differ."""
+        if self.answer is None:
+            return
+        for number in range(CHECKED):
+            expected = workload.model.answer(workload.queries[number])
+            for name, found, wanted in zip(("tau", "tau_std"), self.answer(number), expected, strict=True):
+                if found is None or wanted is None:
+                    continue
+                if not np.allclose(found, wanted, rtol=TOLERANCE, atol=TOLERANCE):
+                    raise BenchError(f"{self.label}: {name} of query {number} is {found}, expected {wanted}")
+
+
+def in_process(workload: Workload) -> list[Subject]:
+    """The model itself: one query with and without standard deviation, and a batch."""
+    model, queries = workload.model, list(workload.queries)
+    count = len(queries)
+    answer = model.answer
+    repeated = np.resize(workload.queries, (BATCH, *workload.queries.shape[1:]))
+    q, dq, ddq = (np.ascontiguousarray(repeated[:, part]) for part in range(3))
+
+    def batch_row(number: int) -> tuple[Array, Array]:
+        found = model.predict(q, dq, ddq)
+        return found.tau[number], found.tau_std[number]
+
+    return [
+        Subject("mean", "in process, mean only", lambda number: answer(queries[number % count], False)),
+        Subject("std", "in process, with std", lambda number: answer(queries[number % count])),
+        Subject(
+            "batch",
+            f"in process, batch of {BATCH}, std",
+            lambda number: model.predict(q, dq, ddq),
+            queries=BATCH,
+            share=0.005,
+            answer=batch_row,
+        ),
+    ]
+
+
+def compared(workload: Workload, wanted: Callable[[str], bool]) -> tuple[list[Subject], list[str], float | None]:
+    """The baselines that are wanted and can be had, and notes: what they are, or why one is left out.
+
+    Last, the model's largest deviation from the exact posterior at the queries, in standard deviations, if compared.
+    """
+    found, notes, largest = [], [], None
+    robot, samples = workload.robot, workload.samples
+    if wanted("rnea"):
+        if robot is None:
+            notes.append("Pinocchio RNEA left out: no robot of the simulator has the joints of this model")
+        else:
+            found.append(Subject("rnea", "Pinocchio RNEA", baselines.rnea(robot, workload.queries)))
+    if samples is None:
+        if any(map(wanted, ("exact", "gpytorch", "gpytorch-fast"))):
+            notes.append("exact GP and GPyTorch left out: the samples of an existing model are not at hand")
+        return found, notes, largest
+    if wanted("exact"):
+        posterior = baselines.exact_posterior(workload)
+        ask = baselines.exact(posterior, workload.queries)
+        found.append(Subject("exact", f"exact GP, {len(posterior.motion)} samples, std", ask, share=0.04))
+        largest, said = baselines.deviation(workload, posterior)
+        notes.append(said)
+    if wanted("gpytorch") or wanted("gpytorch-fast"):
+        if baselines.gpytorch_installed():
+            model = baselines.GPyTorch(samples, workload.model.noise_std)
+            plain, fast = (model.ask(workload.queries, fast_pred_var=each) for each in (False, True))
+            found.append(Subject("gpytorch", "GPyTorch exact GPs, std", plain, share=0.005))
+            found.append(Subject("gpytorch-fast", "GPyTorch, fast_pred_var", fast, share=0.02))
+            notes.append(baselines.GPYTORCH_SAID)
+        else:
+            notes.append("GPyTorch left out: not installed (pip install 'lipserve[bench]')")
+    return found, notes, largest

@@ -1,0 +1,1 @@
+"""Learning while serving: under load, over a change, and over kills."""

@@ -1,0 +1,115 @@
+"""A control loop in a process of its own that asks for torques while others teach the model."""
+
+from __future__ import annotations
+
+import multiprocessing
+import time
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from benchmarks.clients import Address
+from benchmarks.latency.websocket import WebSocket, frame, request_frame
+from benchmarks.timing import Timing, no_collection
+from lipcore.samples import Array
+from service.stream.frames import ANSWER, ERROR, request_bytes
+
+RATE = 500.0
+ECHO_EVERY = 5
+"""After so many answers an echo as long is asked for: what transport and machine cost by themselves."""
+_LOOK_EVERY = 25
+_WARM_UP = 50
+_SPIN = 400_000
+_PATIENCE = 60.0
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a loop saw. Times in µs.
+
+    answers: from sending to the answer; ticks: from the tick of the loop's clock to the answer; echo: of the floor;
+    revisions: when (`time.monotonic_ns`) the first answer of each revision came.
+    """
+
+    answers: Timing
+    ticks: Timing
+    echo: Timing
+    revisions: tuple[tuple[int, int], ...]
+
+
+class Asker:
+    """Runs the loop while it is entered; `finish` ends it and tells what it saw."""
+
+    def __init__(self, address: Address, model: str, motions: Array, rate: float = RATE) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(target=_loop, args=(theirs, address, model, motions, rate), daemon=True)
+
+    def __enter__(self) -> Self:
+        self._process.start()
+        if not self._connection.poll(_PATIENCE):
+            raise TimeoutError(f"the asking process was not ready after {_PATIENCE:g} s")
+        self._connection.recv()
+        return self
+
+    def finish(self) -> Asked:
+        """End the loop; raise EOFError where its process has ended by itself."""
+        self._connection.send(None)
+        asked: Asked = self._connection.recv()
+        return asked
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._process.kill()
+        self._process.join()
+        self._connection.close()
+
+
+def _loop(connection: Connection, address: Address, model: str, motions: Array, rate: float) -> None:
+    """Ask at every tick of an absolute schedule until the other side says something."""
+    frames = [request_frame(motion) for motion in motions]
+    period, clock, count = round(1e9 / rate), time.monotonic_ns, len(frames)
+    answers: list[int] = []
+    ticks: list[int] = []
+    echoes: list[int] = []
+    revisions: list[tuple[int, int]] = []
+    last = -1
+    with (
+        WebSocket(address, f"/v1/models/{model}/stream") as asked,
+        WebSocket(address, "/v1/echo/stream") as echo,
+        no_collection(),
+    ):
+        echoed = frame(bytes((request_bytes(motions.shape[2]) + len(asked.ask(frames[0]))) // 2))
+        for number in range(_WARM_UP):
+            asked.ask(frames[number % count])
+            echo.ask(echoed)
+        connection.send(None)
+        first, index = clock() + period, 0
+        while index < ECHO_EVERY or index % _LOOK_EVERY or not connection.poll():
+            tick = first + index * period
+            if (left := tick - clock()) > _SPIN:
+                time.sleep((left - _SPIN) / 1e9)
+            while clock() < tick:
+                pass
+            sent = clock()
+            answer = asked.ask(frames[index % count])
+            now = clock()
+            answers.append(now - sent)
+            ticks.append(now - tick)
+            _, flags, _, _, _, revision, _ = ANSWER.unpack_from(answer)
+            if flags & ERROR:
+                raise RuntimeError(answer[ANSWER.size :].decode(errors="replace"))
+            if revision != last:
+                last = revision
+                revisions.append((now, revision))
+            if index % ECHO_EVERY == 0:
+                began = clock()
+                echo.ask(echoed)
+                echoes.append(clock() - began)
+            index += 1
+    found = [Timing.of(np.array(each, dtype=np.int64)) for each in (answers, ticks, echoes)]
+    connection.send(Asked(found[0], found[1], found[2], tuple(revisions)))

@@ -1,0 +1,1 @@
+"""The paper's experiment on simulated robots: `python -m benchmarks.reproduce`."""

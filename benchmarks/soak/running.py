@@ -1,0 +1,150 @@
+"""The load from start to end: options in, results out."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+import lipcore
+from benchmarks import facts
+from benchmarks.online.bed import Bed, install, serving, train
+from benchmarks.online.running import FIT
+from benchmarks.online.scene import Scene
+from benchmarks.soak import accounting, clients
+from benchmarks.soak.accounting import Account
+from benchmarks.soak.clients import PROCESSES, Mix, Work
+from benchmarks.soak.connections import BATCH_PERIOD, BATCH_ROWS, STEADY, TAUGHT, Expected, Log
+from benchmarks.soak.memory import MemoryWatch
+from benchmarks.timing import Timing
+from lipcore.model import TorqueModel
+from lipcore.samples import Samples
+from service.learning.learning_options import LearningOptions
+
+KINDS = ("predict", "stream", "observe", "upload")
+QUERIES, UPLOADED = 200, 300
+"""Motions that are asked; samples of an uploaded recording."""
+OBSERVED_RATE = 50.0
+"""Hz, of the streams that are taught: half a second a batch."""
+LEARNING = LearningOptions(on_change="learn", contact_threshold=1e9, auto_refresh=False, auto_promote=False)
+"""Every row is learnt, so that the clients know what the service must know."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How much load. pause: s between an answer and the next question; fit: of the model; robot, seed: of motion."""
+
+    connections: int = 64
+    seconds: float = 120.0
+    pause: float = 0.02
+    robot: str = "panda"
+    seed: int = 0
+    fit: Mapping[str, Any] = field(default_factory=lambda: dict(FIT))
+
+
+@dataclass
+class Results:
+    """What was seen.
+
+    timings: of exchanges by kind; errors: how often each went wrong, by kind; service, children: MiB each second, while
+    the load was on; before, after: the account before and after the service was started anew.
+    """
+
+    facts: dict[str, str]
+    model: dict[str, str]
+    mix: Mix
+    seconds: float
+    timings: dict[str, Timing] = field(default_factory=dict)
+    errors: dict[str, Counter[str]] = field(default_factory=dict)
+    service: list[float] = field(default_factory=list)
+    children: list[float] = field(default_factory=list)
+    before: Account = field(default_factory=Account)
+    after: Account = field(default_factory=Account)
+
+    @property
+    def failed(self) -> int:
+        """How many exchanges went wrong."""
+        return sum(sum(found.values()) for found in self.errors.values())
+
+    def write(self, path: Path, targets: list[dict[str, Any]]) -> None:
+        """Write all figures as JSON."""
+        path.write_text(json.dumps({**asdict(self), "targets": targets}, indent=2) + "\n")
+
+
+def run(options: Options, console: Console) -> Results:
+    """Serve, load, count; raise BenchError where a step fails."""
+    scene, mix = Scene(options.robot, seed=options.seed), Mix.of(options.connections)
+    machine = facts.machine()
+    with tempfile.TemporaryDirectory(prefix="lipserve-bench-") as folder:
+        home = Path(folder)
+        console.print(f"training a model of {options.robot}", highlight=False)
+        base, seconds = train(scene.history(80.0, 10.0), scene.arm.joint_types, options.fit)
+        manifest = lipcore.save(base, home / "model")
+        install(home / "home", home / "model", {STEADY: LEARNING, TAUGHT: LEARNING}, base.n_joints)
+        results = Results(machine, facts.model(manifest, f"trained here in {seconds:.0f} s"), mix, options.seconds)
+        observed, queries = _observed(scene, options, mix.observe), scene.unseen(0.0)
+        with serving(home / "home") as bed:
+            console.print(f"{mix.total} connections for {options.seconds:g} s", highlight=False)
+            logs = _load(bed, base, options, mix, observed, queries, scene, results)
+            results.before = Account.of(logs)
+            console.print("counting what is there", highlight=False)
+            accounting.check(results.before, logs, bed.client)
+            accounting.compare(results.before, logs, observed, base, queries, bed)
+        with serving(home / "home") as bed:
+            console.print("counting again after a new start", highlight=False)
+            results.after = Account.of(logs)
+            accounting.check(results.after, logs, bed.client)
+            accounting.send_again(results.after, logs, observed, bed)
+            accounting.compare(results.after, logs, observed, base, queries, bed)
+    return results
+
+
+def _load(
+    bed: Bed,
+    base: TorqueModel,
+    options: Options,
+    mix: Mix,
+    observed: dict[int, Samples],
+    queries: Samples,
+    scene: Scene,
+    results: Results,
+) -> list[Log]:
+    asked = queries.rows(slice(0, QUERIES))
+    tau = base.predict(asked.q, asked.dq, asked.ddq).tau
+    expected = Expected(asked.q, asked.dq, asked.ddq, tau)
+    recording = scene.history(UPLOADED / 10.0, 10.0)
+    parts = [clients.share(each, PROCESSES) for each in (mix.predict, mix.stream, mix.observe, mix.upload)]
+    works, first = [], 0
+    for number in range(PROCESSES):
+        part = Mix(*(each[number] for each in parts))
+        mine = dict(list(observed.items())[first : first + part.observe])
+        first += part.observe
+        url = bed.client.url
+        works.append(Work(bed.tcp, url, part, 1000 * number, options.seconds, options.pause, expected, recording, mine))
+    with MemoryWatch(bed.pid) as watch:
+        logs = clients.run(works)
+    results.service, results.children = watch.service, watch.children
+    for kind in KINDS:
+        of_kind = [log for log in logs if log.kind == kind]
+        times = [time for log in of_kind for time in log.times]
+        if times:
+            results.timings[kind] = Timing.of(np.array(times))
+        results.errors[kind] = sum((log.errors for log in of_kind), Counter())
+    return logs
+
+
+def _observed(scene: Scene, options: Options, streams: int) -> dict[int, Samples]:
+    """What each connection that teaches sends, by its number: more than it will have the time for."""
+    batches = int(options.seconds / BATCH_PERIOD) + 2
+    long = scene.more(streams * batches * BATCH_ROWS / OBSERVED_RATE)
+    every = round(scene.rate / OBSERVED_RATE)
+    rows = long.rows(slice(0, None, every))
+    size = batches * BATCH_ROWS
+    return {number: rows.rows(slice(number * size, (number + 1) * size)) for number in range(streams)}

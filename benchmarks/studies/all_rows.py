@@ -1,0 +1,65 @@
+"""Whether a posterior of all rows answers better than one of the few that a fit chooses: error and coverage.
+
+    python benchmarks/studies/all_rows.py [ROBOT...]
+
+A simulated arm with friction that no estimator expresses exactly (a jump at zero speed) is learnt from episodes of 50
+seconds, at several rates and for several lengths. Each fit chooses its rows and its basis as a training job does. Then
+the same basis is told of all rows: each counted by the seconds that it stands for (see `lipcore.online.spacing`), and
+each in full. `worth` is the sum of what the rows count by their time. Judged on unseen trajectories of twice the
+bandwidth: nMSE, and coverage of the 95 % interval, noise included, each the mean over joints and trajectories.
+"""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+import lipcore
+from benchmarks.online.scene import Scene
+from lipcore.conditioning import condition
+from lipcore.metrics import evaluate
+from lipcore.online.spacing import weights
+
+GRID = ((10.0, 1), (10.0, 2), (100.0, 1), (100.0, 2), (100.0, 4), (100.0, 20), (1000.0, 2))
+"""Hz, and episodes of SECONDS."""
+SECONDS = 50
+SPEEDS = (2.0, 10.0)
+CANDIDATES = 20_000
+OPTIONS = lipcore.FitOptions(starts=1, max_iterations=60, statistics="chosen")
+
+
+def judge(model: lipcore.TorqueModel, scenes: list[Scene]) -> str:
+    """Mean nMSE and coverage on unseen trajectories."""
+    errors, inside = [], []
+    for scene in scenes:
+        unseen = scene.unseen(0.0)
+        answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
+        found = evaluate(scene.measured(unseen), answer.tau, answer.tau_std, answer.noise_std)
+        errors.append(np.mean((answer.tau - unseen.tau) ** 2, axis=0) / unseen.tau.var(axis=0))
+        inside.append(found.coverage)
+    return f"{np.mean(errors):.1e} ({np.mean(inside):.0%})"
+
+
+def main() -> None:
+    """Print a Markdown table: nMSE (coverage) of each way to count."""
+    torch.set_num_threads(1)
+    print("| robot, speed | rows | worth | chosen | all, by their time | all, in full |\n| " + "--- | " * 6)
+    for robot in sys.argv[1:] or ("panda", "ur5"):
+        for speed in SPEEDS:
+            scene = Scene(robot=robot, speed=speed)
+            unseen = [replace(scene, seed=seed) for seed in (0, 1, 2)]
+            for rate, episodes in GRID:
+                parts = scene.fleet(episodes, round(rate * SECONDS), rate)
+                samples = lipcore.Samples.concatenate(parts)
+                few = np.linspace(0, len(samples) - 1, min(len(samples), CANDIDATES)).round().astype(np.int64)
+                chosen = lipcore.train(samples.rows(few), scene.arm.joint_types, "lip-chain", OPTIONS)
+                weight = np.concatenate([weights(part.t) for part in parts])
+                timed, full = (condition(chosen, samples, each) for each in (weight, None))
+                found = " | ".join(judge(model, unseen) for model in (chosen, timed, full))
+                what = f"{robot}, {speed:g}"
+                print(f"| {what} | {rate:g} Hz, {len(samples)} | {weight.sum():.0f} | {found} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,177 @@
+"""What is measured: a model, queries it has not seen, and a service of its own that answers with it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+import lipcore
+from benchmarks.clients import Address
+from lipcore.model import TorqueModel
+from lipcore.robots import ROBOTS, Robot, load_robot
+from lipcore.samples import Array, Samples
+from lipcore.simulation import Stream, simulate
+from service.cli import recordings
+from service.cli.demonstration import ServiceProcess
+from service.client import Client
+from service.client.progress import follow
+from service.foundation.settings import Settings
+from service.foundation.states import SUCCEEDED
+from service.models import registry
+from service.storage.database import Database
+from service.storage.files import Files, new_id
+
+MODEL = "bench"
+TRAIN_SEED, QUERY_SEED = 1, 2
+QUERY_SINUSOIDS = 100
+"""Queries follow an unseen trajectory of twice the bandwidth, as in the paper's tests."""
+UNKNOWN_QUERIES = 500
+
+
+class BenchError(RuntimeError):
+    """A step of the benchmark failed."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Which model: trained here on a simulated stream, or an existing folder.
+
+    fit: options of the training job; load: options of the job that runs while answers are timed.
+    """
+
+    robot: str = "panda"
+    stream: Stream = field(default_factory=Stream)
+    fit: Mapping[str, Any] = field(default_factory=dict)
+    load: Mapping[str, Any] = field(
+        default_factory=lambda: {"hyperparameter_samples": 300, "max_iterations": 10_000, "starts": 1}
+    )
+    folder: Path | None = None
+
+
+@dataclass(frozen=True)
+class Workload:
+    """A model as this process loaded it, and what it is asked.
+
+    queries: (Q, 3, n), q, dq and ddq; samples: what the model was trained on, robot: its simulator, where known.
+    """
+
+    folder: Path
+    manifest: Mapping[str, Any]
+    model: TorqueModel
+    queries: Array
+    samples: Samples | None
+    robot: Robot | None
+
+    @classmethod
+    def load(cls, folder: Path, robot: Robot | None, samples: Samples | None, stream: Stream) -> Workload:
+        """Load the model in this process; queries are an unseen trajectory where its stream is known."""
+        manifest = json.loads((folder / "manifest.json").read_bytes())
+        model = lipcore.load(folder)
+        model.warm_up()
+        if samples is not None and robot is not None:
+            unseen = simulate(robot, _unseen(stream), QUERY_SEED)
+            queries = np.stack([unseen.q, unseen.dq, unseen.ddq], axis=1)
+        else:
+            queries = _within(manifest["training_range"], UNKNOWN_QUERIES)
+        return cls(folder, manifest, model, np.ascontiguousarray(queries), samples, robot)
+
+
+@dataclass(frozen=True)
+class Bed:
+    """A running service with the model, and how to reach it. pid: of its process."""
+
+    client: Client
+    tcp: Address
+    unix: Address
+    dataset: str
+    workload: Workload
+    pid: int
+
+
+@contextmanager
+def open_bed(home: Path, source: Source, console: Console) -> Iterator[Bed]:
+    """Start a service in an empty `home` and give it the model, trained by a job or copied; load it here too."""
+    if source.folder is not None:
+        _install(home, source.folder)
+    unix = home / "lipserve.sock"
+    env = {"LIPSERVE_HOME": str(home), "LIPSERVE_UDS": str(unix), "LIPSERVE_LOG_LEVEL": "warning"}
+    service = ServiceProcess(0, env)
+    try:
+        with Client(service.url) as client:
+            console.print(f"service ready after {service.wait_ready(client):.1f} s")
+            robot = load_robot(source.robot)
+            samples = simulate(robot, source.stream, TRAIN_SEED)
+            dataset = _upload(client, samples, home / "stream.npz")
+            if source.folder is None:
+                workload = Workload.load(
+                    _train(client, home, dataset, robot, source, console), robot, samples, source.stream
+                )
+            else:
+                workload = Workload.load(source.folder, _simulator(source.folder), None, source.stream)
+            yield Bed(client, ("127.0.0.1", service.port), unix, dataset, workload, service.process.pid)
+    finally:
+        service.stop()
+
+
+def model_folder(name: str) -> Path:
+    """Folder of the latest version of a model in the home of the settings; raise NotFoundError."""
+    settings = Settings()
+    database = Database.of(settings)
+    try:
+        return Files.of(settings).version_folder(registry.find(database, name, None).folder)
+    finally:
+        database.close()
+
+
+def _install(home: Path, folder: Path) -> None:
+    """Publish a copy of a saved model in a home that no service has opened yet."""
+    database, files, name = Database(home), Files(home), new_id("mv")
+    try:
+        with files.new_version(name) as target:
+            manifest = lipcore.copy_model(folder, target)
+        with database.transaction() as session:
+            registry.publish(session, MODEL, name, manifest, None)
+    finally:
+        database.close()
+
+
+def _upload(client: Client, samples: Samples, path: Path) -> str:
+    recordings.write(path, samples)
+    return client.upload(path).id
+
+
+def _train(client: Client, home: Path, dataset: str, robot: Robot, source: Source, console: Console) -> Path:
+    queued = client.train(MODEL, [dataset], "lip-chain", list(robot.joint_types), dict(source.fit))
+    job = follow(client, queued, console)
+    if job.state != SUCCEEDED:
+        raise BenchError(f"the training job has {job.state}: {job.error.message if job.error else ''}")
+    for folder in (home / "versions").iterdir():
+        if json.loads((folder / "manifest.json").read_bytes())["lineage"].get("job") == job.id:
+            return folder
+    raise BenchError(f"no model in {home} comes from job {job.id}")
+
+
+def _unseen(stream: Stream) -> Stream:
+    return replace(stream, n_sinusoids=QUERY_SINUSOIDS)
+
+
+def _simulator(folder: Path) -> Robot | None:
+    """The robot whose joints the model has, where it can be simulated."""
+    names = tuple(json.loads((folder / "manifest.json").read_bytes())["joint_names"])
+    found = next((name for name, source in ROBOTS.items() if source.free == names), None)
+    return None if found is None else load_robot(found)
+
+
+def _within(ranges: Mapping[str, Mapping[str, list[float]]], count: int) -> Array:
+    """Random motions inside the range of the training samples, (count, 3, n)."""
+    rng = np.random.default_rng(QUERY_SEED)
+    low, high = (np.array([ranges[name][end] for name in ("q", "dq", "ddq")]) for end in ("min", "max"))
+    motions: Array = low + (high - low) * rng.random((count, *low.shape))
+    return motions

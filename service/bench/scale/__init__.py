@@ -1,1 +1,0 @@
-"""`lipserve bench scale`: several services and workers, with a database, a store and a scheduler of their own."""

@@ -1,0 +1,194 @@
+"""A synchronous client of torque streams, for controllers on the same host or network."""
+
+from __future__ import annotations
+
+import socket
+from contextlib import ExitStack
+from pathlib import Path
+from time import monotonic
+from types import TracebackType
+from typing import Self
+
+from numpy.typing import ArrayLike
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
+from websockets.sync.client import connect
+
+from service.foundation.settings import DEFAULT_URL
+from service.stream.exchange import Exchange, closed, destination, refused, unanswered, unsettled
+from service.stream.messages import StreamAnswer, StreamError, StreamHello, StreamLearnt, StreamRefusal
+from service.web.access.credentials import headers_of
+
+__all__ = ["StreamAnswer", "StreamClient", "StreamError", "StreamHello", "StreamLearnt", "StreamRefusal"]
+
+
+class StreamClient:
+    """One stream; use it as a context manager or close it. Not to be shared between threads.
+
+    model: its name; unix: path of the service's Unix-domain socket, instead of host and port of the address; version:
+    pins one, alias: follows what that points to, else the version that serves answers; timeout: longest wait for the
+    connection, and for one answer, in s; stream_id: name of the source of the torques that are sent to learn from, None
+    where only answers are wanted; first_sequence: of the first frame: to send frames again after a lost connection,
+    take the first of them above `learnt.through`; key: API key, that of the environment variable LIPSERVE_KEY where
+    None.
+    Raise StreamError where the service cannot be reached or refuses.
+    """
+
+    def __init__(
+        self,
+        model: str,
+        url: str = DEFAULT_URL,
+        unix: Path | None = None,
+        version: int | None = None,
+        timeout: float = 10.0,
+        stream_id: str | None = None,
+        first_sequence: int = 1,
+        alias: str | None = None,
+        key: str | None = None,
+    ) -> None:
+        headers = headers_of(key)
+        self.timeout = timeout
+        self._exchange, self._stack = Exchange(stream_id, first_sequence), ExitStack()
+        address, host, port = destination(url, model, version=version, alias=alias, stream_id=stream_id)
+        try:
+            made = _connect(host, port, unix, timeout)
+            self._socket = self._stack.enter_context(
+                connect(
+                    address,
+                    sock=made,
+                    compression=None,
+                    open_timeout=timeout,
+                    close_timeout=1.0,
+                    additional_headers=headers,
+                )
+            )
+        except InvalidStatus as error:
+            raise refused(error.response.status_code, error.response.body) from error
+        except (OSError, InvalidHandshake) as error:
+            raise StreamError(f"no service answers at {unix or url}: {error}", "unreachable") from error
+        self._take(timeout)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._stack.close()
+
+    @property
+    def hello(self) -> StreamHello:
+        """What the service said of the version that answers, so far as it has been read."""
+        assert self._exchange.hello is not None  # its first message
+        return self._exchange.hello
+
+    @property
+    def learnt(self) -> StreamLearnt:
+        """What the service has acknowledged of the torques sent over this connection, so far as it has been read."""
+        return self._exchange.learnt
+
+    @property
+    def refusals(self) -> tuple[StreamRefusal, ...]:
+        """The last 1000 times that the service could not log torques, so far as it has been read."""
+        return tuple(self._exchange.refusals)
+
+    def ask(
+        self,
+        q: ArrayLike,
+        dq: ArrayLike,
+        ddq: ArrayLike,
+        std: bool = True,
+        deadline: float = 0.0,
+        tau: ArrayLike | None = None,
+    ) -> StreamAnswer:
+        """Return the torque at one motion: q, dq, ddq of shape (n,) in SI units.
+
+        deadline: seconds that the service may take before it counts the answer as late; 0 for none; tau: (n,) N·m, the
+        torque measured there, to be learnt from after the answer.
+        Raise StreamError where the service refuses the motion (the stream goes on), is gone, or does not answer in
+        time: an answer that comes after all is dropped by the next call.
+        """
+        sequence = self.send(q, dq, ddq, std, deadline, tau)
+        while True:
+            try:
+                answer = self.receive()
+            except StreamError as error:
+                if error.sequence is None or error.sequence == sequence:
+                    raise
+                continue
+            if answer.sequence == sequence:
+                return answer
+
+    def send(
+        self,
+        q: ArrayLike,
+        dq: ArrayLike,
+        ddq: ArrayLike,
+        std: bool = True,
+        deadline: float = 0.0,
+        tau: ArrayLike | None = None,
+    ) -> int:
+        """Send one query, with torque to learn from or without, and return its sequence; `receive` has its answer."""
+        sequence, frame = self._exchange.frame(q, dq, ddq, std, deadline, tau)
+        try:
+            self._socket.send(frame)
+        except ConnectionClosed as error:
+            raise closed(error) from error
+        return sequence
+
+    def receive(self) -> StreamAnswer:
+        """Return the answer to the oldest query without one; raise StreamError where it was refused."""
+        while not self._exchange.answers:
+            self._take(self.timeout)
+        return self._exchange.answer()
+
+    def flush(self, timeout: float | None = None) -> StreamLearnt:
+        """Wait until every torque sent is acknowledged or refused, and return what has become of them.
+
+        timeout: longest wait in s, the client's own where None. Answers that come meanwhile wait for `receive`.
+        Raise StreamError where it takes longer, or the service is gone.
+        """
+        timeout = self.timeout if timeout is None else timeout
+        end = monotonic() + timeout
+        while self._exchange.unsettled:
+            try:
+                self._take(max(end - monotonic(), 0.0))
+            except StreamError as error:
+                if error.code != "timeout":
+                    raise
+                raise unsettled(len(self._exchange.unsettled), timeout) from error
+        return self._exchange.learnt
+
+    def _take(self, timeout: float) -> None:
+        """Read one message."""
+        try:
+            said = self._socket.recv(timeout)
+        except TimeoutError as error:
+            raise unanswered(timeout) from error
+        except ConnectionClosed as error:
+            raise closed(error) from error
+        try:
+            self._exchange.take(said)
+        except StreamError:  # of a layout that this client cannot read
+            self.close()
+            raise
+
+
+def _connect(host: str, port: int, unix: Path | None, timeout: float) -> socket.socket:
+    """Open a connection without Nagle's delay, and without the proxy that a controller's environment may name."""
+    if unix is not None:
+        made = socket.socket(socket.AF_UNIX)
+        try:
+            made.settimeout(timeout)
+            made.connect(str(unix))
+        except OSError:
+            made.close()
+            raise
+    else:
+        made = socket.create_connection((host, port), timeout)
+        made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    made.settimeout(None)
+    return made

@@ -1,7 +1,0 @@
-"""Files of the service: below its home, or in a store that several services share."""
-
-from service.files.durable import DamagedFileError
-from service.files.objects import FilesUnreachableError
-from service.files.store import PATIENCE_S, Files, new_id
-
-__all__ = ["PATIENCE_S", "DamagedFileError", "Files", "FilesUnreachableError", "new_id"]

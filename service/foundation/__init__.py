@@ -1,0 +1,1 @@
+"""What everything may import: settings, errors, names, states."""

@@ -1,0 +1,137 @@
+"""Looking into the log: which batches came, what became of their rows, and the rows themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from math import isfinite
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from lipcore.online.batch import Rows
+from lipcore.online.record import Record
+from lipcore.samples import Array
+from lipcore.vocabulary import CODES
+from service.context import Service
+from service.foundation.errors import NotFoundError, not_found
+from service.learning.control.schema import Observation, ObservationDetail, ObservationPage, ObservationRows, Replay
+from service.learning.ingest import identity
+from service.learning.quality.summary import figures
+from service.learning.schema import ObservationResponse
+from service.learning.storage import log
+from service.learning.storage.log import EventKind
+from service.learning.storage.payload import decode
+from service.models import registry
+from service.storage.database import EventRow
+from service.web.pagination import Page
+
+BATCHES: tuple[EventKind] = ("batch",)
+
+
+def page(service: Service, model: str, part: Page, stream_id: str | None, rejected: bool) -> ObservationPage:
+    """List the batches of a model, newest first; raise NotFoundError where there is no such model."""
+    registry.find(service.database, model, None)
+    with service.database.session() as session:
+        events, following = log.page(session, model, part, stream_id, rejected, BATCHES)
+        return ObservationPage(
+            items=[Observation(**_outline(session, event)) for event in events], next_cursor=following
+        )
+
+
+def show(service: Service, model: str, stream_id: str, sequence: int, rows: bool) -> ObservationDetail:
+    """Return a batch with all that is known of it; raise NotFoundError."""
+    registry.find(service.database, model, None)
+    with service.database.session() as session:
+        event = find(session, model, stream_id, sequence)
+        return ObservationDetail(
+            **_outline(session, event),
+            report=None if event.report is None else _said(event.report),
+            figures=None if event.record is None else figures(Record.from_json(event.record)),
+            replays=[_replay(session, event, each) for each in replays(session, event)],
+            observed=_rows(rows_of(event)) if rows else None,
+        )
+
+
+def find(session: Session, model: str, stream_id: str, sequence: int) -> EventRow:
+    """Return the batch of a sequence, its own or that of one of its frames; raise NotFoundError."""
+    event = log.covering(session, model, stream_id, sequence)
+    if event is not None:
+        return event
+    source = log.stream(session, model, stream_id)
+    if source is not None and log.is_forgotten(source, sequence):
+        raise NotFoundError(f"batch {sequence} of stream {stream_id!r} is no longer kept, if it has come")
+    raise not_found("batch", f"{sequence} of stream {stream_id}")
+
+
+def rows_of(event: EventRow) -> Rows:
+    """Return the rows of a batch or a replay, which are read only now."""
+    assert event.payload is not None  # both have one for as long as they are in the log
+    return decode(event.payload)
+
+
+def replays(session: Session, batch: EventRow) -> Sequence[EventRow]:
+    """Events that have learnt rows of a batch later, the first one first, also those that were undone since."""
+    query = select(EventRow).where(
+        EventRow.model == batch.model,
+        EventRow.number > batch.number,
+        EventRow.kind == "replay",
+        EventRow.detail["event"].as_integer() == batch.number,
+    )
+    return session.scalars(query.order_by(EventRow.number)).all()
+
+
+def _outline(session: Session, event: EventRow) -> dict[str, Any]:
+    return {
+        "stream_id": event.stream_id,
+        "sequence": event.sequence,
+        "last_sequence": event.last_sequence,
+        "event": event.number,
+        "state": identity.state(session, event),
+        "received_at": _moment(event.received),
+        "first_at": None if event.first is None else _moment(event.first),
+        "last_at": None if event.last is None else _moment(event.last),
+        "version": event.version,
+        "revision": event.revision,
+        "rows": (event.report or {}).get("rows", event.rows),
+        "accepted": event.learnt,
+        "rejected": (event.report or {}).get("rejected", {}),
+    }
+
+
+def _said(report: dict[str, Any]) -> dict[str, Any]:
+    """The part of a report that the client was told; the rest is for who goes on from there."""
+    return {name: value for name, value in report.items() if name in ObservationResponse.model_fields}
+
+
+def _replay(session: Session, batch: EventRow, event: EventRow) -> Replay:
+    """A replay is unlearnt with its batch; undone in another way it is by a rollback."""
+    undone = identity.state(session, batch) if batch.void else "rolled_back"
+    return Replay(
+        event=event.number,
+        replayed_at=_moment(event.received),
+        state=undone if event.void else "learnt",
+        codes=(event.detail or {})["codes"],
+        rows=event.rows,
+    )
+
+
+def _rows(rows: Rows) -> ObservationRows:
+    return ObservationRows(
+        time=_finite(rows.time),
+        q=[_finite(row) for row in rows.q],
+        dq=[_finite(row) for row in rows.dq],
+        ddq=[_finite(row) for row in rows.ddq],
+        tau=[_finite(row) for row in rows.tau],
+        code=[CODES[code] for code in rows.code],
+    )
+
+
+def _finite(values: Array) -> list[float | None]:
+    return [value if isfinite(value) else None for value in values.tolist()]
+
+
+def _moment(seconds: float) -> str:
+    """Unix seconds as every other answer has times."""
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds")

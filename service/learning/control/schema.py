@@ -1,0 +1,173 @@
+"""How well a model predicts, its log and what its owner undoes in it, as the API takes and shows them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchema
+
+from lipcore.online.record import LEVEL
+from lipcore.vocabulary import CODES, LEARNT
+from service.foundation.errors import invalid_request
+from service.learning.schema import MOST_SEQUENCE, State
+from service.models.schema import VersionNumber
+
+REPLAYABLE = tuple(code for code in CODES if code not in (CODES[LEARNT], "non_finite", "edge"))
+"""Codes whose rows are complete, so that they can be learnt after all."""
+Nullable = list[float | None]
+
+
+class Figures(BaseModel):
+    """Per joint, over rows that could be predicted; null where there are none, nmse also where torque did not vary."""
+
+    rows: int
+    nmse: Nullable = Field(description="Mean squared error / variance of the measured torque")
+    rmse: Nullable = Field(description="N·m")
+    coverage: Nullable = Field(description="Share of measurements inside the 95 % interval, noise included")
+    nlpd: Nullable = Field(description="Mean negative log predictive density, nats")
+
+
+class QualityWindow(Figures):
+    """Figures of the rows that arrived in the last `seconds`, and what became of these."""
+
+    seconds: float
+    accepted: int = Field(description="Rows that teach")
+    rejected: dict[str, int] = Field(description="Rows that were kept out, by code")
+
+
+class Quality(BaseModel):
+    """Prequential quality: each row is predicted by the version and revision that answered when it arrived."""
+
+    model: str
+    version: int
+    revision: int = Field(description="That of answers now")
+    joint_names: list[str]
+    level: float = Field(LEVEL, description="Probability of the interval whose coverage is told")
+    windows: list[QualityWindow]
+
+
+class Observation(BaseModel):
+    """A batch of the log, and what became of it."""
+
+    stream_id: str
+    sequence: int
+    last_sequence: int = Field(description="Of its last frame; equal to `sequence` where it came in one request")
+    event: int = Field(description="Its place in the model's log")
+    state: State
+    received_at: str
+    first_at: str | None = Field(description="Event time of its first row that has one")
+    last_at: str | None = Field(description="Event time of its last row that has one")
+    version: int | None = Field(description="The version that predicted its rows before they were learnt")
+    revision: int | None
+    rows: int
+    accepted: int = Field(description="Rows that teach")
+    rejected: dict[str, int] = Field(description="Rows that were kept out, by code")
+
+
+class ObservationPage(BaseModel):
+    """One page of batches, newest first."""
+
+    items: list[Observation]
+    next_cursor: str | None
+
+
+class Replay(BaseModel):
+    """Rows of a batch that were kept out at first and were learnt later."""
+
+    event: int = Field(description="Its place in the model's log")
+    replayed_at: str
+    state: State
+    codes: list[str] = Field(description="Codes whose rows were learnt")
+    rows: int
+
+
+class ObservationRows(BaseModel):
+    """All rows of a batch as they are kept; null stands for what was not a finite number."""
+
+    time: Nullable = Field(description="Event time, Unix seconds")
+    q: list[Nullable]
+    dq: list[Nullable]
+    ddq: list[Nullable] = Field(description="As sent, or as derived from dq")
+    tau: list[Nullable]
+    code: list[str] = Field(description=f"What became of each: {', '.join(CODES)}")
+
+
+class ObservationDetail(Observation):
+    """A batch with its acknowledgement, how well it was predicted, and its rows where asked for."""
+
+    report: dict[str, Any] | None = Field(description="What its acknowledgement said")
+    figures: Figures | None = Field(description="How well its rows were predicted; null where none could be")
+    replays: list[Replay]
+    observed: ObservationRows | None = Field(
+        description="Its rows, where asked for. A batch whose accelerations were derived may bring along rows of the "
+        "batches next to it that had to wait for it"
+    )
+
+
+class Revised(BaseModel):
+    """What was changed is in every answer of this version whose `revision` is at least this one."""
+
+    model: str
+    version: int
+    revision: int
+
+
+class Unlearnt(Revised):
+    """A batch was taken out."""
+
+    stream_id: str
+    sequence: int
+    rows: int = Field(description="Rows that do not teach any more, replayed ones included")
+    trained: list[int] = Field(
+        description="Versions trained after the batch came, perhaps on its rows: nothing is taken out of these"
+    )
+
+
+def _code(value: Any) -> str:
+    if value not in REPLAYABLE:
+        raise invalid_request("codes", value, f"some of {', '.join(REPLAYABLE)}: other rows cannot be learnt")
+    return str(value)
+
+
+Code = Annotated[str, PlainValidator(_code), WithJsonSchema({"type": "string", "enum": list(REPLAYABLE)})]
+
+
+class ReplayRequest(BaseModel):
+    """Which rows of a batch to learn after all."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [{"codes": ["contact"]}]})
+
+    codes: list[Code] | None = Field(
+        None, min_length=1, max_length=len(CODES), description="Rows kept out by these codes; by any code by default"
+    )
+
+
+class Replayed(Revised):
+    """Rows that were kept out are learnt."""
+
+    stream_id: str
+    sequence: int
+    rows: int
+    codes: dict[str, int] = Field(description="Rows by the code that had kept them out")
+
+
+class RollbackRequest(BaseModel):
+    """Where to go back to: a revision of the version that serves, or another version."""
+
+    model_config = ConfigDict(
+        extra="forbid", strict=True, json_schema_extra={"examples": [{"revision": 120}, {"version": 1}]}
+    )
+
+    revision: int | None = Field(
+        None, ge=0, le=MOST_SEQUENCE, description="What was learnt after it is forgotten; the log keeps the rows"
+    )
+    version: VersionNumber | None = Field(None, description="It serves from now on, with what it has learnt itself")
+
+
+class RolledBack(Revised):
+    """The model is back where it was."""
+
+    undone: int = Field(description="Batches and replays that do not teach any more")
+    complete: bool = Field(
+        description="Whether all is kept that the version learns: to an old version the log may reach back no more"
+    )

@@ -1,0 +1,188 @@
+"""Where the log of a model leads: what is learnt next, what a rollback passes over, what an unlearning takes out.
+
+All of it is a function of the events up to the one in question, whatever was logged later: the marks `void` of events,
+which later ones set, are not read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import ColumnElement, select
+from sqlalchemy.orm import Session, undefer
+
+from service.learning.storage import log
+from service.storage.database import EventRow
+
+PAGE_ROWS = 500
+"""Rows that are learnt in one step, unless a single batch has more: about 0.4 s for a robot of seven joints."""
+PAGE_EVENTS = 200
+
+
+@dataclass(frozen=True)
+class Taking:
+    """What an unlearning takes out: the batch and its replays, as far as they are learnt, in their order.
+
+    number: its event; batch: the number of the batch; reweighed: whether forgetting was set otherwise in between, so
+    that nobody can tell what the rows weigh by now.
+    """
+
+    number: int
+    batch: int
+    events: Sequence[EventRow]
+    reweighed: bool
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """What follows an event: either the events that are learnt next, or a rollback that leads from it to `end`.
+
+    takings: what is unlearnt in it, by the numbers of the unlearnings. forgetting_s: what a rollback to before the
+    beginning of a version sets, in a list; None where nothing is set. complete: whether no event of it is missing.
+    """
+
+    end: int
+    is_rollback: bool
+    events: Sequence[EventRow]
+    takings: Mapping[int, Taking]
+    forgetting_s: Sequence[float | None] | None
+    complete: bool
+
+
+class RewoundError(Exception):
+    """The state cannot be changed into what the log now says: make it anew, from a snapshot up to event `number`.
+
+    number: None for the newest snapshot of all. without: batches that are to be left out on the way, each with the
+    number of the event before which that is so.
+    """
+
+    def __init__(self, number: int | None, without: Mapping[int, int] | None = None) -> None:
+        super().__init__(f"the state has to be made anew from {'a snapshot' if number is None else f'event {number}'}")
+        self.number, self.without = number, dict(without or {})
+
+
+def ahead(session: Session, model: str, start: int, number: int, last: int) -> Stretch:
+    """What follows event `number` up to `last` at most; start: that of the version. Raise RewoundError.
+
+    Where a rollback leads back to this event, it is gone to at once: what it undoes is not learnt in vain.
+    """
+    rollbacks = _rollbacks(session, model, start, number, last)
+    if earlier := [to for to, *_ in rollbacks if to < number]:
+        raise RewoundError(min(earlier))
+    here = [(end, said) for to, end, said in rollbacks if to == number]
+    if here:
+        end, said = max(here)
+        takings = {each.number: each for each in takings_since(session, model, start, number, end)}
+        forgetting = [in_force(session, model, said)] if said < start else None
+        return Stretch(end, True, [], takings, forgetting, log.is_complete(session, model, number, end))
+    stop = min([last, *(to for to, *_ in rollbacks)])
+    count = _count(session, model, number, stop)
+    events = [each for each in log.events(session, model, number, count, void=True) if each.number <= stop]
+    end = events[-1].number if events else stop
+    unlearnings = [each for each in events if each.kind == "unlearn"]
+    takings = {each.number: _taking(session, each, start, each.number - 1) for each in unlearnings}
+    return Stretch(end, False, events, takings, None, end - number == len(events))
+
+
+def takings_since(session: Session, model: str, start: int, number: int, end: int) -> list[Taking]:
+    """What the unlearnings after event `number`, before `end`, take out of its state."""
+    query = select(EventRow).where(*_span(model, number, end - 1), EventRow.kind == "unlearn")
+    found: dict[int, Taking] = {}
+    for event in session.scalars(query.order_by(EventRow.number)):
+        taking = _taking(session, event, start, number)
+        found.setdefault(taking.batch, taking)  # more than once is once
+    return list(found.values())
+
+
+def left_out(session: Session, model: str, start: int, batch: int, end: int) -> dict[int, int]:
+    """The batches to leave out where the log up to `end` is learnt anew without one; `end` by their numbers.
+
+    Besides it those that are unlearnt on the way: then nothing is learnt that would have to be taken out again.
+    """
+    found = {batch}
+    while True:
+        query = select(EventRow.detail).where(*_span(model, min(found), end), EventRow.kind == "unlearn")
+        more = {detail["event"] for detail in session.scalars(query) if detail["event"] > start} - found
+        if not more:
+            return dict.fromkeys(found, end)
+        found |= more
+
+
+def in_force(session: Session, model: str, number: int) -> float | None:
+    """Time constant of forgetting, s, after event `number`; None: nothing is forgotten."""
+    query = select(EventRow.number, EventRow.detail).where(
+        EventRow.model == model, EventRow.number <= number, EventRow.kind == "settings"
+    )
+    settings: dict[int, Any] = {row.number: row.detail for row in session.execute(query)}
+    undone = _undone(session, model, min(settings, default=number), number)
+    held = [at for at in settings if not any(at in each for each in undone)]
+    return settings[max(held)]["forgetting_s"] if held else None
+
+
+def batch_of(event: EventRow) -> int:
+    """Number of the batch that an event learns or unlearns: its own where it is one."""
+    return event.number if event.kind == "batch" else int((event.detail or {})["event"])
+
+
+def _rollbacks(session: Session, model: str, start: int, number: int, last: int) -> list[tuple[int, int, int]]:
+    """Where each rollback after an event leads, on what is left of the log by then; its own number; what it says."""
+    query = select(EventRow.number, EventRow.detail).where(*_span(model, number, last), EventRow.kind == "rollback")
+    found: list[tuple[int, int, int]] = []
+    for own, detail in session.execute(query.order_by(EventRow.number)):
+        to = max(detail["to"], start)
+        for before, until, _ in found:
+            to = before if before < to < until else to
+        found.append((to, own, detail["to"]))
+    return found
+
+
+def _count(session: Session, model: str, number: int, stop: int) -> int:
+    """How many events make the next page."""
+    upcoming = select(EventRow.rows).where(*_span(model, number, stop)).order_by(EventRow.number)
+    count, total = 0, 0
+    for rows in session.scalars(upcoming.limit(PAGE_EVENTS)):
+        if count and total + rows > PAGE_ROWS:
+            break
+        count, total = count + 1, total + rows
+    return count
+
+
+def _taking(session: Session, unlearning: EventRow, start: int, through: int) -> Taking:
+    """What an unlearning takes out of the state after event `through`, which may be one long before it."""
+    model, batch = unlearning.model, batch_of(unlearning)
+    about = (EventRow.detail["event"].as_integer() == batch) & EventRow.kind.in_(("replay", "unlearn"))
+    query = select(EventRow.number, EventRow.kind, EventRow.detail).where(
+        *_span(model, batch - 1, unlearning.number - 1),
+        (EventRow.number == batch) | (EventRow.kind == "rollback") | about,
+    )
+    learnt: list[int] = []
+    if batch > start:
+        for number, kind, detail in session.execute(query.order_by(EventRow.number)):
+            if kind == "unlearn":
+                learnt = []
+            elif kind == "rollback":
+                learnt = [each for each in learnt if each <= detail["to"]]
+            elif number <= through:
+                learnt.append(number)
+    chosen = select(EventRow).where(EventRow.model == model, EventRow.number.in_(learnt)).order_by(EventRow.number)
+    events = list(session.scalars(chosen.options(undefer(EventRow.payload)))) if learnt else []
+    return Taking(unlearning.number, batch, events, bool(learnt) and _is_reweighed(session, model, learnt[0], through))
+
+
+def _is_reweighed(session: Session, model: str, number: int, through: int) -> bool:
+    """Whether forgetting was set between two events."""
+    query = select(EventRow.number).where(*_span(model, number, through), EventRow.kind == "settings")
+    undone = _undone(session, model, number, through)
+    return any(not any(at in each for each in undone) for at in session.scalars(query))
+
+
+def _undone(session: Session, model: str, number: int, through: int) -> list[range]:
+    """The events that rollbacks between two events have undone."""
+    query = select(EventRow.number, EventRow.detail).where(*_span(model, number, through), EventRow.kind == "rollback")
+    return [range(detail["to"] + 1, own) for own, detail in session.execute(query)]
+
+
+def _span(model: str, after: int, through: int) -> tuple[ColumnElement[bool], ...]:
+    return EventRow.model == model, EventRow.number > after, EventRow.number <= through

@@ -1,0 +1,191 @@
+"""One version that follows the log of its model: learns page by page, solves, stores its state."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from sqlalchemy.exc import DBAPIError
+
+from lipcore.arm.linearisation import linearisation_error
+from lipcore.model import TorqueModel
+from lipcore.online import state
+from lipcore.online.batch import Rows
+from lipcore.online.learner import OnlineModel
+from lipcore.online.revision import Revision
+from lipcore.samples import Array
+from service.foundation.errors import StorageFullError
+from service.foundation.settings import Settings
+from service.learning.learner import publication, recent
+from service.learning.learner.course import RewoundError
+from service.learning.learner.messages import Published
+from service.learning.learner.novelty import Novelty
+from service.learning.learner.restore import Arrival, advance, restore
+from service.learning.storage import log, snapshots
+from service.storage.database import Database
+from service.storage.files import Files
+from service.web.limits.disk import Disk
+from service.web.storage_errors import translated
+
+logger = logging.getLogger(__name__)
+
+Watcher = Callable[["Follower", Sequence[Arrival]], None]
+
+
+class Follower:
+    """A version in the learner process. Times are seconds of `time.monotonic`.
+
+    base: the version as trained; known: what it has learnt, and up to which event; answering: the model as it was last
+    solved, which has not seen the batches that `watchers` are told of.
+    watchers: called with the follower and the batches of a page before it learns them, in order.
+    """
+
+    def __init__(
+        self, database: Database, files: Files, settings: Settings, model: str, version: int, base: TorqueModel
+    ) -> None:
+        self.database, self.files, self.settings = database, files, settings
+        self.model, self.version, self.base = model, version, base
+        self.disk = Disk(settings)
+        with database.session() as session:
+            self.start = log.start_of(session, model, version)
+        # only what needs no learning: pages are taken one by one, and others have their turn in between
+        self.known = restore(database, files, model, version, base, most_rows=0)
+        self.answering, self.watchers = base, list[Watcher]()
+        self.novelty = Novelty(settings.novelty_rows)
+        self.woken, self.behind = True, True
+        self.due = 0.0
+        self._solved: tuple[OnlineModel, Array] | None = None
+        self._revision: Revision | None = None
+        self._linearisation: tuple[float, ...] | None = None
+        self._published = self.start
+        self._stored, self._stored_at = self.known.number, time.monotonic()
+        self._snapshot: str | None = None
+        self._seconds = 0.0
+
+    @property
+    def number(self) -> int:
+        """Number of the last event that the state contains."""
+        return self.known.number
+
+    def step(self) -> None:
+        """Learn the next page, if there is one; `behind` says whether there may be more."""
+        began = time.monotonic()
+        try:
+            following = advance(self.database, self.known, watch=self._watch)
+        except RewoundError as error:
+            following = restore(
+                self.database, self.files, self.model, self.version, self.base, rewound=error, most_rows=0
+            )
+        self.behind = self.woken = following is not self.known
+        self.known = following
+        self._seconds += time.monotonic() - began
+
+    @property
+    def unpublished(self) -> bool:
+        """Whether there is something that the service does not know."""
+        return self.known.number > self._published and self.known.settled
+
+    def publish(self) -> Published:
+        """Solve, write the arrays for the service, and return the message that goes with them."""
+        began = time.monotonic()
+        floor = recent.floor(self.database, self.model, self.version, self.number, self.base.n_joints)
+        revision = self._solve(floor)
+        path: Path = publication.write(publication.folder(self.files), revision)
+        ended = time.monotonic()
+        message = Published(
+            model=self.model,
+            version=self.version,
+            revision=self.number - self.start,
+            number=self.number,
+            path=path,
+            samples=self.known.online.samples,
+            novel_rows=self.novelty.rows,
+            novel_share=self.novelty.share,
+            seconds=self._seconds + ended - began,
+            at=time.time(),
+            linearisation=self._linearisation,
+        )
+        self._published, self._seconds = self.number, 0.0
+        # at most half of the time goes into solving
+        self.due = max(began + self.settings.publish_every_s, ended + (ended - began))
+        return message
+
+    @property
+    def snapshot_due(self) -> float:
+        """When the state is to be stored; infinity where it is stored or cannot be yet."""
+        if self.number == self._stored or not self.known.settled:
+            return np.inf
+        return self._stored_at + self.settings.snapshot_every_s
+
+    def store_in_turn(self) -> None:
+        """Store the state, unless another service has stored what this version has learnt since it was due last.
+
+        Whoever comes first does it for all: they learn the same.
+        """
+        if self.database.shared:
+            with self.database.session() as session:
+                last = snapshots.last_stored(session, self.model, self.version)
+            since = None if last is None or last[0] == self._snapshot else time.time() - last[1]
+            if since is not None and since < self.settings.snapshot_every_s:
+                self._stored_at = time.monotonic()
+                return
+        self.store()
+
+    def store(self) -> None:
+        """Store the state, unless it is stored, or a later one, or it is a stage on the way to another one.
+
+        Where there is no room for it, learning goes on all the same: the log has everything.
+        """
+        if self.number == self._stored or not self.known.settled or self._is_stored():
+            return
+        self._stored_at = time.monotonic()
+        payload = state.dump(self.known.online)
+        try:
+            self.disk.take(len(payload))
+            self._snapshot = snapshots.save(
+                self.database,
+                self.files,
+                self.model,
+                self.version,
+                self.number,
+                payload,
+                most=self.settings.max_snapshots,
+            )
+        except (StorageFullError, OSError, DBAPIError) as error:
+            said = translated(error)
+            if said is None:
+                raise
+            logger.warning("what version %d of model %s has learnt is not stored: %s", self.version, self.model, said)
+            return
+        self._stored = self.number
+
+    def _is_stored(self) -> bool:
+        """Whether another service has stored this state or a later one; a single one knows what it has stored."""
+        if not self.database.shared:
+            return False
+        with self.database.session() as session:
+            row = snapshots.latest(session, self.model, self.version, None)
+        return row is not None and row.number >= self.number
+
+    def _solve(self, floor: Array) -> Revision:
+        """The arrays of the state; those of the last time where nothing but the number has changed."""
+        online = self.known.online
+        if self._revision is None or self._solved is None or not self._is_solved(online, floor):
+            self.answering = online.model(floor)
+            self._revision, self._solved = Revision.of(self.answering), (online, floor)
+            error = linearisation_error(self.answering)
+            # a joint whose errors are no larger than stated needs nothing mended
+            self._linearisation = None if error is None else tuple(np.where(floor > 0, error, 0.0).tolist())
+        return self._revision
+
+    def _is_solved(self, online: OnlineModel, floor: Array) -> bool:
+        return self._solved is not None and self._solved[0] is online and np.array_equal(self._solved[1], floor)
+
+    def _watch(self, arrivals: Sequence[Arrival]) -> None:
+        for watcher in self.watchers:
+            watcher(self, arrivals)
+        if arrivals:
+            self.novelty.see(self.known.online, Rows.concatenate([each.rows for each in arrivals]))

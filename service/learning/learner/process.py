@@ -1,0 +1,156 @@
+"""The learner process as the service sees it: woken, heard, and started again when it dies.
+
+Nothing here imports numerics: the process takes its place on the machine before it does, see `training.process`.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+
+from service.foundation.settings import Settings
+from service.learning.learner.messages import Message
+from service.training.process import Place, call, start_process, training_cpus
+from service.web.observability import logs
+
+logger = logging.getLogger(__name__)
+
+FIRST_PAUSE, LONGEST_PAUSE = 0.5, 30.0
+"""Seconds until a process that died is started again: each time twice as long, unless it lived for LONGEST_PAUSE."""
+END_SECONDS = 5.0
+"""Longest wait for the process to store what it has learnt and end."""
+
+
+def learner_place(settings: Settings) -> Place:
+    """The place of the learner process: on the CPUs of training, before it, one thread."""
+    cpus = None
+    if hasattr(os, "sched_getaffinity"):  # Linux
+        cpus = training_cpus(os.sched_getaffinity(0), settings.training_cpus)
+    return Place(threads=1, niceness=settings.learner_niceness, cpus=cpus, log=logs.current())
+
+
+class LearnerProcess:
+    """Started when a model is woken for the first time.
+
+    on_message: called in a thread of its own, with one message after the other, in the order in which they were sent.
+    """
+
+    def __init__(self, settings: Settings, on_message: Callable[[Message], None]) -> None:
+        self.settings, self.on_message = settings, on_message
+        self._changed = threading.Condition()
+        self._waiting: set[str] = set()
+        self._models: set[str] = set()
+        self._connection: Connection | None = None
+        self._process: BaseProcess | None = None
+        self._threads: list[threading.Thread] = []
+        self._closing = False
+
+    @property
+    def pid(self) -> int | None:
+        """Id of the process, None while there is none."""
+        process = self._process
+        return None if process is None or not process.is_alive() else process.pid
+
+    @property
+    def wanted(self) -> bool:
+        """Whether there should be a process: a model has been woken, and the service is not closing."""
+        return bool(self._threads) and not self._closing
+
+    def wake(self, model: str) -> None:
+        """Say that a model's log has grown, or that other versions of it learn. Never waits for the process."""
+        with self._changed:
+            if self._closing:
+                return
+            self._models.add(model)
+            self._waiting.add(model)
+            if not self._threads:
+                self._threads = [threading.Thread(target=each, daemon=True) for each in (self._supervise, self._send)]
+                for thread in self._threads:
+                    thread.start()
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """Let the process store what it has learnt and end; end it where that takes too long."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        if not self._threads:
+            return
+        supervisor, sender = self._threads
+        supervisor.join(END_SECONDS)
+        if supervisor.is_alive() and self._process is not None:
+            logger.warning("the learner process does not end: killed")
+            self._process.kill()
+        supervisor.join()
+        sender.join()
+
+    def _supervise(self) -> None:
+        pause = FIRST_PAUSE
+        while not self._closing:
+            began = time.monotonic()
+            connection, self._process = self._start()
+            with self._changed:
+                self._connection = connection
+                self._waiting |= self._models
+                self._changed.notify_all()
+                if self._closing:  # while it was started: nobody will tell it to end
+                    self._process.kill()
+            self._listen(connection)
+            self._process.join()
+            with self._changed:
+                self._connection = None
+                if self._closing:
+                    return
+                pause = FIRST_PAUSE if time.monotonic() - began >= LONGEST_PAUSE else pause
+                logger.error("the learner process ended with exit code %s; it is started again", self._process.exitcode)
+                self._changed.wait_for(lambda: self._closing, pause)
+                pause = min(2 * pause, LONGEST_PAUSE)
+
+    def _start(self) -> tuple[Connection, BaseProcess]:
+        context = multiprocessing.get_context("spawn")
+        ours, theirs = context.Pipe()
+        arguments = learner_place(self.settings), self.settings, theirs
+        process = context.Process(target=_learn, args=arguments, daemon=True, name="lipserve-learner")
+        process.start()
+        theirs.close()  # the process has its own: with this one open, its end would go unnoticed
+        return ours, process
+
+    def _listen(self, connection: Connection) -> None:
+        """Hand on what the process says, until it has ended."""
+        while True:
+            try:
+                message = connection.recv()
+            except (EOFError, OSError):
+                return
+            try:
+                self.on_message(message)
+            except Exception:  # the next one may be right
+                logger.exception("a message of the learner process was not taken: %s", message)
+
+    def _send(self) -> None:
+        """Name the models to the process: in a thread, because it may be busy and the pipe full."""
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closing or (self._connection is not None and self._waiting))
+                connection, closing = self._connection, self._closing
+                models, self._waiting = self._waiting, set()
+            if connection is not None:
+                with suppress(OSError):  # it has died: all models are named to the next one
+                    connection.send(None if closing else models)
+            if closing:
+                return
+
+
+def _learn(place: Place, settings: Settings, connection: Connection) -> None:
+    start_process(place)
+    # a signal to all processes of the service ends the parent in order, which then lets this one store its state
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    call("service.learning.learner.worker", "run", settings, connection)  # numerics, see above

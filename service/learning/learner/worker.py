@@ -1,0 +1,179 @@
+"""What the learner process does: every version that learns has a follower, and they take turns."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from math import inf
+from multiprocessing.connection import Connection
+
+from sqlalchemy import select
+
+from service.foundation.settings import Settings
+from service.learning.learner import publication
+from service.learning.learner.follower import Follower
+from service.learning.learner.messages import Failed, Message
+from service.learning.refreshing.duel import Duels
+from service.learning.storage import snapshots
+from service.models import registry
+from service.storage.database import Database, LearnerRow
+from service.storage.files import Files
+
+logger = logging.getLogger(__name__)
+
+Key = tuple[str, int]
+FIRST_PAUSE, LONGEST_PAUSE = 1.0, 60.0
+"""Seconds until a version that failed is tried again; each time twice as long."""
+
+
+def run(settings: Settings, connection: Connection) -> None:
+    """Follow the models whose names come over the connection, until it ends or None comes."""
+    database, files = Database.of(settings), Files.of(settings)
+    publication.clear(files)
+    snapshots.sweep(database, files)
+    learner = Learner(database, files, settings)
+    try:
+        with suppress(EOFError, BrokenPipeError):  # the service is gone
+            while (models := _heard(connection, learner.pause())) is not None:
+                learner.wake(models)
+                for message in learner.turn():
+                    connection.send(message)
+        learner.close()
+    finally:
+        database.close()
+
+
+def _heard(connection: Connection, seconds: float) -> set[str] | None:
+    """Names of the models that were named within so many seconds, None where it is time to end."""
+    models: set[str] = set()
+    while connection.poll(None if seconds == inf else seconds):
+        named = connection.recv()
+        if named is None:
+            return None
+        models.update(named)
+        seconds = 0.0
+    return models
+
+
+class Learner:
+    """The followers of all versions that learn, at most as many as the settings allow."""
+
+    def __init__(self, database: Database, files: Files, settings: Settings) -> None:
+        self.database, self.files, self.settings = database, files, settings
+        self.followers: dict[Key, Follower] = {}  # in the order in which they were woken last
+        self.duels = Duels(settings)
+        self._woken: set[str] = set()
+        self._unread: dict[str, float] = {}  # when models are looked up again, where the database was away
+        self._failed: dict[Key, tuple[float, float]] = {}
+
+    def wake(self, models: set[str]) -> None:
+        """Say that something has happened to these models."""
+        self._woken |= models
+
+    def pause(self) -> float:
+        """Seconds until there is something to do, if nothing happens."""
+        times = [*self._unread.values(), *(at for at, _ in self._failed.values())]
+        for follower in self.followers.values():
+            if follower.behind:
+                return 0.0
+            times.append(follower.snapshot_due)
+            if follower.woken or follower.unpublished:
+                times.append(follower.due)
+        return max(0.0, min(times, default=inf) - time.monotonic()) if not self._woken else 0.0
+
+    def turn(self) -> Iterator[Message]:
+        """Let every follower do the next thing that is to be done; yield what the service has to know."""
+        now = time.monotonic()
+        again = {model for (model, _), (at, _) in self._failed.items() if now >= at}
+        again |= {model for model, at in self._unread.items() if now >= at}
+        woken, self._woken = self._woken | again, set()
+        for model in sorted(woken):
+            yield from self._enlist(model)
+        for key, follower in list(self.followers.items()):
+            try:
+                yield from self._serve(follower)
+            except Exception as error:  # the others shall learn all the same
+                yield self._fail(key, error)
+        yield from self.duels.outcomes()
+
+    def close(self) -> None:
+        """Store what has been learnt."""
+        for key in list(self.followers):
+            self._drop(key)
+
+    def _serve(self, follower: Follower) -> Iterator[Message]:
+        now = time.monotonic()
+        if follower.behind or (follower.woken and now >= follower.due):
+            follower.step()
+        if follower.unpublished and now >= follower.due:
+            yield follower.publish()
+            self._failed.pop((follower.model, follower.version), None)
+        if time.monotonic() >= follower.snapshot_due:
+            follower.store_in_turn()
+
+    def _enlist(self, model: str) -> Iterator[Message]:
+        """Wake the followers of a model: of the version that serves and of the candidates for its place."""
+        try:
+            versions = self._learning(model)
+        except Exception:  # of the database; the followers keep what they have learnt meanwhile
+            logger.exception("which versions of model %r learn cannot be read: tried again", model)
+            self._unread[model] = time.monotonic() + FIRST_PAUSE
+            return
+        self._unread.pop(model, None)
+        for key in [key for key in self.followers if key[0] == model and key[1] not in versions]:
+            self._drop(key)
+        self._failed = {key: tried for key, tried in self._failed.items() if key[0] != model or key[1] in versions}
+        for version in versions:
+            key = (model, version)
+            at, pause = self._failed.get(key, (0.0, 0.0))
+            if at > time.monotonic() and key not in self.followers:
+                continue
+            try:
+                follower = self.followers.pop(key, None) or self._follow(key)
+            except Exception as error:
+                yield self._fail(key, error)
+                continue
+            follower.woken = True
+            self.followers[key] = follower
+            if key in self._failed:
+                self._failed[key] = (inf, pause)  # forgotten once it has published
+        enlisted = [self.followers[model, version] for version in versions if (model, version) in self.followers]
+        serving = next((each for each in enlisted if each.version == versions[-1]), None)
+        self.duels.arrange(model, serving, [each for each in enlisted if each is not serving])
+
+    def _learning(self, model: str) -> list[int]:
+        """Versions of a model that learn; the one that serves last, so that it is the last to be dropped."""
+        serving = registry.serving(self.database, [model]).get(model)
+        if serving is None:
+            return []
+        with self.database.session() as session:
+            candidates = select(LearnerRow.version).where(LearnerRow.model == model, LearnerRow.role == "candidate")
+            known = session.get(LearnerRow, (model, serving.version))
+            found = [version for version in session.scalars(candidates) if version != serving.version]
+        if known is None:  # trained before there was a log
+            with self.database.transaction() as session:
+                registry.serve(session, model, serving.version)
+        return [*found, serving.version]
+
+    def _follow(self, key: Key) -> Follower:
+        while len(self.followers) >= self.settings.max_learning_models:
+            self._drop(next(iter(self.followers)))
+        row = registry.find(self.database, *key)
+        base = self.files.load_version(row.folder, row.checksums)
+        return Follower(self.database, self.files, self.settings, *key, base)
+
+    def _drop(self, key: Key) -> None:
+        follower = self.followers.pop(key)
+        try:
+            follower.store()
+        except Exception:  # the log has it all the same
+            logger.exception("version %d of model %r could not be stored", key[1], key[0])
+
+    def _fail(self, key: Key, error: Exception) -> Failed:
+        logger.error("version %d of model %r cannot learn", key[1], key[0], exc_info=error)
+        self.followers.pop(key, None)
+        pause = min(2 * self._failed[key][1], LONGEST_PAUSE) if key in self._failed else FIRST_PAUSE
+        self._failed[key] = (time.monotonic() + pause, pause)
+        return Failed(*key, f"{type(error).__name__}: {error}")

@@ -1,0 +1,65 @@
+"""How a model learns: what its owner has set, and whether it holds still after a change."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from service.foundation.errors import invalid_request, not_found
+from service.learning.learning_options import LearningOptions
+from service.learning.storage import log
+from service.storage.database import Database, LearningRow, ModelRow
+
+
+def options(session: Session, model: str) -> LearningOptions:
+    """What is set for a model, the defaults where nothing is."""
+    row = session.get(LearningRow, model)
+    return LearningOptions() if row is None else LearningOptions(**row.options)
+
+
+def set_options(database: Database, model: str, wanted: LearningOptions, n_joints: int, received: float) -> None:
+    """Set how a model learns from now on; a new time constant of forgetting is an event of its log.
+
+    Raise NotFoundError for a model that does not exist, InvalidRequestError where `torque_limits` is not of its joints.
+    """
+    limits = wanted.torque_limits
+    if limits is not None and len(limits) != n_joints:
+        raise invalid_request(
+            "torque_limits", f"a list of {len(limits)}", f"{n_joints} positive numbers, one for each joint in order"
+        )
+    with database.turn(model), database.transaction(model) as session:
+        row = _row(session, model)
+        row.options = wanted.model_dump()
+        if wanted.forgetting_s != log.forgetting(session, model, log.newest(session, model)):
+            log.append(session, model, "settings", {"forgetting_s": wanted.forgetting_s}, received)
+
+
+def hold(session: Session, model: str, detail: dict[str, Any]) -> None:
+    """Let a model hold still: what comes is answered and logged, but not learnt. detail: why."""
+    _row(session, model).held = detail
+
+
+def release(session: Session, model: str) -> None:
+    """Let a model learn again; nothing happens where it does."""
+    row = session.get(LearningRow, model)
+    if row is not None:
+        row.held = None
+
+
+def held(session: Session, model: str) -> dict[str, Any] | None:
+    """Why a model holds still; None where it learns."""
+    row = session.get(LearningRow, model)
+    return None if row is None else row.held
+
+
+def _row(session: Session, model: str) -> LearningRow:
+    """The row of a model, a new one with the defaults where there is none."""
+    row = session.get(LearningRow, model)
+    if row is None:
+        if session.scalar(select(ModelRow).where(ModelRow.name == model)) is None:
+            raise not_found("model", model)
+        row = LearningRow(model=model, options=LearningOptions().model_dump(), held=None)
+        session.add(row)
+    return row

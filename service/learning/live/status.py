@@ -1,0 +1,99 @@
+"""Where a model that is followed stands, once a second."""
+
+from __future__ import annotations
+
+import time
+
+from lipcore.vocabulary import CODES
+from service.context import Service
+from service.learning import learning
+from service.learning.control import decisions
+from service.learning.control.learning_schema import Held
+from service.learning.control.status import novel_share
+from service.learning.live.schema import LiveAnswers, LiveNovelty, LiveStatus
+from service.learning.quality import summary
+from service.learning.storage import log
+from service.web.observability.meters import OTHER, StreamMeter
+from service.web.pagination import Page
+
+MOST_ALARMS = 5
+COUNTS = (*CODES, "batches", "duplicates")
+
+
+class Status:
+    """Looks at one model again and again; not for the event loop."""
+
+    def __init__(self, service: Service, model: str) -> None:
+        self.service, self.model = service, model
+        self._answers = Answers(service, model)
+
+    def __call__(self, novel: list[LiveNovelty], passed: float | None) -> LiveStatus:
+        """Return how it stands; raise NotFoundError where it was deleted. passed: s since the last time."""
+        service, model = self.service, self.model
+        served, now = service.loaded.get(model, None), time.time()
+        monitor, said = service.updates.monitor(model), service.updates.status(model, served.version)
+        with service.database.session() as session:
+            events = log.newest(session, model) - log.start_of(session, model, served.version)
+            options, held = learning.options(session, model), learning.held(session, model)
+        return LiveStatus(
+            model=model,
+            at=now,
+            version=served.version,
+            revision=served.revision,
+            lag_events=max(events - served.revision, 0),
+            joint_names=list(served.model.joint_names),
+            joint_types=list(served.model.joint_types),
+            torque_convention=served.model.torque_convention,
+            learns=options.enabled,
+            on_change=options.on_change,
+            contact_threshold=options.contact_threshold,
+            held=None if held is None else Held(at=held["at"], evidence=held["evidence"]),
+            failure=None if said.failed is None else said.failed.error,
+            novel_share=novel_share(said),
+            novel=novel,
+            counts={name: monitor.counts[name] for name in COUNTS},
+            windows=[summary.window(each, now) for each in monitor.windows],
+            answers=self._answers.since(passed),
+            alarms=decisions.page(service, model, Page(after=None, limit=MOST_ALARMS)).items,
+        )
+
+
+class Answers:
+    """What streams of a model were answered, from one look to the next."""
+
+    def __init__(self, service: Service, model: str) -> None:
+        self._meters, self._model = service.meters, model
+        self._before: tuple[list[int], int, int] | None = None
+
+    def since(self, passed: float | None) -> LiveAnswers | None:
+        """What came since the last look, `passed` s ago; None at the first one."""
+        # read only: meters belong to the event loop, which makes them
+        meter = self._meters.streams().get(self._model)
+        if meter is None and OTHER in self._meters.streams():
+            return None
+        meter = meter or StreamMeter()
+        bounds, now = meter.durations.bounds, (list(meter.durations.counts), sum(meter.refused.values()), meter.late)
+        before, self._before = self._before, now
+        if before is None or passed is None:
+            return None
+        counts = [late - early for late, early in zip(now[0], before[0], strict=True)]
+        return LiveAnswers(
+            seconds=round(passed, 3),
+            count=sum(counts),
+            refused=now[1] - before[1],
+            late=now[2] - before[2],
+            p50_at_most_s=at_most(counts, bounds, 0.5),
+            p99_at_most_s=at_most(counts, bounds, 0.99),
+        )
+
+
+def at_most(counts: list[int], bounds: tuple[float, ...], share: float) -> float | None:
+    """The least bound below which this share of what was counted lies, None where there is none. counts: by bucket."""
+    total, below = sum(counts), 0
+    if not total:
+        return None
+    for count, bound in zip(counts, bounds, strict=False):  # the last bucket has no bound
+        below += count
+        if below >= share * total:
+            return bound
+    return None

@@ -1,0 +1,95 @@
+"""Metrics of models that learn: computed when they are asked for, and kept nowhere."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+from sqlalchemy import select
+
+from lipcore.vocabulary import CODES
+from service.context import Service
+from service.inference.loaded import Served
+from service.learning.control import revisions
+from service.learning.control.status import novel_share
+from service.learning.quality import summary
+from service.learning.quality.monitor import Monitor
+from service.storage.database import StreamRow
+from service.web.observability.metric import MetricKind
+
+FIGURES = {
+    "nmse": "Mean squared error / variance of the measured torque; every row is predicted before it is learnt",
+    "coverage": "Share of measurements inside the 95 % interval, noise included",
+    "nlpd": "Mean negative log predictive density, nats",
+}
+QUALITY = {
+    name: MetricKind("gauge", f"lipserve_quality_{name}", said, ("model", "joint", "window"))
+    for name, said in FIGURES.items()
+}
+REVISION = MetricKind("gauge", "lipserve_revision", "Revision that answers contain", ("model", "version"))
+NOVEL = MetricKind("gauge", "lipserve_novel_share", "Share of the latest samples that lie beyond the basis", ("model",))
+LAG = MetricKind(
+    "gauge", "lipserve_learning_lag_events", "Events of the log that answers do not contain yet", ("model",)
+)
+ROWS = MetricKind(
+    "counter",
+    "lipserve_observations_total",
+    "Rows of observations since the service has started, by what became of them",
+    ("model", "outcome"),
+)
+KINDS = (*QUALITY.values(), REVISION, NOVEL, LAG, ROWS)
+
+
+class Learning(Collector):
+    """The figures of all models of one service that learn. Not for the event loop."""
+
+    def __init__(self, service: Service) -> None:
+        self._service = service
+
+    def describe(self) -> list[Metric]:
+        """Nothing: what there is depends on the models."""
+        return []
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield every metric with a sample for each model."""
+        gauges = {name: kind.family() for name, kind in QUALITY.items()}
+        revision, novel, lag, rows = (kind.family() for kind in (REVISION, NOVEL, LAG, ROWS))
+        for model, monitor in self._monitors().items():
+            _add_quality(gauges, model, monitor)
+            for outcome in CODES:
+                rows.add_metric([model, outcome], monitor.counts[outcome])
+            if (served := self._service.loaded.hot(model, None)) is None:
+                continue
+            revision.add_metric([model, str(served.version)], served.revision)
+            lag.add_metric([model], self._lag(served))
+            share = novel_share(self._service.updates.status(model, served.version))
+            if share is not None:
+                novel.add_metric([model], share)
+        yield from (*gauges.values(), revision, novel, lag, rows)
+
+    def _monitors(self) -> dict[str, Monitor]:
+        """Monitors by model: those there are, and of models in memory that have got observations before the start.
+
+        No model is loaded for it, which would drop another one.
+        """
+        updates, loaded = self._service.updates, self._service.loaded
+        with self._service.database.session() as session:
+            learning = list(session.scalars(select(StreamRow.model).distinct()))
+        fresh = {model: updates.monitor(model) for model in learning if loaded.hot(model, None) is not None}
+        return dict(sorted((updates.monitors() | fresh).items()))
+
+    def _lag(self, served: Served) -> int:
+        with self._service.database.session() as session:
+            return max(revisions.current(session, served.name, served.version) - served.revision, 0)
+
+
+def _add_quality(gauges: dict[str, GaugeMetricFamily], model: str, monitor: Monitor) -> None:
+    now = time.time()
+    for window in monitor.windows:
+        seen = summary.window(window, now)
+        for name, gauge in gauges.items():
+            for joint, value in zip(monitor.joint_names, getattr(seen, name), strict=True):
+                if value is not None:
+                    gauge.add_metric([model, joint, f"{seen.seconds:g}"], value)

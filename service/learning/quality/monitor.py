@@ -1,0 +1,154 @@
+"""What a running service keeps in memory of a model that learns; all of it can be told again from the log."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter, OrderedDict
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from sqlalchemy import ColumnElement, select
+from sqlalchemy.orm import Session
+
+from lipcore.online.change import ChangeDetector
+from lipcore.online.record import Record
+from lipcore.vocabulary import CODES, LEARNT
+from service.foundation.settings import Settings
+from service.learning.ingest.contacts import ContactGate
+from service.learning.ingest.judging import Innovations, Verdict, Watch
+from service.learning.quality.windows import Window
+from service.learning.storage import log
+from service.storage.database import EventRow
+
+MOST_EVENTS = 3000
+"""Events that the windows are rebuilt from after a start, at most: 0.3 ms each."""
+DETECTOR_S = 60.0
+"""Time before a start that the detector of changes is rebuilt from, s: more than it looks back."""
+
+
+class Monitor:
+    """One model's windows of quality, its gates and its detector of changes.
+
+    joint_names: in whose order records are. lock: held while a batch is judged and logged, one at a time; whoever only
+    reads windows and counts needs none. counts: rows by code and "learnt", "batches" and "duplicates", since the start
+    and that this service has taken. held: whether learning waited for a decision at the last batch. number: of the last
+    event that was taken in.
+
+    Several services take batches of one model in turn, and each takes in what the others took before it judges: gates,
+    detector and windows are then the same to the last bit as if one service had taken all, from the first batch on that
+    all of them know. The innovations are those of the batches that this service took itself, because a batch is
+    logged without what was predicted: what tells friction from a payload stands on fewer rows.
+    """
+
+    def __init__(self, joint_names: tuple[str, ...], settings: Settings) -> None:
+        self.joint_names, self.lock = joint_names, threading.Lock()
+        n = len(joint_names)
+        self.windows = tuple(Window(seconds, n) for seconds in settings.quality_windows_s)
+        self.counts: Counter[str] = Counter()
+        self.held, self.number = False, 0
+        self._since_due = 0
+        self._patience, self._most_streams = settings.contact_patience_s, settings.max_observation_streams
+        self._gates: OrderedDict[str, ContactGate] = OrderedDict()
+        self._detector, self._innovations = ChangeDetector(), Innovations.empty(n)
+
+    @classmethod
+    def rebuilt(
+        cls, session: Session, model: str, joint_names: tuple[str, ...], settings: Settings, now: float
+    ) -> Monitor:
+        """The monitor of a model from its log. now: Unix time, s."""
+        made = cls(joint_names, settings)
+        made.number = log.newest(session, model)
+        since = now - max(*settings.quality_windows_s, DETECTOR_S)
+        for event in _batches(session, model, EventRow.received > since, EventRow.number <= made.number):
+            made._remember(event, event.received > now - DETECTOR_S)
+        return made
+
+    def follow(self, session: Session, model: str) -> None:
+        """Take in the batches that other services have logged since the last that was taken in; `lock` is held."""
+        for event in _batches(session, model, EventRow.number > self.number):
+            self._remember(event, True)
+            self.number = event.number
+
+    def watch(self, stream_id: str) -> Watch:
+        """What is known before the next rows of a stream."""
+        gate = self._gates.get(stream_id) or ContactGate.start(self._patience)
+        return Watch(gate, self._detector, self._innovations)
+
+    def usual(self, now: float) -> Record:
+        """Record of the shortest window before a Unix time, s."""
+        return min(self.windows, key=lambda window: window.seconds).record(now)
+
+    def note(self, event: EventRow, stream_id: str, verdict: Verdict, report: Mapping[str, Any]) -> None:
+        """Take in a batch that has been logged with this report; `lock` is held."""
+        received, self.number = event.received, event.number
+        counts = _counts(report)
+        self._add(verdict.record, counts, received)
+        self.counts.update({"batches": 1, **counts})
+        self._since_due += 1
+        self._detector, self._innovations = verdict.watch.detector, verdict.watch.innovations
+        self.held = verdict.held
+        self._keep(stream_id, verdict.watch.gate)
+
+    def due(self, batches: int) -> bool:
+        """Whether so many batches have been noted since the last time that this was true."""
+        with self.lock:
+            if self._since_due < batches:
+                return False
+            self._since_due = 0
+            return True
+
+    def decided(self) -> None:
+        """Learning goes on after it was held; `lock` is held. What has changed is no contact."""
+        self.held = False
+        self._gates.update({stream_id: gate.stand_back() for stream_id, gate in self._gates.items()})
+
+    def _remember(self, event: EventRow, recent: bool) -> None:
+        """Take in a batch as it was judged when it was logged. recent: whether the detector still looks back to it."""
+        report = event.report or {}
+        record = None if event.record is None else Record.from_json(event.record)
+        if record is not None and record.n_joints != len(self.joint_names):
+            return
+        self._add(record, _counts(report), event.received)
+        if self.held and not report.get("waited", True):
+            self.decided()
+        self.held, waits = report["held"], report["held"] or report["open"]
+        if event.stream_id is not None:
+            if (known := report.get("gate")) is not None:
+                gate = ContactGate.from_json(known, self._patience)
+            else:  # logged by an earlier release
+                gate = ContactGate.start(self._patience)
+                gate = gate.stand_back() if waits else gate
+            self._keep(event.stream_id, gate)
+        at = report.get("until", event.last)
+        if at is None or not recent:
+            return
+        if record is not None:
+            told = replace(record, standardised=np.array(report["surprise"], np.float64))
+            self._detector, _ = self._detector.step(told, at)
+        if not waits:
+            self._detector = self._detector.acknowledged()
+
+    def _add(self, record: Record | None, counts: Mapping[str, int], received: float) -> None:
+        for window in self.windows:
+            window.add(record, counts, received)
+
+    def _keep(self, stream_id: str, gate: ContactGate) -> None:
+        self._gates[stream_id] = gate
+        self._gates.move_to_end(stream_id)
+        if len(self._gates) > self._most_streams:
+            self._gates.popitem(last=False)
+
+
+def _batches(session: Session, model: str, *conditions: ColumnElement[bool]) -> Iterator[EventRow]:
+    """The last batches of a model that meet conditions, as many as are taken in, in order."""
+    found = select(EventRow).where(
+        EventRow.model == model, EventRow.kind == "batch", EventRow.report.is_not(None), *conditions
+    )
+    return reversed(list(session.scalars(found.order_by(EventRow.number.desc()).limit(MOST_EVENTS))))
+
+
+def _counts(report: Mapping[str, Any]) -> dict[str, int]:
+    """Rows by code, those that are learnt too."""
+    return {CODES[LEARNT]: report["accepted"], **report["rejected"]}

@@ -1,0 +1,138 @@
+"""Observations as the API takes them, and their acknowledgement."""
+
+from __future__ import annotations
+
+from math import nan
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema
+
+from service.foundation.errors import invalid_request
+from service.foundation.matrices import to_array
+
+MOST_SEQUENCE = 2**53 - 1
+"""The largest whole number that every JSON reader takes for what it is."""
+State = Literal["learnt", "unlearnt", "rolled_back"]
+
+_NUMBERS: dict[str, Any] = {"type": "array", "items": {"type": ["number", "null"]}}
+_ROWS: dict[str, Any] = {"type": "array", "items": _NUMBERS}
+
+StreamId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+SequenceNumber = Annotated[int, Field(strict=True, ge=0, le=MOST_SEQUENCE)]
+
+
+def _to_array(value: Any, info: ValidationInfo) -> NDArray[np.float64]:
+    """JSON rows as an array, null as NaN; see `to_array`."""
+    return to_array(info.field_name or "value", value, _row)
+
+
+def _to_times(value: Any, info: ValidationInfo) -> NDArray[np.float64]:
+    """One number or numbers (N,) as an array (N,), null as NaN; raise InvalidRequestError naming what is wrong."""
+    name = info.field_name or "value"
+    if not isinstance(value, list):
+        return np.array(_row(name, [value]))
+    return np.array(_row(name, value), np.float64)
+
+
+def _row(name: str, row: list[Any]) -> list[float]:
+    out = []
+    for index, number in enumerate(row):
+        if type(number) not in (int, float, type(None)):
+            raise invalid_request(f"{name}[{index}]", number, "a number, or null where none was measured")
+        try:
+            out.append(nan if number is None else float(number))
+        except OverflowError:
+            raise invalid_request(f"{name}[{index}]", number, "a number of at most 1e308") from None
+    return out
+
+
+Matrix = Annotated[NDArray[np.float64], PlainValidator(_to_array), WithJsonSchema({"anyOf": [_NUMBERS, _ROWS]})]
+"""JSON array of shape (N, n), or (n,) for one row; null where there is no number."""
+Times = Annotated[
+    NDArray[np.float64], PlainValidator(_to_times), WithJsonSchema({"anyOf": [{"type": "number"}, _NUMBERS]})
+]
+"""JSON array of shape (N,), or a number for one row."""
+
+
+class ObservationRequest(BaseModel):
+    """A batch of rows from one source, in SI units. A row with null or a number that is not finite is not learnt."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        strict=True,
+        arbitrary_types_allowed=True,
+        json_schema_extra={
+            "examples": [
+                {
+                    "stream_id": "cell-3",
+                    "sequence": 0,
+                    "t": [0.0, 0.01],
+                    "q": [[0.0, -0.5, 0.0, -2.0, 0.0, 1.5, 0.7], [0.001, -0.5, 0.0, -2.0, 0.0, 1.5, 0.7]],
+                    "dq": [[0.1, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0], [0.1, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0]],
+                    "ddq": [[0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0]],
+                    "tau": [[0.0, -25.0, 0.3, 16.0, 0.5, 1.5, 0.0], [0.0, -25.0, 0.3, 16.0, 0.5, 1.5, 0.0]],
+                }
+            ]
+        },
+    )
+
+    stream_id: StreamId = Field(description="The robot or recording that the rows come from")
+    sequence: SequenceNumber = Field(
+        description="Number of the batch in its stream, counted up by one. With `stream_id` it is its identity: sent "
+        "again, it is acknowledged again and learnt once"
+    )
+    t: Times | None = Field(
+        None, description="Times of the rows by the stream's own clock, s: (N). Without them rows count as of arrival"
+    )
+    q: Matrix = Field(description="Positions, rad (prismatic: m): (N, n), or (n) for one row")
+    dq: Matrix = Field(description="Velocities, rad/s (m/s)")
+    ddq: Matrix | None = Field(
+        None, description="Accelerations, rad/s² (m/s²); left out, they are derived from `t` and `dq`, with a delay"
+    )
+    tau: Matrix = Field(description="Measured torques, N·m (prismatic: N), of the model's convention")
+    joint_names: list[str] | None = Field(
+        None, max_length=1000, description="Joints in the order of the columns; that of the model by default"
+    )
+
+
+class DerivedAcceleration(BaseModel):
+    """How accelerations were derived: as the slope of a parabola through the velocities around a row."""
+
+    delay_s: float = Field(description="How much later than its row an acceleration is known, s")
+    window: int = Field(description="Rows on either side of a row that its acceleration stands on")
+    rate_hz: float = Field(description="Rows a second")
+    carried: int = Field(
+        description="Rows of the batches next to this one that had to wait for it, decided and counted with it"
+    )
+
+
+class Derivation(BaseModel):
+    """What was not measured."""
+
+    ddq: DerivedAcceleration
+
+
+class ObservationResponse(BaseModel):
+    """The rows are logged for good: `accepted` of them are learnt within a moment."""
+
+    model: str
+    version: int = Field(description="The version that predicted the rows before it learnt them")
+    revision: int = Field(description="Answers of this version with this `revision` or a later one contain the batch")
+    stream_id: str
+    sequence: int
+    rows: int = Field(description="Rows that came")
+    accepted: int = Field(description="Rows to be learnt")
+    duplicate: bool = Field(description="Whether the batch had come before: then this is what was said the first time")
+    state: State = Field(description="What has become of the batch since")
+    rejected: dict[str, int] = Field(
+        description="Rows that are kept but not learnt, by code: `non_finite`, `limit`, `time_jump`, `saturation`, "
+        "`stationary`, `contact`, `change` (a changed robot whose owner has not decided), `edge` (acceleration not "
+        "derivable; where the stream goes on, these are learnt with the next batch)"
+    )
+    gaps: list[list[int]] = Field(
+        description="Ranges [first, last] of sequences of the stream that have not come, the latest ones"
+    )
+    derived: Derivation | None = Field(None, description="What was derived because it was not sent")
+    held: bool = Field(description="Whether learning stands still until the model's owner has decided about a change")

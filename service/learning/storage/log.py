@@ -1,0 +1,239 @@
+"""The event log of a model: what came, in the order of commits. The learnt state is a function of it.
+
+Functions that write are called inside `Database.transaction()`: numbers are given out under its lock, so that they are
+dense and rise in the order of commits, and an event is durable once the transaction has ended.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from sqlalchemy import Select, delete, func, select, update
+from sqlalchemy.orm import Session, undefer
+
+from lipcore.online.batch import Rows
+from lipcore.vocabulary import CODES, LEARNT
+from service.foundation.errors import BusyError, ConflictError
+from service.learning.storage.gaps import Gaps
+from service.learning.storage.payload import encode
+from service.storage.database import EventRow, LearnerRow, LearningRow, SnapshotRow, StreamRow, now
+from service.web.pagination import Page
+from service.web.pagination import newest as newest_rows
+
+StreamKind = Literal["batches", "frames"]
+EventKind = Literal["batch", "replay", "unlearn", "rollback", "change", "settings"]
+UNTIMED = [CODES.index("non_finite"), CODES.index("time_jump")]
+"""Codes of rows whose own time says nothing."""
+
+
+@dataclass(frozen=True)
+class NewBatch:
+    """A batch to be logged; its fields are those of `EventRow` and, where the stream is new, of `StreamRow`."""
+
+    stream_id: str
+    kind: StreamKind
+    sequence: int
+    last_sequence: int
+    digest: str
+    offset: float
+    received: float
+    version: int
+    revision: int
+    rows: Rows
+    report: dict[str, Any]
+    record: dict[str, Any] | None
+
+
+def append_batch(session: Session, model: str, batch: NewBatch, most_streams: int | None = None) -> EventRow:
+    """Log a batch and what its stream still misses; return its event.
+
+    Raise ConflictError where the stream is of another kind, where frames do not go on after the last, or where the
+    batch may have been learnt before and is no longer kept; BusyError beyond `most_streams` streams of the model. That
+    no batch of this sequence is kept is checked with `find_batch` before, in the same transaction.
+    """
+    event = EventRow(
+        number=newest(session, model) + 1,
+        stream_id=batch.stream_id,
+        sequence=batch.sequence,
+        last_sequence=batch.last_sequence,
+        digest=batch.digest,
+        version=batch.version,
+        revision=batch.revision,
+        report=batch.report,
+        record=batch.record,
+    )
+    _note_arrival(session, model, batch, most_streams)
+    return _append(session, event, model, "batch", batch.received, batch.rows)
+
+
+def append(
+    session: Session, model: str, kind: EventKind, detail: dict[str, Any], received: float, rows: Rows | None = None
+) -> EventRow:
+    """Log an event of another kind than a batch; return it."""
+    event = EventRow(number=newest(session, model) + 1, detail=detail)
+    return _append(session, event, model, kind, received, rows)
+
+
+def find_batch(session: Session, model: str, stream_id: str, sequence: int) -> EventRow | None:
+    """The batch of exactly this sequence."""
+    return session.scalar(_of_stream(model, stream_id).where(EventRow.sequence == sequence))
+
+
+def covering(session: Session, model: str, stream_id: str, sequence: int) -> EventRow | None:
+    """The batch that this sequence lies in, of frames or of its own."""
+    found = _of_stream(model, stream_id).where(EventRow.sequence <= sequence).order_by(EventRow.sequence.desc())
+    event = session.scalar(found.limit(1))
+    return event if event is not None and event.last_sequence is not None and sequence <= event.last_sequence else None
+
+
+def neighbours(session: Session, model: str, stream_id: str, sequence: int) -> tuple[EventRow | None, EventRow | None]:
+    """The batches that are kept next below and next above a sequence, with a gap in between or without."""
+    found = _of_stream(model, stream_id)
+    before = found.where(EventRow.sequence < sequence).order_by(EventRow.sequence.desc()).limit(1)
+    after = found.where(EventRow.sequence > sequence).order_by(EventRow.sequence).limit(1)
+    return session.scalar(before), session.scalar(after)
+
+
+def stream(session: Session, model: str, stream_id: str) -> StreamRow | None:
+    """What is known of a source of observations."""
+    return session.get(StreamRow, (model, stream_id))
+
+
+def is_forgotten(source: StreamRow, sequence: int) -> bool:
+    """Whether a batch may have come that is no longer kept, so that a repetition could not be told from another."""
+    gaps = Gaps.from_json(source.missing, source.last)
+    return source.forgotten is not None and sequence <= source.forgotten and gaps.came(sequence)
+
+
+def newest(session: Session, model: str) -> int:
+    """Number of the newest event, 0 where there is none."""
+    query = select(EventRow.number).where(EventRow.model == model).order_by(EventRow.number.desc()).limit(1)
+    return session.scalar(query) or 0
+
+
+def events(session: Session, model: str, after: int, limit: int, void: bool = False) -> list[EventRow]:
+    """Events above number `after` with their payload, rising, at most `limit`; void ones only where asked for."""
+    query = select(EventRow).where(EventRow.model == model, EventRow.number > after).order_by(EventRow.number)
+    if not void:
+        query = query.where(EventRow.void.is_(False))
+    return list(session.scalars(query.limit(limit).options(undefer(EventRow.payload))))
+
+
+def is_complete(session: Session, model: str, after: int, through: int) -> bool:
+    """Whether every event with after < number <= through is kept: else no state can be told that needs them."""
+    span = (EventRow.model == model, EventRow.number > after, EventRow.number <= through)
+    return session.scalar(select(func.count()).select_from(EventRow).where(*span)) == max(through - after, 0)
+
+
+def page(
+    session: Session,
+    model: str,
+    part: Page,
+    stream_id: str | None = None,
+    rejected: bool = False,
+    kinds: Collection[EventKind] | None = None,
+) -> tuple[list[EventRow], str | None]:
+    """Events of a page, newest first, and the cursor after it; rejected: only those with rows that are not learnt."""
+    conditions = [EventRow.model == model]
+    if stream_id is not None:
+        conditions.append(EventRow.stream_id == stream_id)
+    if rejected:
+        conditions.append(EventRow.learnt < EventRow.rows)
+    if kinds is not None:
+        conditions.append(EventRow.kind.in_(kinds))
+    return newest_rows(session, EventRow, part, *conditions)
+
+
+def unlearn(session: Session, model: str, event: EventRow, received: float) -> EventRow:
+    """Take a batch and its replays out of what is learnt; return the event that says so."""
+    replays = select(EventRow.number).where(
+        EventRow.model == model,
+        EventRow.number > event.number,
+        EventRow.kind == "replay",
+        EventRow.detail["event"].as_integer() == event.number,
+    )
+    numbers = [event.number, *session.scalars(replays)]
+    session.execute(update(EventRow).where(EventRow.model == model, EventRow.number.in_(numbers)).values(void=True))
+    return append(session, model, "unlearn", {"event": event.number}, received)
+
+
+def rollback(session: Session, model: str, to: int, received: float) -> EventRow:
+    """Take what was learnt after event `to` out again, by every version, and what was set; return the event.
+
+    What was unlearnt stays unlearnt.
+    """
+    made = ("batch", "replay", "change", "settings")
+    later = (EventRow.model == model, EventRow.number > to)
+    session.execute(update(EventRow).where(*later, EventRow.kind.in_(made), EventRow.void.is_(False)).values(void=True))
+    session.execute(delete(SnapshotRow).where(SnapshotRow.model == model, SnapshotRow.number > to))
+    event = append(session, model, "rollback", {"to": to}, received)
+    settings = session.get(LearningRow, model)
+    if settings is not None:
+        settings.options = {**settings.options, "forgetting_s": forgetting(session, model, to)}
+    return event
+
+
+def forgetting(session: Session, model: str, number: int) -> float | None:
+    """Time constant of forgetting, s, that is in force after event `number`; None: nothing is forgotten."""
+    query = select(EventRow.detail).where(
+        EventRow.model == model, EventRow.number <= number, EventRow.kind == "settings", EventRow.void.is_(False)
+    )
+    detail = session.scalar(query.order_by(EventRow.number.desc()).limit(1))
+    return None if detail is None else detail["forgetting_s"]
+
+
+def start_of(session: Session, model: str, version: int) -> int:
+    """Number of the last event that a version contains by training."""
+    row = session.get(LearnerRow, (model, version))
+    return 0 if row is None else row.start
+
+
+def _of_stream(model: str, stream_id: str) -> Select[EventRow]:
+    return select(EventRow).where(EventRow.model == model, EventRow.stream_id == stream_id)
+
+
+def _append(
+    session: Session, event: EventRow, model: str, kind: EventKind, received: float, rows: Rows | None
+) -> EventRow:
+    event.model, event.kind, event.received = model, kind, received
+    if rows is not None:
+        event.payload, event.rows, event.learnt = encode(rows), len(rows), int(np.sum(rows.code == LEARNT))
+        times = rows.time[np.isfinite(rows.time) & ~np.isin(rows.code, UNTIMED)]
+        if len(times):
+            event.first, event.last = float(times.min()), float(times.max())
+    session.add(event)
+    session.flush()
+    return event
+
+
+def _note_arrival(session: Session, model: str, batch: NewBatch, most_streams: int | None) -> None:
+    """Write down in the row of a stream what came, and what has not; a new row for a new stream."""
+    source = stream(session, model, batch.stream_id)
+    if source is None:
+        known = session.scalar(select(func.count()).select_from(StreamRow).where(StreamRow.model == model)) or 0
+        if most_streams is not None and known >= most_streams:
+            raise BusyError(
+                f"model {model!r} has {known} sources of observations, the most it may have: go on with one of their "
+                "stream_ids, or raise LIPSERVE_MAX_OBSERVATION_STREAMS"
+            )
+        source = StreamRow(model=model, stream_id=batch.stream_id, kind=batch.kind, offset=batch.offset)
+        source.created_at = now()
+        gaps = Gaps(batch.sequence, batch.last_sequence)
+        session.add(source)
+    else:
+        _check_stream(source, batch)
+        gaps = Gaps.from_json(source.missing, source.last).arrived(batch.sequence, batch.last_sequence)
+    source.last, source.missing = gaps.last, gaps.to_json()
+
+
+def _check_stream(source: StreamRow, batch: NewBatch) -> None:
+    name = f"stream {source.stream_id!r} of model {source.model!r}"
+    if source.kind != batch.kind:
+        raise ConflictError(f"{name} carries {source.kind}, not {batch.kind}: use another stream_id")
+    if batch.kind == "frames" and batch.sequence <= source.last:
+        raise ConflictError(f"{name} has come to frame {source.last}, frame {batch.sequence} does not go on from there")
+    if is_forgotten(source, batch.sequence):
+        raise ConflictError(f"batch {batch.sequence} of {name} may have come before: that far back none is kept")

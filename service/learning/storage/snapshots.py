@@ -1,0 +1,115 @@
+"""Snapshots of what a version had learnt, which make a restart short and a rollback possible."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import datetime
+
+from sqlalchemy import Select, delete, select
+from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import Session
+
+from service.storage.database import Database, EventRow, SnapshotRow, VersionRow, now
+from service.storage.files import Files, new_id
+from service.web.storage_errors import undecided
+
+
+def save(
+    database: Database, files: Files, model: str, version: int, number: int, payload: bytes, *, most: int
+) -> str | None:
+    """Store a version's state after event `number` durably and return its id; thin what is kept to `most`.
+
+    None, and nothing is stored, where a rollback has gone back behind that event since: nothing goes on from there any
+    more; and where the version has been deleted. Unlearnings make none outdated: whoever goes on from it comes to them.
+    """
+    snapshot = new_id("snap")
+    digest = files.write_snapshot(snapshot, payload)
+    try:
+        with database.transaction(model) as session:
+            outdated = _is_outdated(session, model, version, number)
+            gone = [snapshot] if outdated else _add(session, snapshot, digest, model, version, number, most)
+    except SQLAlchemyError as error:
+        if not undecided(error):
+            files.delete_snapshot(snapshot)
+        raise
+    for name in gone:  # only after the commit: until then the rows still name them
+        files.delete_snapshot(name)
+    return None if outdated else snapshot
+
+
+def sweep(database: Database, files: Files) -> int:
+    """Delete the files that an interrupted `save` has left; return how many. Only for the process that saves.
+
+    None where several services store snapshots: one whose row is not there yet may be another's.
+    """
+    if database.shared:
+        return 0
+    with database.session() as session:
+        known = {f"{snapshot}.safetensors" for snapshot in session.scalars(select(SnapshotRow.id))}
+    left = [path for path in files.learning.iterdir() if path.is_file() and path.name not in known]
+    for path in left:
+        path.unlink(missing_ok=True)
+    return len(left)
+
+
+def latest(session: Session, model: str, version: int, at_most: int | None) -> SnapshotRow | None:
+    """The snapshot of a version with the highest number, up to `at_most` where given."""
+    query = _of(model, version) if at_most is None else _of(model, version).where(SnapshotRow.number <= at_most)
+    return session.scalar(query.limit(1))
+
+
+def last_stored(session: Session, model: str, version: int) -> tuple[str, float] | None:
+    """Id of the snapshot of a version that was stored last, by whichever service, and when: Unix time, s."""
+    query = select(SnapshotRow).where(SnapshotRow.model == model, SnapshotRow.version == version)
+    row = session.scalar(query.order_by(SnapshotRow.seq.desc()).limit(1))
+    return None if row is None else (row.id, datetime.fromisoformat(row.created_at).timestamp())
+
+
+def read(files: Files, row: SnapshotRow) -> bytes:
+    """What was stored; raise DamagedFileError where its file is another one, or lost."""
+    return files.read_snapshot(row.id, row.sha256)
+
+
+def thinned(numbers: Sequence[int], most: int) -> list[int]:
+    """Places of the snapshots to keep where they stand at these falling numbers, at most `most` >= 2.
+
+    The newest half stays and so does the oldest. Of the others those go whose neighbours are closest together, so that
+    what is left reaches back in even steps.
+    """
+    kept = list(range(len(numbers)))
+    while len(kept) > most:
+        inner = range((most + 1) // 2, len(kept) - 1)
+        kept.pop(min(inner, key=lambda place: numbers[kept[place - 1]] - numbers[kept[place + 1]]))
+    return kept
+
+
+def _of(model: str, version: int) -> Select[SnapshotRow]:
+    return (
+        select(SnapshotRow)
+        .where(SnapshotRow.model == model, SnapshotRow.version == version)
+        .order_by(SnapshotRow.number.desc())
+    )
+
+
+def _is_outdated(session: Session, model: str, version: int, number: int) -> bool:
+    """Whether a rollback has undone event `number`, or the version is no more."""
+    of_version = (VersionRow.model == model, VersionRow.version == version)
+    if session.scalar(select(VersionRow.version).where(*of_version)) is None:
+        return True
+    since = select(EventRow.detail).where(
+        EventRow.model == model, EventRow.number > number, EventRow.kind == "rollback"
+    )
+    return any(detail["to"] < number for detail in session.scalars(since))
+
+
+def _add(session: Session, snapshot: str, digest: str, model: str, version: int, number: int, most: int) -> list[str]:
+    """Add a snapshot's row; return the ids of those that gave way to it."""
+    rows = list(session.scalars(_of(model, version)))
+    row = SnapshotRow(id=snapshot, model=model, version=version, number=number, created_at=now(), sha256=digest)
+    session.add(row)
+    others = [row for row in rows if row.number != number]
+    numbers = sorted([number, *(row.number for row in others)], reverse=True)
+    kept = {numbers[place] for place in thinned(numbers, most)}
+    gone = [row.id for row in rows if row.number == number or row.number not in kept]
+    session.execute(delete(SnapshotRow).where(SnapshotRow.id.in_(gone)))
+    return gone

@@ -1,1 +1,0 @@
-"""The paper's experiment on simulated robots: `lipserve reproduce`."""

@@ -1,0 +1,47 @@
+"""The database: tables, sessions, and migrations of what earlier releases stored."""
+
+from service.storage.database.engine import Database
+from service.storage.database.tables import (
+    AlarmRow,
+    AliasMoveRow,
+    AliasRow,
+    ApiKeyRow,
+    Base,
+    DatasetRow,
+    DeletedModelRow,
+    EventRow,
+    JobRow,
+    LearnerRow,
+    LearningRow,
+    ModelRow,
+    ReplicaRow,
+    RobotRow,
+    ServingRow,
+    SnapshotRow,
+    StreamRow,
+    VersionRow,
+    now,
+)
+
+__all__ = [
+    "AlarmRow",
+    "AliasMoveRow",
+    "AliasRow",
+    "ApiKeyRow",
+    "Base",
+    "Database",
+    "DatasetRow",
+    "DeletedModelRow",
+    "EventRow",
+    "JobRow",
+    "LearnerRow",
+    "LearningRow",
+    "ModelRow",
+    "ReplicaRow",
+    "RobotRow",
+    "ServingRow",
+    "SnapshotRow",
+    "StreamRow",
+    "VersionRow",
+    "now",
+]

@@ -1,0 +1,134 @@
+"""Sessions on the database: SQLite below the home, or a PostgreSQL server that several services share."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from secrets import token_hex
+from typing import Protocol
+
+from sqlalchemy import Connection, Engine, event
+from sqlalchemy.orm import Session, sessionmaker
+
+from service.foundation.settings import CONNECTIONS, Settings
+from service.storage.database import notices
+from service.storage.database.migrations import migrate
+from service.storage.database.notices import Notice
+from service.storage.database.sqlite import Sqlite
+
+PATIENCE_S = 30.0
+"""Longest wait for another writer, of processes that nobody waits for."""
+
+
+class DriverMissingError(RuntimeError):
+    """What PostgreSQL needs is not installed."""
+
+
+class Adapter(Protocol):
+    """What SQLite and PostgreSQL do differently."""
+
+    engine: Engine
+    shared: bool
+    """Whether other services may write to it too."""
+
+    def lock(self, connection: Connection, model: str | None) -> None:
+        """Begin a transaction of a writer: the only one of a model, or the only one of all where None."""
+
+    def turn(self, model: str) -> AbstractContextManager[None]:
+        """Be the only one, of all services, that takes something for a model while the block runs."""
+
+    def heard(self, pause_s: float) -> Iterator[str | None]:
+        """What other services tell, see `Database.heard`."""
+
+    def close(self) -> None:
+        """Close all connections."""
+
+    def check(self, seconds: float) -> None:
+        """Raise an error unless the database can be read and written within so many seconds."""
+
+    def damage(self, most: int = 1) -> list[str]:
+        """What the database finds wrong with itself, at most so many faults; empty where it is whole."""
+
+    def inconsistencies(self, most: int) -> list[str]:
+        """As `damage`, looked at more closely, and rows that refer to none."""
+
+
+class Database:
+    """Sessions on one database; safe to share between threads. timeout_s: longest wait for another writer.
+
+    url: of a PostgreSQL server, None for SQLite below the home. connections: most that are open at a time there.
+    origin: by which others know who has changed something.
+    """
+
+    def __init__(
+        self, home: Path, timeout_s: float = PATIENCE_S, url: str | None = None, connections: int = CONNECTIONS
+    ) -> None:
+        self.adapter = _adapter(home, timeout_s, url, connections)
+        self.engine = self.adapter.engine
+        migrate(self.engine, self.adapter.lock)
+        self._sessions = sessionmaker(self.engine, expire_on_commit=False)
+        self.origin = token_hex(8)
+        if self.shared:
+            event.listen(self._sessions, "after_flush", notices.collect)
+
+    @classmethod
+    def of(cls, settings: Settings, timeout_s: float = PATIENCE_S) -> Database:
+        """The database that the settings name."""
+        return cls(settings.home, timeout_s, settings.database_url, settings.database_connections)
+
+    @property
+    def shared(self) -> bool:
+        """Whether other services may write to it too."""
+        return self.adapter.shared
+
+    @contextmanager
+    def session(self) -> Iterator[Session]:
+        """Session for reading: every statement sees what was committed before it."""
+        with self._sessions() as session:
+            yield session
+
+    @contextmanager
+    def transaction(self, model: str | None = None) -> Iterator[Session]:
+        """Session whose changes are committed at the end, all or none; what is read inside cannot change before.
+
+        model: where given, only rows of this model are written, so that those of other models need not wait (which
+        SQLite's writers do all the same); else it is the only writer.
+        """
+        with self._sessions() as session:
+            self.adapter.lock(session.connection(), model)
+            yield session
+            if self.shared:
+                notices.send(session, self.origin)
+            session.commit()
+
+    def turn(self, model: str) -> AbstractContextManager[None]:
+        """Be the only one, of all services that share the database, that takes something for a model meanwhile.
+
+        For what is read before the transaction that writes it down. Nothing needs it where there is one service.
+        """
+        return self.adapter.turn(model)
+
+    def heard(self, pause_s: float) -> Generator[Notice | None, None, None]:
+        """What is changed from the first None on that this yields, as it is committed; and None after each pause, s.
+
+        Ends with an error where the connection does. Where there is one service, nothing is told and this ends at once.
+        """
+        for payload in self.adapter.heard(pause_s):
+            notice = None if payload is None else notices.read(payload)
+            if payload is None or notice is not None:
+                yield notice
+
+    def close(self) -> None:
+        """Close all connections."""
+        self.adapter.close()
+
+
+def _adapter(home: Path, timeout_s: float, url: str | None, connections: int) -> Adapter:
+    if url is None:
+        return Sqlite(home, timeout_s)
+    try:
+        from service.storage.database.postgresql import Postgresql  # noqa: PLC0415 - its driver is an extra
+    except ModuleNotFoundError as error:
+        raise DriverMissingError("LIPSERVE_DATABASE_URL needs more: pip install 'lipserve[cluster]'") from error
+    return Postgresql(url, timeout_s, connections)

@@ -1,0 +1,109 @@
+"""A bucket of an S3-compatible service as a store of objects, by s3fs (fsspec).
+
+Credentials, region and endpoint come from the usual AWS_ variables, files or roles; none of them is ever logged here.
+"""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import s3fs
+from botocore.exceptions import BotoCoreError, NoCredentialsError, PartialCredentialsError
+from fsspec.asyn import sync
+from fsspec.exceptions import FSTimeoutError
+
+from service.storage.files.objects import FilesUnreachableError, Found, unreachable
+
+CONNECT_S, READ_S, ATTEMPTS = 5, 30, 2
+"""Longest waits in s for a connection and for the next bytes, and how often a request is sent."""
+CHECK_S = 3.0
+"""Longest wait in s for an answer to `check`."""
+PART, PARTS = 16 << 20, 2
+"""Bytes of a part of a large object, and how many of them are on their way, and in memory, at a time."""
+NO_BUCKET = "there is no such bucket"
+_OF_DISK = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+
+
+class Bucket:
+    """Objects of a bucket whose keys begin with a prefix; safe from several threads, of one process."""
+
+    def __init__(self, bucket: str, prefix: str) -> None:
+        self._bucket, self._prefix = bucket, prefix
+        self._root = f"{bucket}/{prefix}".rstrip("/")
+        self._system = s3fs.S3FileSystem(
+            skip_instance_cache=True,  # one of a forked parent would speak through the parent's connections
+            use_listings_cache=False,
+            config_kwargs={
+                "connect_timeout": CONNECT_S,
+                "read_timeout": READ_S,
+                "retries": {"total_max_attempts": ATTEMPTS, "mode": "standard"},
+            },
+        )
+        self._system.retries = 1  # of its own, on top of the library's
+
+    def put(self, path: Path, key: str) -> None:
+        """Store a file; a large one goes in parts, and is there once all of them are."""
+        with _told(missing=NO_BUCKET):
+            self._system.put_file(str(path), self._path(key), chunksize=PART, max_concurrency=PARTS)
+
+    def get(self, key: str, path: Path) -> None:
+        """Copy an object into a new file; raise FileNotFoundError where there is none."""
+        with _told():
+            try:
+                self._system.get_file(self._path(key), str(path), chunksize=PART, max_concurrency=PARTS)
+            except FileNotFoundError:
+                self.check()  # a bucket that is gone is no reason to take what lay there for lost
+                raise
+
+    def delete(self, key: str) -> None:
+        """Delete an object; nothing happens where there is none."""
+        with _told(missing=NO_BUCKET):
+            self._system.rm_file(self._path(key))
+
+    def list(self, prefix: str) -> Iterator[Found]:
+        """Objects whose keys begin so."""
+        parent, _, beginning = prefix.rpartition("/")
+        with _told(missing=NO_BUCKET):
+            found: dict[str, Any] = self._system.find(self._path(parent), detail=True, prefix=beginning)
+        for path, about in found.items():
+            if about["type"] == "file":
+                yield Found(path.removeprefix(f"{self._root}/"), about["LastModified"].timestamp())
+
+    def check(self) -> None:
+        """See that the bucket is there and can be listed."""
+        with _told(missing=NO_BUCKET):
+            prefix = f"{self._prefix}/" if self._prefix else ""
+            asked = {"Bucket": self._bucket, "Prefix": prefix, "MaxKeys": 1}
+            sync(self._system.loop, self._system._call_s3, "list_objects_v2", timeout=CHECK_S, **asked)
+
+    def _path(self, key: str) -> str:
+        return f"{self._root}/{key}"
+
+
+@contextmanager
+def _told(missing: str | None = None) -> Iterator[None]:
+    """Let errors of the store be FilesUnreachableError, without the address and what else the library says."""
+    try:
+        yield
+    except FilesUnreachableError:
+        raise
+    except FileNotFoundError:
+        if missing is None:
+            raise
+        raise unreachable(missing) from None
+    except PermissionError:
+        raise unreachable("access is denied: check the credentials and what they may do in the bucket") from None
+    except (NoCredentialsError, PartialCredentialsError):
+        raise unreachable("no credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or a role") from None
+    except (TimeoutError, FSTimeoutError):
+        raise unreachable("the store does not answer in time") from None
+    except BotoCoreError as error:
+        raise unreachable(f"the store does not answer ({type(error).__name__})") from None
+    except OSError as error:
+        if error.errno in _OF_DISK:  # of this host, while an object was fetched
+            raise
+        raise unreachable(f"the store refuses ({type(error).__name__}: {error.strerror or error})") from None

@@ -1,0 +1,254 @@
+"""What the service keeps in files: samples of data sets, folders of versions, snapshots of what was learnt, uploads.
+
+A file is visible only once a database row names it, and the row is written after the file is complete: below the home,
+or in the store that several services share.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import secrets
+import tempfile
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from lipcore import persistence
+from lipcore.manifest import ModelFormatError
+from lipcore.model import TorqueModel
+from lipcore.samples import Samples
+from service.foundation.errors import DamagedDataError
+from service.foundation.settings import Settings
+from service.storage import sample_file
+from service.storage.files import durable
+from service.storage.files.durable import DamagedFileError
+from service.storage.files.local import Local, remove
+from service.storage.files.objects import FilesUnreachableError, Patient, store_of
+from service.storage.files.shared import Shared
+from service.storage.sample_file import ArrayOf, PartOf
+
+logger = logging.getLogger(__name__)
+
+Result = TypeVar("Result")
+
+CACHE_BYTES = 4 << 30
+PATIENCE_S = 60.0
+"""How long training asks again for shared files that cannot be reached, before it is given up."""
+
+
+def new_id(prefix: str) -> str:
+    """Return a fresh random id such as `ds_5f0c…`."""
+    return f"{prefix}_{secrets.token_hex(8)}"
+
+
+class Files:
+    """The file store of one service. Ids come from `new_id`, never from a client. Safe from several threads.
+
+    home: of this service, whose uploads and publications always lie below it. url: of the store that it shares with
+    others, see `Settings.files_url`; None where all is below the home. cache_bytes: copies of shared files kept there.
+    patience_s: how long it is asked again where it cannot be reached; then methods raise FilesUnreachableError, an
+    OSError. What cannot be deleted there now is when a service starts, a day later or more.
+
+    datasets, versions: folders below the home, of the files themselves or of copies, for tests and tools.
+    """
+
+    def __init__(
+        self, home: Path, url: str | None = None, cache_bytes: int = CACHE_BYTES, patience_s: float = 0.0
+    ) -> None:
+        self.uploads, self.learning = home / "uploads", home / "learning"
+        for folder in (self.uploads, self.learning):
+            folder.mkdir(parents=True, exist_ok=True)
+        self._place: Local | Shared
+        if url is None:
+            self._place = Local(home)
+        else:
+            objects = store_of(url)
+            self._place = Shared(home, Patient(objects, patience_s) if patience_s else objects, cache_bytes)
+        self.datasets, self.versions = self._place.datasets, self._place.versions
+
+    @classmethod
+    def of(cls, settings: Settings, patience_s: float = 0.0) -> Files:
+        """The file store that the settings name."""
+        return cls(settings.home, settings.files_url, settings.files_cache_bytes, patience_s)
+
+    @classmethod
+    @contextmanager
+    def fresh(cls, settings: Settings) -> Iterator[Files]:
+        """For who verifies what is stored: no copy is read, and no more than one file at a time takes space here."""
+        files = cls.of(settings)
+        with files._place.fresh() as place:
+            files._place = place
+            yield files
+
+    @property
+    def shared(self) -> bool:
+        """Whether other services write to the same store."""
+        return self._place.shared
+
+    @property
+    def folders(self) -> Mapping[str, Path]:
+        """Folders on the disk of the home that grow, by what is in them."""
+        return self._place.kinds
+
+    def write_samples(self, dataset: str, rows: int, n_joints: int, array: ArrayOf) -> str:
+        """Store samples durably under a new id, asking for one array after the other; return their sha256."""
+        return self._place.write(_samples(dataset), lambda file: sample_file.write(file, rows, n_joints, array))
+
+    def read_samples(
+        self, dataset: str, joint_names: list[str], sha256: str, most: int | None = None, part: PartOf | None = None
+    ) -> Samples:
+        """Read samples stored under `dataset`, or part of them, evenly thinned to `most`.
+
+        Raise DamagedDataError unless they are those that were stored.
+        """
+        path = self.samples_file(dataset, sha256)
+        chosen = None
+        if part is not None:
+            episode, t = (sample_file.read_array(path, name) for name in ("episode", "t"))
+            chosen = np.flatnonzero(part(episode, t))
+        count = sample_file.rows_of(path) if chosen is None else len(chosen)
+        if most is not None and count > most:
+            thinned = np.linspace(0, count - 1, most).round().astype(np.int64)
+            chosen = thinned if chosen is None else chosen[thinned]
+        return Samples(joint_names=tuple(joint_names), **sample_file.read(path, chosen))
+
+    def samples_file(self, dataset: str, sha256: str) -> Path:
+        """Where the samples of a data set lie, see sample_file.py; raise DamagedDataError as `read_samples`.
+
+        In a shared store it is a copy, to be opened within minutes: whoever reads on after that has it open, or asks
+        again.
+        """
+        try:
+            return self._checked(_samples(dataset), sha256)
+        except DamagedFileError as error:
+            raise DamagedDataError(f"data set {dataset!r} is damaged: {error}. Upload it again") from error
+
+    def delete_samples(self, dataset: str) -> None:
+        """Delete samples; nothing happens where there are none."""
+        with _forgiven():
+            self._place.delete(_samples(dataset))
+
+    def write_snapshot(self, snapshot: str, payload: bytes) -> str:
+        """Store what a version has learnt durably under a new id; return its sha256."""
+        self._place.write(_snapshot(snapshot), lambda file: file.write(payload))
+        return hashlib.sha256(payload).hexdigest()
+
+    def read_snapshot(self, snapshot: str, sha256: str | None = None) -> bytes:
+        """Read what is stored under `snapshot`; raise DamagedFileError unless it has the sha256, where known."""
+        key = _snapshot(snapshot)
+        path = self._place.file(key) if sha256 is None else self._checked(key, sha256)
+        try:
+            return path.read_bytes()
+        except FileNotFoundError:
+            raise DamagedFileError(f"{path} is missing") from None
+
+    def delete_snapshot(self, snapshot: str) -> None:
+        """Delete a snapshot; nothing happens where there is none."""
+        with _forgiven():
+            self._place.delete(_snapshot(snapshot))
+
+    def new_version(self, name: str) -> AbstractContextManager[Path]:
+        """Give the path of a folder that the block makes, as `lipcore.save` does; whoever leaves it has stored it.
+
+        Where the block fails, or storing does, nothing is left. Its row is to be written afterwards; where that fails
+        in turn, `delete_version`.
+        """
+        return self._place.new_version(name)
+
+    def version_folder(self, name: str) -> Path:
+        """Where the files of a version lie, for `lipcore.load` and the like, which say so where there are none.
+
+        In a shared store it is a copy, which may go after some minutes; `read_version` is surer.
+        """
+        return self._place.version(name)
+
+    def read_version(self, name: str, read: Callable[[Path], Result]) -> Result:
+        """Return what `read` makes of the folder of a version, and raises where that is damaged: ModelFormatError.
+
+        A copy that is damaged, or was deleted meanwhile, is fetched again, once.
+        """
+        try:
+            return read(self._place.version(name))
+        except ModelFormatError:
+            if not self.shared:
+                raise
+        return read(self._place.version(name, again=True))
+
+    def load_version(self, name: str, checksums: Mapping[str, str] | None) -> TorqueModel:
+        """Load a version, see `lipcore.load`; raise ModelFormatError where it is damaged or missing."""
+        return self.read_version(name, lambda folder: persistence.load(folder, checksums))
+
+    def has_version(self, name: str) -> bool:
+        """Whether the files of a version are there, as far as can be told at once."""
+        return self._place.has_version(name)
+
+    def delete_version(self, name: str) -> None:
+        """Delete a version's files; raise OSError where the disk of the home does not let it."""
+        with _forgiven():
+            self._place.delete_version(name)
+
+    def versions_marked(self, mark: str) -> list[str]:
+        """Names of versions, be they complete or not, that begin with `mv_` and `mark`."""
+        return self._place.versions_marked(mark)
+
+    def upload(self) -> Path:
+        """Create an empty temporary file for an upload; the caller deletes it."""
+        handle, name = tempfile.mkstemp(dir=self.uploads)
+        os.close(handle)
+        return Path(name)
+
+    def clear(self) -> int:
+        """Delete what an earlier run of the service of this home was about to store or to fetch. Return how many."""
+        left = [*self.uploads.iterdir(), *self._place.drafts()]
+        for path in left:
+            remove(path)
+        return len(left)
+
+    def sweep(self, datasets: Collection[str], versions: Collection[str], snapshots: Collection[str]) -> int:
+        """Delete what an interrupted write left: files that no row names. Return how many.
+
+        In a shared store, where others are writing, only what is a day old.
+        """
+        return self._place.sweep(datasets, versions, snapshots)
+
+    def check(self) -> None:
+        """See that a shared store answers, in seconds; raise FilesUnreachableError. Nothing where all is local."""
+        self._place.check()
+
+    def try_out(self) -> None:
+        """See that a shared store can be written, read and listed; raise OSError. Nothing where all is local."""
+        self._place.try_out()
+
+    def _checked(self, key: str, sha256: str) -> Path:
+        """Where a file lies that has the sha256; raise DamagedFileError."""
+        path = self._place.file(key)
+        try:
+            durable.check(path, sha256)
+        except DamagedFileError:
+            if not self.shared:
+                raise
+            path = self._place.file(key, again=True)  # the copy may be damaged, not the object
+            durable.check(path, sha256)
+        return path
+
+
+@contextmanager
+def _forgiven() -> Iterator[None]:
+    """Let what a shared store does not delete now be: it is swept."""
+    try:
+        yield
+    except FilesUnreachableError as error:
+        logger.warning("a file is left in the shared store until it is swept: %s", error.strerror)
+
+
+def _samples(dataset: str) -> str:
+    return f"datasets/{dataset}.safetensors"
+
+
+def _snapshot(snapshot: str) -> str:
+    return f"learning/{snapshot}.safetensors"

@@ -1,0 +1,1 @@
+"""What every request passes: routes, access, limits, metrics, health."""

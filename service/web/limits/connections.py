@@ -1,0 +1,186 @@
+"""Connections: how many there may be, and an end to those whose clients neither ask nor read."""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import json
+import sys
+import termios
+from contextlib import suppress
+from http import HTTPStatus
+from typing import Any, ClassVar
+
+from starlette.types import ASGIApp, Receive, Scope, Send
+from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
+
+from service.foundation.errors import BusyError, ErrorBody, ErrorResponse, refuse
+from service.foundation.settings import Settings
+from service.web.limits.gate import HEALTH
+
+REFUSED = 64
+"""Connections beyond the most there may be that are told so; others are closed without a word."""
+
+
+class GuardedProtocol(HttpToolsProtocol):
+    """One HTTP connection, with limits. Times are looked at when something happens rarely, not with each request."""
+
+    settings: ClassVar[Settings]
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._head: asyncio.TimerHandle | None = None  # until when a request has to have come, line and headers
+        self._unread: asyncio.TimerHandle | None = None  # until when the client has to have read something
+        self._left, self._resumed = 0, False
+        self._upgraded = False  # to a stream, which reads the socket from then on
+        self._known: object = None
+        self._overhead = 0
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin, unless there are too many connections."""
+        super().connection_made(transport)
+        beyond = len(self.connections) - self.settings.max_connections
+        if beyond > REFUSED:
+            transport.abort()
+            return
+        if beyond > 0:
+            self.app = _Crowded(self.app, self.settings.max_connections)
+            self.ws_protocol_class = None
+        self._head = self.loop.call_later(self.settings.header_s, self._late)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget the connection."""
+        self._cancel_head()
+        if self._unread is not None:
+            self._unread.cancel()
+            self._unread = None
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Take bytes from the socket."""
+        self._overhead += len(data)
+        super().data_received(data)
+        if self._upgraded:
+            return
+        cycle = self.cycle
+        if cycle is None or cycle.response_complete:
+            # part of a line and of headers, or what is left of a body that was refused
+            if self._head is None and not self.transport.is_closing():
+                self._head = self.loop.call_later(self.settings.header_s, self._late)
+        else:
+            if self._head is not None:
+                self._cancel_head()
+            if cycle is not self._known:
+                self._known, self._overhead = cycle, 0
+        if self._overhead > self.settings.max_header_bytes:
+            self._too_long()
+
+    def on_body(self, body: bytes) -> None:
+        """Take a piece of a body; beside bodies, as much again may come: lengths of their pieces."""
+        self._overhead -= 2 * len(body)
+        super().on_body(body)
+
+    def on_response_complete(self) -> None:
+        """Go on after an answer, which may not have left yet."""
+        super().on_response_complete()
+        if self._unread is None and self.transport.get_write_buffer_size():
+            self._watch_reading()
+
+    def pause_writing(self) -> None:
+        """Wait until the client reads on."""
+        super().pause_writing()
+        if self._unread is None:
+            self._watch_reading()
+
+    def resume_writing(self) -> None:
+        """Write on."""
+        self._resumed = True
+        super().resume_writing()
+
+    def handle_websocket_upgrade(self) -> None:
+        """Leave the connection to a stream, which has limits of its own."""
+        self._upgraded = True
+        self._cancel_head()
+        super().handle_websocket_upgrade()
+
+    def send_400_response(self, msg: str) -> None:
+        """Answer what is no HTTP."""
+        self._say(HTTPStatus.BAD_REQUEST, "invalid_request", msg)
+
+    def _unsupported_upgrade_warning(self) -> None:
+        """Do not log, as often as clients like, what they would have liked to speak."""
+
+    def _cancel_head(self) -> None:
+        if self._head is not None:
+            self._head.cancel()
+            self._head = None
+
+    def _late(self) -> None:
+        """Close a connection on which no request came in time."""
+        self._head = None
+        if self.transport.is_closing():
+            return
+        if self._overhead > 0 and self.cycle is None:
+            said = f"the request's line and headers did not come within {self.settings.header_s:g} s"
+            self._say(HTTPStatus.REQUEST_TIMEOUT, "request_timeout", said)
+        else:
+            self.transport.close()
+
+    def _too_long(self) -> None:
+        """Close a connection whose headers, or those after a body, have no end."""
+        if self.transport.is_closing():
+            return
+        if self.cycle is None or self.cycle.response_complete:
+            said = f"the request's line and headers have more than {self.settings.max_header_bytes} bytes"
+            self._say(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, "too_large", said)
+        else:
+            self.transport.abort()
+
+    def _watch_reading(self) -> None:
+        self._left, self._resumed = self._waiting(), False
+        self._unread = self.loop.call_later(self.settings.answer_s, self._look_reading)
+
+    def _look_reading(self) -> None:
+        """Give up a client that has read nothing for a while; look again at one that reads slowly."""
+        self._unread = None
+        if not self.transport.get_write_buffer_size():
+            return
+        if self._waiting() >= self._left and not self._resumed:
+            self.transport.abort()
+        else:
+            self._watch_reading()
+
+    def _waiting(self) -> int:
+        """Bytes that the client has not taken: here, and in the kernel, whose buffers hide a slow reader for long."""
+        found = self.transport.get_write_buffer_size()
+        with suppress(OSError, ValueError):  # a kernel that does not tell, a socket that is closed
+            number = self.transport.get_extra_info("socket").fileno()
+            found += int.from_bytes(fcntl.ioctl(number, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
+        return found
+
+    def _say(self, status: HTTPStatus, code: str, message: str) -> None:
+        """Answer what did not become a request, and close."""
+        body = ErrorResponse(error=ErrorBody(code=code, message=message)).model_dump()
+        content = json.dumps(body).encode()
+        head = b"content-type: application/json\r\ncontent-length: %d\r\nconnection: close\r\n\r\n" % len(content)
+        self.transport.write(STATUS_LINE[status] + head + content)
+        self.transport.close()
+
+
+class _Crowded:
+    """What answers on a connection that is one too many: health as always, anything else with 429."""
+
+    def __init__(self, app: ASGIApp, most: int) -> None:
+        self.app, self.most = app, most
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["path"].startswith(HEALTH):
+            await self.app(scope, receive, send)
+            return
+        said = f"{self.most} connections are open, the most there may be (LIPSERVE_MAX_CONNECTIONS): try again"
+        await refuse(BusyError(said, headers={"Retry-After": "1", "Connection": "close"}), scope, receive, send)
+
+
+def guarded(settings: Settings) -> type[GuardedProtocol]:
+    """Class of connections with the limits of the settings, for `uvicorn.Config(http=...)`."""
+    return type("GuardedProtocol", (GuardedProtocol,), {"settings": settings})

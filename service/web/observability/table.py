@@ -1,0 +1,26 @@
+"""The table of all metrics, as the documentation has it: `python -m service.web.observability.table`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+
+from service.learning.quality import metrics as learning
+from service.web.observability import system, traffic, work
+from service.web.observability.metric import MetricKind
+
+KINDS: tuple[MetricKind, ...] = (*traffic.KINDS, *work.KINDS, *learning.KINDS, *system.KINDS)
+"""All metrics that /metrics shows besides Prometheus's usual ones of a process."""
+
+
+def lines() -> Iterator[str]:
+    """Lines of the table, in Markdown."""
+    yield "| metric | kind | labels | what it is |"
+    yield "| --- | --- | --- | --- |"
+    for kind in KINDS:
+        labels = ", ".join(f"`{label}`" for label in kind.labels)
+        yield f"| `{kind.name}` | {kind.kind} | {labels} | {kind.said} |"
+
+
+if __name__ == "__main__":
+    sys.stdout.writelines(f"{line}\n" for line in lines())

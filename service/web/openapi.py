@@ -1,0 +1,97 @@
+"""What the OpenAPI document says of errors that more than one route answers, and the table of all error codes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from fastapi import FastAPI
+
+from service.foundation import errors
+from service.foundation.errors import ServiceError
+from service.web.access.scopes import OPEN
+
+METHODS = ("get", "put", "post", "delete")
+ANY = (errors.InvalidRequestError, errors.ForbiddenError, errors.RateLimitedError, ServiceError, errors.NotReadyError)
+"""What any route may answer, whatever it is asked for: the first to a query parameter that it does not know."""
+GUARDED = (errors.UnauthorizedError, errors.StorageUnavailableError)
+"""What every route may answer but those that need no key, which use no database either."""
+BODY = (errors.RequestTimeoutError, errors.TooLargeError, errors.UnsupportedMediaTypeError)
+"""What a route with a body may answer before it has read it."""
+WRITING = (errors.StorageFullError,)
+PURE = ("/predict", "/evaluate", "/trace", "/compare", "/echo", "/infer")
+"""Ends of the paths of POST routes that store nothing."""
+BEFORE_ROUTES = {
+    (405, "method_not_allowed"): "The path is there, the method is not: the header `Allow` lists those that are.",
+}
+"""Errors that are no class, because no route raises them."""
+
+
+def install(app: FastAPI) -> None:
+    """Complete the document that the application makes of its routes, once it is asked for."""
+    made = app.openapi
+
+    def openapi() -> dict[str, Any]:
+        if app.openapi_schema is None:
+            _complete(made())
+        return made()
+
+    app.openapi = openapi  # type: ignore[method-assign]
+
+
+def error_table() -> str:
+    """All error codes with status and meaning, in Markdown."""
+    rows = {(kind.status, kind.code): _said(kind) for kind in _below(ServiceError)}
+    rows |= BEFORE_ROUTES | {(ServiceError.status, ServiceError.code): _said(ServiceError)}
+    lines = [f"| {status} | `{code}` | {said} |" for (status, code), said in sorted(rows.items())]
+    return "\n".join(["| status | code | meaning |", "|---|---|---|", *lines]) + "\n"
+
+
+def _complete(document: dict[str, Any]) -> None:
+    document["info"]["description"] += f"\n{error_table()}"
+    for path, operations in document["paths"].items():
+        for method in METHODS:
+            if method in operations:
+                _add(path, method, operations[method])
+
+
+def _add(path: str, method: str, operation: dict[str, Any]) -> None:
+    """Add to an operation's answers those that are not its own."""
+    kinds: list[type[ServiceError]] = [*ANY]
+    if (method.upper(), path) not in OPEN:
+        kinds += GUARDED
+    if "requestBody" in operation:
+        kinds += BODY
+    if method != "get" and not path.endswith(PURE):
+        kinds += WRITING
+    protocol = f"{path}/".startswith(f"{errors.OPEN_INFERENCE}/")
+    answers = operation["responses"]
+    own = set(answers)
+    for kind in kinds:
+        status = str(400 if protocol and kind.status == 422 else kind.status)
+        said = _said(kind) if protocol else f"`{kind.code}`: {_said(kind)}"
+        answer = answers.setdefault(status, _answer("Failure" if protocol else "ErrorResponse"))
+        if status not in own or (not protocol and f"`{kind.code}`" not in answer["description"]):
+            answer["description"] = f"{answer['description']} {said}".strip()
+    for status, answer in answers.items():
+        if int(status) >= 400:  # FastAPI thinks of the media type of what is answered without an error
+            (schema,) = answer["content"].values()
+            answer["content"] = {"application/json": schema}
+    operation["responses"] = dict(sorted(answers.items()))
+
+
+def _answer(schema: str) -> dict[str, Any]:
+    content = {"application/json": {"schema": {"$ref": f"#/components/schemas/{schema}"}}}
+    return {"description": "", "content": content}
+
+
+def _said(kind: type[ServiceError]) -> str:
+    if kind is ServiceError:
+        return "An unexpected error: the service's log says more."
+    return " ".join((kind.__doc__ or "").split())
+
+
+def _below(kind: type[ServiceError]) -> Iterator[type[ServiceError]]:
+    for below in kind.__subclasses__():
+        yield below
+        yield from _below(below)

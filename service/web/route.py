@@ -1,0 +1,136 @@
+"""What every route refuses in the same way, before its endpoint sees the request."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Coroutine, Iterator
+from typing import Any
+from urllib.parse import parse_qsl
+
+from fastapi import Request, Response
+from fastapi.dependencies.models import Dependant
+from fastapi.routing import APIRoute
+from starlette.types import Scope
+
+from service.foundation.errors import InvalidRequestError, UnsupportedMediaTypeError, invalid_request, problem, sentence
+
+JSON, OCTETS = b"application/json", b"application/octet-stream"
+_ANY_JSON = re.compile(rb"application/([^;/]+\+)?json\s*(;.*)?", re.IGNORECASE | re.DOTALL)
+MOST_PARAMETERS = 100
+"""Query parameters that are read at all."""
+
+
+class Route(APIRoute):
+    """A route that takes no query parameter it does not know or that comes twice, and no JSON that is ambiguous."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        """The handler of a request that has been found in order."""
+        handle, parameters = super().get_route_handler(), tuple(_parameters(self.dependant))
+        body = self.body_field is not None
+
+        async def checked(request: Request) -> Response:
+            check_query(request.scope, parameters)
+            _check_encoding(request.scope)
+            return await handle(await _JsonRequest.read(request) if body else request)
+
+        return checked
+
+
+def check_query(scope: Scope, known: tuple[str, ...] = ()) -> None:
+    """Raise InvalidRequestError for a query parameter that is not among those known, or that is given twice."""
+    if not scope["query_string"]:
+        return
+    try:
+        given = parse_qsl(scope["query_string"].decode("latin-1"), True, max_num_fields=MOST_PARAMETERS)
+    except ValueError:
+        raise invalid_request("query", "too long", f"at most {MOST_PARAMETERS} parameters") from None
+    seen = set()
+    for name, value in given:
+        if name not in known:
+            expected = f"one of the parameters {', '.join(known)}" if known else "no query parameters"
+            raise invalid_request(name or "query", value, expected)
+        if name in seen:
+            raise invalid_request(name, "given twice", "each parameter once")
+        seen.add(name)
+
+
+def media_type(scope: Scope) -> bytes:
+    """The content-type of a request, empty where none is given."""
+    return next((value for name, value in scope["headers"] if name == b"content-type"), b"")
+
+
+def is_json(scope: Scope) -> bool:
+    """Whether the body is announced as JSON, in one of the usual ways."""
+    given = media_type(scope)
+    return given == JSON or given.partition(b";")[0].strip().lower() == JSON
+
+
+def read_json(body: bytes) -> Any:
+    """The value of a JSON text as RFC 8259 has it, besides NaN and Infinity, which are refused where they stand.
+
+    Raise InvalidRequestError naming the place where it is not UTF-8, no JSON, nested too deep, or names a field twice.
+    """
+    try:
+        return json.loads(body.decode("utf-8-sig"), object_pairs_hook=_object)
+    except UnicodeDecodeError as error:
+        found = f"not UTF-8 at byte {error.start}"
+    except json.JSONDecodeError as error:
+        found = f"not JSON at character {error.pos}: {error.msg}"
+    except RecursionError:
+        found = "nested too deep"
+    except ValueError:  # Python reads no whole number of more digits
+        found = "not JSON that can be read: a whole number has more than 4300 digits"
+    raise invalid_request("body", found, "JSON")
+
+
+def each_once(body: bytes, *names: bytes) -> bool:
+    """Whether a JSON object that has only these fields surely has each once: False may also mean that it is not clear.
+
+    For readers that take the last of two; what is not clear is read again by `read_json`, which knows.
+    """
+    return b"\\" not in body and all(body.count(b'"%b"' % name) <= 1 for name in names)
+
+
+class _JsonRequest(Request):
+    """A request whose JSON has been read."""
+
+    _value: Any
+
+    @classmethod
+    async def read(cls, request: Request) -> Request:
+        """Read the body of a request; raise UnsupportedMediaTypeError or InvalidRequestError, unless it is empty."""
+        read = cls(request.scope, request.receive)
+        if body := await read.body():
+            if not _ANY_JSON.fullmatch(media_type(request.scope)):
+                item = problem("content-type", media_type(request.scope).decode("latin-1"), JSON.decode())
+                raise UnsupportedMediaTypeError(sentence(item), [item])
+            read._value = read_json(body)
+        return read
+
+    async def json(self) -> Any:
+        """The value that the body stands for."""
+        return self._value
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for index, name in enumerate(names) if name in names[:index])
+        item = problem(twice, "given twice", "each field once")
+        raise InvalidRequestError(sentence(item), [item])
+    return found
+
+
+def _check_encoding(scope: Scope) -> None:
+    given = next((value for name, value in scope["headers"] if name == b"content-encoding"), b"identity")
+    if given.lower() != b"identity":
+        item = problem("Content-Encoding", given.decode("latin-1"), "none: bodies are taken uncompressed")
+        raise UnsupportedMediaTypeError(sentence(item), [item])
+
+
+def _parameters(dependant: Dependant) -> Iterator[str]:
+    yield from (parameter.alias for parameter in dependant.query_params)
+    for below in dependant.dependencies:
+        yield from _parameters(below)

@@ -1,0 +1,109 @@
+"""What failing storage means to a client: errors of the database and of the operating system as those of the service.
+
+Nothing was stored where one of these comes: files are written whole or not at all, rows in transactions. Only where the
+connection to a database server is lost in the middle of a commit nobody knows (`undecided`): sent again, a batch is
+known by its number, and what has an idempotency key by that.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import sqlite3
+
+from fastapi import FastAPI, Request
+from fastapi.responses import JSONResponse
+from sqlalchemy.exc import DBAPIError, OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
+
+from service.foundation.errors import ServiceError, StorageFullError, StorageUnavailableError, answer_of
+
+logger = logging.getLogger(__name__)
+
+FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+"""Of the operating system: the disk, a quota or the largest file allowed is used up."""
+UNAVAILABLE = frozenset(
+    getattr(errno, name)
+    for name in ("EROFS", "EIO", "EACCES", "EPERM", "EMFILE", "ENFILE", "ENODEV", "ENXIO", "ESTALE", "ENOTCONN")
+    if hasattr(errno, name)
+)
+RETRY_AFTER = {"Retry-After": "1"}
+_BUSY = frozenset({sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED})
+_DAMAGED = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB})
+_FAILING = frozenset({sqlite3.SQLITE_READONLY, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PERM})
+_BUSY_STATES = frozenset({"55P03", "57014", "40001", "40P01"})
+"""Lock not available, query cancelled, serialization failure, deadlock."""
+_LOST_STATES = ("08", "57P", "25P03", "53300")
+"""Connections broken or refused, the server stopping or starting, one idle for too long, too many of them."""
+_FAILING_STATES = ("25006", "28", "3D", "42501", "53", "58", "XX")
+"""Read-only, no access, no such database, out of memory and the like, its disk, its own faults."""
+_LOCKED = "the database is locked by another writer: try again"
+_LOST = "the database server cannot be reached now: try again"
+_NO_SPACE = "nothing was stored: the disk of the database is full. Delete data sets or versions"
+
+
+def translated(error: BaseException) -> ServiceError | None:
+    """The error that a client is answered with; None where `error` says nothing of the storage."""
+    if isinstance(error, (StorageFullError, StorageUnavailableError)):
+        return error
+    if isinstance(error, PoolTimeoutError):
+        return StorageUnavailableError("too many requests wait for the database: try again", headers=RETRY_AFTER)
+    if isinstance(error, DBAPIError):
+        return _of_database(error)
+    if isinstance(error, OSError) and error.errno in FULL:
+        return StorageFullError(f"nothing was stored: {error.strerror}. Delete data sets or versions")
+    if isinstance(error, OSError) and error.errno in UNAVAILABLE:
+        return StorageUnavailableError(f"files cannot be read or written now: {error.strerror}", headers=RETRY_AFTER)
+    return None
+
+
+def undecided(error: BaseException) -> bool:
+    """Whether what a transaction was to store may be stored all the same, so that its files have to stay."""
+    return isinstance(error, DBAPIError) and error.connection_invalidated
+
+
+def _of_database(error: DBAPIError) -> ServiceError | None:
+    if error.orig is not None and hasattr(error.orig, "sqlstate"):
+        return _of_postgresql(error, error.orig.sqlstate)
+    code = getattr(error.orig, "sqlite_errorcode", None)
+    primary = None if code is None else code & 0xFF  # the rest of an extended code says where it came up
+    if primary in _BUSY:
+        return StorageUnavailableError(_LOCKED, headers=RETRY_AFTER)
+    if primary == sqlite3.SQLITE_FULL:
+        return StorageFullError(_NO_SPACE)
+    if primary in _DAMAGED:
+        return StorageUnavailableError(f"the database is damaged: {error.orig}; the service's log says more")
+    if primary in _FAILING:
+        return StorageUnavailableError(f"the database cannot be used now: {error.orig}", headers=RETRY_AFTER)
+    return None
+
+
+def _of_postgresql(error: DBAPIError, state: str | None) -> ServiceError | None:
+    """By SQLSTATE, which there is none of where the server could not be asked. What it says names hosts and users."""
+    if state is None:
+        lost = error.connection_invalidated or isinstance(error, OperationalError)
+        return StorageUnavailableError(_LOST, headers=RETRY_AFTER) if lost else None
+    if state in _BUSY_STATES:
+        return StorageUnavailableError(_LOCKED, headers=RETRY_AFTER)
+    if state == "53100":
+        return StorageFullError(_NO_SPACE)
+    if state.startswith(_LOST_STATES):
+        return StorageUnavailableError(_LOST, headers=RETRY_AFTER)
+    if state.startswith(_FAILING_STATES):
+        message = f"the database cannot be used now: SQLSTATE {state}; the service's log says more"
+        return StorageUnavailableError(message, headers=RETRY_AFTER)
+    return None
+
+
+def install(app: FastAPI) -> None:
+    """Answer requests that fail for the storage's sake with what they can act on."""
+    for kind in (DBAPIError, PoolTimeoutError, OSError):
+        app.add_exception_handler(kind, _answer)
+
+
+async def _answer(request: Request, error: Exception) -> JSONResponse:
+    said = translated(error)
+    if said is None:
+        raise error  # as unexpected as any other
+    logger.error("%s at %s: %s", said.code, request.scope["path"], error)
+    return answer_of(request.scope, said)
