@@ -12,10 +12,10 @@ from rich.console import Console
 
 import lipcore
 from benchmarks import facts
+from benchmarks.latency.measuring import add_run
 from benchmarks.latency.results import MotionRow, Results
 from benchmarks.latency.subjects import Subject, in_process
 from benchmarks.latency.targets import p50, single
-from benchmarks.latency.measuring import add_run
 from benchmarks.workload import TRAIN_SEED, Workload
 from lipcore.robots import Robot, load_robot
 from lipcore.samples import Samples

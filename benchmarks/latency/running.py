@@ -13,10 +13,10 @@ from rich.console import Console
 from benchmarks import facts, processor
 from benchmarks.latency import motions, subjects, transports
 from benchmarks.latency.loop import DEADLINE_MS
+from benchmarks.latency.measuring import add_run, control_loop
 from benchmarks.latency.results import Results, State
 from benchmarks.latency.subjects import Subject
 from benchmarks.load import TrainingLoad
-from benchmarks.latency.measuring import add_run, control_loop
 from benchmarks.processor import Usage, watched
 from benchmarks.workload import Bed, Source, open_bed
 

@@ -128,7 +128,7 @@ class Contest:
         trained = [name for name in SIMPLEST_FIRST if self.entries[name].model is not None]
         for name in trained[: trained.index(best)]:
             if self._ties(name, best):
-                return name, f"{best} predicts better by no more than chance may: the simpler one is taken"
+                return name, f"{best} predicts better by no more than one standard error: the simpler one is taken"
         if len(trained) == 1:
             return best, "no other could be trained"
         return best, "it predicts best what the training did not see"
@@ -188,7 +188,9 @@ class Contest:
         return max(SIMPLEST_FIRST, key=lambda name: self.entries[name].density)
 
     def _ties(self, name: str, best: str) -> bool:
+        """Whether an estimator comes within one standard error of the best (Breiman et al. 1984, the 1-SE rule)."""
         first, second = self.entries[best].answer, self.entries[name].answer
         if first is None or second is None:
             return False
-        return not bool(compare(self.held, first, second).total.significant[0])
+        total = compare(self.held, first, second).total
+        return bool(total.mean[0] <= total.standard_error[0])

@@ -37,7 +37,7 @@ def latency(
     Motions are drawn from the range that the model was trained on. Times include Python's client.
     """
     with connected(url) as client:
-        version = client.version(model)
+        version = client.version(model, client.model(model).serving_version)
         low, high = (
             np.array([version.training_range[name][side] for name in ("q", "dq", "ddq")]) for side in ("min", "max")
         )

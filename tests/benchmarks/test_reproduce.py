@@ -14,13 +14,14 @@ import pinocchio
 import pytest
 
 import lipcore
+from benchmarks import run
 from benchmarks.reproduce import figures, report, table
+from benchmarks.reproduce.command import ERRORS, app
 from benchmarks.reproduce.experiment import Cell, Experiment, run_cell
 from benchmarks.reproduce.results import Results, ResultsError
 from lipcore.fit_options import FitOptions
 from lipcore.robots import ROBOTS, load_robot
 from lipcore.simulation import Stream, simulate
-from service import cli
 
 ESTIMATORS = ("se", "rigid-body", "lip-chain")
 JOINTS = ("joint1", "joint2")
@@ -36,18 +37,18 @@ FILES = {
 TINY = ("--robot", "double-pendulum", "--training-sets", "1", "--test-sets", "2", "--samples", "40", "--workers", "1")
 
 
-def lipserve(*arguments):
-    """Run `lipserve` with arguments in this process; return its exit code."""
+def reproduce(*arguments):
+    """Run the experiment with arguments in this process; return its exit code."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.argv", ["lipserve", *map(str, arguments)])
+        patch.setattr("sys.argv", ["reproduce", *map(str, arguments)])
         with pytest.raises(SystemExit) as ended:
-            cli.main()
+            run(app, ERRORS, "python -m benchmarks.reproduce")
     return ended.value.code or 0
 
 
 def tiny(out, *options):
     estimators = [part for name in ESTIMATORS for part in ("--estimator", name)]
-    return lipserve("reproduce", *TINY, *estimators, "--size", 20, "--test-stride", 2, "--out", out, *options)
+    return reproduce(*TINY, *estimators, "--size", 20, "--test-stride", 2, "--out", out, *options)
 
 
 @pytest.fixture(scope="module")
@@ -299,7 +300,7 @@ def test_training_and_test_sets_have_other_seeds_and_frequencies():
 )
 def test_bad_options_are_named_before_any_work(tmp_path, capsys, options, said):
     out = tmp_path / "out"
-    assert lipserve("reproduce", *options, "--out", out) == 1
+    assert reproduce(*options, "--out", out) == 1
     err = capsys.readouterr().err
     assert err.startswith("error: ")
     assert said in err
@@ -308,7 +309,7 @@ def test_bad_options_are_named_before_any_work(tmp_path, capsys, options, said):
 
 @pytest.mark.parametrize("option", ["--training-sets", "--test-sets", "--workers", "--test-stride"])
 def test_counts_below_one_are_refused(tmp_path, capsys, option):
-    assert lipserve("reproduce", option, 0, "--out", tmp_path / "out") == 2
+    assert reproduce(option, 0, "--out", tmp_path / "out") == 2
     assert option in capsys.readouterr().err
 
 
@@ -322,6 +323,6 @@ def test_counts_below_one_are_refused(tmp_path, capsys, option):
 def test_a_missing_package_is_said_with_the_remedy_before_any_work(tmp_path, monkeypatch, capsys, package, remedy):
     monkeypatch.setitem(sys.modules, package, None)
     out = tmp_path / "out"
-    assert lipserve("reproduce", "--out", out) == 1
+    assert reproduce("--out", out) == 1
     assert re.fullmatch(f"error: {remedy}\n", capsys.readouterr().err)
     assert not out.exists()

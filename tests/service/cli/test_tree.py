@@ -61,7 +61,7 @@ def test_commands_and_options_are_completed(completed):
     assert completed("lipserve models pro") == ["promote"]
     assert completed("lipserve predict --comp") == ["--components"]
     assert completed("lipserve train x.csv --estimator rigid") == ["rigid-body", "rigid-body+lip-chain"]
-    assert "--quick" in completed("python -m benchmarks.reproduce --qu")
+    assert "--queries" in completed("lipserve bench latency arm --qu")
     assert "latency" in completed("lipserve bench la")
 
 
