@@ -23,7 +23,6 @@ from service.foundation.settings import Settings
 from service.guide import routes as guide
 from service.inference import echo
 from service.inference import routes as inference
-from service.inference.loaded import LoadedModels
 from service.learning import routes as observations
 from service.learning.control import routes as control
 from service.learning.live import routes as live
@@ -33,10 +32,12 @@ from service.learning.updates import Updates
 from service.models import archive_routes as archives
 from service.models import registry
 from service.models import routes as models
+from service.models.loaded import LoadedModels
 from service.oip import routes as oip
 from service.replication.replication import Replication
 from service.robots import routes as robots
 from service.storage.database import Database
+from service.storage.disk import Disk
 from service.storage.files import Files, sweeping
 from service.storage.home import hold_home
 from service.stream import routes as stream
@@ -48,7 +49,6 @@ from service.web.access.keyring import Keyring
 from service.web.access.local import LocalAccess
 from service.web.access.middleware import KeyAccess
 from service.web.limits import BodyLimit
-from service.web.limits.disk import Disk
 from service.web.limits.gate import Gate
 from service.web.limits.rate import RateLimit
 from service.web.limits.stopping import Stopping

@@ -9,12 +9,12 @@ from anyio import CapacityLimiter
 from fastapi import Depends, Request
 
 from service.foundation.settings import Settings
-from service.inference.loaded import LoadedModels
 from service.learning.updates import Updates
+from service.models.loaded import LoadedModels
 from service.storage.database import Database
+from service.storage.disk import Disk
 from service.storage.files import Files
 from service.training.queue import JobQueue
-from service.web.limits.disk import Disk
 from service.web.limits.stopping import Stopping
 from service.web.observability.meters import Meters
 from service.web.observability.readiness import Readiness

@@ -13,10 +13,10 @@ from service.app import create_app
 from service.cli.errors import CommandError
 from service.foundation.settings import Settings
 from service.storage.home import HomeError, check_home
-from service.stream.protocol import StreamProtocol
-from service.web import sockets
-from service.web.limits.connections import guarded
 from service.web.observability import logs
+from service.web.server import sockets
+from service.web.server.connections import guarded
+from service.web.server.stream_protocol import StreamProtocol
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 ERRORS = (HomeError,)

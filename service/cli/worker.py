@@ -9,8 +9,8 @@ import typer
 from pydantic import ValidationError
 
 from service.cli.errors import CommandError
+from service.compute.process import THREAD_VARIABLES
 from service.foundation.settings import Settings
-from service.training.process import THREAD_VARIABLES
 from service.web.observability import logs
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
@@ -35,7 +35,7 @@ def worker(
     logs.configure(logs.LogOptions(settings.log_level, settings.log_format))
     # before numerics are imported: they start their threads then
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(settings.training_threads)))
-    from service.compute import membership  # noqa: PLC0415
+    from service.training import membership  # noqa: PLC0415
 
     try:
         membership.check(settings)

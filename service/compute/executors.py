@@ -16,8 +16,8 @@ from functools import partial
 from typing import Any, ParamSpec, TypeVar
 
 from service.compute import remote
+from service.compute.process import Place, start_process
 from service.foundation.settings import Settings
-from service.training.process import Place, start_process
 from service.web.observability import logs
 
 P = ParamSpec("P")

@@ -15,7 +15,7 @@ from lipcore.preparation.recipe import Recipe
 from lipcore.samples import Array
 from service.datasets.staging import EPISODE, TIME, Staged, column
 from service.foundation.errors import invalid_data
-from service.web.limits.disk import Disk
+from service.storage.disk import Disk
 
 FOLDER = "prepared"
 """Of prepared columns: those that were read have the same names."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.samples import Array
-from service.web.limits.disk import Disk
+from service.storage.disk import Disk
 
 TIME, EPISODE = "t", "episode"
 QUANTITIES = ("q", "dq", "ddq", "tau")

@@ -16,11 +16,11 @@ from service.context import Service
 from service.datasets import store
 from service.foundation.errors import InvalidRequestError, invalid_request
 from service.inference import checks, components
-from service.inference.loaded import Served
 from service.inference.schema import EvaluateRequest, EvaluateResponse, Interval, PredictRequest, Reliability
 from service.inference.stretches import stretches
 from service.inference.wire import Prediction
 from service.models import registry
+from service.models.loaded import Served
 from service.storage.database import DatasetRow
 from service.training import holding_out
 from service.training.holding_out import CannotHoldOutError, SetSplit

@@ -19,10 +19,10 @@ from service.foundation.errors import (
 )
 from service.inference import answer, trace
 from service.inference.schema import EvaluateRequest, EvaluateResponse, PredictRequest, PredictResponse
-from service.inference.served import Served
 from service.inference.trace_schema import TraceRequest, TraceResponse
-from service.inference.waiting import reached
 from service.inference.wire import decode, encode
+from service.models.served import Served
+from service.models.waiting import reached
 from service.web.hot import Reply, hot_route
 from service.web.route import Route, is_json
 

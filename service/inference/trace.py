@@ -14,8 +14,8 @@ from lipcore.samples import Array, Samples
 from service.context import Service
 from service.foundation.errors import invalid_request
 from service.inference import answer
-from service.inference.served import Served
 from service.inference.trace_schema import TraceComponent, TraceComponentValues, TraceRequest, TraceResponse
+from service.models.served import Served
 from service.storage import sample_file
 from service.training.holding_out import CannotHoldOutError
 

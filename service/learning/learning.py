@@ -8,8 +8,8 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from service.foundation.errors import invalid_request, not_found
+from service.journal import log
 from service.learning.learning_options import LearningOptions
-from service.learning.storage import log
 from service.storage.database import Database, LearningRow, ModelRow
 
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from service.foundation.settings import Settings
-from service.inference.loaded import LoadedModels, Served
 from service.learning.ingest.frames import Frames, FramesResult, observe_frames
 from service.learning.ingest.intake import Ingest
 from service.learning.ingest.threads import IngestThreads
@@ -21,9 +20,10 @@ from service.learning.learner.process import LearnerProcess, learner_place
 from service.learning.live.feed import Feed
 from service.learning.quality.monitor import Monitor
 from service.learning.schema import ObservationRequest, ObservationResponse
+from service.models.loaded import LoadedModels, Served
 from service.storage.database import Database
+from service.storage.disk import Disk
 from service.storage.files import Files
-from service.web.limits.disk import Disk
 
 __all__ = ["Frames", "FramesResult", "Status", "Updates"]
 logger = logging.getLogger(__name__)

@@ -16,9 +16,10 @@ from service.foundation.errors import (
     UnreadableVersionError,
     responses,
 )
-from service.models import aliases, comparison, deletion, registry
+from service.inference import comparison
+from service.inference.comparison_schema import CompareRequest, CompareResponse
+from service.models import aliases, deletion, registry
 from service.models.alias_schema import Alias, AliasList, AliasRequest
-from service.models.comparison_schema import CompareRequest, CompareResponse
 from service.models.schema import AliasName, Model, ModelPage, Version, VersionNumber
 from service.web.pagination import PageQuery
 from service.web.route import Route

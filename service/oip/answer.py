@@ -5,7 +5,7 @@ from __future__ import annotations
 from service.foundation.errors import invalid_request
 from service.foundation.settings import Settings
 from service.inference import checks
-from service.inference.loaded import Served
+from service.models.loaded import Served
 from service.oip import outputs, wire
 from service.oip.outputs import Array
 from service.oip.query import Query, read

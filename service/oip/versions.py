@@ -9,8 +9,8 @@ from anyio import to_thread
 from lipcore.model import TorqueModel
 from service.context import Service
 from service.foundation.errors import NotFoundError, NotReadyError, UnreadableVersionError, problem, sentence
-from service.inference.loaded import Served
 from service.models import registry
+from service.models.loaded import Served
 from service.models.schema import ALIAS
 from service.oip.outputs import FORWARD, shapes
 from service.oip.schema import INPUTS, TORQUE, ModelMetadata, TensorMetadata

@@ -11,8 +11,8 @@ from time import perf_counter
 from starlette.types import Message, Receive, Send
 
 from service.foundation.settings import Settings
-from service.stream.protocol import StreamProtocol
 from service.web.access.credentials import subprotocol_of
+from service.web.server.stream_protocol import StreamProtocol
 
 
 class Conversation(ABC):

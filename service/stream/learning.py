@@ -15,8 +15,8 @@ import numpy as np
 
 from service.context import Service
 from service.foundation.errors import ErrorBody, ServiceError, invalid_request
-from service.inference.loaded import Served
 from service.learning.ingest.frames import Frames, FramesResult
+from service.models.loaded import Served
 from service.stream.frames import NUMBER, REQUEST
 from service.web.storage_errors import translated
 

@@ -15,11 +15,11 @@ from uvicorn.protocols.utils import ClientDisconnected
 from service.context import Service
 from service.foundation.errors import BusyError, NotFoundError, NotReadyError, invalid_request
 from service.inference import checks
-from service.inference.waiting import reached
 from service.models.schema import ALIAS
+from service.models.waiting import reached
 from service.stream.conversation import Conversation, Echo
-from service.stream.protocol import CONNECTION, StreamProtocol
 from service.stream.session import Session
+from service.web.server.stream_protocol import CONNECTION, StreamProtocol
 
 STREAM_ID = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
 PATH, ECHO_PATH = "/v1/models/{model}/stream", "/v1/echo/stream"

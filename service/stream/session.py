@@ -13,13 +13,13 @@ from starlette.types import Message, Receive, Send
 from service.context import Service
 from service.foundation.errors import ErrorBody, ErrorResponse, ServiceError, invalid_request
 from service.inference import checks
-from service.inference.loaded import Served
+from service.models.loaded import Served
 from service.models.moves import SERVING
 from service.stream.conversation import Conversation
 from service.stream.frames import ANSWER, ASK_LEARN, ASK_STD, ERROR, HAS_STD, LATE, LAYOUT, REQUEST, UNREAD
 from service.stream.learning import Learning, Taught
-from service.stream.protocol import StreamProtocol
 from service.stream.reading import FrameReader
+from service.web.server.stream_protocol import StreamProtocol
 
 logger = logging.getLogger(__name__)
 

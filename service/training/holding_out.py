@@ -15,8 +15,8 @@ import numpy as np
 from lipcore.samples import Array
 from lipcore.splits import GUARD_S, Mask, Numbers, Parts, Split, SplitError, choose, split
 from service.foundation.errors import invalid_request
+from service.models.holdout_schema import HeldOutSet, Holdout, HoldoutLineage
 from service.storage.database import DatasetRow
-from service.training.holdout_schema import HeldOutSet, Holdout, HoldoutLineage
 
 UNTIMED_GUARD = 25.0
 """Samples left out on both sides in a data set without times, whose rate is not known."""

@@ -20,12 +20,12 @@ from sqlalchemy import select
 
 from service import __version__
 from service.compute.executors import placed
+from service.compute.process import training_place
 from service.foundation.settings import Settings
 from service.foundation.states import ACTIVE, CANCELLED, QUEUED, RUNNING
 from service.storage.database import Database, JobRow
 from service.storage.files import Files
 from service.training import history, leftovers, worker
-from service.training.process import training_place
 from service.training.settling import Settler
 from service.training.slots import Slot
 from service.training.watch import Ended, Facts, Hand

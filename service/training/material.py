@@ -15,15 +15,16 @@ from lipcore.samples import Array, Samples
 from lipcore.urdf import RigidBody
 from lipcore.vocabulary import TorqueConvention
 from service.foundation.settings import Settings
-from service.learning.refreshing import material, scope
-from service.learning.storage import log
+from service.journal import log
+from service.models.holdout_schema import Holdout, HoldoutLineage
 from service.models.lineage import named
 from service.robots import store as robots
 from service.storage.database import Database, DatasetRow, VersionRow
 from service.storage.files import Files
 from service.training import holding_out
+from service.training import refresh_material as material
+from service.training import refresh_scope as scope
 from service.training.holding_out import Divided
-from service.training.holdout_schema import Holdout, HoldoutLineage
 from service.training.rows import CANDIDATES, Part, Table, opened
 
 

@@ -19,6 +19,7 @@ from functools import partial
 from sqlalchemy import select
 
 from service.compute.cluster import Cluster
+from service.compute.process import training_place
 from service.foundation.settings import Settings
 from service.foundation.states import ACTIVE, CANCELLED, QUEUED, RUNNING
 from service.storage.database import Database, JobRow
@@ -26,7 +27,6 @@ from service.storage.files import Files
 from service.storage.replicas import Replicas
 from service.training import history, worker
 from service.training.feed import Feed
-from service.training.process import training_place
 from service.training.settling import Settled, Settler, queue_again
 from service.training.slots import Slot
 from service.training.watch import Ended, Facts, Hand

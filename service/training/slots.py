@@ -15,7 +15,7 @@ from contextlib import suppress
 from multiprocessing.process import BaseProcess
 from typing import Any
 
-from service.training.process import Place, call, start_process
+from service.compute.process import Place, call, start_process
 
 REAPING_S = 0.5
 """Longest wait for what the system says of a process that has ended, s."""

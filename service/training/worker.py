@@ -18,12 +18,13 @@ from service.compute.executors import ClusterUnavailableError
 from service.foundation.errors import ServiceError, StorageFullError, StorageUnavailableError
 from service.foundation.settings import Settings
 from service.foundation.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, JobState
-from service.learning.refreshing import scope
 from service.models import registry
 from service.models.lineage import figures, software, training_metrics
 from service.storage.database import Database, JobRow, LearnerRow, now
+from service.storage.disk import Disk
 from service.storage.files import PATIENCE_S, Files
 from service.training import history, leftovers
+from service.training import refresh_scope as scope
 from service.training.holding_out import CannotHoldOutError
 from service.training.material import Material, observed, recorded
 from service.training.pulse import Pulse, SupersededError
@@ -31,7 +32,6 @@ from service.training.remaining import Remaining
 from service.training.rows import CANDIDATES
 from service.training.summing import all_rows
 from service.web import storage_errors
-from service.web.limits.disk import Disk
 from service.web.observability.context import job_id
 
 logger = logging.getLogger(__name__)

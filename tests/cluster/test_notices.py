@@ -9,7 +9,7 @@ from contextlib import closing, suppress
 import pytest
 from sqlalchemy import delete
 
-from service.learning.storage import log
+from service.journal import log
 from service.models import moves, registry
 from service.replication.listening import Listener
 from service.storage.database import AlarmRow, Database, DeletedModelRow, EventRow, ModelRow, VersionRow, now

@@ -16,7 +16,7 @@ from service.datasets.preparing import prepare
 from service.datasets.staging import staging
 from service.foundation.errors import InvalidDataError, TooLargeError
 from service.foundation.settings import Settings
-from service.web.limits.disk import Disk
+from service.storage.disk import Disk
 from tests.service.data import arrays, columns, csv, npz, stream
 
 SAMPLES = stream(samples=60, rate=50.0)

@@ -16,7 +16,7 @@ import pytest
 from websockets.sync.client import unix_connect
 
 from service.client import Client, ServiceUnreachableError
-from service.web.sockets import SocketError, UnixSocket
+from service.web.server.sockets import SocketError, UnixSocket
 from tests.service.data import DEADLINE, eventually
 from tests.service.server import Server
 

@@ -21,7 +21,7 @@ from service.datasets.preparing import prepare
 from service.datasets.staging import Staged
 from service.foundation.errors import ServiceError
 from service.foundation.settings import Settings
-from service.web.limits.disk import Disk
+from service.storage.disk import Disk
 
 FEWEST = 10
 """Rows of a recording."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from service.client.call import Answer
 from service.client.results.arrays import Array, Plain, array
 from service.client.results.table import figure, html_table, text_table
-from service.models.comparison_schema import Outcome
+from service.inference.comparison_schema import Outcome
 
 
 @dataclass(frozen=True, eq=False)

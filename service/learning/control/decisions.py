@@ -10,11 +10,11 @@ from sqlalchemy.orm import Session
 
 from service.context import Service
 from service.foundation.errors import ConflictError
+from service.journal import alarms, log
 from service.learning import learning
 from service.learning.control import replaying, revisions
 from service.learning.control.learning_schema import Alarm, AlarmPage, ChangeRequest, Decided
 from service.learning.learning_options import LearningOptions
-from service.learning.storage import alarms, log
 from service.models import registry
 from service.storage.database import AlarmRow, EventRow
 from service.web.pagination import Page

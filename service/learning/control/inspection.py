@@ -16,13 +16,13 @@ from lipcore.samples import Array
 from lipcore.vocabulary import CODES
 from service.context import Service
 from service.foundation.errors import NotFoundError, not_found
+from service.journal import log
+from service.journal.log import EventKind
+from service.journal.payload import decode
 from service.learning.control.schema import Observation, ObservationDetail, ObservationPage, ObservationRows, Replay
 from service.learning.ingest import identity
 from service.learning.quality.summary import figures
 from service.learning.schema import ObservationResponse
-from service.learning.storage import log
-from service.learning.storage.log import EventKind
-from service.learning.storage.payload import decode
 from service.models import registry
 from service.storage.database import EventRow
 from service.web.pagination import Page

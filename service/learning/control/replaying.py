@@ -14,10 +14,10 @@ from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES, LEARNT
 from service.context import Service
 from service.foundation.errors import ConflictError, invalid_request
+from service.journal import log
 from service.learning.control import inspection, revisions
 from service.learning.control.schema import REPLAYABLE, Replayed, ReplayRequest
 from service.learning.control.undoing import find_learnt
-from service.learning.storage import log
 from service.storage.database import EventRow
 
 TIME_JUMP = CODES.index("time_jump")

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from service.journal import log
+from service.journal.log import EventKind
 from service.learning.control.schema import Revised
-from service.learning.storage import log
-from service.learning.storage.log import EventKind
 from service.models import registry
 from service.storage.database import Database, EventRow, SnapshotRow
 from service.web.pagination import Page

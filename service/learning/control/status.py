@@ -6,10 +6,10 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from service.context import Service
+from service.journal import log
 from service.learning import learning
 from service.learning.control import revisions
 from service.learning.control.learning_schema import Candidate, Held, Learning, LearningStatus, Snapshot, Stream
-from service.learning.storage import log
 from service.learning.updates import Status
 from service.storage.database import LearnerRow, StreamRow
 

@@ -9,11 +9,11 @@ from sqlalchemy.orm import Session
 
 from service.context import Service
 from service.foundation.errors import ConflictError, invalid_request, problem
+from service.journal import log
 from service.learning.control import inspection, revisions
 from service.learning.control.revisions import Range
 from service.learning.control.schema import RollbackRequest, RolledBack, Unlearnt
 from service.learning.ingest import identity
-from service.learning.storage import log
 from service.models import registry
 from service.storage.database import EventRow, LearnerRow
 

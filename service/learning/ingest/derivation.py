@@ -20,7 +20,7 @@ from lipcore.online.batch import Rows
 from lipcore.samples import Array
 from lipcore.vocabulary import CODES
 from service.foundation.errors import invalid_request
-from service.learning.storage import payload
+from service.journal import payload
 from service.storage.database import EventRow
 
 EDGE = CODES.index("edge")

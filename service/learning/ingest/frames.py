@@ -16,11 +16,11 @@ from lipcore.online.batch import Rows
 from lipcore.online.gates import check_rows
 from lipcore.samples import Array
 from service.foundation.errors import ConflictError
-from service.inference.loaded import Served
+from service.journal import log, payload
 from service.learning.ingest import identity, screening
 from service.learning.ingest.intake import Arrival, Ingest, check_kind, enabled
 from service.learning.quality.monitor import Monitor
-from service.learning.storage import log, payload
+from service.models.loaded import Served
 from service.storage.database import EventRow
 
 NUMBERS = ("q", "dq", "ddq", "tau")

@@ -10,10 +10,10 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from service.foundation.errors import ConflictError
+from service.journal import log
 from service.learning.errors import ExpiredError
 from service.learning.ingest.parsing import Measured
 from service.learning.schema import ObservationResponse, State
-from service.learning.storage import log
 from service.storage.database import EventRow
 
 

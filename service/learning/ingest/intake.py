@@ -15,7 +15,9 @@ from sqlalchemy.orm import Session
 
 from service.foundation.errors import ConflictError, not_found
 from service.foundation.settings import Settings
-from service.inference.loaded import LoadedModels, Served
+from service.journal import alarms, log
+from service.journal.log import NewBatch, StreamKind
+from service.journal.retention import retain
 from service.learning import learning
 from service.learning.errors import LearningDisabledError
 from service.learning.ingest import identity, judging, screening
@@ -27,12 +29,10 @@ from service.learning.learning_options import LearningOptions
 from service.learning.live.thinning import Judged
 from service.learning.quality.monitor import Monitor
 from service.learning.schema import Derivation, ObservationRequest, ObservationResponse
-from service.learning.storage import alarms, log
-from service.learning.storage.log import NewBatch, StreamKind
-from service.learning.storage.retention import retain
 from service.models import registry
+from service.models.loaded import LoadedModels, Served
 from service.storage.database import Database, EventRow, ModelRow, StreamRow
-from service.web.limits.disk import Disk
+from service.storage.disk import Disk
 
 logger = logging.getLogger(__name__)
 

@@ -11,8 +11,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from typing import Any, TypeVar
 
+from service.compute.process import Place
 from service.foundation.errors import BusyError
-from service.training.process import Place
 
 logger = logging.getLogger(__name__)
 

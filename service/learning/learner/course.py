@@ -13,7 +13,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session, undefer
 
-from service.learning.storage import log
+from service.journal import log
 from service.storage.database import EventRow
 
 PAGE_ROWS = 500

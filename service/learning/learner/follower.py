@@ -19,15 +19,15 @@ from lipcore.online.revision import Revision
 from lipcore.samples import Array
 from service.foundation.errors import StorageFullError
 from service.foundation.settings import Settings
+from service.journal import log, snapshots
 from service.learning.learner import publication, recent
 from service.learning.learner.course import RewoundError
 from service.learning.learner.messages import Published
 from service.learning.learner.novelty import Novelty
 from service.learning.learner.restore import Arrival, advance, restore
-from service.learning.storage import log, snapshots
 from service.storage.database import Database
+from service.storage.disk import Disk
 from service.storage.files import Files
-from service.web.limits.disk import Disk
 from service.web.storage_errors import translated
 
 logger = logging.getLogger(__name__)

@@ -8,9 +8,9 @@ from sqlalchemy.orm import Session
 
 from lipcore.model import TorqueModel
 from lipcore.online.consolidation import consolidate
+from service.journal import log, snapshots
 from service.learning.learner import recent
 from service.learning.learner.restore import Restored, restore
-from service.learning.storage import log, snapshots
 from service.storage.database import Database, LearnerRow, ServingRow
 from service.storage.files import Files
 

@@ -16,9 +16,9 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 
+from service.compute.process import Place, call, start_process, training_cpus
 from service.foundation.settings import Settings
 from service.learning.learner.messages import Message
-from service.training.process import Place, call, start_process, training_cpus
 from service.web.observability import logs
 
 logger = logging.getLogger(__name__)

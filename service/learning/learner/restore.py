@@ -28,10 +28,10 @@ from lipcore.model import TorqueModel
 from lipcore.online import state
 from lipcore.online.batch import Rows
 from lipcore.online.learner import ForgottenError, OnlineModel
+from service.journal import log, snapshots
+from service.journal.payload import decode
 from service.learning.learner import course
 from service.learning.learner.course import RewoundError, Stretch, Taking, batch_of
-from service.learning.storage import log, snapshots
-from service.learning.storage.payload import decode
 from service.storage.database import Database, EventRow
 from service.storage.files import Files
 

@@ -12,11 +12,11 @@ from multiprocessing.connection import Connection
 from sqlalchemy import select
 
 from service.foundation.settings import Settings
+from service.journal import snapshots
 from service.learning.learner import publication
 from service.learning.learner.follower import Follower
 from service.learning.learner.messages import Failed, Message
 from service.learning.refreshing.duel import Duels
-from service.learning.storage import snapshots
 from service.models import registry
 from service.storage.database import Database, LearnerRow
 from service.storage.files import Files

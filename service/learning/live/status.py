@@ -6,13 +6,13 @@ import time
 
 from lipcore.vocabulary import CODES
 from service.context import Service
+from service.journal import log
 from service.learning import learning
 from service.learning.control import decisions
 from service.learning.control.learning_schema import Held
 from service.learning.control.status import novel_share
 from service.learning.live.schema import LiveAnswers, LiveNovelty, LiveStatus
 from service.learning.quality import summary
-from service.learning.storage import log
 from service.web.observability.meters import OTHER, StreamMeter
 from service.web.pagination import Page
 

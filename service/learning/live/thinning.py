@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from lipcore.online.batch import Rows
 from lipcore.samples import Array
 from lipcore.vocabulary import CODES, LEARNT
-from service.inference.loaded import Served
 from service.learning.ingest.derivation import EDGE
 from service.learning.ingest.screening import Screened
 from service.learning.live.schema import DECIMALS, LivePart
+from service.models.loaded import Served
 
 
 class Judged(NamedTuple):

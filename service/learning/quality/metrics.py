@@ -11,11 +11,11 @@ from sqlalchemy import select
 
 from lipcore.vocabulary import CODES
 from service.context import Service
-from service.inference.loaded import Served
 from service.learning.control import revisions
 from service.learning.control.status import novel_share
 from service.learning.quality import summary
 from service.learning.quality.monitor import Monitor
+from service.models.loaded import Served
 from service.storage.database import StreamRow
 from service.web.observability.metric import MetricKind
 

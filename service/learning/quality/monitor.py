@@ -16,10 +16,10 @@ from lipcore.online.change import ChangeDetector
 from lipcore.online.record import Record
 from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.settings import Settings
+from service.journal import log
 from service.learning.ingest.contacts import ContactGate
 from service.learning.ingest.judging import Innovations, Verdict, Watch
 from service.learning.quality.windows import Window
-from service.learning.storage import log
 from service.storage.database import EventRow
 
 MOST_EVENTS = 3000

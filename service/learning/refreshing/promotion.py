@@ -8,13 +8,13 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from service.inference.loaded import LoadedModels
+from service.journal import alarms
 from service.learning import learning
 from service.learning.learner.messages import Contested
-from service.learning.refreshing import scope
-from service.learning.storage import alarms
 from service.models import registry
+from service.models.loaded import LoadedModels
 from service.storage.database import Database, LearnerRow, ServingRow
+from service.training import refresh_scope as scope
 
 logger = logging.getLogger(__name__)
 

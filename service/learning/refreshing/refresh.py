@@ -15,15 +15,15 @@ from sqlalchemy.orm import Session
 from service.foundation.errors import BusyError, ConflictError, not_found
 from service.foundation.settings import Settings
 from service.foundation.states import ACTIVE
+from service.journal import alarms, log
+from service.journal.alarms import AlarmKind
 from service.learning import learning
 from service.learning.learner.messages import Published
-from service.learning.refreshing import scope
 from service.learning.refreshing.promotion import CANDIDATE
-from service.learning.storage import alarms, log
-from service.learning.storage.alarms import AlarmKind
 from service.models import registry
 from service.storage.database import AlarmRow, Database, JobRow, LearnerRow, ServingRow, VersionRow
 from service.training import jobs
+from service.training import refresh_scope as scope
 from service.training.queue import JobQueue
 from service.training.schema import Job
 from service.web.idempotency import Identity, done

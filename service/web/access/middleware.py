@@ -8,12 +8,12 @@ from anyio import CancelScope
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.foundation.errors import ForbiddenError, NotFoundError, ServiceError, readable, refuse
-from service.stream.protocol import CONNECTION, StreamProtocol
 from service.web.access.credentials import secret_of
 from service.web.access.keyring import CHALLENGE, Keyring, refusal
 from service.web.access.keys import Key
 from service.web.access.scopes import ADMIN, WEBSOCKET, rule_of, scopes_of_stream
 from service.web.observability.context import KEY_ID
+from service.web.server.stream_protocol import CONNECTION, StreamProtocol
 
 __all__ = ["KEY_ID", "KeyAccess"]
 

@@ -12,7 +12,7 @@ from fastapi import Request
 
 from service.foundation.errors import UnsupportedMediaTypeError, problem
 from service.foundation.names import LONGEST, for_people
-from service.web.limits.disk import Disk
+from service.storage.disk import Disk
 from service.web.limits.form import FormFile
 
 FORM = "multipart/form-data"

@@ -9,9 +9,9 @@ from prometheus_client.exposition import choose_encoder
 
 from service.context import ServiceDep
 from service.learning.quality.metrics import Learning
+from service.training.metrics import Work
 from service.web.observability.system import System
 from service.web.observability.traffic import Traffic
-from service.web.observability.work import Work
 from service.web.route import Route
 
 EXAMPLE = """# HELP lipserve_requests_total Requests that were answered; 101: a stream, 499: the client went away before

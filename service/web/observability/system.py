@@ -12,7 +12,7 @@ from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector
 
 from service import __version__
-from service.web.limits.disk import measure
+from service.storage.disk import measure
 from service.web.observability.metric import MetricKind
 
 if TYPE_CHECKING:

@@ -6,7 +6,8 @@ import sys
 from collections.abc import Iterator
 
 from service.learning.quality import metrics as learning
-from service.web.observability import system, traffic, work
+from service.training import metrics as work
+from service.web.observability import system, traffic
 from service.web.observability.metric import MetricKind
 
 KINDS: tuple[MetricKind, ...] = (*traffic.KINDS, *work.KINDS, *learning.KINDS, *system.KINDS)

@@ -82,13 +82,11 @@ JOBS = [
     ),
     *_around_commit("job cancelled while it runs", actions.cancel, "service.training.jobs:cancel"),
 ]
-POINTED = "service.inference.loaded:LoadedModels.point"
+POINTED = "service.models.loaded:LoadedModels.point"
 APPEND = "service.learning.ingest.intake:Ingest.append"
-STORE = "service.learning.storage.snapshots:save"
+STORE = "service.journal.snapshots:save"
 LEARNING = [
-    Point(
-        "observation: row made", actions.observe, Fault("service.learning.storage.log:append_batch", "after"), "nothing"
-    ),
+    Point("observation: row made", actions.observe, Fault("service.journal.log:append_batch", "after"), "nothing"),
     *_around_commit("observation", actions.observe, APPEND),
     *_around_commit("unlearning", actions.unlearn, "service.learning.control.undoing:unlearn"),
     *_both("learner: page read", actions.observe, Fault("service.learning.learner.restore:advance", "before")),
@@ -119,7 +117,7 @@ MOVES = [
     Point(
         "other version serves: before it answers",
         actions.serve,
-        Fault("service.inference.loaded:LoadedModels.adopt"),
+        Fault("service.models.loaded:LoadedModels.adopt"),
         "all",
     ),
     *_around_commit("alias moved", actions.point_alias, MOVE),

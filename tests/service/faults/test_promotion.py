@@ -20,7 +20,7 @@ POINTS = {
     "roles are changed": (Fault("service.models.registry:serve", "after", DECIDE, "itself"), False),
     "before the commit": (Fault(COMMIT, "before", DECIDE, "itself"), False),
     "after the commit": (Fault(COMMIT, "after", DECIDE, "itself"), True),
-    "before it answers": (Fault("service.inference.loaded:LoadedModels.adopt", "before", DECIDE, "itself"), True),
+    "before it answers": (Fault("service.models.loaded:LoadedModels.adopt", "before", DECIDE, "itself"), True),
 }
 VERDICT = f"""
 import sys

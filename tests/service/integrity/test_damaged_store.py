@@ -15,8 +15,8 @@ from service import cli
 from service.cli.verification import verify
 from service.foundation.errors import DamagedDataError
 from service.foundation.settings import Settings
+from service.journal import snapshots
 from service.learning.learner.restore import restore
-from service.learning.storage import snapshots
 from service.models import registry
 from service.storage.database import DatasetRow, EventRow, RobotRow, SnapshotRow, VersionRow
 from service.storage.files import DamagedFileError, Files

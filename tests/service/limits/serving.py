@@ -12,9 +12,9 @@ from typing import Any, Self
 import uvicorn
 
 from service.foundation.settings import Settings
-from service.web.limits.connections import guarded
 from service.web.limits.stopping import Stopping
-from service.web.sockets import Server
+from service.web.server.connections import guarded
+from service.web.server.sockets import Server
 from tests.service.data import DEADLINE, eventually
 from tests.service.server import free_port
 

@@ -7,7 +7,7 @@ import time
 import pytest
 from websockets.sync.client import connect
 
-from service.web.limits.connections import REFUSED, GuardedProtocol
+from service.web.server.connections import REFUSED, GuardedProtocol
 from tests.service.data import DEADLINE, eventually
 from tests.service.limits.serving import Raw, Serving, refusal
 

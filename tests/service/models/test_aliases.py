@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from service.foundation.errors import NotFoundError
-from service.inference.loaded import LoadedModels
 from service.models import registry
+from service.models.loaded import LoadedModels
 from tests.service.data import error, service_of
 from tests.service.models.versions import predict, publish
 

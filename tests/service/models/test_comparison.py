@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lipcore.paired import Answer, Comparison, Difference, compare
-from service.models.comparison import _verdict
+from service.inference.comparison import _verdict
 from tests.service.data import arrays, error, npz, post, stream, upload
 from tests.service.models.versions import publish, trained, worse
 

@@ -11,9 +11,9 @@ from sqlalchemy import select, update
 from service.foundation.errors import ConflictError, NotFoundError, UnreadableVersionError
 from service.foundation.settings import Settings
 from service.foundation.states import CANCELLED, RUNNING
-from service.inference.loaded import LoadedModels
-from service.learning.storage import snapshots
+from service.journal import snapshots
 from service.models import registry
+from service.models.loaded import LoadedModels
 from service.storage.database import (
     AlarmRow,
     AliasMoveRow,

@@ -11,7 +11,7 @@ from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
-from service.training.process import Place, start_process
+from service.compute.process import Place, start_process
 from service.web.observability import logs
 from service.web.observability.context import job_id, request_id
 from service.web.observability.logs import LogOptions

@@ -10,8 +10,8 @@ from prometheus_client.parser import text_string_to_metric_families as parse
 from sqlalchemy import delete
 
 from service.storage.database import JobRow
+from service.training.metrics import DURATION, FINISHED, JOBS, Work
 from service.web.observability import table
-from service.web.observability.work import DURATION, FINISHED, JOBS, Work
 from tests.service.data import QUICK, service_of, stream, upload
 from tests.service.observability.test_request_ids import QUERY
 

@@ -18,7 +18,7 @@ from service.datasets.report.making import make_report
 from service.datasets.report.schema import DatasetReport
 from service.datasets.staging import Staged, column
 from service.foundation.settings import Settings
-from service.web.limits.disk import Disk
+from service.storage.disk import Disk
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from service.datasets.preparing import prepare
 from service.datasets.staging import QUANTITIES, Staged, column
 from service.foundation.errors import InvalidDataError
 from service.foundation.settings import Settings
-from service.web.limits.disk import Disk
+from service.storage.disk import Disk
 
 RATE = 90.0
 ROWS = 900

@@ -11,8 +11,8 @@ from sqlalchemy import select
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES
 from service.foundation.settings import Settings
-from service.learning.storage import log
-from service.learning.storage.log import NewBatch
+from service.journal import log
+from service.journal.log import NewBatch
 from service.storage.database import Database, EventRow, ModelRow, StreamRow, VersionRow, now
 
 MODEL, OTHER = "arm", "other"

@@ -20,13 +20,13 @@ from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.online.record import Record
 from service.foundation.settings import Settings
-from service.inference.loaded import LoadedModels
+from service.journal import log, snapshots
+from service.journal.log import NewBatch
 from service.learning.learner import publication
 from service.learning.learner.messages import Published
 from service.learning.learner.restore import Restored, advance, restore
-from service.learning.storage import log, snapshots
-from service.learning.storage.log import NewBatch
 from service.models import registry
+from service.models.loaded import LoadedModels
 from service.storage.database import Database, EventRow
 from service.storage.files import Files
 from tests.service.data import QUICK, stream

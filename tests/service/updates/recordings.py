@@ -13,7 +13,7 @@ from lipcore.online.learner import OnlineModel
 from lipcore.online.spacing import INDEPENDENT_HZ
 from lipcore.samples import Samples
 from lipcore.vocabulary import CODES
-from service.learning.storage import log, payload
+from service.journal import log, payload
 from tests.service.data import stream
 from tests.service.updates.lessons import QUERIES, RATE, Pupil, School
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.learning.storage import alarms
+from service.journal import alarms
 from tests.service.data import error
 
 

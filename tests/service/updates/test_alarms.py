@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.learning.storage import alarms
+from service.journal import alarms
 from service.web.pagination import Page
 from tests.service.updates.batches import MODEL, OTHER, opened
 

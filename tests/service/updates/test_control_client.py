@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from service.client import ApiError, Client
-from service.learning.storage import alarms
+from service.journal import alarms
 from tests.service.updates.lessons import LESSON
 
 

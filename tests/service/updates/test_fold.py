@@ -18,10 +18,10 @@ from sqlalchemy import delete
 import lipcore
 from lipcore.online import state
 from lipcore.online.revision import Revision
+from service.journal import log, snapshots
 from service.learning.learner import course, recent
 from service.learning.learner.course import RewoundError
 from service.learning.learner.restore import advance, restore
-from service.learning.storage import log, snapshots
 from service.models import registry
 from service.storage.database import Database, SnapshotRow
 from service.storage.files import Files

@@ -12,9 +12,9 @@ import pytest
 from lipcore.online.record import Record
 from lipcore.online.spacing import INDEPENDENT_HZ, weights
 from service.foundation.errors import BusyError, ConflictError
+from service.journal import log, retention
 from service.learning.errors import ExpiredError, LearningDisabledError
 from service.learning.ingest.frames import Frames, FramesResult
-from service.learning.storage import log, retention
 from tests.service.updates.lessons import apart
 from tests.service.updates.recordings import codes, learnt_from, logged, part, recording, send
 

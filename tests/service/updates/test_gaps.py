@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.foundation.errors import BusyError, ConflictError
-from service.learning.storage import gaps, log
-from service.learning.storage.gaps import Gaps
+from service.journal import gaps, log
+from service.journal.gaps import Gaps
 from tests.service.updates.batches import MODEL, OTHER, batch, live, opened, source, write
 
 

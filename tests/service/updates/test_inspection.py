@@ -7,8 +7,8 @@ import pytest
 
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES
-from service.learning.storage import log
-from service.learning.storage.log import NewBatch
+from service.journal import log
+from service.journal.log import NewBatch
 from tests.service.data import error
 from tests.service.updates.lessons import LESSON, lesson
 

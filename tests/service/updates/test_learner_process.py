@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 from sqlalchemy import select
 
-from service.inference.loaded import LoadedModels
 from service.learning.learner import process as processes
 from service.learning.learner import publication
 from service.learning.learner.messages import Published
 from service.learning.learner.process import LearnerProcess, learner_place
+from service.models.loaded import LoadedModels
 from service.storage.database import SnapshotRow
 from tests.service.data import DEADLINE, eventually
 from tests.service.updates.pendulums import ARM, Arm, adopt, at_once, same

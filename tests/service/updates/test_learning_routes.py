@@ -6,9 +6,9 @@ import time
 
 import pytest
 
+from service.journal import log, snapshots
 from service.learning import learning
 from service.learning.control import decisions
-from service.learning.storage import log, snapshots
 from service.storage.database import LearnerRow
 from tests.service.data import error
 from tests.service.updates.lessons import LESSON, apart

@@ -8,8 +8,8 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from service.learning.storage import log
-from service.learning.storage.payload import decode, encode
+from service.journal import log
+from service.journal.payload import decode, encode
 from service.storage.database import LearnerRow
 from service.web.pagination import Page
 from tests.service.updates.batches import MODEL, OTHER, batch, everything, note, opened, rows, take_back, write

@@ -11,8 +11,8 @@ from contextlib import suppress
 import numpy as np
 
 from service.foundation.settings import Settings
-from service.learning.storage import log
-from service.learning.storage.payload import encode
+from service.journal import log
+from service.journal.payload import encode
 from service.storage.database import Database
 from tests.service.data import DEADLINE
 from tests.service.updates.batches import MODEL, batch, everything, opened, rows, source

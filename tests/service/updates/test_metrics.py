@@ -8,7 +8,7 @@ from prometheus_client.openmetrics.parser import text_string_to_metric_families 
 from prometheus_client.parser import text_string_to_metric_families as parse
 
 from lipcore.vocabulary import CODES
-from service.learning.storage import log
+from service.journal import log
 from tests.service.updates.lessons import lesson
 
 GAUGES = {

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import lipcore
+from service.journal import log
 from service.learning.learner import recent
 from service.learning.learner.restore import restore
-from service.learning.storage import log
 from service.models import registry
 from tests.service.data import DEADLINE, ended, eventually, train, upload
 from tests.service.updates.lessons import Pupil, School, answered

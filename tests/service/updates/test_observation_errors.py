@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from service.learning.storage import log, retention
+from service.journal import log, retention
 from tests.service.data import error
 from tests.service.updates import lessons
 from tests.service.updates.recordings import batch, logged, part, recording, send

@@ -11,8 +11,8 @@ import pytest
 
 from service.client import Client
 from service.foundation.settings import Settings
+from service.journal import log
 from service.learning.schema import ObservationResponse
-from service.learning.storage import log
 from service.storage.database import Database, EventRow
 from tests.service.data import error, eventually
 from tests.service.updates import lessons

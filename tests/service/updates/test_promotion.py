@@ -8,9 +8,9 @@ import pytest
 from sqlalchemy import select
 
 import lipcore
+from service.journal import log
 from service.learning.learner.messages import Contested
 from service.learning.refreshing import promotion
-from service.learning.storage import log
 from service.models import registry
 from service.storage.database import LearnerRow
 from tests.service.updates.lessons import answered

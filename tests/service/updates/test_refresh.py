@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.foundation.states import RUNNING
-from service.learning.storage import log
+from service.journal import log
 from service.storage.database import JobRow
 from service.training import worker
 from service.training.material import observed

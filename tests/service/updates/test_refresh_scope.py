@@ -7,10 +7,11 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from service.learning.refreshing import material, scope
-from service.learning.refreshing.scope import Scope
-from service.learning.storage import log
+from service.journal import log
 from service.storage.database import DatasetRow, now
+from service.training import refresh_material as material
+from service.training import refresh_scope as scope
+from service.training.refresh_scope import Scope
 from tests.service.updates import batches
 from tests.service.updates.batches import MODEL, everything, note, opened, roll_back, rows, take_back, write
 

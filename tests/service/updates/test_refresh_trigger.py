@@ -10,9 +10,9 @@ import pytest
 
 import lipcore
 from service.foundation.states import CANCELLED, FAILED
+from service.journal import log
 from service.learning.learner.messages import Published
 from service.learning.refreshing import refresh
-from service.learning.storage import log
 from service.models import registry
 from service.storage.database import AlarmRow, JobRow, now
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.learning.storage import log
-from service.learning.storage.payload import decode
+from service.journal import log
+from service.journal.payload import decode
 from tests.service.updates.lessons import LESSON, apart, lesson
 
 EQUAL = 1e-8

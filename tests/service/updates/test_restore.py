@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from lipcore.vocabulary import CODES
+from service.journal import snapshots
 from service.learning.learner import course, learnt, recent
 from service.learning.learner import restore as restoring
 from service.learning.learner.course import RewoundError
 from service.learning.learner.restore import advance
-from service.learning.storage import snapshots
 from tests.service.updates.pendulums import (
     ARM,
     QUERIES,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from service.foundation.settings import Settings
-from service.learning.storage import log, retention
-from service.learning.storage.payload import encode
+from service.journal import log, retention
+from service.journal.payload import encode
 from service.storage.database import LearnerRow, ServingRow, SnapshotRow, now
 from tests.service.updates.batches import MODEL, OTHER, batch, everything, note, opened, rows, source, take_back, write
 

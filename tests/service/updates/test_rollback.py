@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from service.journal import log, snapshots
 from service.learning.control import revisions
-from service.learning.storage import log, snapshots
 from tests.service.data import error, eventually
 from tests.service.updates.batches import MODEL, batch, note, opened, roll_back, write
 from tests.service.updates.lessons import apart

@@ -8,8 +8,8 @@ from sqlalchemy import delete
 
 from service.app import create_app
 from service.foundation.errors import NotFoundError
-from service.inference.loaded import LoadedModels
 from service.models import registry
+from service.models.loaded import LoadedModels
 from service.models.registry import Serving
 from service.storage.database import LearnerRow, ServingRow
 from tests.service.data import ADDRESS

@@ -12,8 +12,8 @@ from sqlalchemy import select
 
 from service.app import create_app
 from service.foundation.settings import Settings
-from service.learning.storage import snapshots
-from service.learning.storage.snapshots import thinned
+from service.journal import snapshots
+from service.journal.snapshots import thinned
 from service.storage.database import SnapshotRow, VersionRow, now
 from service.storage.files import DamagedFileError, Files
 from tests.service.updates.batches import MODEL, OTHER, batch, opened, roll_back, take_back, write

@@ -17,7 +17,7 @@ from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from service.client.stream import StreamClient, StreamError
 from service.foundation.settings import Settings
-from service.learning.storage import payload
+from service.journal import payload
 from service.storage.database import Database, EventRow
 from tests.service.data import DEADLINE, eventually, stream, train, upload
 from tests.service.server import Server

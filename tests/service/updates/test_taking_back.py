@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.learning.storage import log
+from service.journal import log
 from service.storage.database import SnapshotRow, now
 from tests.service.updates.batches import (
     MODEL,

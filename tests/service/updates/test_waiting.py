@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from service.inference.waiting import Waiting
 from service.learning.learner.process import LearnerProcess
+from service.models.waiting import Waiting
 from tests.service.data import error, service_of
 from tests.service.updates.lessons import QUERIES, lesson
 

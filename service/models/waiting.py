@@ -14,7 +14,7 @@ from service.foundation.errors import RevisionNotReachedError, problem
 
 if TYPE_CHECKING:
     from service.context import Service
-    from service.inference.served import Served
+    from service.models.served import Served
 
 AGAIN = {"Retry-After": "1"}
 

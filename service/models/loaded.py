@@ -16,12 +16,12 @@ import lipcore
 from lipcore.model import TorqueModel
 from lipcore.online.revision import Revision
 from service.foundation.errors import NotFoundError, UnreadableVersionError, not_found
-from service.inference.served import Alias, Key, Served, Snapshot
-from service.inference.waiting import Waiting
 from service.learning.learner import learnt as learning
 from service.models import moves, registry
 from service.models.lineage import learnt_from
 from service.models.registry import Serving
+from service.models.served import Alias, Key, Served, Snapshot
+from service.models.waiting import Waiting
 from service.storage.database import Database, VersionRow
 from service.storage.files import Files
 

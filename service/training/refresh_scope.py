@@ -11,7 +11,7 @@ from typing import Any
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from service.learning.storage import log
+from service.journal import log
 from service.storage.database import DatasetRow, EventRow
 
 MEMORY = 5.0

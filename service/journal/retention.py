@@ -6,7 +6,7 @@ from sqlalchemy import ColumnElement, and_, delete, func, not_, select
 from sqlalchemy.orm import Session
 
 from service.foundation.settings import Settings
-from service.learning.storage import log, snapshots
+from service.journal import log, snapshots
 from service.storage.database import Database, EventRow, LearnerRow, ServingRow, StreamRow, VersionRow
 
 CHUNK = 200

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from lipcore.online.batch import Rows
 from lipcore.samples import Array, Samples
-from service.learning.refreshing.scope import Scope
-from service.learning.storage import log
-from service.learning.storage.payload import decode
+from service.journal import log
+from service.journal.payload import decode
 from service.storage.database import Database
+from service.training.refresh_scope import Scope
 
 PAGE = 50
 """Events read at a time."""

@@ -12,8 +12,7 @@ from lipcore.samples import Array, Samples
 from service.context import Service
 from service.foundation.errors import invalid_request
 from service.inference.answer import measured
-from service.inference.loaded import Served
-from service.models.comparison_schema import (
+from service.inference.comparison_schema import (
     CompareRequest,
     CompareResponse,
     Differences,
@@ -22,6 +21,7 @@ from service.models.comparison_schema import (
     TotalDifference,
     VersionFigures,
 )
+from service.models.loaded import Served
 
 
 def compare(service: Service, model: str, request: CompareRequest) -> CompareResponse:

@@ -17,8 +17,8 @@ from sqlalchemy.orm import Session, undefer
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.errors import BusyError, ConflictError
-from service.learning.storage.gaps import Gaps
-from service.learning.storage.payload import encode
+from service.journal.gaps import Gaps
+from service.journal.payload import encode
 from service.storage.database import EventRow, LearnerRow, LearningRow, SnapshotRow, StreamRow, now
 from service.web.pagination import Page
 from service.web.pagination import newest as newest_rows

@@ -1,0 +1,1 @@
+"""What extends uvicorn: connections, sockets, and the protocol of streams. Held to its versions by a test."""
