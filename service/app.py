@@ -15,7 +15,6 @@ from starlette.routing import BaseRoute
 from threadpoolctl import threadpool_limits
 
 from service import __version__
-from service.context import Service
 from service.dashboard import routes as dashboard
 from service.datasets import routes as datasets
 from service.foundation import errors
@@ -25,7 +24,9 @@ from service.inference import echo
 from service.inference import routes as inference
 from service.learning import routes as observations
 from service.learning.control import routes as control
+from service.learning.learner.learnt import LearntVersions
 from service.learning.live import routes as live
+from service.learning.quality.metrics import Learning
 from service.learning.refreshing import routes as refreshing
 from service.learning.refreshing.wiring import attach
 from service.learning.updates import Updates
@@ -36,13 +37,14 @@ from service.models.loaded import LoadedModels
 from service.oip import routes as oip
 from service.replication.replication import Replication
 from service.robots import routes as robots
-from service.storage.database import Database
-from service.storage.disk import Disk
-from service.storage.files import Files, sweeping
+from service.storage import looks as looking
+from service.storage.files import sweeping
 from service.storage.home import hold_home
+from service.storage.storage import Storage
 from service.stream import routes as stream
+from service.training import metrics as jobs_metrics
 from service.training import routes as training
-from service.training.queue import queue_of
+from service.training.queue import JobQueue, queue_of
 from service.web import health, openapi, storage_errors
 from service.web.access import openapi as access
 from service.web.access.keyring import Keyring
@@ -52,11 +54,15 @@ from service.web.limits import BodyLimit
 from service.web.limits.gate import Gate
 from service.web.limits.rate import RateLimit
 from service.web.limits.stopping import Stopping
+from service.web.limits.turns import Turns
 from service.web.observability import routes as metrics
 from service.web.observability import tracing
 from service.web.observability.meters import Meters
+from service.web.observability.readiness import Look, Readiness
 from service.web.observability.request_log import RequestLog
 from service.web.observability.requests import RequestContext
+from service.web.observability.system import System
+from service.web.observability.traffic import Traffic
 
 logger = logging.getLogger(__name__)
 
@@ -80,21 +86,21 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         lock = hold_home(settings.home)
         torch.set_num_threads(settings.serving_threads)  # here, for this thread and those that come later
-        service = await to_thread.run_sync(_open, settings, stopping, meters)
+        storage, jobs, updates = await to_thread.run_sync(_open, settings)
         threadpool_limits(settings.serving_threads)  # of BLAS, whose libraries the models have brought in
-        app.state.service = service
-        replication = Replication(service) if service.database.shared else None
+        _share(app, storage, jobs, updates)
+        replication = Replication(updates) if storage.database.shared else None
         try:
-            async with nullcontext() if keyring is None else keyring.watching(service.database):
+            async with nullcontext() if keyring is None else keyring.watching(storage.database):
                 yield
         finally:
             async with AsyncExitStack() as rest:
                 rest.callback(lock.close)
-                rest.callback(service.database.close)
-                rest.push_async_callback(to_thread.run_sync, service.updates.close)
+                rest.callback(storage.database.close)
+                rest.push_async_callback(to_thread.run_sync, updates.close)
                 if replication is not None:
                     rest.push_async_callback(to_thread.run_sync, replication.close)
-                await to_thread.run_sync(service.jobs.close)  # first: what learns needs the CPU to store its state
+                await to_thread.run_sync(jobs.close)  # first: what learns needs the CPU to store its state
 
     hot = [*inference.hot.routes, *echo.hot.routes, *oip.hot.routes, *observations.hot.routes]
     # the documentation page loads nothing from other hosts: robots' networks often have no way out
@@ -110,7 +116,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         routes=hot,
         telemetry=tracing.telemetry(settings),
     )
-    app.state.stopping = stopping
+    app.state.stopping, app.state.meters = stopping, meters
     errors.install(app)
     openapi.install(app)
     storage_errors.install(app)
@@ -161,20 +167,40 @@ def _add_middleware(
     app.add_middleware(RequestContext, meters=meters, log=log, tracing=settings.opentelemetry)  # the outermost
 
 
-def _open(settings: Settings, stopping: Stopping, meters: Meters) -> Service:
+def _open(settings: Settings) -> tuple[Storage, JobQueue, Updates]:
     """Open the home, finish what an earlier run left, and load the models that are asked for first."""
     sys.setswitchinterval(SWITCH_INTERVAL)
-    database, files = Database.of(settings, settings.database_timeout_s), Files.of(settings)
+    storage = Storage.open(settings)
+    database, files = storage.database, storage.files
     sweeping.start(database, files)
     registry.install_shipped(database, files)
-    loaded = LoadedModels(database, files, settings.max_loaded_models)
+    loaded = LoadedModels(storage, LearntVersions(database, files))
     logger.info("loaded %d models", loaded.preload())
-    jobs = queue_of(settings)(settings, database, lambda model, _: loaded.adopt(model))
+    jobs = queue_of(settings)(storage, lambda model, _: loaded.adopt(model))
     if recovered := jobs.recover():
         logger.warning("queued again after an interruption: %s", ", ".join(recovered))
-    limiter = CapacityLimiter(settings.max_concurrent_predictions)
-    disk = Disk(settings)
-    updates = Updates(settings, database, files, loaded, disk)
-    service = Service(settings, database, files, loaded, jobs, limiter, updates, disk, stopping, meters)
-    attach(service)
-    return service
+    updates = Updates(loaded)
+    attach(updates, jobs)
+    return storage, jobs, updates
+
+
+def _share(app: FastAPI, storage: Storage, jobs: JobQueue, updates: Updates) -> None:
+    """Put the parts where routes ask for them, each for those that it uses."""
+    state, loaded, settings = app.state, updates.loaded, storage.settings
+    looks: dict[str, Look] = {
+        "database": lambda _: looking.database(storage),
+        "home": lambda _: looking.home(storage),
+        **({"files": lambda _: looking.files(storage)} if storage.files.shared else {}),
+        "models": loaded.look,
+        "learner": updates.look,
+        "training": lambda lasting: jobs_metrics.look(jobs, lasting),
+    }
+    state.storage, state.loaded, state.jobs, state.updates = storage, loaded, jobs, updates
+    state.turns = Turns(CapacityLimiter(settings.max_concurrent_predictions))
+    state.readiness = Readiness(looks, state.stopping)
+    state.collectors = (
+        Traffic(state.meters),
+        jobs_metrics.Work(storage.database),
+        Learning(updates),
+        System(storage, state.readiness),
+    )

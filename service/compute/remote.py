@@ -3,6 +3,7 @@ whose modules import nothing. The modules of a call would be numerics, whose imp
 
 from __future__ import annotations
 
+import importlib
 import pickle
 from typing import Any
 
@@ -18,8 +19,7 @@ def call(packed: bytes) -> Any:
     return function(*given, **named)
 
 
-def host(version: str, job: str) -> None:
-    """Run a job on a worker, see `service.training.hosting`."""
-    from service.training import hosting  # noqa: PLC0415
-
-    hosting.host(version, job)
+def call_named(name: str, *given: Any) -> Any:
+    """Do a call on a worker of a function by its name, `package.module:function`, which only the worker imports."""
+    module, _, function = name.partition(":")
+    return getattr(importlib.import_module(module), function)(*given)

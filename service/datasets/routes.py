@@ -8,7 +8,6 @@ from typing import Annotated
 from anyio import to_thread
 from fastapi import APIRouter, Depends, Query, Request, Response, status
 
-from service.context import ServiceDep
 from service.datasets import store
 from service.datasets.media import MEDIA_TYPES, SUFFIXES, UPLOAD_BODY
 from service.datasets.options import UploadOptions
@@ -28,7 +27,9 @@ from service.foundation.errors import (
     responses,
 )
 from service.foundation.names import NameForPeople
+from service.storage.storage import StorageDep
 from service.web.idempotency import KeyHeader, identity
+from service.web.limits.turns import UploadsDep
 from service.web.limits.upload import Kinds, receive_to
 from service.web.pagination import PageQuery
 from service.web.route import Route
@@ -50,21 +51,20 @@ router = APIRouter(
 async def upload(
     request: Request,
     response: Response,
-    service: ServiceDep,
+    storage: StorageDep,
+    turns: UploadsDep,
     options: Annotated[UploadOptions, Depends(upload_options)],
     name: Annotated[NameForPeople | None, Query(description="A name for people; the file's by default")] = None,
     idempotency_key: KeyHeader = None,
 ) -> Dataset:
     """Validate a recording, prepare it and store it as an immutable data set, or say what is wrong and where."""
-    path = service.files.upload()
+    path = storage.files.upload()
     try:
-        kind, file_name = await receive_to(request, path, KINDS, service.disk)
+        kind, file_name = await receive_to(request, path, KINDS, storage.disk)
         said = (sorted(request.query_params.multi_items()), kind, file_name)
         named = await to_thread.run_sync(partial(identity, idempotency_key, *said, file=path))
         called = name or file_name or "unnamed"
-        dataset = await to_thread.run_sync(
-            store.add, service, path, kind, called, options, named, limiter=service.uploads
-        )
+        dataset = await to_thread.run_sync(store.add, storage, path, kind, called, options, named, limiter=turns)
     finally:
         path.unlink(missing_ok=True)
     response.headers["Location"] = f"/v1/datasets/{dataset.id}"
@@ -72,15 +72,15 @@ async def upload(
 
 
 @router.get("", summary="List data sets, newest first")
-def list_datasets(service: ServiceDep, page: PageQuery) -> DatasetPage:
+def list_datasets(storage: StorageDep, page: PageQuery) -> DatasetPage:
     """One page of data sets with their reports."""
-    return store.page(service.database, page)
+    return store.page(storage.database, page)
 
 
 @router.get("/{dataset}", summary="One data set and its report", responses=responses(NotFoundError))
-def show(service: ServiceDep, dataset: str) -> Dataset:
+def show(storage: StorageDep, dataset: str) -> Dataset:
     """What was found in the recording and what was derived."""
-    return store.show(service.database, dataset)
+    return store.show(storage.database, dataset)
 
 
 @router.get(
@@ -89,7 +89,7 @@ def show(service: ServiceDep, dataset: str) -> Dataset:
     responses=responses(NotFoundError, DamagedDataError),
 )
 def preview(
-    service: ServiceDep,
+    storage: StorageDep,
     dataset: str,
     quantities: Annotated[
         str, Query(max_length=100, description="Any of q, dq, ddq, tau, separated by commas")
@@ -101,7 +101,7 @@ def preview(
     for name in wanted:
         if name not in QUANTITIES or wanted.count(name) > 1:
             raise invalid_request("quantities", name, f"each of {', '.join(QUANTITIES)} at most once")
-    return store.preview(service, dataset, wanted, points)
+    return store.preview(storage, dataset, wanted, points)
 
 
 @router.delete(
@@ -110,6 +110,6 @@ def preview(
     summary="Delete a data set",
     responses=responses(NotFoundError, ConflictError),
 )
-def delete(service: ServiceDep, dataset: str) -> None:
+def delete(storage: StorageDep, dataset: str) -> None:
     """Delete the samples. Models trained on them stay."""
-    store.delete(service, dataset)
+    store.delete(storage, dataset)

@@ -14,7 +14,6 @@ from sqlalchemy.exc import SQLAlchemyError
 from lipcore.profiles import Profile
 from lipcore.samples import Samples
 from lipcore.vocabulary import JointType
-from service.context import Service
 from service.datasets.mapping.reading import read
 from service.datasets.options import UploadOptions
 from service.datasets.preparing import prepare
@@ -29,13 +28,14 @@ from service.storage import sample_file
 from service.storage.database import Database, DatasetRow, JobRow, now
 from service.storage.files import Files, new_id
 from service.storage.sample_file import PartOf
+from service.storage.storage import Storage
 from service.web.idempotency import Identity, done, mark
 from service.web.pagination import Page, newest
 from service.web.storage_errors import undecided
 
 
 def add(
-    service: Service, upload: Path, kind: str, name: str, options: UploadOptions, named: Identity | None = None
+    storage: Storage, upload: Path, kind: str, name: str, options: UploadOptions, named: Identity | None = None
 ) -> Dataset:
     """Read, check and prepare an upload, then store it: samples first, the row that makes them visible last.
 
@@ -44,12 +44,12 @@ def add(
     """
     from service.datasets.formats.opening import open_table  # noqa: PLC0415 - pyarrow is 35 MiB, for uploads only
 
-    with service.database.session() as session:
+    with storage.database.session() as session:
         if (before := done(session, DatasetRow, named)) is not None:
             return _show(before)
-    settings, disk = service.settings, service.disk
-    profile = None if options.robot is None else profile_of(service.database, options.robot)
-    with staging(service.files.uploads) as folder:
+    settings, disk = storage.settings, storage.disk
+    profile = None if options.robot is None else profile_of(storage.database, options.robot)
+    with staging(storage.files.uploads) as folder:
         with open_table(upload, kind, options.read, settings) as table:
             found = read(table, folder, options, profile, settings, disk)
         prepared = prepare(found.staged, folder, options.recipe, settings.min_samples, disk)
@@ -60,7 +60,7 @@ def add(
         staged = prepared.staged
         disk.take(sample_file.size(staged.rows, staged.n_joints))
         dataset = new_id("ds")
-        digest = service.files.write_samples(dataset, staged.rows, staged.n_joints, partial(_array, staged))
+        digest = storage.files.write_samples(dataset, staged.rows, staged.n_joints, partial(_array, staged))
     row = DatasetRow(
         id=dataset,
         name=name,
@@ -73,15 +73,15 @@ def add(
     )
     mark(row, named)
     try:
-        with service.database.transaction() as session:
+        with storage.database.transaction() as session:
             if (before := done(session, DatasetRow, named)) is None:
                 session.add(row)
     except (SQLAlchemyError, ConflictError) as error:
         if not undecided(error):
-            service.files.delete_samples(dataset)
+            storage.files.delete_samples(dataset)
         raise
     if before is not None:  # the same request was faster on another connection
-        service.files.delete_samples(dataset)
+        storage.files.delete_samples(dataset)
         return _show(before)
     return _show(row)
 
@@ -105,10 +105,10 @@ def samples(files: Files, row: DatasetRow, most: int | None = None, part: PartOf
     return files.read_samples(row.id, row.joint_names, row.sha256, most, part)
 
 
-def preview(service: Service, dataset: str, quantities: Sequence[str], points: int) -> Preview:
+def preview(storage: Storage, dataset: str, quantities: Sequence[str], points: int) -> Preview:
     """Thin some quantities of a data set for a plot; raise NotFoundError or DamagedDataError."""
-    row = find(service.database, dataset)
-    return preview_file(service.files.samples_file(row.id, row.sha256), row.joint_names, quantities, points)
+    row = find(storage.database, dataset)
+    return preview_file(storage.files.samples_file(row.id, row.sha256), row.joint_names, quantities, points)
 
 
 def page(database: Database, part: Page) -> DatasetPage:
@@ -118,9 +118,9 @@ def page(database: Database, part: Page) -> DatasetPage:
     return DatasetPage(items=[_show(row) for row in rows], next_cursor=following)
 
 
-def delete(service: Service, dataset: str) -> None:
+def delete(storage: Storage, dataset: str) -> None:
     """Delete a data set; raise ConflictError while a job waits for it or reads it."""
-    with service.database.transaction() as session:
+    with storage.database.transaction() as session:
         row = session.scalar(select(DatasetRow).where(DatasetRow.id == dataset))
         if row is None:
             raise not_found("dataset", dataset)
@@ -128,7 +128,7 @@ def delete(service: Service, dataset: str) -> None:
             if dataset in job.request["datasets"]:
                 raise ConflictError(f"data set {dataset!r} is in use by job {job.id!r}: cancel it or wait for its end")
         session.delete(row)
-    service.files.delete_samples(dataset)
+    storage.files.delete_samples(dataset)
 
 
 def _joint_types(profile: Profile, joint_names: Sequence[str]) -> list[JointType] | None:

@@ -12,3 +12,6 @@ SUCCEEDED: Final = "succeeded"
 FAILED: Final = "failed"
 CANCELLED: Final = "cancelled"
 ACTIVE = (QUEUED, RUNNING)
+
+PartState = Literal["ok", "warning", "failed"]
+"""Of a part of the service."""

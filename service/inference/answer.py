@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from lipcore.metrics import LEVELS, RELIABILITY_LEVELS
 from lipcore.metrics import evaluate as compare
 from lipcore.samples import Samples
-from service.context import Service
 from service.datasets import store
 from service.foundation.errors import InvalidRequestError, invalid_request
 from service.inference import checks, components
@@ -20,7 +19,7 @@ from service.inference.schema import EvaluateRequest, EvaluateResponse, Interval
 from service.inference.stretches import stretches
 from service.inference.wire import Prediction
 from service.models import registry
-from service.models.loaded import Served
+from service.models.loaded import LoadedModels, Served
 from service.storage.database import DatasetRow
 from service.training import holding_out
 from service.training.holding_out import CannotHoldOutError, SetSplit
@@ -40,30 +39,31 @@ def at_once(served: Served, motion: Array, max_position: float) -> Prediction | 
     return _prediction(served, tau, tau_std)
 
 
-def predict(service: Service, model: str, request: PredictRequest, served: Served | None = None) -> Prediction:
+def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: Served | None = None) -> Prediction:
     """Torque with uncertainty at the queries; raise InvalidRequestError or NotFoundError. Not for the event loop.
 
     served: what answers, where that is found already.
     """
-    served = served or service.loaded.get(model, request.version, request.alias)
-    loaded = served.model
+    settings = loaded.storage.settings
+    served = served or loaded.get(model, request.version, request.alias)
+    known = served.model
     single = request.q.ndim == 1
-    components.check(loaded, request, service.settings.max_component_batch)
+    components.check(known, request, settings.max_component_batch)
     for name in ("q", "dq", "ddq", "tau"):
         values = getattr(request, name)
         if values is None:
             continue
-        if values.shape[-1] != loaded.n_joints:
-            expected = f"{loaded.n_joints} numbers: {', '.join(loaded.joint_names)}"
+        if values.shape[-1] != known.n_joints:
+            expected = f"{known.n_joints} numbers: {', '.join(known.joint_names)}"
             raise invalid_request(name, f"{values.shape[-1]} numbers long", expected)
         if values.shape != request.q.shape:
             raise invalid_request(name, f"of shape {values.shape}", f"the shape of q, {request.q.shape}")
     queries = np.atleast_2d(request.q)
-    if len(queries) > service.settings.max_batch:
-        raise invalid_request("q", f"{len(queries)} queries", f"at most {service.settings.max_batch} in one request")
-    checks.positions(request.q, service.settings.max_position)
+    if len(queries) > settings.max_batch:
+        raise invalid_request("q", f"{len(queries)} queries", f"at most {settings.max_batch} in one request")
+    checks.positions(request.q, settings.max_position)
 
-    answer = loaded.predict(queries, np.atleast_2d(request.dq), np.atleast_2d(request.ddq), request.covariance)
+    answer = known.predict(queries, np.atleast_2d(request.dq), np.atleast_2d(request.ddq), request.covariance)
     parts = {"tau": answer.tau, "tau_std": answer.tau_std}
     if answer.covariance is not None:
         parts["covariance"] = answer.covariance
@@ -74,7 +74,7 @@ def predict(service: Service, model: str, request: PredictRequest, served: Serve
         found[name] = shaped.tolist()
     prediction = _prediction(served, **found)
     if request.components:
-        prediction.components = components.answer(loaded, request)
+        prediction.components = components.answer(known, request)
     return prediction
 
 
@@ -108,28 +108,28 @@ class Measured:
         return served.has_learnt_from(self.id, self.sha256)
 
 
-def measured(service: Service, dataset: str, *versions: Served) -> Measured:
+def measured(loaded: LoadedModels, dataset: str, *versions: Served) -> Measured:
     """Read a data set for these versions; raise NotFoundError, or InvalidRequestError where it is of other joints."""
-    row = fitting(service, dataset, *versions)
-    used = store.samples(service.files, row, service.settings.max_evaluation_samples)
+    row = fitting(loaded, dataset, *versions)
+    used = store.samples(loaded.files, row, loaded.storage.settings.max_evaluation_samples)
     return Measured(row.id, row.sha256, row.rows, used)
 
 
-def held_out(service: Service, dataset: str, served: Served) -> Measured:
+def held_out(loaded: LoadedModels, dataset: str, served: Served) -> Measured:
     """Read what the training of a version has held out of a data set; as `measured`, and where it was nothing raise
     InvalidRequestError."""
-    row = fitting(service, dataset, served)
-    split = split_of(service, row, served)
+    row = fitting(loaded, dataset, served)
+    split = split_of(loaded, row, served)
     try:
-        used = store.samples(service.files, row, service.settings.max_evaluation_samples, split.held_out)
+        used = store.samples(loaded.files, row, loaded.storage.settings.max_evaluation_samples, split.held_out)
     except CannotHoldOutError as error:
         raise not_held_out(str(error)) from None
     return Measured(row.id, row.sha256, split.rows, used)
 
 
-def split_of(service: Service, row: DatasetRow, served: Served) -> SetSplit:
+def split_of(loaded: LoadedModels, row: DatasetRow, served: Served) -> SetSplit:
     """How a data set was split for a version; raise InvalidRequestError where nothing of it was held out."""
-    version = registry.find(service.database, served.name, served.version)
+    version = registry.find(loaded.database, served.name, served.version)
     split = holding_out.remembered(row, version.manifest["lineage"])
     if split is None:
         raise not_held_out(f"version {served.version} has held nothing out of data set {row.id}")
@@ -141,32 +141,34 @@ def not_held_out(why: str) -> InvalidRequestError:
     return invalid_request("part", "held_out", f"all, as {why}")
 
 
-def fitting(service: Service, dataset: str, *versions: Served) -> DatasetRow:
+def fitting(loaded: LoadedModels, dataset: str, *versions: Served) -> DatasetRow:
     """The row of a data set; raise NotFoundError, or InvalidRequestError where its joints or its torque convention are
     not those of these versions."""
-    row = store.find(service.database, dataset)
+    row = store.find(loaded.database, dataset)
     for served in versions:
-        loaded = served.model
-        if tuple(row.joint_names) != loaded.joint_names:
-            expected = f"the joints of the model, {list(loaded.joint_names)}"
+        known = served.model
+        if tuple(row.joint_names) != known.joint_names:
+            expected = f"the joints of the model, {list(known.joint_names)}"
             raise invalid_request("dataset", f"a data set with the joints {row.joint_names}", expected)
-        if row.torque_convention != loaded.torque_convention:
-            expected = f"that of the model, {loaded.torque_convention}"
+        if row.torque_convention != known.torque_convention:
+            expected = f"that of the model, {known.torque_convention}"
             raise invalid_request("dataset", f"a data set whose torque is {row.torque_convention}", expected)
     return row
 
 
-def evaluate(service: Service, model: str, request: EvaluateRequest, served: Served | None = None) -> EvaluateResponse:
+def evaluate(
+    loaded: LoadedModels, model: str, request: EvaluateRequest, served: Served | None = None
+) -> EvaluateResponse:
     """Compare a model with a data set or what it has held out of it; raise InvalidRequestError or NotFoundError.
 
     served: what answers, where that is found already.
     """
-    served = served or service.loaded.get(model, request.version, request.alias)
-    loaded = served.model
+    served = served or loaded.get(model, request.version, request.alias)
+    known = served.model
     whole = request.part == "all"
-    recorded = (measured if whole else held_out)(service, request.dataset, served)
+    recorded = (measured if whole else held_out)(loaded, request.dataset, served)
     used = recorded.used
-    answer = loaded.predict(used.q, used.dq, used.ddq)
+    answer = known.predict(used.q, used.dq, used.ddq)
     metrics = compare(used.tau, answer.tau, answer.tau_std, answer.noise_std)
     return EvaluateResponse(
         model=served.name,
@@ -174,7 +176,7 @@ def evaluate(service: Service, model: str, request: EvaluateRequest, served: Ser
         revision=served.revision,
         dataset=recorded.id,
         part=request.part,
-        joint_names=list(loaded.joint_names),
+        joint_names=list(known.joint_names),
         samples=recorded.samples,
         samples_used=len(used),
         level=metrics.level,

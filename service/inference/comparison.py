@@ -9,7 +9,6 @@ from lipcore import paired
 from lipcore.metrics import evaluate
 from lipcore.paired import Answer, Comparison, Difference
 from lipcore.samples import Array, Samples
-from service.context import Service
 from service.foundation.errors import invalid_request
 from service.inference.answer import measured
 from service.inference.comparison_schema import (
@@ -21,16 +20,16 @@ from service.inference.comparison_schema import (
     TotalDifference,
     VersionFigures,
 )
-from service.models.loaded import Served
+from service.models.loaded import LoadedModels, Served
 
 
-def compare(service: Service, model: str, request: CompareRequest) -> CompareResponse:
+def compare(loaded: LoadedModels, model: str, request: CompareRequest) -> CompareResponse:
     """Compare two versions; raise InvalidRequestError, NotFoundError, DamagedDataError or UnreadableVersionError.
 
     Not for the event loop.
     """
-    first, second = versions = _versions(service, model, request)
-    found = measured(service, request.dataset, *versions)
+    first, second = versions = _versions(loaded, model, request)
+    found = measured(loaded, request.dataset, *versions)
     answers = [_answer(each, found.used) for each in versions]
     compared = paired.compare(found.used, *answers)
     outcome, verdict = _verdict(first.version, second.version, compared)
@@ -58,9 +57,9 @@ def compare(service: Service, model: str, request: CompareRequest) -> CompareRes
     )
 
 
-def _versions(service: Service, model: str, request: CompareRequest) -> tuple[Served, Served]:
+def _versions(loaded: LoadedModels, model: str, request: CompareRequest) -> tuple[Served, Served]:
     first, second = (
-        service.loaded.get(model, named, None) if isinstance(named, int) else service.loaded.get(model, None, named)
+        loaded.get(model, named, None) if isinstance(named, int) else loaded.get(model, None, named)
         for named in request.versions
     )
     if first.version == second.version:

@@ -4,26 +4,29 @@ from __future__ import annotations
 
 from enum import Enum
 
-from anyio import to_thread
+from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Response
 from starlette.types import Scope
 
-from service.context import Service, ServiceDep
 from service.foundation.errors import (
     DamagedDataError,
     InvalidRequestError,
     NotFoundError,
     RevisionNotReachedError,
     TooLargeError,
+    UnreadableVersionError,
     responses,
 )
-from service.inference import answer, trace
+from service.inference import answer, comparison, trace
+from service.inference.comparison_schema import CompareRequest, CompareResponse
 from service.inference.schema import EvaluateRequest, EvaluateResponse, PredictRequest, PredictResponse
 from service.inference.trace_schema import TraceRequest, TraceResponse
 from service.inference.wire import decode, encode
+from service.models.loaded import LoadedModels, LoadedModelsDep
 from service.models.served import Served
 from service.models.waiting import reached
 from service.web.hot import Reply, hot_route
+from service.web.limits.turns import PredictionsDep
 from service.web.route import Route, is_json
 
 _ERRORS = responses(InvalidRequestError, NotFoundError, TooLargeError)
@@ -40,39 +43,42 @@ async def _answer(scope: Scope, body: bytes) -> Reply | None:
     query = decode(body) if is_json(scope) else None
     if query is None:
         return None
-    service: Service = scope["app"].state.service
+    state = scope["app"].state
+    loaded: LoadedModels = state.loaded
     model: str = scope["path_params"]["model"]
-    served, motion = service.loaded.hot(model, query.version, query.alias), query.single()
+    served, motion = loaded.hot(model, query.version, query.alias), query.single()
     if query.min_revision is not None:
-        served = await reached(service, model, query.version, query.alias, query.min_revision)
+        served = await reached(loaded, model, query.version, query.alias, query.min_revision)
     if served is not None and motion is not None:
-        at_once = answer.at_once(served, motion, service.settings.max_position)
+        at_once = answer.at_once(served, motion, loaded.storage.settings.max_position)
         if at_once is not None:
             return Reply(encode(at_once))
     request = query.request()
-    return None if request is None else Reply(await _in_thread(service, model, request, served))
+    return None if request is None else Reply(await _in_thread(loaded, state.turns.predictions, model, request, served))
 
 
-async def _in_thread(service: Service, model: str, request: PredictRequest, served: Served | None) -> bytes:
-    return await to_thread.run_sync(_encoded, service, model, request, served, limiter=service.predictions)
+async def _in_thread(
+    loaded: LoadedModels, turns: CapacityLimiter, model: str, request: PredictRequest, served: Served | None
+) -> bytes:
+    return await to_thread.run_sync(_encoded, loaded, model, request, served, limiter=turns)
 
 
-def _encoded(service: Service, model: str, request: PredictRequest, served: Served | None) -> bytes:
-    return encode(answer.predict(service, model, request, served))
+def _encoded(loaded: LoadedModels, model: str, request: PredictRequest, served: Served | None) -> bytes:
+    return encode(answer.predict(loaded, model, request, served))
 
 
-async def _wanted(service: Service, model: str, request: PredictRequest | EvaluateRequest) -> Served | None:
+async def _wanted(loaded: LoadedModels, model: str, request: PredictRequest | EvaluateRequest) -> Served | None:
     """The version that answers, where the request waits for a revision of it; None where it does not."""
     if request.min_revision is None:
         return None
-    return await reached(service, model, request.version, request.alias, request.min_revision)
+    return await reached(loaded, model, request.version, request.alias, request.min_revision)
 
 
-async def predict(service: ServiceDep, model: str, request: PredictRequest) -> Response:
+async def predict(loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: PredictRequest) -> Response:
     """Answer one query or a batch. Nothing is clipped; `tau_std` grows where the model knows little."""
     # a right query has been answered before: this reads the others, to say what is wrong, or in JSON of other dialects
-    served = await _wanted(service, model, request)
-    return Reply(await _in_thread(service, model, request, served)).response()
+    served = await _wanted(loaded, model, request)
+    return Reply(await _in_thread(loaded, turns, model, request, served)).response()
 
 
 hot.add_api_route(
@@ -87,18 +93,35 @@ hot.add_api_route(
 
 
 @router.post("/{model}/evaluate", summary="Compare a model with a data set", responses=_LATE)
-async def evaluate(service: ServiceDep, model: str, request: EvaluateRequest) -> EvaluateResponse:
+async def evaluate(
+    loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: EvaluateRequest
+) -> EvaluateResponse:
     """Error, coverage and density of the model's torques against measured ones, joint by joint."""
-    served = await _wanted(service, model, request)
-    return await to_thread.run_sync(answer.evaluate, service, model, request, served, limiter=service.predictions)
+    served = await _wanted(loaded, model, request)
+    return await to_thread.run_sync(answer.evaluate, loaded, model, request, served, limiter=turns)
 
 
 @router.post("/{model}/trace", summary="Follow a model along a data set", responses=responses(DamagedDataError))
-async def trace_model(service: ServiceDep, model: str, request: TraceRequest) -> TraceResponse:
+async def trace_model(
+    loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: TraceRequest
+) -> TraceResponse:
     """Measured torque beside the model's, row by row, for a plot: mean, both standard deviations and components.
 
     Where there are more rows than points, rows are chosen evenly. Each is shown as it was measured and predicted, and
     the share of them outside the interval is fair, but a peak between two of them is missing: ask for fewer rows to
     see all.
     """
-    return await to_thread.run_sync(trace.trace, service, model, request, limiter=service.predictions)
+    return await to_thread.run_sync(trace.trace, loaded, model, request, limiter=turns)
+
+
+@router.post(
+    "/{model}/compare",
+    summary="Compare two versions on a data set",
+    tags=["models"],
+    responses=responses(NotFoundError, UnreadableVersionError, DamagedDataError),
+)
+async def compare(
+    loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: CompareRequest
+) -> CompareResponse:
+    """Which of two versions predicts a data set better, joint by joint and over all, and whether that may be chance."""
+    return await to_thread.run_sync(comparison.compare, loaded, model, request, limiter=turns)

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from lipcore import dynamics
 from lipcore.motion import Motion
 from lipcore.samples import Array, Samples
-from service.context import Service
 from service.foundation.errors import invalid_request
 from service.inference import answer
 from service.inference.trace_schema import TraceComponent, TraceComponentValues, TraceRequest, TraceResponse
+from service.models.loaded import LoadedModels
 from service.models.served import Served
 from service.storage import sample_file
 from service.training.holding_out import CannotHoldOutError
@@ -22,24 +22,24 @@ from service.training.holding_out import CannotHoldOutError
 Rows = NDArray[np.int64]
 
 
-def trace(service: Service, model: str, request: TraceRequest) -> TraceResponse:
+def trace(loaded: LoadedModels, model: str, request: TraceRequest) -> TraceResponse:
     """Follow a model along a data set or what it has held out of it.
 
     Raise InvalidRequestError, NotFoundError or DamagedDataError. Not for the event loop.
     """
-    most = service.settings.max_trace_points
+    most = loaded.storage.settings.max_trace_points
     if request.points > most:
         raise invalid_request("points", request.points, f"at most {most}")
-    served = service.loaded.get(model, request.version, request.alias)
+    served = loaded.get(model, request.version, request.alias)
     offered = dynamics.available(served.model.estimator)
     _check(served, request.components, offered)
-    dataset = answer.fitting(service, request.dataset, served)
-    path = service.files.samples_file(dataset.id, dataset.sha256)
+    dataset = answer.fitting(loaded, request.dataset, served)
+    path = loaded.files.samples_file(dataset.id, dataset.sha256)
     episode, t = (sample_file.read_array(path, name) for name in ("episode", "t"))
     part = np.arange(len(t), dtype=np.int64)
     if request.part == "held_out":
         try:
-            part = np.flatnonzero(answer.split_of(service, dataset, served).held_out(episode, t)).astype(np.int64)
+            part = np.flatnonzero(answer.split_of(loaded, dataset, served).held_out(episode, t)).astype(np.int64)
         except CannotHoldOutError as error:
             raise answer.not_held_out(str(error)) from None
     chosen = _within(part, request, len(t))
@@ -65,7 +65,7 @@ def trace(service: Service, model: str, request: TraceRequest) -> TraceResponse:
         std=found.tau_std.tolist(),
         noise_std=found.noise_std.tolist(),
         offered=[name for name in get_args(TraceComponent) if name in offered],
-        components=_components(served, samples, request.components, service.settings.max_component_batch),
+        components=_components(served, samples, request.components, loaded.storage.settings.max_component_batch),
         in_training=request.part == "all" and served.has_learnt_from(dataset.id, dataset.sha256),
     )
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from fastapi import APIRouter
 from starlette.types import Scope
 
-from service.context import Service, ServiceDep
 from service.foundation.errors import (
     BusyError,
     ConflictError,
@@ -17,6 +16,7 @@ from service.foundation.errors import (
 from service.learning.errors import ExpiredError, LearningDisabledError
 from service.learning.ingest import wire
 from service.learning.schema import ObservationRequest, ObservationResponse
+from service.learning.updates import Updates, UpdatesDep
 from service.web.hot import Reply, hot_route
 from service.web.route import is_json
 
@@ -40,17 +40,17 @@ async def _answer(scope: Scope, body: bytes) -> Reply | None:
     """Take a batch that can be read as it stands."""
     if not is_json(scope):
         return None
-    service: Service = scope["app"].state.service
-    reply = await service.updates.threads.run(_decoded, service, scope["path_params"]["model"], body)
+    updates: Updates = scope["app"].state.updates
+    reply = await updates.threads.run(_decoded, updates, scope["path_params"]["model"], body)
     return None if reply is None else Reply(reply)
 
 
-def _decoded(service: Service, model: str, body: bytes) -> bytes | None:
+def _decoded(updates: Updates, model: str, body: bytes) -> bytes | None:
     request = wire.decode(body)
-    return None if request is None else service.updates.observe(model, request).model_dump_json().encode()
+    return None if request is None else updates.observe(model, request).model_dump_json().encode()
 
 
-async def observe(service: ServiceDep, model: str, request: ObservationRequest) -> ObservationResponse:
+async def observe(updates: UpdatesDep, model: str, request: ObservationRequest) -> ObservationResponse:
     """Take a batch of measured rows to learn from, durable once it is answered, and learnt within a moment.
 
     Each row is predicted before it is learnt. Rows that cannot be explained are kept and counted, but not learnt. Send
@@ -58,7 +58,7 @@ async def observe(service: ServiceDep, model: str, request: ObservationRequest) 
     stream; a robot whose clock was set goes on under another `stream_id`. Of joints in another order, say
     `joint_names`. Batches of about a tenth of a second to a second serve best.
     """
-    return await service.updates.threads.run(service.updates.observe, model, request)
+    return await updates.threads.run(updates.observe, model, request)
 
 
 hot.add_api_route(

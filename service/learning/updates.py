@@ -8,9 +8,11 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
-from service.foundation.settings import Settings
+from fastapi import Depends, Request
+
+from service.foundation.states import PartState
 from service.learning.ingest.frames import Frames, FramesResult, observe_frames
 from service.learning.ingest.intake import Ingest
 from service.learning.ingest.threads import IngestThreads
@@ -21,12 +23,13 @@ from service.learning.live.feed import Feed
 from service.learning.quality.monitor import Monitor
 from service.learning.schema import ObservationRequest, ObservationResponse
 from service.models.loaded import LoadedModels, Served
-from service.storage.database import Database
-from service.storage.disk import Disk
-from service.storage.files import Files
+from service.web.observability.readiness import Lasting
 
 __all__ = ["Frames", "FramesResult", "Status", "Updates"]
 logger = logging.getLogger(__name__)
+
+RESTART_S = 10.0
+"""Time in s within which a learner process that died should have been started again."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,9 @@ class Updates:
     be filled before the first batch comes.
     """
 
-    def __init__(self, settings: Settings, database: Database, files: Files, loaded: LoadedModels, disk: Disk) -> None:
+    def __init__(self, loaded: LoadedModels) -> None:
+        storage = loaded.storage
+        settings, database = storage.settings, storage.database
         self.settings, self.database, self.loaded = settings, database, loaded
         self.when_published: list[Callable[[Published], None]] = []
         self.when_contested: list[Callable[[Contested], None]] = []
@@ -55,8 +60,11 @@ class Updates:
         self._said: dict[tuple[str, int], Status] = {}
         self.learner = LearnerProcess(settings, self._hear)
         loaded.learn_from(self.learner.wake)
+        loaded.when_deleted.append(self.forget)
         self.live = Feed(settings)
-        self._ingest = Ingest(settings, database, loaded, self._monitor, self.learner.wake, disk, self.live.note)
+        self._ingest = Ingest(
+            settings, database, loaded, self._monitor, self.learner.wake, storage.disk, self.live.note
+        )
 
     def close(self) -> None:
         """Finish the batches that have begun, and end the learner process, which stores what it knows."""
@@ -101,6 +109,17 @@ class Updates:
             self._monitors.pop(model, None)
             self._said = {key: status for key, status in self._said.items() if key[0] != model}
 
+    def look(self, lasting: Lasting) -> tuple[PartState, str]:
+        """Whether the learner process runs where something learns, for readiness."""
+        if not self.learner.wanted:
+            return "ok", "not needed yet"
+        gone = lasting(self.learner.pid is None)
+        if gone is None:
+            return "ok", "runs"
+        if gone <= RESTART_S:
+            return "warning", "is being started"
+        return "failed", f"has not run for {gone:.0f} s: observations are stored, but not learnt"
+
     def status(self, model: str, version: int) -> Status:
         """What the learner process said last of a version."""
         with self._lock:
@@ -142,3 +161,11 @@ class Updates:
         revision = publication.read(message.path)
         self.loaded.revise(message.model, message.version, message.revision, revision)
         self._note(message, published=message, failed=None)
+
+
+async def _updates(request: Request) -> Updates:
+    found: Updates = request.app.state.updates
+    return found
+
+
+UpdatesDep = Annotated[Updates, Depends(_updates)]

@@ -5,23 +5,23 @@ from __future__ import annotations
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from service.context import Service
 from service.foundation.errors import ConflictError, invalid_request, not_found
 from service.models import moves, registry
 from service.models.alias_schema import Alias, AliasList, AliasMove, AliasRequest
+from service.models.loaded import LoadedModels
 from service.models.moves import SERVING
 from service.storage.database import AliasMoveRow, AliasRow, ModelRow, VersionRow
 
 
-def page(service: Service, model: str) -> AliasList:
+def page(loaded: LoadedModels, model: str) -> AliasList:
     """Every alias of a model, `serving` first; raise NotFoundError."""
-    with service.loaded.moving, service.database.session() as session:  # all of it as of one moment
+    with loaded.moving, loaded.database.session() as session:  # all of it as of one moment
         _check_model(session, model)
         names = list(session.scalars(select(AliasRow.alias).where(AliasRow.model == model).order_by(AliasRow.alias)))
-        return AliasList(items=[_show(service, session, model, name) for name in (SERVING, *names)])
+        return AliasList(items=[_show(loaded, session, model, name) for name in (SERVING, *names)])
 
 
-def put(service: Service, model: str, alias: str, request: AliasRequest) -> Alias:
+def put(loaded: LoadedModels, model: str, alias: str, request: AliasRequest) -> Alias:
     """Point an alias, a new one too, to a version.
 
     The version is in memory and warm before the alias moves: queries follow by one assignment, those in flight keep
@@ -31,40 +31,40 @@ def put(service: Service, model: str, alias: str, request: AliasRequest) -> Alia
     if (request.version is None) == (request.alias is None):
         found = "neither" if request.version is None else "both"
         raise invalid_request("version or alias", found, "exactly one of the two")
-    return _move(service, model, alias, service.loaded.get(model, request.version, request.alias).version)
+    return _move(loaded, model, alias, loaded.get(model, request.version, request.alias).version)
 
 
-def rollback(service: Service, model: str, alias: str) -> Alias:
+def rollback(loaded: LoadedModels, model: str, alias: str) -> Alias:
     """Take the last move of an alias back, its removal too, and the next time the one before it.
 
     Raise NotFoundError where there never was such an alias, ConflictError where it has pointed to nothing before, or to
     a version that has been deleted; UnreadableVersionError. Not for the event loop.
     """
-    with service.database.session() as session:
+    with loaded.database.session() as session:
         move = _last(session, model, alias)
         version = _before(session, move)
-    service.loaded.get(model, version)
-    return _move(service, model, alias, version, move)
+    loaded.get(model, version)
+    return _move(loaded, model, alias, version, move)
 
 
-def remove(service: Service, model: str, alias: str) -> None:
+def remove(loaded: LoadedModels, model: str, alias: str) -> None:
     """Remove an alias; raise NotFoundError, or ConflictError for `serving`. A rollback brings it back."""
-    with service.loaded.moving:
-        with service.database.transaction() as session:
+    with loaded.moving:
+        with loaded.database.transaction() as session:
             _check_model(session, model)
             if alias == SERVING:
                 raise ConflictError("the alias 'serving' is built in: it can be moved, and not be removed")
             if session.get(AliasRow, (model, alias)) is None:
                 raise not_found("alias", alias)
             moves.point(session, model, alias, None)
-        service.loaded.point(model, alias, None)
+        loaded.point(model, alias, None)
 
 
-def _move(service: Service, model: str, alias: str, version: int, taken_back: AliasMoveRow | None = None) -> Alias:
+def _move(loaded: LoadedModels, model: str, alias: str, version: int, taken_back: AliasMoveRow | None = None) -> Alias:
     """Move an alias to a version that is in memory; taken_back: the move that has to be the last one still."""
     number = None if taken_back is None else taken_back.seq
-    with service.loaded.moving:
-        with service.database.transaction() as session:
+    with loaded.moving:
+        with loaded.database.transaction() as session:
             _check_model(session, model)
             if not registry.exists(session, model, version):  # deleted since it was found
                 raise not_found("version", version)
@@ -73,14 +73,14 @@ def _move(service: Service, model: str, alias: str, version: int, taken_back: Al
             if alias == SERVING:
                 registry.serve(session, model, version, number)
             else:
-                _check_room(service, session, model, alias)
+                _check_room(loaded, session, model, alias)
                 moves.point(session, model, alias, version, number)
-            shown = _show(service, session, model, alias)
+            shown = _show(loaded, session, model, alias)
         if alias != SERVING:
-            service.loaded.point(model, alias, version)
+            loaded.point(model, alias, version)
     if alias == SERVING:
-        service.loaded.adopt(model)
-        service.updates.learner.wake(model)
+        loaded.adopt(model)
+        loaded.wake(model)
     return shown
 
 
@@ -109,14 +109,14 @@ def _check_model(session: Session, model: str) -> None:
         raise not_found("model", model)
 
 
-def _check_room(service: Service, session: Session, model: str, alias: str) -> None:
-    most = service.settings.max_aliases
+def _check_room(loaded: LoadedModels, session: Session, model: str, alias: str) -> None:
+    most = loaded.storage.settings.max_aliases
     if session.get(AliasRow, (model, alias)) is None and moves.count(session, model) >= most:
         raise ConflictError(f"model {model!r} has {most} aliases, the most it may have: remove one first")
 
 
-def _show(service: Service, session: Session, model: str, alias: str) -> Alias:
-    found = moves.history(session, model, alias, service.settings.max_alias_moves)
+def _show(loaded: LoadedModels, session: Session, model: str, alias: str) -> Alias:
+    found = moves.history(session, model, alias, loaded.storage.settings.max_alias_moves)
     if alias == SERVING:
         version = registry.answering(session, model)
         changed_at = found[0].at if found else session.get_one(VersionRow, (model, version)).created_at

@@ -15,12 +15,12 @@ from lipcore.arm.warning import warnings
 from lipcore.manifest import MANIFEST, ROBOT, TENSORS, Limits, ModelFormatError, read_manifest_bytes
 from lipcore.parameters import report
 from lipcore.probing import probe
-from service.context import Service
 from service.foundation.errors import InvalidDataError, invalid_data, problem
 from service.foundation.settings import Settings
 from service.models import archive, registry
 from service.models.archive import CHECKSUMS, EXPORT, ArchiveError
 from service.models.holdout_schema import HoldoutLineage
+from service.models.loaded import LoadedModels
 from service.models.schema import ModelName, Version
 from service.storage.database import LearnerRow, ServingRow, now
 from service.storage.files import new_id
@@ -77,13 +77,13 @@ class Lineage(BaseModel):
     holdout: HoldoutLineage | None = None
 
 
-def add(service: Service, upload: Path, name: str | None) -> Version:
+def add(loaded: LoadedModels, upload: Path, name: str | None) -> Version:
     """Make a new version of what an archive holds; return it. Not for the event loop.
 
     name: of the model, that of the archive by default. The version answers only where it is the model's first one: any
     other has to be chosen. Raise InvalidDataError naming the member that is wrong and what is wrong with it.
     """
-    settings = service.settings
+    settings = loaded.storage.settings
     files = _read(upload, settings)
     about = _about(files.pop(EXPORT))
     manifest = _checked(files, settings)
@@ -93,27 +93,27 @@ def add(service: Service, upload: Path, name: str | None) -> Version:
         "imported": [*manifest["lineage"].get("imported", []), {**about.model_dump(), "imported_at": now()}],
     }
     files[MANIFEST] = persistence.manifest_bytes(manifest)
-    service.disk.require(sum(map(len, files.values())))
+    loaded.storage.disk.require(sum(map(len, files.values())))
     folder = new_id("mv")
-    with service.files.new_version(folder) as target:
+    with loaded.files.new_version(folder) as target:
         persistence.write(target, files)
     try:
-        version, serves = _publish(service, model, folder, manifest)
+        version, serves = _publish(loaded, model, folder, manifest)
     except BaseException as error:
         if not undecided(error):
             with suppress(OSError):  # what cannot be deleted now is swept
-                service.files.delete_version(folder)
+                loaded.files.delete_version(folder)
         raise
     if serves:
-        service.loaded.adopt(model)
+        loaded.adopt(model)
     came_from = f"version {about.version} of {about.model}"
     logger.info("imported version %d of model %s, which was %s", version, model, came_from)
-    return registry.show_version(service.database, model, version)
+    return registry.show_version(loaded.database, model, version)
 
 
-def _publish(service: Service, model: str, folder: str, manifest: dict[str, Any]) -> tuple[int, bool]:
+def _publish(loaded: LoadedModels, model: str, folder: str, manifest: dict[str, Any]) -> tuple[int, bool]:
     """Add the version; return its number, and whether it answers where none is named."""
-    with service.database.transaction() as session:
+    with loaded.database.transaction() as session:
         version = registry.publish(session, model, folder, manifest, None, candidate=True)
         serving = session.get(ServingRow, model)
         serves = serving is not None and serving.version == version

@@ -8,7 +8,6 @@ from anyio import to_thread
 from fastapi import APIRouter, Query, Request, Response, status
 from fastapi.responses import StreamingResponse
 
-from service.context import ServiceDep
 from service.foundation.errors import (
     InvalidDataError,
     InvalidRequestError,
@@ -21,7 +20,9 @@ from service.foundation.errors import (
 from service.models import archive_import, urdf
 from service.models.archive import MEDIA_TYPE
 from service.models.export import export
+from service.models.loaded import LoadedModelsDep
 from service.models.schema import AliasName, ModelName, Version, VersionNumber
+from service.web.limits.turns import ArchivesDep
 from service.web.limits.upload import Kinds, receive_to
 from service.web.route import Route
 
@@ -60,14 +61,15 @@ router = APIRouter(prefix="/v1/models", tags=["models"], responses=responses(Inv
 async def import_version(
     request: Request,
     response: Response,
-    service: ServiceDep,
+    loaded: LoadedModelsDep,
+    turns: ArchivesDep,
     name: Annotated[ModelName | None, Query(description="Name of the model; that of the archive by default")] = None,
 ) -> Version:
     """Check an archive and make a new version of it, which answers where the model had none."""
-    path = service.files.upload()
+    path = loaded.files.upload()
     try:
-        await receive_to(request, path, KINDS, service.disk)
-        version = await to_thread.run_sync(archive_import.add, service, path, name, limiter=service.archives)
+        await receive_to(request, path, KINDS, loaded.storage.disk)
+        version = await to_thread.run_sync(archive_import.add, loaded, path, name, limiter=turns)
     finally:
         path.unlink(missing_ok=True)
     response.headers["Location"] = f"/v1/models/{version.model}/versions/{version.version}"
@@ -84,14 +86,15 @@ async def import_version(
     },
 )
 async def export_version(
-    service: ServiceDep,
+    loaded: LoadedModelsDep,
+    turns: ArchivesDep,
     model: str,
     version: WhichVersion = None,
     alias: WhichAlias = None,
     learnt: Annotated[bool, Query(description="With what it has learnt online; false: as it was trained")] = True,
 ) -> StreamingResponse:
     """One archive with all that another service needs to answer alike; `export.json` in it says what it holds."""
-    found = await to_thread.run_sync(export, service, model, version, alias, learnt, limiter=service.archives)
+    found = await to_thread.run_sync(export, loaded, model, version, alias, learnt, limiter=turns)
     headers = {"Content-Length": str(found.size), "Content-Disposition": f'attachment; filename="{found.name}"'}
     return StreamingResponse(found.pieces, media_type=MEDIA_TYPE, headers=headers)
 
@@ -108,12 +111,14 @@ async def export_version(
         },
     },
 )
-def version_urdf(service: ServiceDep, model: str, version: WhichVersion = None, alias: WhichAlias = None) -> Response:
+def version_urdf(
+    loaded: LoadedModelsDep, model: str, version: WhichVersion = None, alias: WhichAlias = None
+) -> Response:
     """Links, joints, physically possible masses and friction, as they were trained, for simulators and planners.
 
     Of estimators with rigid bodies whose geometry is known; the others answer 422. Comments in the text say what a URDF
     has no place for, and what torque does not tell.
     """
-    name, text = urdf.write(service, model, version, alias)
+    name, text = urdf.write(loaded, model, version, alias)
     headers = {"Content-Disposition": f'attachment; filename="{name}"'}
     return Response(text, media_type=urdf.MEDIA_TYPE, headers=headers)

@@ -9,10 +9,10 @@ from contextlib import contextmanager
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
-from service.context import Service
 from service.foundation.errors import ConflictError, not_found
 from service.foundation.states import ACTIVE
 from service.models import moves, registry
+from service.models.loaded import LoadedModels
 from service.storage.database import (
     AlarmRow,
     AliasMoveRow,
@@ -37,14 +37,14 @@ OF_MODEL = (AliasMoveRow, AliasRow, ServingRow, LearnerRow, LearningRow, StreamR
 """Tables of what belongs to a model, beside its versions. Jobs and data sets keep their history."""
 
 
-def delete_version(service: Service, model: str, version: int) -> None:
+def delete_version(loaded: LoadedModels, model: str, version: int) -> None:
     """Delete a version for good; its number is not given again. Not for the event loop.
 
     Raise NotFoundError; ConflictError, naming the reason, while an alias points to it, it serves, it is compared with
     the one that serves, or a job trains it anew.
     """
-    with service.loaded.moving:
-        with service.database.transaction() as session:
+    with loaded.moving:
+        with loaded.database.transaction() as session:
             row = session.get(VersionRow, (model, version))
             if row is None:
                 known = session.scalar(select(ModelRow.name).where(ModelRow.name == model))
@@ -55,20 +55,20 @@ def delete_version(service: Service, model: str, version: int) -> None:
             session.execute(delete(SnapshotRow).where(*of_version))
             session.execute(delete(LearnerRow).where(LearnerRow.model == model, LearnerRow.version == version))
             session.delete(row)
-        service.loaded.forget(model, [version])
-    _remove_files(service.files, [row.folder], snapshots)
-    service.updates.learner.wake(model)
+        loaded.forget(model, [version])
+    _remove_files(loaded.files, [row.folder], snapshots)
+    loaded.wake(model)
     logger.info("deleted version %d of model %s", version, model)
 
 
-def delete_model(service: Service, model: str) -> None:
+def delete_model(loaded: LoadedModels, model: str) -> None:
     """Delete a model with its versions, aliases, log, streams, snapshots and alarms. Not for the event loop.
 
     A model that is trained later under the same name goes on with the numbers of versions. Raise NotFoundError, or
     ConflictError while a job of the model waits or runs.
     """
-    with service.loaded.moving:
-        with service.database.transaction() as session:
+    with loaded.moving:
+        with loaded.database.transaction() as session:
             row = session.scalar(select(ModelRow).where(ModelRow.name == model))
             if row is None:
                 raise not_found("model", model)
@@ -81,10 +81,9 @@ def delete_model(service: Service, model: str) -> None:
                 session.execute(delete(table).where(table.model == model))
             session.execute(delete(VersionRow).where(VersionRow.model == model))
             session.execute(delete(ModelRow).where(ModelRow.name == model))
-        service.loaded.forget(model, [each.version for each in versions], whole=True)
-    service.updates.forget(model)
-    _remove_files(service.files, [each.folder for each in versions], snapshots)
-    service.updates.learner.wake(model)
+        loaded.forget(model, [each.version for each in versions], whole=True)
+    _remove_files(loaded.files, [each.folder for each in versions], snapshots)
+    loaded.wake(model)
     logger.info("deleted model %s with %d versions", model, len(versions))
 
 

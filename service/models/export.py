@@ -11,12 +11,11 @@ from typing import Any
 
 from lipcore import persistence
 from lipcore.manifest import MANIFEST, TENSORS, ModelFormatError
-from service.context import Service
 from service.foundation.errors import UnreadableVersionError, invalid_request, not_found
-from service.learning.learner import learnt as learning
 from service.models import archive, registry
 from service.models.archive import CHECKSUMS, EXPORT, Part
 from service.models.lineage import software
+from service.models.loaded import LoadedModels
 from service.models.moves import SERVING
 from service.storage.database import VersionRow, now
 
@@ -30,18 +29,18 @@ class Exported:
     pieces: Iterator[bytes]
 
 
-def export(service: Service, model: str, version: int | None, alias: str | None, learnt: bool) -> Exported:
+def export(loaded: LoadedModels, model: str, version: int | None, alias: str | None, learnt: bool) -> Exported:
     """Archive a version, the one that serves where none is named. Not for the event loop.
 
     learnt: with what it has learnt online, else as trained. Nothing is sent before all of it has been checked. Raise
     NotFoundError, InvalidRequestError for both a version and an alias, UnreadableVersionError for damaged files,
     StorageFullError.
     """
-    row = find(service, model, version, alias)
+    row = find(loaded, model, version, alias)
     try:
-        files, revision = _files(service, row, learnt)
+        files, revision = _files(loaded, row, learnt)
     except ModelFormatError as error:
-        registry.find(service.database, row.model, row.version)  # it may have been deleted meanwhile
+        registry.find(loaded.database, row.model, row.version)  # it may have been deleted meanwhile
         message = f"version {row.version} of model {row.model!r} cannot be exported: {error}"
         raise UnreadableVersionError(message) from error
     about = {
@@ -59,12 +58,12 @@ def export(service: Service, model: str, version: int | None, alias: str | None,
     sums = {name: persistence.sha256(content) for name, content in files.items()}
     parts = [Part(name, len(content), content) for name, content in {CHECKSUMS: _json(sums), **files}.items()]
     size = archive.size(parts)
-    kept = [_on_disk(service, each) if each.name == TENSORS else each for each in parts]
+    kept = [_on_disk(loaded, each) if each.name == TENSORS else each for each in parts]
     suffix = f"-r{revision}" if revision else ""
     return Exported(f"{row.model}-v{row.version}{suffix}.tar", size, archive.stream(kept))
 
 
-def find(service: Service, model: str, version: int | None, alias: str | None) -> VersionRow:
+def find(loaded: LoadedModels, model: str, version: int | None, alias: str | None) -> VersionRow:
     """Return the version of a number or of an alias, the one that serves where both are None.
 
     Raise NotFoundError, InvalidRequestError for both.
@@ -72,21 +71,21 @@ def find(service: Service, model: str, version: int | None, alias: str | None) -
     if version is not None and alias is not None:
         raise invalid_request("version or alias", "both", "one of the two at most")
     if alias is not None:
-        version = service.loaded.newest(model, alias)
+        version = loaded.newest(model, alias)
         if version is None and alias != SERVING:
-            registry.find(service.database, model, None)  # that there is no such model is said first
+            registry.find(loaded.database, model, None)  # that there is no such model is said first
             raise not_found("alias", alias)
-    return registry.find(service.database, model, version)
+    return registry.find(loaded.database, model, version)
 
 
-def _files(service: Service, row: VersionRow, learnt: bool) -> tuple[dict[str, bytes], int]:
+def _files(loaded: LoadedModels, row: VersionRow, learnt: bool) -> tuple[dict[str, bytes], int]:
     """The files of a version by name, checked, and the revision that they are of: 0 as trained."""
-    files = service.files.read_version(row.folder, lambda folder: _checked(folder, row))
+    files = loaded.files.read_version(row.folder, lambda folder: _checked(folder, row))
     if not learnt:
         return files, 0
-    served = service.loaded.hot(row.model, row.version)
+    served = loaded.hot(row.model, row.version)
     base = persistence.decode(files) if served is None else served.base
-    known = learning.consolidated(service.database, service.files, row.model, row.version, base)
+    known = loaded.learnt.consolidated(row.model, row.version, base)
     if known is None:
         return files, 0
     lineage = {**row.manifest["lineage"], "learnt": _learnt(row, known.revision)}
@@ -108,11 +107,11 @@ def _learnt(row: VersionRow, revision: int) -> dict[str, Any]:
     return found if earlier is None else {**found, "before": earlier}
 
 
-def _on_disk(service: Service, part: Part) -> Part:
+def _on_disk(loaded: LoadedModels, part: Part) -> Part:
     """A part whose content waits on disk, in a file without a name, for a client that may be slow."""
     assert isinstance(part.content, bytes)
-    service.disk.require(part.size)
-    file = tempfile.TemporaryFile(dir=service.files.uploads)  # noqa: SIM115 - closed by who reads it
+    loaded.storage.disk.require(part.size)
+    file = tempfile.TemporaryFile(dir=loaded.files.uploads)  # noqa: SIM115 - closed by who reads it
     try:
         file.write(part.content)
         file.flush()

@@ -8,22 +8,24 @@ import logging
 import threading
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
+from typing import Annotated
 from weakref import WeakValueDictionary
 
 import numpy as np
+from fastapi import Depends, Request
 
 import lipcore
 from lipcore.model import TorqueModel
 from lipcore.online.revision import Revision
 from service.foundation.errors import NotFoundError, UnreadableVersionError, not_found
-from service.learning.learner import learnt as learning
+from service.foundation.states import PartState
 from service.models import moves, registry
 from service.models.lineage import learnt_from
 from service.models.registry import Serving
-from service.models.served import Alias, Key, Served, Snapshot
+from service.models.served import Alias, Key, LearntStates, Served, Snapshot
 from service.models.waiting import Waiting
-from service.storage.database import Database, VersionRow
-from service.storage.files import Files
+from service.storage.database import VersionRow
+from service.storage.storage import Storage
 
 logger = logging.getLogger(__name__)
 
@@ -31,23 +33,28 @@ __all__ = ["LoadedModels", "Served"]
 
 
 class LoadedModels:
-    """Cache of loaded versions; safe to share between threads. The least recently used are dropped beyond `capacity`.
+    """Cache of loaded versions; safe to share between threads. The least recently used are dropped beyond `capacity`, a
+    setting.
 
     A version becomes the one that answers once it is in memory and warm, by one assignment: queries in flight keep
     theirs, and none waits. So does a revision of it. An alias moves in the same way.
 
-    moving: held while an alias is moved or a version deleted, in the database and then here, one at a time.
-    waiting: who waits for a model to answer otherwise.
+    learnt: knows what versions have learnt. moving: held while an alias is moved or a version deleted, in the database
+    and then here, one at a time. waiting: who waits for a model to answer otherwise. when_deleted: called with the name
+    of a model that is gone.
     """
 
-    def __init__(self, database: Database, files: Files, capacity: int) -> None:
-        self.database, self.files, self.capacity = database, files, capacity
+    def __init__(self, storage: Storage, learnt: LearntStates, capacity: int | None = None) -> None:
+        self.storage, self.learnt = storage, learnt
+        self.database, self.files = storage.database, storage.files
+        self.capacity = storage.settings.max_loaded_models if capacity is None else capacity
+        self.when_deleted: list[Callable[[str], None]] = []
         self._lagging: set[str] = set()
         self._wake: Callable[[str], None] = self._lagging.add
         self._revisions: dict[Key, tuple[int, Revision]] = {}
         self._held: WeakValueDictionary[Key, Served] = WeakValueDictionary()  # by streams too, after they are dropped
         self._revising = threading.Lock()
-        self._snapshot = Snapshot(aliases=moves.pointers(database))
+        self._snapshot = Snapshot(aliases=moves.pointers(storage.database))
         self._deleted: set[Key] = set()
         self._lock = threading.Lock()
         self.moving = threading.Lock()
@@ -147,6 +154,9 @@ class LoadedModels:
                 self._used.pop(key, None)
                 self._unreadable.pop(key, None)
         self.waiting.tell(model)
+        if whole:
+            for tell in self.when_deleted:
+                tell(model)
 
     def announce(self, models: Collection[str]) -> None:
         """Answer for these models with the versions that now serve. Not for the event loop."""
@@ -177,6 +187,14 @@ class LoadedModels:
         """Versions that are in memory; asking does not count as using them."""
         return self._snapshot.served.keys()
 
+    def look(self, lasting: object = None) -> tuple[PartState, str]:
+        """Whether the versions that serve can be read, for readiness."""
+        lost, models = registry.lost(self.database, self.files, self.versions(), self.unreadable())
+        if not lost:
+            return "ok", f"{models} can be read"
+        state: PartState = "failed" if lost == models else "warning"
+        return state, f"{lost} of {models} cannot be read: `lipserve verify` names them"
+
     def unreadable(self) -> dict[Key, str]:
         """Versions that could not be read when they were last asked for, and why."""
         return dict(self._unreadable)
@@ -189,6 +207,10 @@ class LoadedModels:
         self._wake = wake
         while self._lagging:
             wake(self._lagging.pop())
+
+    def wake(self, model: str) -> None:
+        """Have the learner look at a model: its log, or the roles of its versions, may have changed."""
+        self._wake(model)
 
     def revise(self, name: str, version: int, revision: int, learnt: Revision) -> bool:
         """Answer with what a version has learnt, from now on or once it is loaded; return whether that changed answers.
@@ -257,7 +279,7 @@ class LoadedModels:
             revision, learnt = published
             return replace(served, model=_warm(learnt.apply(base)), revision=revision)
         try:
-            known = learning.find(self.database, self.files, row.model, row.version, base)
+            known = self.learnt.find(row.model, row.version, base)
         except Exception:  # whoever asks is answered all the same, by the version as trained, and told its revision
             logger.exception("what version %d of model %r has learnt is not known", row.version, row.model)
             return served
@@ -306,3 +328,11 @@ def _warm(model: TorqueModel) -> TorqueModel:
     """The model after an answer, which brings its arrays into memory."""
     model.answer(np.zeros((3, model.n_joints)))
     return model
+
+
+async def _loaded(request: Request) -> LoadedModels:
+    found: LoadedModels = request.app.state.loaded
+    return found
+
+
+LoadedModelsDep = Annotated[LoadedModels, Depends(_loaded)]

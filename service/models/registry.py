@@ -252,3 +252,19 @@ def _show(session: Session, row: ModelRow) -> Model:
             for v in versions
         ],
     )
+
+
+def lost(
+    database: Database, files: Files, held: Collection[tuple[str, int]], damaged: Collection[tuple[str, int]]
+) -> tuple[int, int]:
+    """How many models have a version that serves and cannot be read, and how many there are.
+
+    held: versions in memory, which answer whatever their files are; damaged: those whose files could not be read.
+    """
+    with database.session() as session:
+        names = list(session.scalars(select(ModelRow.name)))
+        rows = session.execute(select(VersionRow.model, VersionRow.version, VersionRow.folder))
+        folders = {(model, version): folder for model, version, folder in rows}
+    serves = {(model, each.version) for model, each in serving(database, names).items()}
+    gone = [key for key in serves - set(held) if key in damaged or not files.has_version(folders.get(key, ""))]
+    return len(gone), len(names)

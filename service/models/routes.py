@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from anyio import to_thread
 from fastapi import APIRouter, Path, status
 
-from service.context import ServiceDep
 from service.foundation.errors import (
     ConflictError,
-    DamagedDataError,
     InvalidRequestError,
     NotFoundError,
     UnreadableVersionError,
     responses,
 )
-from service.inference import comparison
-from service.inference.comparison_schema import CompareRequest, CompareResponse
 from service.models import aliases, deletion, registry
 from service.models.alias_schema import Alias, AliasList, AliasRequest
+from service.models.loaded import LoadedModelsDep
 from service.models.schema import AliasName, Model, ModelPage, Version, VersionNumber
 from service.web.pagination import PageQuery
 from service.web.route import Route
@@ -29,25 +25,25 @@ AliasPath = Annotated[AliasName, Path(description="`serving`, or a name of your 
 
 
 @router.get("", summary="List models, newest first")
-def list_models(service: ServiceDep, page: PageQuery) -> ModelPage:
+def list_models(loaded: LoadedModelsDep, page: PageQuery) -> ModelPage:
     """One page of models with their versions."""
-    found = registry.page(service.database, page)
-    service.loaded.announce([item.name for item in found.items])
+    found = registry.page(loaded.database, page)
+    loaded.announce([item.name for item in found.items])
     return found
 
 
 @router.get("/{model}", summary="One model and its versions", responses=responses(NotFoundError))
-def show(service: ServiceDep, model: str) -> Model:
+def show(loaded: LoadedModelsDep, model: str) -> Model:
     """Which versions there are and which one answers."""
-    found = registry.show(service.database, model)
-    service.loaded.announce([found.name])
+    found = registry.show(loaded.database, model)
+    loaded.announce([found.name])
     return found
 
 
 @router.get("/{model}/versions/{version}", summary="One version", responses=responses(NotFoundError))
-def show_version(service: ServiceDep, model: str, version: VersionNumber) -> Version:
+def show_version(loaded: LoadedModelsDep, model: str, version: VersionNumber) -> Version:
     """Joints, noise, training range, options, what the fit reported, and the data it came from."""
-    return registry.show_version(service.database, model, version)
+    return registry.show_version(loaded.database, model, version)
 
 
 @router.delete(
@@ -56,10 +52,10 @@ def show_version(service: ServiceDep, model: str, version: VersionNumber) -> Ver
     summary="Delete a version",
     responses=responses(NotFoundError, ConflictError),
 )
-def delete_version(service: ServiceDep, model: str, version: VersionNumber) -> None:
-    """Delete a version that nothing needs: no alias, not the service, no contest and no job. Its number is not given
+def delete_version(loaded: LoadedModelsDep, model: str, version: VersionNumber) -> None:
+    """Delete a version that nothing needs: no alias, not the loaded, no contest and no job. Its number is not given
     again."""
-    deletion.delete_version(service, model, version)
+    deletion.delete_version(loaded, model, version)
 
 
 @router.delete(
@@ -68,15 +64,15 @@ def delete_version(service: ServiceDep, model: str, version: VersionNumber) -> N
     summary="Delete a model",
     responses=responses(NotFoundError, ConflictError),
 )
-def delete_model(service: ServiceDep, model: str) -> None:
+def delete_model(loaded: LoadedModelsDep, model: str) -> None:
     """Delete a model with its versions, aliases and all that it has observed and learnt. Jobs and data sets stay."""
-    deletion.delete_model(service, model)
+    deletion.delete_model(loaded, model)
 
 
 @router.get("/{model}/aliases", summary="List the aliases of a model", responses=responses(NotFoundError))
-def list_aliases(service: ServiceDep, model: str) -> AliasList:
+def list_aliases(loaded: LoadedModelsDep, model: str) -> AliasList:
     """Where each points, since when, and where it pointed before. `serving` is the version that answers by default."""
-    return aliases.page(service, model)
+    return aliases.page(loaded, model)
 
 
 @router.put(
@@ -84,9 +80,9 @@ def list_aliases(service: ServiceDep, model: str) -> AliasList:
     summary="Point an alias to a version",
     responses=responses(NotFoundError, ConflictError, UnreadableVersionError),
 )
-def put_alias(service: ServiceDep, model: str, alias: AliasPath, request: AliasRequest) -> Alias:
+def put_alias(loaded: LoadedModelsDep, model: str, alias: AliasPath, request: AliasRequest) -> Alias:
     """Make or move an alias. The version is loaded first: queries follow in one step, and none fails or waits."""
-    return aliases.put(service, model, alias, request)
+    return aliases.put(loaded, model, alias, request)
 
 
 @router.delete(
@@ -95,9 +91,9 @@ def put_alias(service: ServiceDep, model: str, alias: AliasPath, request: AliasR
     summary="Remove an alias",
     responses=responses(NotFoundError, ConflictError),
 )
-def remove_alias(service: ServiceDep, model: str, alias: AliasPath) -> None:
+def remove_alias(loaded: LoadedModelsDep, model: str, alias: AliasPath) -> None:
     """Remove an alias; the version stays, and a rollback brings the alias back. `serving` cannot be removed."""
-    aliases.remove(service, model, alias)
+    aliases.remove(loaded, model, alias)
 
 
 @router.post(
@@ -105,16 +101,6 @@ def remove_alias(service: ServiceDep, model: str, alias: AliasPath) -> None:
     summary="Point an alias to where it pointed before",
     responses=responses(NotFoundError, ConflictError, UnreadableVersionError),
 )
-def rollback_alias(service: ServiceDep, model: str, alias: AliasPath) -> Alias:
+def rollback_alias(loaded: LoadedModelsDep, model: str, alias: AliasPath) -> Alias:
     """Take back the last move, the next time the one before it, and so on."""
-    return aliases.rollback(service, model, alias)
-
-
-@router.post(
-    "/{model}/compare",
-    summary="Compare two versions on a data set",
-    responses=responses(NotFoundError, UnreadableVersionError, DamagedDataError),
-)
-async def compare(service: ServiceDep, model: str, request: CompareRequest) -> CompareResponse:
-    """Which of two versions predicts a data set better, joint by joint and over all, and whether that may be chance."""
-    return await to_thread.run_sync(comparison.compare, service, model, request, limiter=service.predictions)
+    return aliases.rollback(loaded, model, alias)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Protocol
 
 from lipcore.model import TorqueModel
 from service.models.moves import SERVING
@@ -40,6 +41,26 @@ class Served:
         """Standard deviation of the measured torque around the function, (n,) N·m, as answers carry it."""
         found: list[float] = self.model.noise_std.tolist()
         return found
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """A version as trained and what it has learnt since: the model at a revision. behind: whether the log holds more
+    than that."""
+
+    model: TorqueModel
+    revision: int
+    behind: bool
+
+
+class LearntStates(Protocol):
+    """Knows what versions have learnt; each answer is None where that is nothing. base: the version as trained."""
+
+    def find(self, model: str, version: int, base: TorqueModel) -> Learnt | None:
+        """As much of it as takes no time."""
+
+    def consolidated(self, model: str, version: int, base: TorqueModel) -> Learnt | None:
+        """All of it, as a model that can be saved: it takes the time to learn what came since the last snapshot."""
 
 
 @dataclass(frozen=True)

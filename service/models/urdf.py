@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from lipcore.arm.urdf_writer import urdf_of_parameters
-from service.context import Service
 from service.foundation.errors import InvalidRequestError, problem
 from service.models.export import find
+from service.models.loaded import LoadedModels
 
 MEDIA_TYPE = "application/xml"
 EXAMPLE = """<?xml version="1.0"?>
@@ -30,12 +30,12 @@ EXAMPLE = """<?xml version="1.0"?>
 """
 
 
-def write(service: Service, model: str, version: int | None, alias: str | None) -> tuple[str, str]:
+def write(loaded: LoadedModels, model: str, version: int | None, alias: str | None) -> tuple[str, str]:
     """The name of a file and the URDF that belongs in it, of the version that serves where none is named.
 
     Raise NotFoundError, InvalidRequestError for both a version and an alias, and for a version without an arm.
     """
-    row = find(service, model, version, alias)
+    row = find(loaded, model, version, alias)
     name, manifest = f"{row.model}-v{row.version}", row.manifest
     try:
         text = urdf_of_parameters(

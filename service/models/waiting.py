@@ -13,7 +13,7 @@ from anyio import to_thread
 from service.foundation.errors import RevisionNotReachedError, problem
 
 if TYPE_CHECKING:
-    from service.context import Service
+    from service.models.loaded import LoadedModels
     from service.models.served import Served
 
 AGAIN = {"Retry-After": "1"}
@@ -66,13 +66,13 @@ class Waiting:
                     del self._waiters[model]
 
 
-async def reached(service: Service, model: str, version: int | None, alias: str | None, revision: int) -> Served:
+async def reached(loaded: LoadedModels, model: str, version: int | None, alias: str | None, revision: int) -> Served:
     """Return the version that answers once it has a revision, or a later one. For the event loop, which goes on.
 
     Raise RevisionNotReachedError after `min_revision_wait_s`; NotFoundError or UnreadableVersionError at once.
     """
-    loaded, loop = service.loaded, asyncio.get_running_loop()
-    until, asked = loop.time() + service.settings.min_revision_wait_s, False
+    loop = asyncio.get_running_loop()
+    until, asked = loop.time() + loaded.storage.settings.min_revision_wait_s, False
     with loaded.waiting.waiter(model) as waiter:
         while True:
             served = loaded.hot(model, version, alias)
@@ -81,7 +81,7 @@ async def reached(service: Service, model: str, version: int | None, alias: str 
             if served.revision >= revision:
                 return served
             if not asked:  # whoever has logged what is missing may have told nobody yet
-                service.updates.learner.wake(model)
+                loaded.wake(model)
                 asked = True
             left = until - loop.time()
             if left <= 0:

@@ -9,12 +9,13 @@ from fastapi import APIRouter, Request, Response
 from starlette.types import Scope
 
 from service import __version__
-from service.context import Service, ServiceDep
+from service.models.loaded import LoadedModels
 from service.oip import answer, versions, wire
 from service.oip.openapi import MODEL, VERSION, failures, infer_answer, infer_body
 from service.oip.schema import BINARY, ModelMetadata, ModelReady, ServerLive, ServerMetadata, ServerReady
 from service.web import health
 from service.web.hot import Reply, hot_route
+from service.web.observability.readiness import ReadinessDep
 from service.web.route import Route
 
 SMALL = 16 * 1024
@@ -41,9 +42,9 @@ async def live() -> ServerLive:
 
 
 @router.get("/health/ready", summary="Can the server answer?", responses=failures(503))
-def ready(service: ServiceDep) -> ServerReady:
+def ready(readiness: ReadinessDep) -> ServerReady:
     """Answer once the models are loaded and while the database answers."""
-    health.ready(service)
+    health.ready(readiness)
     return ServerReady()
 
 
@@ -63,10 +64,11 @@ def ready(service: ServiceDep) -> ServerReady:
 )
 async def model_metadata(request: Request) -> ModelMetadata:
     """Inputs that a request brings, outputs that it may ask for, and the versions there are."""
-    service: Service = request.app.state.service
+    loaded: LoadedModels = request.app.state.loaded
+    turns = request.app.state.turns.predictions
     where = request.path_params
-    served = await versions.find(service, where["model"], where.get("version"))
-    return await to_thread.run_sync(versions.metadata, service, served)
+    served = await versions.find(loaded, turns, where["model"], where.get("version"))
+    return await to_thread.run_sync(versions.metadata, loaded, served)
 
 
 @router.get(
@@ -83,18 +85,19 @@ async def model_metadata(request: Request) -> ModelMetadata:
 )
 async def model_ready(request: Request) -> ModelReady:
     """Answer once the version is in memory; it is loaded if it is not."""
-    service: Service = request.app.state.service
+    loaded: LoadedModels = request.app.state.loaded
+    turns = request.app.state.turns.predictions
     where = request.path_params
-    served = await versions.ready(service, where["model"], where.get("version"))
+    served = await versions.ready(loaded, turns, where["model"], where.get("version"))
     return ModelReady(name=served.name)
 
 
 async def _answer(scope: Scope, body: bytes) -> Reply:
     """Answer any request, a wrong one with the error that it raises: one query here, all else in a thread."""
-    service: Service = scope["app"].state.service
-    limiter, settings = service.predictions, service.settings
+    loaded: LoadedModels = scope["app"].state.loaded
+    limiter, settings = scope["app"].state.turns.predictions, loaded.storage.settings
     headers, where = scope["headers"], scope["path_params"]
-    served = await versions.find(service, where["model"], where.get("version"))
+    served = await versions.find(loaded, limiter, where["model"], where.get("version"))
     if len(body) > SMALL:
         return await to_thread.run_sync(answer.infer, served, body, headers, settings, limiter=limiter)
     message = wire.decode(body, headers)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 
-from anyio import to_thread
+from anyio import CapacityLimiter, to_thread
 
 from lipcore.model import TorqueModel
-from service.context import Service
 from service.foundation.errors import NotFoundError, NotReadyError, UnreadableVersionError, problem, sentence
 from service.models import registry
-from service.models.loaded import Served
+from service.models.loaded import LoadedModels, Served
 from service.models.schema import ALIAS
 from service.oip.outputs import FORWARD, shapes
 from service.oip.schema import INPUTS, TORQUE, ModelMetadata, TensorMetadata
@@ -18,27 +17,27 @@ from service.oip.schema import INPUTS, TORQUE, ModelMetadata, TensorMetadata
 _LISTED = 20
 
 
-async def find(service: Service, name: str, version: str | None) -> Served:
+async def find(loaded: LoadedModels, turns: CapacityLimiter, name: str, version: str | None) -> Served:
     """Return a version by its number or an alias, the one that serves where None, loaded if need be.
 
-    Raise NotFoundError naming those there are.
+    turns: of what loads. Raise NotFoundError naming those there are.
     """
     number, alias = (None, None) if version is None else _meant(version)
-    found = service.loaded.hot(name, number, alias)
+    found = loaded.hot(name, number, alias)
     if found is not None:
         return found
-    return await to_thread.run_sync(_load, service, name, version, number, alias, limiter=service.predictions)
+    return await to_thread.run_sync(_load, loaded, name, version, number, alias, limiter=turns)
 
 
-async def ready(service: Service, name: str, version: str | None) -> Served:
+async def ready(loaded: LoadedModels, turns: CapacityLimiter, name: str, version: str | None) -> Served:
     """Like `find`, but raise NotReadyError where the version cannot be loaded."""
     try:
-        return await find(service, name, version)
+        return await find(loaded, turns, name, version)
     except UnreadableVersionError as error:
         raise NotReadyError(error.message) from error
 
 
-def metadata(service: Service, served: Served) -> ModelMetadata:
+def metadata(loaded: LoadedModels, served: Served) -> ModelMetadata:
     """Describe a version and name all of its model; raise NotFoundError. Not for the event loop."""
     model = served.model
     inputs = [TensorMetadata(name=each, shape=[-1, model.n_joints]) for each in INPUTS]
@@ -47,7 +46,7 @@ def metadata(service: Service, served: Served) -> ModelMetadata:
         inputs.append(TensorMetadata(name=TORQUE, shape=[-1, model.n_joints], parameters={"optional": True}))
     return ModelMetadata(
         name=served.name,
-        versions=_known(service, served.name),
+        versions=_known(loaded, served.name),
         platform=f"lipserve_{model.estimator.name}",
         inputs=inputs,
         outputs=[TensorMetadata(name=each, shape=list(shape)) for each, shape in outputs.items()],
@@ -72,20 +71,20 @@ def _meant(version: str) -> tuple[int | None, str | None]:
     return number if str(number) == version else 0, None
 
 
-def _load(service: Service, name: str, version: str | None, number: int | None, alias: str | None) -> Served:
+def _load(loaded: LoadedModels, name: str, version: str | None, number: int | None, alias: str | None) -> Served:
     try:
-        return service.loaded.get(name, number, alias)
+        return loaded.get(name, number, alias)
     except NotFoundError as error:
         if error.detail[0].field == "model":
             raise NotFoundError(f"no model {name[:200]!r}: GET /v1/models lists all", error.detail) from error
-        item = problem("version", version, f"one of {', '.join(_names(service, name)[-_LISTED:])}")
+        item = problem("version", version, f"one of {', '.join(_names(loaded, name)[-_LISTED:])}")
         raise NotFoundError(f"{sentence(item)}, of model {name!r}", [item]) from error
 
 
-def _names(service: Service, name: str) -> list[str]:
+def _names(loaded: LoadedModels, name: str) -> list[str]:
     """Aliases and numbers."""
-    return [*registry.show(service.database, name).aliases, *_known(service, name)]
+    return [*registry.show(loaded.database, name).aliases, *_known(loaded, name)]
 
 
-def _known(service: Service, name: str) -> list[str]:
-    return [str(each.version) for each in registry.show(service.database, name).versions]
+def _known(loaded: LoadedModels, name: str) -> list[str]:
+    return [str(each.version) for each in registry.show(loaded.database, name).versions]

@@ -7,35 +7,35 @@ from collections.abc import Collection
 
 from sqlalchemy import func, select
 
-from service.context import Service
 from service.foundation.errors import ServiceError
+from service.learning.updates import Updates
 from service.models import moves
 from service.storage.database import EventRow, LearnerRow, VersionRow
 
 logger = logging.getLogger(__name__)
 
 
-def look(service: Service, models: Collection[str] | None) -> None:
+def look(updates: Updates, models: Collection[str] | None) -> None:
     """Take in which versions of these models serve, have aliases or are gone; of all that are known here where None.
 
     Not for the event loop: versions are loaded before they answer.
     """
-    known = {model for model, _ in service.loaded.held()} | service.updates.monitors().keys()
+    known = {model for model, _ in updates.loaded.held()} | updates.monitors().keys()
     here = known if models is None else known & set(models)
-    service.loaded.announce(here)
-    _point(service, models)
-    _forget(service, here)
+    updates.loaded.announce(here)
+    _point(updates, models)
+    _forget(updates, here)
 
 
-def lagging(service: Service) -> dict[str, int]:
+def lagging(updates: Updates) -> dict[str, int]:
     """Models that answer here with less than their log holds, and the number of its newest event."""
-    held = service.loaded.held()
+    held = updates.loaded.held()
     newest = select(func.max(EventRow.number)).where(EventRow.model == LearnerRow.model).scalar_subquery()
     query = select(LearnerRow.model, LearnerRow.version, LearnerRow.start, newest).where(
         LearnerRow.role == "serving", LearnerRow.model.in_({model for model, _ in held})
     )
     found: dict[str, int] = {}
-    with service.database.session() as session:
+    with updates.database.session() as session:
         for model, version, start, number in session.execute(query):
             revision = held.get((model, version))
             if revision is not None and number is not None and number - start > revision:
@@ -43,11 +43,11 @@ def lagging(service: Service) -> dict[str, int]:
     return found
 
 
-def _point(service: Service, models: Collection[str] | None) -> None:
+def _point(updates: Updates, models: Collection[str] | None) -> None:
     """Let aliases point where the database says, to versions in memory where the model is in use here."""
-    loaded = service.loaded
+    loaded = updates.loaded
     used = {model for model, _ in loaded.versions()}
-    moved = moves.pointers(service.database, models).items() - loaded.aliases().items()
+    moved = moves.pointers(updates.database, models).items() - loaded.aliases().items()
     for (model, _), version in moved:
         if model in used:
             try:
@@ -55,15 +55,15 @@ def _point(service: Service, models: Collection[str] | None) -> None:
             except ServiceError as error:  # who asks for it is told
                 logger.warning("version %d of model %s, which an alias points to now: %s", version, model, error)
     with loaded.moving:  # read again: what is moved here meanwhile has been by now
-        loaded.repoint(moves.pointers(service.database, models), models)
+        loaded.repoint(moves.pointers(updates.database, models), models)
 
 
-def _forget(service: Service, models: Collection[str]) -> None:
+def _forget(updates: Updates, models: Collection[str]) -> None:
     """Answer no more with versions that are gone."""
-    loaded = service.loaded
+    loaded = updates.loaded
     with loaded.moving:
         held = {key for key in loaded.held() if key[0] in models}
-        with service.database.session() as session:
+        with updates.database.session() as session:
             rows = session.execute(select(VersionRow.model, VersionRow.version).where(VersionRow.model.in_(models)))
             kept = {(model, version) for model, version in rows}
         left = {model for model, _ in kept}
@@ -75,5 +75,3 @@ def _forget(service: Service, models: Collection[str]) -> None:
             if gone or whole:
                 loaded.forget(model, gone, whole)
                 logger.info("another service has deleted %s of model %s", gone or "all versions", model)
-            if whole:
-                service.updates.forget(model)

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Iterable
 
-from service.context import Service
+from service.learning.updates import Updates
 from service.replication.listening import Listener
 from service.replication.looking import lagging, look
 from service.storage.database.notices import Notice
@@ -25,15 +25,15 @@ class Replication:
     thread, one look at a time, because versions are loaded for it.
     """
 
-    def __init__(self, service: Service) -> None:
-        self._service = service
+    def __init__(self, updates: Updates) -> None:
+        self._updates = updates
         self._changed = threading.Condition()
         self._models: set[str] = set()
         self._everything = self._ending = False
         self._woken: dict[str, int] = {}
         self._looker = threading.Thread(target=self._run, daemon=True, name="lipserve-replication")
         self._looker.start()
-        self._listener = Listener(service.database, self._heard, self._missed)
+        self._listener = Listener(updates.database, self._heard, self._missed)
 
     def close(self) -> None:
         """End both threads."""
@@ -69,9 +69,9 @@ class Replication:
                 self._everything, self._models = False, set()
             try:
                 if everything:
-                    look(self._service, None)
+                    look(self._updates, None)
                 elif models:
-                    look(self._service, models)
+                    look(self._updates, models)
                     self._wake(models)  # roles may have changed
                 if everything or time.monotonic() >= due:
                     self._look_around()
@@ -85,15 +85,15 @@ class Replication:
 
     def _look_around(self) -> None:
         """Look at all that is in memory, as if nobody had told anything."""
-        look(self._service, self._known())
-        found = lagging(self._service)
+        look(self._updates, self._known())
+        found = lagging(self._updates)
         self._wake(model for model, number in found.items() if self._woken.get(model) != number)
         self._woken = found  # once for an event: who cannot learn it tries again without being told
-        self._service.updates.follow()
+        self._updates.follow()
 
     def _wake(self, models: Iterable[str]) -> None:
         for model in self._known().intersection(models):
-            self._service.updates.learner.wake(model)
+            self._updates.learner.wake(model)
 
     def _known(self) -> set[str]:
-        return {model for model, _ in self._service.loaded.held()}
+        return {model for model, _ in self._updates.loaded.held()}

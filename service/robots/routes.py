@@ -7,7 +7,6 @@ from typing import Annotated
 from anyio import to_thread
 from fastapi import APIRouter, Query, Request, Response, status
 
-from service.context import ServiceDep
 from service.foundation.errors import (
     ConflictError,
     InvalidDataError,
@@ -21,6 +20,7 @@ from service.foundation.names import NameForPeople
 from service.robots import profiles as shown_profiles
 from service.robots import store
 from service.robots.schema import UPLOAD_BODY, ProfileList, Robot, RobotPage, RobotProfile
+from service.storage.storage import StorageDep
 from service.web.limits.upload import Kinds, receive
 from service.web.pagination import PageQuery
 from service.web.route import Route
@@ -40,21 +40,21 @@ router = APIRouter(prefix="/v1/robots", tags=["robots"], responses=responses(Inv
 async def upload(
     request: Request,
     response: Response,
-    service: ServiceDep,
+    storage: StorageDep,
     name: Annotated[NameForPeople | None, Query(description="A name for people; the URDF's by default")] = None,
 ) -> Robot:
     """Check a URDF and store it, or say what is wrong with it. No file that it names is opened."""
     _, content = await receive(request, KINDS)
-    await to_thread.run_sync(service.disk.take, len(content))
-    robot = await to_thread.run_sync(store.add, service.database, content, name)
+    await to_thread.run_sync(storage.disk.take, len(content))
+    robot = await to_thread.run_sync(store.add, storage.database, content, name)
     response.headers["Location"] = f"/v1/robots/{robot.id}"
     return robot
 
 
 @router.get("", summary="List uploaded robots, newest first")
-def list_robots(service: ServiceDep, page: PageQuery) -> RobotPage:
+def list_robots(storage: StorageDep, page: PageQuery) -> RobotPage:
     """One page of uploaded robots with their joints."""
-    return store.page(service.database, page)
+    return store.page(storage.database, page)
 
 
 @router.get("/profiles", summary="List the robots known by name")
@@ -64,15 +64,15 @@ def profiles() -> ProfileList:
 
 
 @router.get("/profiles/{name}", summary="One robot known by name, or uploaded", responses=responses(NotFoundError))
-def profile(service: ServiceDep, name: str) -> RobotProfile:
+def profile(storage: StorageDep, name: str) -> RobotProfile:
     """Joints, limits and the meaning of effort of a robot, by its name or the id of an uploaded URDF."""
-    return shown_profiles.show(service.database, name)
+    return shown_profiles.show(storage.database, name)
 
 
 @router.get("/{robot}", summary="One uploaded robot", responses=responses(NotFoundError))
-def show(service: ServiceDep, robot: str) -> Robot:
+def show(storage: StorageDep, robot: str) -> Robot:
     """Name, joints and hash of an uploaded URDF."""
-    return store.show(service.database, robot)
+    return store.show(storage.database, robot)
 
 
 @router.delete(
@@ -81,6 +81,6 @@ def show(service: ServiceDep, robot: str) -> Robot:
     summary="Delete an uploaded robot",
     responses=responses(NotFoundError, ConflictError),
 )
-def delete(service: ServiceDep, robot: str) -> None:
+def delete(storage: StorageDep, robot: str) -> None:
     """Delete an uploaded URDF. Models trained with it keep their copy."""
-    store.delete(service.database, robot)
+    store.delete(storage.database, robot)

@@ -12,9 +12,9 @@ from fastapi import APIRouter
 from starlette.types import Receive, Scope, Send
 from uvicorn.protocols.utils import ClientDisconnected
 
-from service.context import Service
 from service.foundation.errors import BusyError, NotFoundError, NotReadyError, invalid_request
 from service.inference import checks
+from service.learning.updates import Updates
 from service.models.schema import ALIAS
 from service.models.waiting import reached
 from service.stream.conversation import Conversation, Echo
@@ -64,15 +64,15 @@ class EchoRoute:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Talk with one client. What is raised before it is accepted is answered in HTTP."""
-        service: Service = scope["app"].state.service
-        with self.streams.one_more(service.settings.max_streams):
-            conversation = await self.conversation(service, scope, receive, send)
+        updates: Updates = scope["app"].state.updates
+        with self.streams.one_more(updates.settings.max_streams):
+            conversation = await self.conversation(updates, scope, receive, send)
             with suppress(ClientDisconnected):  # no error: it went away while it was answered, or its key ended
                 await conversation.run()
 
-    async def conversation(self, service: Service, scope: Scope, receive: Receive, send: Send) -> Conversation:
+    async def conversation(self, updates: Updates, scope: Scope, receive: Receive, send: Send) -> Conversation:
         """Return what talks with the client; raise ServiceError where the address is wrong."""
-        return Echo(_connection(scope), receive, send, service.settings)
+        return Echo(_connection(scope), receive, send, updates.settings)
 
 
 class StreamRoute(EchoRoute):
@@ -80,15 +80,17 @@ class StreamRoute(EchoRoute):
 
     path = PATH
 
-    async def conversation(self, service: Service, scope: Scope, receive: Receive, send: Send) -> Conversation:
+    async def conversation(self, updates: Updates, scope: Scope, receive: Receive, send: Send) -> Conversation:
         """Return what talks with the client; raise InvalidRequestError, NotFoundError, UnreadableVersionError or
         RevisionNotReachedError."""
         asked = _parameters(scope["query_string"])
         model, version, alias = scope["path_params"]["model"], asked.version, asked.alias
         # with 0 it waits for nothing but the model to be in memory
-        served = await reached(service, model, version, alias, asked.min_revision)
+        served = await reached(updates.loaded, model, version, alias, asked.min_revision)
         pinned = version is not None
-        return Session(_connection(scope), receive, send, service, served, pinned, asked.std, asked.stream_id, alias)
+        meter = scope["app"].state.meters.stream(served.name)
+        given = (served, meter, pinned, asked.std, asked.stream_id, alias)
+        return Session(_connection(scope), receive, send, updates, *given)
 
 
 class NoRoute:

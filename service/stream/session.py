@@ -10,15 +10,16 @@ from time import perf_counter
 from anyio import to_thread
 from starlette.types import Message, Receive, Send
 
-from service.context import Service
 from service.foundation.errors import ErrorBody, ErrorResponse, ServiceError, invalid_request
 from service.inference import checks
+from service.learning.updates import Updates
 from service.models.loaded import Served
 from service.models.moves import SERVING
 from service.stream.conversation import Conversation
 from service.stream.frames import ANSWER, ASK_LEARN, ASK_STD, ERROR, HAS_STD, LATE, LAYOUT, REQUEST, UNREAD
 from service.stream.learning import Learning, Taught
 from service.stream.reading import FrameReader
+from service.web.observability.meters import StreamMeter
 from service.web.server.stream_protocol import StreamProtocol
 
 logger = logging.getLogger(__name__)
@@ -27,8 +28,9 @@ logger = logging.getLogger(__name__)
 class Session(Conversation):
     """Answers every frame from the version that is current when the frame is taken; holds that version in memory.
 
-    pinned: whether it stays with this version; std: whether every answer carries tau_std; stream_id: source of the
-    torques that frames carry, None where they carry none; alias: that it follows, None: the version that serves.
+    meter: counts what it answers; pinned: whether it stays with this version; std: whether every answer carries
+    tau_std; stream_id: source of the torques that frames carry, None where they carry none; alias: that it follows,
+    None: the version that serves.
     """
 
     def __init__(
@@ -36,20 +38,21 @@ class Session(Conversation):
         connection: StreamProtocol,
         receive: Receive,
         send: Send,
-        service: Service,
+        updates: Updates,
         served: Served,
+        meter: StreamMeter,
         pinned: bool,
         std: bool,
         stream_id: str | None = None,
         alias: str | None = None,
     ) -> None:
-        super().__init__(connection, receive, send, service.settings)
-        self._loaded, self._name = service.loaded, served.name
+        super().__init__(connection, receive, send, updates.settings)
+        self._loaded, self._name = updates.loaded, served.name
         self._pin = served.version if pinned else None
         self._alias = None if alias == SERVING else alias
         self._std, self._late, self._due = std, 0, inf
-        self._meter, self._deadline = service.meters.stream(served.name), service.settings.stream_deadline_s
-        self._learning = None if stream_id is None else Learning(service, stream_id, self.say)
+        self._meter, self._deadline = meter, updates.settings.stream_deadline_s
+        self._learning = None if stream_id is None else Learning(updates, stream_id, self.say)
         self._take(served)
 
     async def run(self) -> None:

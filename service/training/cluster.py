@@ -1,7 +1,7 @@
 """The queue of training jobs where a Dask cluster runs them.
 
 The rows of the jobs say all that counts. For each job of this service that waits the scheduler has a ticket: a call of
-`remote.host`, which some worker makes once it is free. Tickets may be lost or come twice; a job is done by whoever
+a call of `hosting.host`, which some worker makes once it is free. Tickets may be lost or come twice; a job is done by whoever
 changes its row first. The service watches the row, and sees to it that a waiting job has a ticket.
 """
 
@@ -28,6 +28,9 @@ logger = logging.getLogger(__name__)
 
 AGAIN_S = 1.0
 """Seconds after which a job whose ticket was lost gets another one."""
+
+HOST = "service.training.hosting:host"
+"""What a worker does with a job; by name, since its module would be imported here and by the scheduler."""
 
 
 class ClusterQueue(JobQueue):
@@ -71,7 +74,7 @@ class ClusterQueue(JobQueue):
             if gpu is not None:
                 key = f"lipserve-job-{job}-{token_hex(4)}"
                 try:
-                    future = self._away.submit(key, gpu, remote.host, __version__, job)
+                    future = self._away.submit(key, gpu, remote.call_named, HOST, __version__, job)
                 except ClusterUnavailableError as error:
                     logger.warning("job %s waits: %s", job, error)
                     return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
 from typing import Annotated
 
@@ -9,34 +10,37 @@ from anyio import to_thread
 from fastapi import Depends
 from fastapi.sse import ServerSentEvent
 
-from service.context import Service, ServiceDep
 from service.foundation.states import ACTIVE
+from service.models.loaded import LoadedModels
 from service.storage.database import JobRow
 from service.training import jobs
+from service.training.queue import JobQueue, JobQueueDep
 
 
-def _row(service: ServiceDep, job: str) -> JobRow:
-    return jobs.find(service.database, job)
+def _row(queue: JobQueueDep, job: str) -> JobRow:
+    return jobs.find(queue.database, job)
 
 
-async def _followed(service: ServiceDep, row: Annotated[JobRow, Depends(_row)]) -> AsyncIterator[JobRow]:
+async def _followed(queue: JobQueueDep, row: Annotated[JobRow, Depends(_row)]) -> AsyncIterator[JobRow]:
     """The job at the start; one more is counted while the answer lasts."""
-    with service.jobs.feed.one_more(service.settings.max_job_followers):
+    with queue.feed.one_more(queue.settings.max_job_followers):
         yield row
 
 
 FollowedDep = Annotated[JobRow, Depends(_followed)]
 
 
-async def events(service: Service, row: JobRow) -> AsyncIterator[ServerSentEvent]:
+async def events(
+    queue: JobQueue, loaded: LoadedModels, closing: asyncio.Event, row: JobRow
+) -> AsyncIterator[ServerSentEvent]:
     """`state` with the job as it is; then `state` or `progress`, each with the whole job; ends with the job."""
     last: JobRow | None = None
-    async for now in service.jobs.feed.follow(row, service.stopping.closing):
+    async for now in queue.feed.follow(row, closing):
         kind = None if last is None else _kind(last, now)
         if last is not None and kind is None:
             continue
         if now.version is not None:  # who sees it succeed is answered by its version from then on
-            await to_thread.run_sync(service.loaded.announce, [now.model])
+            await to_thread.run_sync(loaded.announce, [now.model])
         yield ServerSentEvent(event=kind or "state", data=jobs.shown(now))
         if now.state not in ACTIVE:
             return

@@ -15,6 +15,7 @@ from service.datasets import store
 from service.foundation.errors import BusyError, ConflictError, InvalidRequestError, invalid_request, not_found, problem
 from service.foundation.settings import Settings
 from service.foundation.states import ACTIVE, CANCELLED, QUEUED, RUNNING
+from service.models.loaded import LoadedModels
 from service.robots import store as robots
 from service.storage.database import Database, DatasetRow, JobRow, RobotRow, now
 from service.storage.files import new_id
@@ -25,33 +26,33 @@ from service.web.observability.context import request_id
 from service.web.pagination import Page, newest
 
 if TYPE_CHECKING:  # the service learns online too, and that queues jobs
-    from service.context import Service
+    from service.training.queue import JobQueue
 
 USUAL_WAIT_S, LONGEST_WAIT_S = 30, 3600
 """Seconds after which who finds the queue full may try again: where nothing is known of the jobs that run, and most."""
 
 
-def create(service: Service, request: JobRequest, retry_of: str | None = None, named: Identity | None = None) -> Job:
+def create(queue: JobQueue, request: JobRequest, retry_of: str | None = None, named: Identity | None = None) -> Job:
     """Check a request, store it as a queued job and hand it to the queue.
 
     retry_of: the job that it repeats; named: the request, which is not done again where it was before.
     """
-    if (before := done_before(service.database, named)) is not None:
+    if (before := done_before(queue.database, named)) is not None:
         return before
-    _check_options(request.options, service.settings)
-    if len(request.datasets) > service.settings.max_job_datasets:
-        raise invalid_request("datasets", len(request.datasets), f"at most {service.settings.max_job_datasets}")
-    rows = [store.find(service.database, dataset) for dataset in request.datasets]
+    _check_options(request.options, queue.settings)
+    if len(request.datasets) > queue.settings.max_job_datasets:
+        raise invalid_request("datasets", len(request.datasets), f"at most {queue.settings.max_job_datasets}")
+    rows = [store.find(queue.database, dataset) for dataset in request.datasets]
     joint_types = _check_joints(request, rows)
     if request.holdout is not None:
-        holding_out.check(rows, request.holdout, service.settings.min_samples)
-    service.disk.require()  # for the version that will be made
-    _check_estimator(service.database, request, rows[0].joint_names, joint_types)
-    with service.database.transaction() as session:
+        holding_out.check(rows, request.holdout, queue.settings.min_samples)
+    queue.storage.disk.require()  # for the version that will be made
+    _check_estimator(queue.database, request, rows[0].joint_names, joint_types)
+    with queue.database.transaction() as session:
         if (row := done(session, JobRow, named)) is not None:  # the same request was faster on another connection
             return shown(row)
         wanted = {**request.model_dump(mode="json"), "joint_types": joint_types}
-        job = add(session, service.settings, request.model, wanted, retry_of, named)
+        job = add(session, queue.settings, request.model, wanted, retry_of, named)
         present = set(session.scalars(select(DatasetRow.id).where(DatasetRow.id.in_(request.datasets))))
         for dataset in request.datasets:
             if dataset not in present:  # deleted since it was checked
@@ -59,7 +60,7 @@ def create(service: Service, request: JobRequest, retry_of: str | None = None, n
         uploaded = request.robot is not None and request.robot not in ROBOTS
         if uploaded and session.scalar(select(RobotRow.id).where(RobotRow.id == request.robot)) is None:
             raise not_found("robot", request.robot)
-    service.jobs.submit(job.id)
+    queue.submit(job.id)
     return shown(job)
 
 
@@ -110,19 +111,19 @@ def _seconds_to_wait(session: Session) -> int:
     return math.ceil(min(max(min(known), 1.0), LONGEST_WAIT_S)) if known else USUAL_WAIT_S
 
 
-def show(service: Service, job: str) -> Job:
+def show(queue: JobQueue, loaded: LoadedModels, job: str) -> Job:
     """Return one job; raise NotFoundError. Who sees it succeed is answered by its version from then on."""
-    row = find(service.database, job)
+    row = find(queue.database, job)
     if row.version is not None:
-        service.loaded.announce([row.model])
+        loaded.announce([row.model])
     return shown(row)
 
 
-def page(service: Service, part: Page) -> JobPage:
+def page(queue: JobQueue, loaded: LoadedModels, part: Page) -> JobPage:
     """List jobs, newest first. Who sees one succeed is answered by its version from then on."""
-    with service.database.session() as session:
+    with queue.database.session() as session:
         rows, following = newest(session, JobRow, part)
-    service.loaded.announce({row.model for row in rows if row.version is not None})
+    loaded.announce({row.model for row in rows if row.version is not None})
     return JobPage(items=[shown(row) for row in rows], next_cursor=following)
 
 
@@ -135,13 +136,13 @@ def find(database: Database, job: str) -> JobRow:
     return row
 
 
-def cancel(service: Service, job: str) -> Job:
+def cancel(queue: JobQueue, job: str) -> Job:
     """Cancel a job: at once while it waits; while it runs within `job_cancel_grace_s`, with or without its consent.
 
     Raise NotFoundError, ConflictError where it has ended.
     """
-    service.jobs.stop(job)  # before anything is written, for which its process may hold the lock
-    with service.database.transaction() as session:
+    queue.stop(job)  # before anything is written, for which its process may hold the lock
+    with queue.database.transaction() as session:
         row = session.scalar(select(JobRow).where(JobRow.id == job))
         if row is None:
             raise not_found("job", job)

@@ -8,11 +8,14 @@ from datetime import datetime
 from prometheus_client.core import Metric
 from prometheus_client.registry import Collector
 from sqlalchemy import func, select
+from sqlalchemy.orm import Session
 
-from service.foundation.states import ACTIVE, CANCELLED, FAILED, SUCCEEDED
+from service.foundation.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, PartState
 from service.storage.database import Database, JobRow
+from service.training.queue import JobQueue
 from service.web.observability.meters import Durations
 from service.web.observability.metric import MetricKind
+from service.web.observability.readiness import Lasting
 
 JOBS = MetricKind("gauge", "lipserve_jobs", "Training jobs that wait or run now", ("state",))
 FINISHED = MetricKind("counter", "lipserve_jobs_finished_total", "Training jobs that have ended, ever", ("outcome",))
@@ -24,6 +27,8 @@ DURATION = MetricKind(
 )
 KINDS = (JOBS, FINISHED, DURATION)
 BOUNDS = (1.0, 3.0, 10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 10_800.0, 36_000.0)
+START_S = 60.0
+"""Time in s within which a job should have been started where a training process is free."""
 OUTCOMES = (SUCCEEDED, FAILED, CANCELLED)
 
 
@@ -40,8 +45,7 @@ class Work(Collector):
     def collect(self) -> Iterator[Metric]:
         """Yield every metric."""
         with self._database.session() as session:
-            counts = session.execute(select(JobRow.state, func.count()).group_by(JobRow.state))
-            states = dict(counts.all())
+            states = _counts(session)
             ended = select(JobRow.state, JobRow.started_at, JobRow.finished_at).where(JobRow.state.in_(OUTCOMES))
             durations = {outcome: Durations(BOUNDS) for outcome in OUTCOMES}
             for outcome, started, finished in session.execute(ended):
@@ -51,3 +55,25 @@ class Work(Collector):
         yield JOBS.of(([state], states.get(state, 0)) for state in ACTIVE)
         yield FINISHED.of(([outcome], states.get(outcome, 0)) for outcome in OUTCOMES)
         yield DURATION.spread(([outcome], durations[outcome]) for outcome in OUTCOMES)
+
+
+def look(queue: JobQueue, lasting: Lasting) -> tuple[PartState, str]:
+    """Whether queued jobs are started, for readiness: what keeps processes from starting shows in that."""
+    with queue.database.session() as session:
+        counts = _counts(session)
+    waiting, running = counts.get(QUEUED, 0), counts.get(RUNNING, 0)
+    words = f"{waiting} jobs wait, {running} run"
+    if (cluster := queue.cluster) is not None:  # what serves can do without
+        if cluster.problem is not None:
+            return "warning", f"{cluster.problem}; {words}"
+        none = waiting > 0 and cluster.jobs == 0
+        return ("warning" if none else "ok"), f"{words}, the cluster takes {cluster.jobs} at a time"
+    stuck = lasting(waiting > 0 and running < queue.settings.training_workers)
+    if stuck is None or stuck <= START_S:
+        return "ok", words
+    return "failed", f"{waiting} jobs wait, though no more than {running} have run for {stuck:.0f} s"
+
+
+def _counts(session: Session) -> dict[str, int]:
+    """Jobs by state."""
+    return dict(session.execute(select(JobRow.state, func.count()).group_by(JobRow.state)).all())

@@ -15,16 +15,18 @@ from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
 from datetime import UTC, datetime
 from functools import partial
+from typing import Annotated
 
+from fastapi import Depends, Request
 from sqlalchemy import select
 
 from service.compute.cluster import Cluster
 from service.compute.process import training_place
 from service.foundation.settings import Settings
 from service.foundation.states import ACTIVE, CANCELLED, QUEUED, RUNNING
-from service.storage.database import Database, JobRow
-from service.storage.files import Files
+from service.storage.database import JobRow
 from service.storage.replicas import Replicas
+from service.storage.storage import Storage
 from service.training import history, worker
 from service.training.feed import Feed
 from service.training.settling import Settled, Settler, queue_again
@@ -50,13 +52,14 @@ class JobQueue:
     trained: called with the model and the version that a job has made, in a thread of its own.
     """
 
-    def __init__(self, settings: Settings, database: Database, trained: Callable[[str, int], None]) -> None:
-        self.settings, self.database, self.trained = settings, database, trained
+    def __init__(self, storage: Storage, trained: Callable[[str, int], None]) -> None:
+        settings, database = storage.settings, storage.database
+        self.storage, self.settings, self.database, self.trained = storage, settings, database, trained
         self.feed = Feed(database)
         self.problem: str | None = None
         """Why training processes cannot be started, None while they can as far as is known."""
         self.replicas = Replicas(settings, database)
-        self._settler = Settler(settings, database, Files.of(settings), self.replicas.mine)
+        self._settler = Settler(settings, database, storage.files, self.replicas.mine)
         self.cluster: Cluster | None = None
         self._slots = self._places()
         self._reconcile_s = settings.replica_beat_s if database.shared else RECONCILE_S
@@ -296,3 +299,11 @@ def queue_of(settings: Settings) -> type[JobQueue]:
     from service.training.cluster import ClusterQueue  # noqa: PLC0415 - it is one of these
 
     return ClusterQueue
+
+
+async def _queue(request: Request) -> JobQueue:
+    found: JobQueue = request.app.state.jobs
+    return found
+
+
+JobQueueDep = Annotated[JobQueue, Depends(_queue)]

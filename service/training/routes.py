@@ -7,7 +7,6 @@ from collections.abc import AsyncIterable
 from fastapi import APIRouter, Response, status
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
-from service.context import ServiceDep
 from service.foundation.errors import (
     BusyError,
     ConflictError,
@@ -16,9 +15,12 @@ from service.foundation.errors import (
     TooLargeError,
     responses,
 )
+from service.models.loaded import LoadedModelsDep
 from service.training import events, jobs, retrying
+from service.training.queue import JobQueueDep
 from service.training.schema import Job, JobPage, JobRequest
 from service.web.idempotency import KeyHeader, identity
+from service.web.limits.stopping import StoppingDep
 from service.web.pagination import PageQuery
 from service.web.route import Route
 
@@ -33,24 +35,24 @@ router = APIRouter(
     summary="Train a model",
     responses=responses(NotFoundError, TooLargeError, BusyError, ConflictError),
 )
-def create(service: ServiceDep, request: JobRequest, response: Response, idempotency_key: KeyHeader = None) -> Job:
+def create(queue: JobQueueDep, request: JobRequest, response: Response, idempotency_key: KeyHeader = None) -> Job:
     """Queue a training job. It runs in another process and ends in a new version of the model."""
     named = identity(idempotency_key, "train", request.model_dump(mode="json", exclude_unset=True))
-    job = jobs.create(service, request, named=named)
+    job = jobs.create(queue, request, named=named)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job
 
 
 @router.get("", summary="List jobs, newest first")
-def list_jobs(service: ServiceDep, page: PageQuery) -> JobPage:
+def list_jobs(queue: JobQueueDep, loaded: LoadedModelsDep, page: PageQuery) -> JobPage:
     """One page of jobs with their progress."""
-    return jobs.page(service, page)
+    return jobs.page(queue, loaded, page)
 
 
 @router.get("/{job}", summary="One job and its progress", responses=responses(NotFoundError))
-def show(service: ServiceDep, job: str) -> Job:
+def show(queue: JobQueueDep, loaded: LoadedModelsDep, job: str) -> Job:
     """State, progress, and the version it made or why it failed."""
-    return jobs.show(service, job)
+    return jobs.show(queue, loaded, job)
 
 
 @router.get(
@@ -59,18 +61,20 @@ def show(service: ServiceDep, job: str) -> Job:
     response_class=EventSourceResponse,
     responses=responses(NotFoundError, BusyError),
 )
-async def follow(service: ServiceDep, row: events.FollowedDep) -> AsyncIterable[ServerSentEvent]:
+async def follow(
+    queue: JobQueueDep, loaded: LoadedModelsDep, stopping: StoppingDep, row: events.FollowedDep
+) -> AsyncIterable[ServerSentEvent]:
     """Server-sent events, each with the whole job as its data: `state` at the start, at every entry of its history and
     at its end; `progress` in between, about twice a second. The answer ends with the job, or when the service stops:
     ask again then, the first event says how it stands."""
-    async for event in events.events(service, row):
+    async for event in events.events(queue, loaded, stopping.closing, row):
         yield event
 
 
 @router.post("/{job}/cancel", summary="Cancel a job", responses=responses(NotFoundError, ConflictError))
-def cancel(service: ServiceDep, job: str) -> Job:
+def cancel(queue: JobQueueDep, job: str) -> Job:
     """Cancel a waiting job at once, a running one within two seconds: a process that does not obey is killed."""
-    return jobs.cancel(service, job)
+    return jobs.cancel(queue, job)
 
 
 @router.post(
@@ -79,8 +83,8 @@ def cancel(service: ServiceDep, job: str) -> Job:
     summary="Repeat a job that failed or was cancelled",
     responses=responses(NotFoundError, ConflictError, BusyError),
 )
-def retry(service: ServiceDep, job: str, response: Response, idempotency_key: KeyHeader = None) -> Job:
+def retry(queue: JobQueueDep, job: str, response: Response, idempotency_key: KeyHeader = None) -> Job:
     """Queue a new job with the same request; `retry_of` names the old one. What it needs must still be there."""
-    again = retrying.retry(service, job, identity(idempotency_key, "retry", job))
+    again = retrying.retry(queue, job, identity(idempotency_key, "retry", job))
     response.headers["Location"] = f"/v1/jobs/{again.id}"
     return again

@@ -5,9 +5,9 @@ from __future__ import annotations
 from fastapi import APIRouter
 
 from service import __version__
-from service.context import ServiceDep
 from service.foundation.errors import NotReadyError, problem, responses
 from service.web.health_schema import Live, Part, Ready
+from service.web.observability.readiness import ReadinessDep
 from service.web.route import Route
 
 router = APIRouter(prefix="/health", tags=["health"], route_class=Route)
@@ -20,12 +20,12 @@ async def live() -> Live:
 
 
 @router.get("/ready", summary="Can the service answer?", responses=responses(NotReadyError))
-def ready(service: ServiceDep) -> Ready:
+def ready(readiness: ReadinessDep) -> Ready:
     """Answer once the models are loaded, and while each part works: the database and the home can be written and are
     not full, the versions that serve can be read, the learner runs where something learns, training jobs are started,
     and the service is not stopping. Otherwise `detail` names the parts that do not. Looked at once a second at most.
     """
-    report = service.readiness.report(service)
+    report = readiness.report()
     if report.failed:
         message = "; ".join(f"{each.name}: {each.message}" for each in report.failed)
         raise NotReadyError(message, [problem(each.name, each.message, "ok") for each in report.failed])

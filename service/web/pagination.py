@@ -40,7 +40,7 @@ def _page(
     limit: Annotated[int | None, Query(ge=1, description=f"Most items of this page; {USUAL} by default")] = None,
     cursor: Annotated[str | None, Query(description="`next_cursor` of the page before")] = None,
 ) -> Page:
-    most = request.app.state.service.settings.max_page
+    most = request.app.state.storage.settings.max_page
     if limit is None:
         limit = min(USUAL, most)
     if limit > most:

@@ -13,13 +13,18 @@ import numpy as np
 from lipcore.robots import load_robot
 from lipcore.samples import Samples
 from lipcore.simulation import Stream, simulate
-from service.context import Service
 from service.foundation.states import ACTIVE
 
 QUICK = {"hyperparameter_samples": 20, "posterior_samples": 60, "max_iterations": 4}
 """Options of a fit that takes a fraction of a second."""
 ENDLESS = {"hyperparameter_samples": 200, "posterior_samples": 60, "max_iterations": 10_000}
 """Options of a fit that takes about half a minute on 200 samples of `panda`: far longer than a test needs to end it."""
+from service.learning.updates import Updates
+from service.models.loaded import LoadedModels
+from service.storage.storage import Storage
+from service.training.queue import JobQueue
+from service.web.observability.readiness import Readiness
+
 ADDRESS = "http://localhost"
 """Where an in-process client finds the service: one without keys answers to names of this machine only."""
 DEADLINE = 60.0
@@ -125,6 +130,20 @@ def error(answer: Any, status: int, code: str) -> dict[str, Any]:
     return body["error"]
 
 
-def service_of(api: Any) -> Service:
+class Parts:
+    """The parts of a running service."""
+
+    def __init__(self, state: Any) -> None:
+        self.storage: Storage = state.storage
+        self.settings, self.database = self.storage.settings, self.storage.database
+        self.files, self.disk = self.storage.files, self.storage.disk
+        self.loaded: LoadedModels = state.loaded
+        self.jobs: JobQueue = state.jobs
+        self.updates: Updates = state.updates
+        self.readiness: Readiness = state.readiness
+        self.stopping, self.meters = state.stopping, state.meters
+
+
+def service_of(api: Any) -> Parts:
     """The parts of the service behind a test client."""
-    return api.app.state.service
+    return Parts(api.app.state)

@@ -8,13 +8,13 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from service.context import Service
 from service.foundation.errors import ConflictError
 from service.journal import alarms, log
 from service.learning import learning
 from service.learning.control import replaying, revisions
 from service.learning.control.learning_schema import Alarm, AlarmPage, ChangeRequest, Decided
 from service.learning.learning_options import LearningOptions
+from service.learning.updates import Updates
 from service.models import registry
 from service.storage.database import AlarmRow, EventRow
 from service.web.pagination import Page
@@ -24,24 +24,24 @@ CHUNK = 50
 """Batches whose rows are learnt after all in one transaction, so that observations do not wait long for the lock."""
 
 
-def set_options(service: Service, model: str, wanted: LearningOptions) -> None:
+def set_options(updates: Updates, model: str, wanted: LearningOptions) -> None:
     """Set how a model learns from now on; raise NotFoundError or InvalidRequestError."""
-    joints = registry.find(service.database, model, None).manifest["joint_names"]
-    learning.set_options(service.database, model, wanted, len(joints), time.time())
-    service.updates.learner.wake(model)
+    joints = registry.find(updates.database, model, None).manifest["joint_names"]
+    learning.set_options(updates.database, model, wanted, len(joints), time.time())
+    updates.learner.wake(model)
 
 
-def decide(service: Service, model: str, request: ChangeRequest) -> Decided:
+def decide(updates: Updates, model: str, request: ChangeRequest) -> Decided:
     """End a hold; raise NotFoundError, or ConflictError where learning is not held.
 
     The change is logged first and the hold ends last. In between, the rows that were kept out are learnt some batches
     at a time: interrupted, it goes on where it was when it is asked for again.
     """
-    version = revisions.serving(service.database, model)
+    version = revisions.serving(updates.database, model)
     rows, done, ended = 0, None, False
     while not ended:
         # a batch is judged and logged in its turn: none is judged as held and logged after the hold
-        with service.updates.turn(model), service.database.transaction(model) as session:
+        with updates.turn(model), updates.database.transaction(model) as session:
             held = _held(session, model)
             if request.decision == "adapt":
                 _log_change(session, model, held)
@@ -54,14 +54,14 @@ def decide(service: Service, model: str, request: ChangeRequest) -> Decided:
             else:
                 done = pending[-1].number
             revised = revisions.revised(session, model, version)
-    service.updates.learner.wake(model)
+    updates.learner.wake(model)
     return Decided(**revised.model_dump(), decision=request.decision, at=held["at"], rows=rows)
 
 
-def page(service: Service, model: str, part: Page) -> AlarmPage:
+def page(updates: Updates, model: str, part: Page) -> AlarmPage:
     """List the alarms of a model, newest first; raise NotFoundError where there is no such model."""
-    registry.find(service.database, model, None)
-    with service.database.session() as session:
+    registry.find(updates.database, model, None)
+    with updates.database.session() as session:
         rows, following = alarms.page(session, model, part)
     return AlarmPage(items=[_alarm(row) for row in rows], next_cursor=following)
 

@@ -14,7 +14,6 @@ from lipcore.online.batch import Rows
 from lipcore.online.record import Record
 from lipcore.samples import Array
 from lipcore.vocabulary import CODES
-from service.context import Service
 from service.foundation.errors import NotFoundError, not_found
 from service.journal import log
 from service.journal.log import EventKind
@@ -23,6 +22,7 @@ from service.learning.control.schema import Observation, ObservationDetail, Obse
 from service.learning.ingest import identity
 from service.learning.quality.summary import figures
 from service.learning.schema import ObservationResponse
+from service.learning.updates import Updates
 from service.models import registry
 from service.storage.database import EventRow
 from service.web.pagination import Page
@@ -30,20 +30,20 @@ from service.web.pagination import Page
 BATCHES: tuple[EventKind] = ("batch",)
 
 
-def page(service: Service, model: str, part: Page, stream_id: str | None, rejected: bool) -> ObservationPage:
+def page(updates: Updates, model: str, part: Page, stream_id: str | None, rejected: bool) -> ObservationPage:
     """List the batches of a model, newest first; raise NotFoundError where there is no such model."""
-    registry.find(service.database, model, None)
-    with service.database.session() as session:
+    registry.find(updates.database, model, None)
+    with updates.database.session() as session:
         events, following = log.page(session, model, part, stream_id, rejected, BATCHES)
         return ObservationPage(
             items=[Observation(**_outline(session, event)) for event in events], next_cursor=following
         )
 
 
-def show(service: Service, model: str, stream_id: str, sequence: int, rows: bool) -> ObservationDetail:
+def show(updates: Updates, model: str, stream_id: str, sequence: int, rows: bool) -> ObservationDetail:
     """Return a batch with all that is known of it; raise NotFoundError."""
-    registry.find(service.database, model, None)
-    with service.database.session() as session:
+    registry.find(updates.database, model, None)
+    with updates.database.session() as session:
         event = find(session, model, stream_id, sequence)
         return ObservationDetail(
             **_outline(session, event),

@@ -12,32 +12,32 @@ from sqlalchemy.orm import Session
 
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES, LEARNT
-from service.context import Service
 from service.foundation.errors import ConflictError, invalid_request
 from service.journal import log
 from service.learning.control import inspection, revisions
 from service.learning.control.schema import REPLAYABLE, Replayed, ReplayRequest
 from service.learning.control.undoing import find_learnt
+from service.learning.updates import Updates
 from service.storage.database import EventRow
 
 TIME_JUMP = CODES.index("time_jump")
 
 
-def replay(service: Service, model: str, stream_id: str, sequence: int, request: ReplayRequest) -> Replayed:
+def replay(updates: Updates, model: str, stream_id: str, sequence: int, request: ReplayRequest) -> Replayed:
     """Learn the rows of a batch that some codes kept out, once each.
 
     Raise NotFoundError, InvalidRequestError where the batch has no such rows, ConflictError where it was undone or all
     of these rows have been replayed.
     """
-    version = revisions.serving(service.database, model)
+    version = revisions.serving(updates.database, model)
     wanted = REPLAYABLE if request.codes is None else request.codes
-    with service.database.turn(model), service.database.transaction(model) as session:
+    with updates.database.turn(model), updates.database.transaction(model) as session:
         batch = find_learnt(session, model, stream_id, sequence)
         learnt = admit(session, batch, wanted, time.time())
         if not learnt:
             raise _refusal(session, batch, wanted)
         revised = revisions.revised(session, model, version)
-    service.updates.learner.wake(model)
+    updates.learner.wake(model)
     return Replayed(
         **revised.model_dump(), stream_id=stream_id, sequence=sequence, rows=sum(learnt.values()), codes=learnt
     )

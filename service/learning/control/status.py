@@ -5,24 +5,23 @@ from __future__ import annotations
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from service.context import Service
 from service.journal import log
 from service.learning import learning
 from service.learning.control import revisions
 from service.learning.control.learning_schema import Candidate, Held, Learning, LearningStatus, Snapshot, Stream
-from service.learning.updates import Status
+from service.learning.updates import Status, Updates
 from service.storage.database import LearnerRow, StreamRow
 
 MOST_GAPS = 20
 """Gaps of a stream that are listed."""
 
 
-def show(service: Service, model: str) -> Learning:
+def show(updates: Updates, model: str) -> Learning:
     """Return how a model learns and where that stands; raise NotFoundError. Not for the event loop."""
-    served = service.loaded.get(model, None)
+    served = updates.loaded.get(model, None)
     version = served.version
-    said = service.updates.status(model, version)
-    with service.database.session() as session:
+    said = updates.status(model, version)
+    with updates.database.session() as session:
         start, events = log.start_of(session, model, version), log.newest(session, model)
         held = learning.held(session, model)
         status = LearningStatus(

@@ -7,13 +7,13 @@ import time
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from service.context import Service
 from service.foundation.errors import ConflictError, invalid_request, problem
 from service.journal import log
 from service.learning.control import inspection, revisions
 from service.learning.control.revisions import Range
 from service.learning.control.schema import RollbackRequest, RolledBack, Unlearnt
 from service.learning.ingest import identity
+from service.learning.updates import Updates
 from service.models import registry
 from service.storage.database import EventRow, LearnerRow
 
@@ -31,21 +31,21 @@ def find_learnt(session: Session, model: str, stream_id: str, sequence: int) -> 
     return batch
 
 
-def unlearn(service: Service, model: str, stream_id: str, sequence: int) -> Unlearnt:
+def unlearn(updates: Updates, model: str, stream_id: str, sequence: int) -> Unlearnt:
     """Take a batch and what was replayed of it out again; raise NotFoundError or ConflictError."""
-    version = revisions.serving(service.database, model)
-    with service.database.turn(model), service.database.transaction(model) as session:
+    version = revisions.serving(updates.database, model)
+    with updates.database.turn(model), updates.database.transaction(model) as session:
         batch = find_learnt(session, model, stream_id, sequence)
         rows = batch.learnt + sum(each.learnt for each in inspection.replays(session, batch) if not each.void)
         trained = select(LearnerRow.version).where(LearnerRow.model == model, LearnerRow.start >= batch.number)
         versions = list(session.scalars(trained.order_by(LearnerRow.version)))
         log.unlearn(session, model, batch, time.time())
         revised = revisions.revised(session, model, version)
-    service.updates.learner.wake(model)
+    updates.learner.wake(model)
     return Unlearnt(**revised.model_dump(), stream_id=stream_id, sequence=sequence, rows=rows, trained=versions)
 
 
-def rollback(service: Service, model: str, request: RollbackRequest) -> RolledBack:
+def rollback(updates: Updates, model: str, request: RollbackRequest) -> RolledBack:
     """Go back to a revision of the version that serves, or to another version.
 
     Raise NotFoundError, InvalidRequestError where not exactly one of the two is named or it is not older than what
@@ -55,14 +55,14 @@ def rollback(service: Service, model: str, request: RollbackRequest) -> RolledBa
         found = "neither" if request.revision is None else "both"
         raise invalid_request("revision or version", found, "exactly one of the two")
     if request.version is not None:
-        return _to_version(service, model, request.version)
+        return _to_version(updates, model, request.version)
     assert request.revision is not None
-    return _to_revision(service, model, request.revision)
+    return _to_revision(updates, model, request.revision)
 
 
-def _to_revision(service: Service, model: str, revision: int) -> RolledBack:
-    version = revisions.serving(service.database, model)
-    with service.database.turn(model), service.database.transaction(model) as session:
+def _to_revision(updates: Updates, model: str, revision: int) -> RolledBack:
+    version = revisions.serving(updates.database, model)
+    with updates.database.turn(model), updates.database.transaction(model) as session:
         newest = revisions.current(session, model, version)
         if revision >= newest:
             raise invalid_request("revision", revision, f"one below {newest}, the newest of version {version}")
@@ -77,7 +77,7 @@ def _to_revision(service: Service, model: str, revision: int) -> RolledBack:
         count = session.scalar(undone) or 0
         log.rollback(session, model, to, time.time())
         revised = revisions.revised(session, model, version)
-    service.updates.learner.wake(model)
+    updates.learner.wake(model)
     return RolledBack(**revised.model_dump(), undone=count, complete=True)
 
 
@@ -98,14 +98,14 @@ def _is_reached(revision: int, ranges: list[Range]) -> bool:
     return any(first <= revision <= last for first, last in ranges)
 
 
-def _to_version(service: Service, model: str, version: int) -> RolledBack:
-    if version == revisions.serving(service.database, model):
+def _to_version(updates: Updates, model: str, version: int) -> RolledBack:
+    if version == revisions.serving(updates.database, model):
         raise ConflictError(f"version {version} of model {model!r} serves already")
-    service.loaded.get(model, version)  # so that the change costs no query anything, or fails before it is made
-    with service.database.transaction() as session:
+    updates.loaded.get(model, version)  # so that the change costs no query anything, or fails before it is made
+    with updates.database.transaction() as session:
         registry.serve(session, model, version)
         revised = revisions.revised(session, model, version)
         complete = _is_reached(revised.revision, revisions.reachable(session, model, version))
-    service.loaded.adopt(model)
-    service.updates.learner.wake(model)
+    updates.loaded.adopt(model)
+    updates.learner.wake(model)
     return RolledBack(**revised.model_dump(), undone=0, complete=complete)

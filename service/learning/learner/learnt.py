@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from sqlalchemy.orm import Session
 
 from lipcore.model import TorqueModel
@@ -11,6 +9,7 @@ from lipcore.online.consolidation import consolidate
 from service.journal import log, snapshots
 from service.learning.learner import recent
 from service.learning.learner.restore import Restored, restore
+from service.models.served import Learnt
 from service.storage.database import Database, LearnerRow, ServingRow
 from service.storage.files import Files
 
@@ -18,42 +17,38 @@ MOST_ROWS = 500
 """Rows since the last snapshot that are learnt while a version is loaded, about: for more, a learner is needed."""
 
 
-@dataclass(frozen=True)
-class Learnt:
-    """The model at a revision. behind: whether the log holds more than that."""
+class LearntVersions:
+    """What versions have learnt, from the log and snapshots; see `models.served.LearntStates`."""
 
-    model: TorqueModel
-    revision: int
-    behind: bool
+    def __init__(self, database: Database, files: Files) -> None:
+        self._database, self._files = database, files
 
+    def find(self, model: str, version: int, base: TorqueModel) -> Learnt | None:
+        """Return what a version has learnt, None where that is nothing. base: the version as trained.
 
-def find(database: Database, files: Files, model: str, version: int, base: TorqueModel) -> Learnt | None:
-    """Return what a version has learnt, None where that is nothing. base: the version as trained.
+        One that neither serves nor is a candidate has learnt what its last snapshot says, less what was unlearnt since.
+        """
+        state = _restored(self._database, self._files, model, version, base, MOST_ROWS)
+        if state is None:
+            return None
+        known, start, newest = state
+        behind = newest is not None and known.number < newest
+        if known.number == start:
+            return Learnt(base, 0, behind)
+        floor = recent.floor(self._database, model, version, known.number, base.n_joints)
+        return Learnt(known.online.model(floor), known.number - start, behind)
 
-    One that neither serves nor is a candidate has learnt what its last snapshot says, less what was unlearnt since.
-    """
-    state = _restored(database, files, model, version, base, MOST_ROWS)
-    if state is None:
-        return None
-    known, start, newest = state
-    behind = newest is not None and known.number < newest
-    if known.number == start:
-        return Learnt(base, 0, behind)
-    floor = recent.floor(database, model, version, known.number, base.n_joints)
-    return Learnt(known.online.model(floor), known.number - start, behind)
+    def consolidated(self, model: str, version: int, base: TorqueModel) -> Learnt | None:
+        """Return all that a version has learnt as a model that can be saved, None where that is nothing; see `find`.
 
-
-def consolidated(database: Database, files: Files, model: str, version: int, base: TorqueModel) -> Learnt | None:
-    """Return all that a version has learnt as a model that can be saved, None where that is nothing; see `find`.
-
-    It takes the time to learn what has come since the last snapshot.
-    """
-    state = _restored(database, files, model, version, base, None)
-    if state is None or state[0].number == state[1]:
-        return None
-    known, start, _ = state
-    floor = recent.floor(database, model, version, known.number, base.n_joints)
-    return Learnt(consolidate(known.online, floor), known.number - start, False)
+        It takes the time to learn what has come since the last snapshot.
+        """
+        state = _restored(self._database, self._files, model, version, base, None)
+        if state is None or state[0].number == state[1]:
+            return None
+        known, start, _ = state
+        floor = recent.floor(self._database, model, version, known.number, base.n_joints)
+        return Learnt(consolidate(known.online, floor), known.number - start, False)
 
 
 def _restored(

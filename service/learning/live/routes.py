@@ -7,9 +7,11 @@ from collections.abc import AsyncIterable
 from fastapi import APIRouter
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
-from service.context import ServiceDep
 from service.foundation.errors import BusyError, InvalidRequestError, NotFoundError, responses
 from service.learning.live import events
+from service.learning.updates import UpdatesDep
+from service.web.limits.stopping import StoppingDep
+from service.web.observability.meters import MetersDep
 from service.web.route import Route
 
 router = APIRouter(
@@ -23,7 +25,9 @@ router = APIRouter(
     response_class=EventSourceResponse,
     responses=responses(BusyError),
 )
-async def follow(service: ServiceDep, model: events.FollowedDep) -> AsyncIterable[ServerSentEvent]:
+async def follow(
+    updates: UpdatesDep, meters: MetersDep, stopping: StoppingDep, model: events.FollowedDep
+) -> AsyncIterable[ServerSentEvent]:
     """Server-sent events of what streams and batches bring with measured torque, predicted before it is learnt.
 
     `rows`, at most ten a second: `parts`, each of one stream and revision, with torque measured, mean, standard
@@ -32,5 +36,5 @@ async def follow(service: ServiceDep, model: events.FollowedDep) -> AsyncIterabl
     learning waits for a decision. `lost`: so many events were dropped because they were not read in time. The answer
     ends when the model is deleted or the service stops.
     """
-    async for event in events.events(service, model):
+    async for event in events.events(updates, meters, stopping.closing, model):
         yield event

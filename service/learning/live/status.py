@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 
 from lipcore.vocabulary import CODES
-from service.context import Service
 from service.journal import log
 from service.learning import learning
 from service.learning.control import decisions
@@ -13,7 +12,8 @@ from service.learning.control.learning_schema import Held
 from service.learning.control.status import novel_share
 from service.learning.live.schema import LiveAnswers, LiveNovelty, LiveStatus
 from service.learning.quality import summary
-from service.web.observability.meters import OTHER, StreamMeter
+from service.learning.updates import Updates
+from service.web.observability.meters import OTHER, Meters, StreamMeter
 from service.web.pagination import Page
 
 MOST_ALARMS = 5
@@ -23,16 +23,16 @@ COUNTS = (*CODES, "batches", "duplicates")
 class Status:
     """Looks at one model again and again; not for the event loop."""
 
-    def __init__(self, service: Service, model: str) -> None:
-        self.service, self.model = service, model
-        self._answers = Answers(service, model)
+    def __init__(self, updates: Updates, meters: Meters, model: str) -> None:
+        self.updates, self.model = updates, model
+        self._answers = Answers(meters, model)
 
     def __call__(self, novel: list[LiveNovelty], passed: float | None) -> LiveStatus:
         """Return how it stands; raise NotFoundError where it was deleted. passed: s since the last time."""
-        service, model = self.service, self.model
-        served, now = service.loaded.get(model, None), time.time()
-        monitor, said = service.updates.monitor(model), service.updates.status(model, served.version)
-        with service.database.session() as session:
+        updates, model = self.updates, self.model
+        served, now = updates.loaded.get(model, None), time.time()
+        monitor, said = updates.monitor(model), updates.status(model, served.version)
+        with updates.database.session() as session:
             events = log.newest(session, model) - log.start_of(session, model, served.version)
             options, held = learning.options(session, model), learning.held(session, model)
         return LiveStatus(
@@ -54,15 +54,15 @@ class Status:
             counts={name: monitor.counts[name] for name in COUNTS},
             windows=[summary.window(each, now) for each in monitor.windows],
             answers=self._answers.since(passed),
-            alarms=decisions.page(service, model, Page(after=None, limit=MOST_ALARMS)).items,
+            alarms=decisions.page(updates, model, Page(after=None, limit=MOST_ALARMS)).items,
         )
 
 
 class Answers:
     """What streams of a model were answered, from one look to the next."""
 
-    def __init__(self, service: Service, model: str) -> None:
-        self._meters, self._model = service.meters, model
+    def __init__(self, meters: Meters, model: str) -> None:
+        self._meters, self._model = meters, model
         self._before: tuple[list[int], int, int] | None = None
 
     def since(self, passed: float | None) -> LiveAnswers | None:

@@ -10,11 +10,11 @@ from prometheus_client.registry import Collector
 from sqlalchemy import select
 
 from lipcore.vocabulary import CODES
-from service.context import Service
 from service.learning.control import revisions
 from service.learning.control.status import novel_share
 from service.learning.quality import summary
 from service.learning.quality.monitor import Monitor
+from service.learning.updates import Updates
 from service.models.loaded import Served
 from service.storage.database import StreamRow
 from service.web.observability.metric import MetricKind
@@ -39,14 +39,15 @@ ROWS = MetricKind(
     "Rows of observations since the service has started, by what became of them",
     ("model", "outcome"),
 )
-KINDS = (*QUALITY.values(), REVISION, NOVEL, LAG, ROWS)
+LOADED = MetricKind("gauge", "lipserve_models_loaded", "Model versions in memory")
+KINDS = (*QUALITY.values(), REVISION, NOVEL, LAG, ROWS, LOADED)
 
 
 class Learning(Collector):
     """The figures of all models of one service that learn. Not for the event loop."""
 
-    def __init__(self, service: Service) -> None:
-        self._service = service
+    def __init__(self, updates: Updates) -> None:
+        self._updates = updates
 
     def describe(self) -> list[Metric]:
         """Nothing: what there is depends on the models."""
@@ -60,28 +61,29 @@ class Learning(Collector):
             _add_quality(gauges, model, monitor)
             for outcome in CODES:
                 rows.add_metric([model, outcome], monitor.counts[outcome])
-            if (served := self._service.loaded.hot(model, None)) is None:
+            if (served := self._updates.loaded.hot(model, None)) is None:
                 continue
             revision.add_metric([model, str(served.version)], served.revision)
             lag.add_metric([model], self._lag(served))
-            share = novel_share(self._service.updates.status(model, served.version))
+            share = novel_share(self._updates.status(model, served.version))
             if share is not None:
                 novel.add_metric([model], share)
         yield from (*gauges.values(), revision, novel, lag, rows)
+        yield LOADED.of([((), len(self._updates.loaded.versions()))])
 
     def _monitors(self) -> dict[str, Monitor]:
         """Monitors by model: those there are, and of models in memory that have got observations before the start.
 
         No model is loaded for it, which would drop another one.
         """
-        updates, loaded = self._service.updates, self._service.loaded
-        with self._service.database.session() as session:
+        updates, loaded = self._updates, self._updates.loaded
+        with self._updates.database.session() as session:
             learning = list(session.scalars(select(StreamRow.model).distinct()))
         fresh = {model: updates.monitor(model) for model in learning if loaded.hot(model, None) is not None}
         return dict(sorted((updates.monitors() | fresh).items()))
 
     def _lag(self, served: Served) -> int:
-        with self._service.database.session() as session:
+        with self._updates.database.session() as session:
             return max(revisions.current(session, served.name, served.version) - served.revision, 0)
 
 

@@ -6,23 +6,23 @@ import time
 
 from lipcore.online.record import Record
 from lipcore.vocabulary import CODES, LEARNT
-from service.context import Service
 from service.learning.control.schema import Figures, Quality, QualityWindow
 from service.learning.quality.windows import Window
+from service.learning.updates import Updates
 
 SHOWN = ("nmse", "rmse", "coverage", "nlpd")
 
 
-def show(service: Service, model: str) -> Quality:
+def show(updates: Updates, model: str) -> Quality:
     """Return the quality of a model over the windows of the settings; raise NotFoundError. Not for the event loop."""
-    served = service.loaded.get(model, None)
+    served = updates.loaded.get(model, None)
     now = time.time()
     return Quality(
         model=model,
         version=served.version,
         revision=served.revision,
         joint_names=list(served.model.joint_names),
-        windows=[window(each, now) for each in service.updates.monitor(model).windows],
+        windows=[window(each, now) for each in updates.monitor(model).windows],
     )
 
 

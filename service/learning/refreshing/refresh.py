@@ -12,25 +12,22 @@ from typing import Any, Literal
 from sqlalchemy import Select, select
 from sqlalchemy.orm import Session
 
-from service.foundation.errors import BusyError, ConflictError, not_found
+from service.foundation.errors import BusyError, ConflictError
 from service.foundation.settings import Settings
 from service.foundation.states import ACTIVE
-from service.journal import alarms, log
+from service.journal import alarms
 from service.journal.alarms import AlarmKind
 from service.learning import learning
 from service.learning.learner.messages import Published
 from service.learning.refreshing.promotion import CANDIDATE
 from service.models import registry
-from service.storage.database import AlarmRow, Database, JobRow, LearnerRow, ServingRow, VersionRow
-from service.training import jobs
-from service.training import refresh_scope as scope
+from service.storage.database import AlarmRow, Database, LearnerRow, ServingRow
+from service.training import jobs, refreshes
 from service.training.queue import JobQueue
 from service.training.schema import Job
-from service.web.idempotency import Identity, done
 
 logger = logging.getLogger(__name__)
 
-Trigger = Literal["novelty", "linearisation", "asked"]
 MOST_DOUBLINGS = 10
 
 
@@ -41,30 +38,6 @@ class Reason:
     trigger: Literal["novelty", "linearisation"]
     text: str
     evidence: dict[str, Any]
-
-
-def ask(
-    settings: Settings,
-    database: Database,
-    queue: JobQueue,
-    model: str,
-    trigger: Trigger = "asked",
-    retry_of: str | None = None,
-    named: Identity | None = None,
-) -> Job:
-    """Queue a refresh of the version that serves; return its job. Not for the event loop.
-
-    retry_of: the job that it repeats; named: the request, where its client has named it.
-    Raise NotFoundError, BusyError for a full queue, ConflictError where a refresh of the model is under way or there is
-    nothing to train on.
-    """
-    version = registry.find(database, model, None)
-    with database.transaction() as session:
-        if (before := done(session, JobRow, named)) is not None:
-            return jobs.shown(before)
-        job = _queue(session, settings, version, trigger, retry_of, named)
-    queue.submit(job.id)
-    return jobs.shown(job)
 
 
 def consider(settings: Settings, database: Database, queue: JobQueue, published: Published) -> Job | None:
@@ -91,7 +64,7 @@ def consider(settings: Settings, database: Database, queue: JobQueue, published:
             return None
         why = reasons[0]
         try:
-            job = _queue(session, settings, version, why.trigger)
+            job = refreshes.add(session, settings, version, why.trigger)
         except ConflictError as error:
             text = f"{why.text}, but it cannot be refreshed: {error.message}"
             _raise_once(session, model, "refresh", text, why.evidence)
@@ -104,63 +77,22 @@ def consider(settings: Settings, database: Database, queue: JobQueue, published:
     return jobs.shown(job)
 
 
-def _queue(
-    session: Session,
-    settings: Settings,
-    version: VersionRow,
-    trigger: Trigger,
-    retry_of: str | None = None,
-    named: Identity | None = None,
-) -> JobRow:
-    """Add the job of a refresh; raise ConflictError or BusyError."""
-    model, manifest = version.model, version.manifest
-    if not registry.exists(session, model, version.version):  # deleted since it was found
-        raise not_found("version", version.version)
-    for job in session.scalars(_refreshes(model).where(JobRow.state.in_(ACTIVE))):
-        raise ConflictError(f"job {job.id!r} refreshes model {model!r} already: wait for its end or cancel it")
-    through = log.newest(session, model)
-    found = scope.find(session, model, through)
-    kept, left_out = scope.split(session, found, manifest["lineage"])
-    rows = scope.rows(session, model, found)
-    if not kept and rows < settings.min_samples:
-        raise ConflictError(_nothing(version, rows, left_out, settings.min_samples))
-    made_by = None if version.job is None else session.scalar(select(JobRow).where(JobRow.id == version.job))
-    request = {
-        "model": model,
-        "datasets": [row.id for row in kept],
-        "estimator": manifest["estimator"],
-        "joint_types": manifest["joint_types"],
-        "robot": made_by.request.get("robot") if made_by is not None and "robot" in manifest else None,
-        "options": manifest["options"],
-        "refresh": {"version": version.version, "through": through, "trigger": trigger},
-    }
-    return jobs.add(session, settings, model, request, retry_of, named)
-
-
-def _nothing(version: VersionRow, rows: int, left_out: list[dict[str, str]], least: int) -> str:
-    data = "; ".join(f"data set {each['id']!r} is left out: {each['reason']}" for each in left_out)
-    return (
-        f"version {version.version} of model {version.model!r} cannot be refreshed: its log has {rows} rows to train "
-        f"on, expected at least {least} where none of its data sets is left ({data or 'it names none'})"
-    )
-
-
 def _is_due(session: Session, settings: Settings, published: Published) -> bool:
     """Whether a refresh may be queued or an alarm be raised now."""
     model, version = published.model, published.version
     serving = session.get(ServingRow, model)
     if serving is None or serving.version != version or learning.held(session, model) is not None:
         return False
-    refreshes = list(session.scalars(_refreshes(model)))
-    if any(job.state in ACTIVE for job in refreshes):
+    before = list(session.scalars(refreshes.of(model)))
+    if any(job.state in ACTIVE for job in before):
         return False
     contest = select(LearnerRow.version).where(LearnerRow.model == model, LearnerRow.role == CANDIDATE)
     if session.scalar(contest.limit(1)) is not None:
         return False
     if not learning.options(session, model).auto_promote and _is_better_known(session, model, version):
         return False
-    ended = [_unix(job.finished_at or job.created_at) for job in refreshes]
-    earlier = sum(job.request["refresh"]["version"] == version for job in refreshes)
+    ended = [_unix(job.finished_at or job.created_at) for job in before]
+    earlier = sum(job.request["refresh"]["version"] == version for job in before)
     pause = settings.refresh_pause_s * 2 ** min(max(earlier - 1, 0), MOST_DOUBLINGS)
     return not ended or time.time() - max(ended) >= pause
 
@@ -202,12 +134,6 @@ def _reasons(settings: Settings, published: Published) -> Iterator[Reason]:
 
 def _alarms(model: str, kind: AlarmKind) -> Select[int]:
     return select(AlarmRow.seq).where(AlarmRow.model == model, AlarmRow.kind == kind)
-
-
-def _refreshes(model: str) -> Select[JobRow]:
-    """Jobs that refresh a model."""
-    refreshed = JobRow.request["refresh"]["version"].as_integer()
-    return select(JobRow).where(JobRow.model == model, refreshed.is_not(None))
 
 
 def _unix(moment: str) -> float:

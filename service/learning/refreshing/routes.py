@@ -5,7 +5,6 @@ from __future__ import annotations
 from fastapi import APIRouter, Response, status
 from pydantic import BaseModel, ConfigDict
 
-from service.context import ServiceDep
 from service.foundation.errors import (
     BusyError,
     ConflictError,
@@ -14,7 +13,8 @@ from service.foundation.errors import (
     TooLargeError,
     responses,
 )
-from service.learning.refreshing import refresh
+from service.training import refreshes
+from service.training.queue import JobQueueDep
 from service.training.schema import Job
 from service.web.route import Route
 
@@ -33,11 +33,11 @@ class RefreshRequest(BaseModel):
     summary="Train the version that serves anew",
     responses=responses(NotFoundError, ConflictError, TooLargeError, BusyError),
 )
-def create(service: ServiceDep, model: str, request: RefreshRequest, response: Response) -> Job:
+def create(queue: JobQueueDep, model: str, request: RefreshRequest, response: Response) -> Job:
     """Queue a job that trains on the version's data sets and on what has been observed since.
 
     The version that it makes learns along and answers once it has predicted better than the one that serves.
     """
-    job = refresh.ask(service.settings, service.database, service.jobs, model)
+    job = refreshes.ask(queue, model)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job

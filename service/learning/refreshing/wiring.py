@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from service.context import Service
 from service.learning.learner.messages import Contested, Published
 from service.learning.refreshing import promotion, refresh
+from service.learning.updates import Updates
+from service.training.queue import JobQueue
 
 
-def attach(service: Service) -> None:
+def attach(updates: Updates, jobs: JobQueue) -> None:
     """Let versions be refreshed and promoted by themselves; once, before the first observation comes."""
 
     def published(message: Published) -> None:
-        refresh.consider(service.settings, service.database, service.jobs, message)
+        refresh.consider(updates.settings, updates.database, jobs, message)
 
     def contested(message: Contested) -> None:
-        promotion.decide(service.database, service.loaded, service.updates.learner.wake, message)
+        promotion.decide(updates.database, updates.loaded, updates.learner.wake, message)
 
-    service.updates.when_published.append(published)
-    service.updates.when_contested.append(contested)
+    updates.when_published.append(published)
+    updates.when_contested.append(contested)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+from typing import Annotated
+
+from fastapi import Depends, Request
 
 
 class Stopping:
@@ -14,3 +17,11 @@ class Stopping:
     def __init__(self) -> None:
         self.begun = False
         self.closing = asyncio.Event()
+
+
+async def _stopping(request: Request) -> Stopping:
+    found: Stopping = request.app.state.stopping
+    return found
+
+
+StoppingDep = Annotated[Stopping, Depends(_stopping)]

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
+
+from fastapi import Depends, Request
 
 BOUNDS = (
     *(0.000_05, 0.000_1, 0.000_25, 0.000_5, 0.001, 0.002, 0.005, 0.01, 0.025),
@@ -109,3 +111,11 @@ class Meters:
     def streams(self) -> Mapping[str, StreamMeter]:
         """Meters of streams by model, as they are now."""
         return dict(self._streams)
+
+
+async def _meters(request: Request) -> Meters:
+    found: Meters = request.app.state.meters
+    return found
+
+
+MetersDep = Annotated[Meters, Depends(_meters)]

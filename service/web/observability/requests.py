@@ -108,5 +108,5 @@ def _template(scope: Scope) -> str:
 
 def _exists(scope: Scope, model: str) -> bool:
     """Whether the model of a refused request is known to exist: not where nobody has asked for it since the start."""
-    service = getattr(scope["app"].state, "service", None)
-    return service is not None and service.loaded.newest(model) is not None
+    loaded = getattr(scope["app"].state, "loaded", None)
+    return loaded is not None and loaded.newest(model) is not None

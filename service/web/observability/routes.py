@@ -7,11 +7,6 @@ from fastapi.responses import PlainTextResponse
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import choose_encoder
 
-from service.context import ServiceDep
-from service.learning.quality.metrics import Learning
-from service.training.metrics import Work
-from service.web.observability.system import System
-from service.web.observability.traffic import Traffic
 from service.web.route import Route
 
 EXAMPLE = """# HELP lipserve_requests_total Requests that were answered; 101: a stream, 499: the client went away before
@@ -36,12 +31,12 @@ router = APIRouter(tags=["health"], route_class=Route)
         }
     },
 )
-def metrics(request: Request, service: ServiceDep) -> Response:
+def metrics(request: Request) -> Response:
     """Latency and errors of requests and streams, training jobs, quality and lag of models that learn, disk, memory,
     and which parts of the service are in order. docs/metrics.md lists all.
     """
     registry = CollectorRegistry()
-    for collector in (Traffic(service.meters), Work(service.database), Learning(service), System(service)):
+    for collector in request.app.state.collectors:
         registry.register(collector)
     encode, media_type = choose_encoder(request.headers.get("accept", ""))
     return Response(encode(registry), media_type=media_type)

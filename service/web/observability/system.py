@@ -5,7 +5,6 @@ from __future__ import annotations
 import multiprocessing
 from collections import defaultdict
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 from prometheus_client.core import Metric
 from prometheus_client.process_collector import ProcessCollector
@@ -13,14 +12,12 @@ from prometheus_client.registry import Collector
 
 from service import __version__
 from service.storage.disk import measure
+from service.storage.storage import Storage
 from service.web.observability.metric import MetricKind
-
-if TYPE_CHECKING:
-    from service.context import Service
+from service.web.observability.readiness import Readiness
 
 BUILD = MetricKind("gauge", "lipserve_build_info", "1; the version of LIPServe", ("version",))
 PARTS = MetricKind("gauge", "lipserve_ready", "1 where a part is in order, 0 where /health/ready names it", ("part",))
-LOADED = MetricKind("gauge", "lipserve_models_loaded", "Model versions in memory")
 USED = MetricKind("gauge", "lipserve_disk_used_bytes", "Bytes of the home's files, by what they are of", ("what",))
 FREE = MetricKind("gauge", "lipserve_disk_free_bytes", "Bytes that the disk of the home has free")
 MEMORY = MetricKind(
@@ -32,7 +29,7 @@ CPU = MetricKind(
     "CPU time of the processes that learn and train which run now, s",
     ("process",),
 )
-KINDS = (BUILD, PARTS, LOADED, USED, FREE, MEMORY, CPU)
+KINDS = (BUILD, PARTS, USED, FREE, MEMORY, CPU)
 LEARNER = "lipserve-learner"
 _SHOWN = {"process_resident_memory_bytes": MEMORY, "process_cpu_seconds": CPU}
 
@@ -40,8 +37,8 @@ _SHOWN = {"process_resident_memory_bytes": MEMORY, "process_cpu_seconds": CPU}
 class System(Collector):
     """Of one service. Its own process has Prometheus's usual `process_…` metrics. Not for the event loop."""
 
-    def __init__(self, service: Service) -> None:
-        self._service = service
+    def __init__(self, storage: Storage, readiness: Readiness) -> None:
+        self._storage, self._readiness = storage, readiness
         self._own = ProcessCollector(registry=None)
 
     def describe(self) -> list[Metric]:
@@ -50,12 +47,10 @@ class System(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Yield every metric."""
-        service = self._service
         yield BUILD.of([([__version__], 1)])
-        parts = service.readiness.report(service).checks
+        parts = self._readiness.report().checks
         yield PARTS.of(([part.name], float(part.state != "failed")) for part in parts)
-        yield LOADED.of([((), len(service.loaded.versions()))])
-        files, usage = service.files, service.disk.usage()
+        files, usage = self._storage.files, self._storage.disk.usage()
         used = {what: measure(folder) for what, folder in files.folders.items()}
         used["other"] = max(usage.used - sum(used.values()), 0)  # the database above all; measured a moment before
         yield USED.of(([what], size) for what, size in used.items())

@@ -101,7 +101,7 @@ def test_revoking_twice_keeps_the_first_time(lipserve, keys_database):
 
 
 def test_keys_of_a_running_service(lipserve, guarded, monkeypatch):
-    home = guarded.api.app.state.service.settings.home
+    home = guarded.api.app.state.storage.settings.home
     monkeypatch.setenv("LIPSERVE_HOME", str(home))
     made = json.loads(lipserve("keys", "create", "--name", "arm", "--scope", "read", "--json")[1])
 

@@ -396,7 +396,7 @@ def test_failure_while_it_is_published_leaves_nothing(api, files, monkeypatch):
         raise RuntimeError("killed")
 
     monkeypatch.setattr(archive_import, "_publish", fail)
-    folder = api.app.state.service.files.versions
+    folder = api.app.state.storage.files.versions
     before = sorted(folder.iterdir())
     with pytest.raises(RuntimeError, match="killed"):
         send(api, pack(files))

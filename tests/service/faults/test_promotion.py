@@ -25,16 +25,17 @@ POINTS = {
 VERDICT = f"""
 import sys
 from pathlib import Path
-from service.database import Database
-from service.files import Files
-from service.inference.loaded import LoadedModels
-from service.updates.learner.messages import Contested
-from service.updates.refreshing import promotion
+from service.foundation.settings import Settings
+from service.storage.storage import Storage
+from service.learning.learner.learnt import LearntVersions
+from service.models.loaded import LoadedModels
+from service.learning.learner.messages import Contested
+from service.learning.refreshing import promotion
 
-database = Database(Path(sys.argv[1]))
-loaded = LoadedModels(database, Files(Path(sys.argv[1])), 2)
+storage = Storage.open(Settings(home=Path(sys.argv[1])))
+loaded = LoadedModels(storage, LearntVersions(storage.database, storage.files), 2)
 loaded.preload()
-promotion.decide(database, loaded, print, Contested("{ARM}", 1, 2, "promote", {{"rows": 700}}))
+promotion.decide(storage.database, loaded, print, Contested("{ARM}", 1, 2, "promote", {{"rows": 700}}))
 """
 """What a service does with the verdict of a contest, which takes minutes to come to."""
 

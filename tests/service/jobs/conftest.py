@@ -13,6 +13,9 @@ from sqlalchemy import select
 from service.foundation.settings import Settings
 from service.foundation.states import ACTIVE, QUEUED
 from service.storage.database import Database, JobRow, now
+from service.storage.disk import Disk
+from service.storage.files import Files
+from service.storage.storage import Storage
 from service.training import queue
 from service.training.queue import JobQueue
 from tests.service.data import eventually
@@ -27,7 +30,8 @@ class Bench:
         self.settings = settings
         self.database = Database(settings.home, DATABASE_TIMEOUT_S)
         self.made: list[tuple[str, int]] = []
-        self.queue = JobQueue(settings, self.database, lambda *made: self.made.append(made))
+        storage = Storage(settings, self.database, Files.of(settings), Disk(settings))
+        self.queue = JobQueue(storage, lambda *made: self.made.append(made))
 
     def add(self, name: str, **values: Any) -> str:
         """A queued job of that name that nobody has been told of."""

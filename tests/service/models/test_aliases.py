@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from service.foundation.errors import NotFoundError
+from service.learning.learner.learnt import LearntVersions
 from service.models import registry
 from service.models.loaded import LoadedModels
 from tests.service.data import error, service_of
@@ -167,7 +168,7 @@ def test_aliases_outlive_a_restart(api, arm):
     put(api, arm, "gone", version=1)
     api.delete(f"/v1/models/{arm}/aliases/gone")
     service = service_of(api)
-    started = LoadedModels(service.database, service.files, capacity=2)
+    started = LoadedModels(service.storage, LearntVersions(service.database, service.files), capacity=2)
     assert started.get(arm, None, "production").version == 1
     with pytest.raises(NotFoundError, match="no alias 'gone'"):
         started.get(arm, None, "gone")

@@ -12,6 +12,7 @@ from service.foundation.errors import ConflictError, NotFoundError, UnreadableVe
 from service.foundation.settings import Settings
 from service.foundation.states import CANCELLED, RUNNING
 from service.journal import snapshots
+from service.learning.learner.learnt import LearntVersions
 from service.models import registry
 from service.models.loaded import LoadedModels
 from service.storage.database import (
@@ -216,7 +217,7 @@ def test_a_batch_that_was_predicted_by_what_is_deleted_is_not_logged(api, arm):
 
 def test_who_asks_for_a_pointer_is_answered_though_it_moves_and_the_version_before_goes(api, arm, monkeypatch):
     service = service_of(api)
-    fresh = LoadedModels(service.database, service.files, capacity=2)
+    fresh = LoadedModels(service.storage, LearntVersions(service.database, service.files), capacity=2)
     find = registry.find
     moved = threading.Event()
 

@@ -9,9 +9,9 @@ from prometheus_client.openmetrics.parser import text_string_to_metric_families 
 from prometheus_client.parser import text_string_to_metric_families as parse
 from sqlalchemy import delete
 
+from docs import metrics as table
 from service.storage.database import JobRow
 from service.training.metrics import DURATION, FINISHED, JOBS, Work
-from service.web.observability import table
 from tests.service.data import QUICK, service_of, stream, upload
 from tests.service.observability.test_request_ids import QUERY
 

@@ -8,8 +8,10 @@ from contextlib import closing
 import pytest
 
 from service.learning.learner.process import LearnerProcess
-from service.web.observability import readiness
-from service.web.observability.readiness import KEPT_S, RESTART_S, START_S, Readiness
+from service.learning.updates import RESTART_S
+from service.storage import looks
+from service.training.metrics import START_S
+from service.web.observability.readiness import KEPT_S, Readiness
 from tests.service.data import QUICK, error, service_of, stream, upload
 
 FEW = {**QUICK, "posterior_samples": 40}
@@ -35,11 +37,12 @@ def clock():
 @pytest.fixture
 def look(clock):
     """A look at a service, as if nobody had looked within the last second: states by part."""
-    seen = Readiness(clock)
+    kept = {}
 
     def look(service):
+        seen = kept.setdefault(id(service.readiness), Readiness(service.readiness.looks, service.stopping, clock))
         seen.forget()
-        return {check.name: (check.state, check.message) for check in seen.report(service).checks}
+        return {check.name: (check.state, check.message) for check in seen.report().checks}
 
     return look
 
@@ -58,7 +61,7 @@ def test_what_does_not_work_is_named(api, fresh_looks, monkeypatch):
 
 
 def test_a_locked_database_is_found(api, look, monkeypatch):
-    monkeypatch.setattr(readiness, "WRITE_S", 0.05)
+    monkeypatch.setattr(looks, "WRITE_S", 0.05)
     service = service_of(api)
     with closing(sqlite3.connect(service.database.engine.url.database, isolation_level=None)) as other:
         other.execute("BEGIN IMMEDIATE")
@@ -140,15 +143,15 @@ def test_a_service_that_stops_is_not_ready_though_all_parts_work(api, monkeypatc
     assert [item["field"] for item in said["detail"]] == ["stopping"]
 
 
-def test_a_report_is_kept_for_a_moment(api, clock, monkeypatch):
-    seen, looks = Readiness(clock), []
-    monkeypatch.setattr(readiness, "_home", lambda service: looks.append(1) or ("ok", ""))
+def test_a_report_is_kept_for_a_moment(api, clock):
+    looked = []
+    seen = Readiness({"home": lambda lasting: looked.append(1) or ("ok", "")}, service_of(api).stopping, clock)
     for _ in range(5):
-        seen.report(service_of(api))
-    assert len(looks) == 1
+        seen.report()
+    assert len(looked) == 1
     clock.now += KEPT_S
-    seen.report(service_of(api))
-    assert len(looks) == 2
+    seen.report()
+    assert len(looked) == 2
 
 
 def test_asking_does_not_count_as_using_a_version(api, look):

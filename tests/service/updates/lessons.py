@@ -13,11 +13,10 @@ from fastapi.testclient import TestClient
 
 import lipcore
 from service.app import create_app
-from service.context import Service
 from service.foundation.settings import Settings
 from service.models import registry
 from service.storage.files import new_id
-from tests.service.data import ADDRESS, error, eventually, service_of, stream
+from tests.service.data import ADDRESS, Parts, error, eventually, service_of, stream
 
 LESSON = 10
 """Rows of a batch: so few that the stated uncertainty is not yet held against the errors seen."""
@@ -34,7 +33,7 @@ class School:
     trained: Path
 
     @property
-    def service(self) -> Service:
+    def service(self) -> Parts:
         """The parts of the service."""
         return service_of(self.client)
 

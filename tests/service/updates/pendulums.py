@@ -28,7 +28,9 @@ from service.learning.learner.restore import Restored, advance, restore
 from service.models import registry
 from service.models.loaded import LoadedModels
 from service.storage.database import Database, EventRow
+from service.storage.disk import Disk
 from service.storage.files import Files
+from service.storage.storage import Storage
 from tests.service.data import QUICK, stream
 
 ARM = "arm"
@@ -76,6 +78,11 @@ class Arm:
         arm = cls(Database.of(chosen), Files.of(chosen), chosen)
         arm.publish()
         return arm
+
+    @property
+    def storage(self) -> Storage:
+        """Where it is kept."""
+        return Storage(self.settings, self.database, self.files, Disk(self.settings))
 
     def publish(self, model: str | None = None, **arguments: Any) -> int:
         """Add the trained model as a version, of this model unless said."""

@@ -15,6 +15,7 @@ from sqlalchemy import select
 
 from service.learning.learner import process as processes
 from service.learning.learner import publication
+from service.learning.learner.learnt import LearntVersions
 from service.learning.learner.messages import Published
 from service.learning.learner.process import LearnerProcess, learner_place
 from service.models.loaded import LoadedModels
@@ -30,7 +31,9 @@ class Serving:
 
     def __init__(self, home):
         self.arm = Arm.open(home, learner_niceness=1)
-        self.loaded = LoadedModels(self.arm.database, self.arm.files, capacity=4)
+        self.loaded = LoadedModels(
+            self.arm.database, self.arm.files, LearntVersions(self.arm.database, self.arm.files), capacity=4
+        )
         self.loaded.preload()
         self.messages = []
         self.learner = LearnerProcess(self.arm.settings, self.take)

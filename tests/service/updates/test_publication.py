@@ -13,6 +13,7 @@ from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.online.revision import Revision
 from service.learning.learner import learnt, publication
+from service.learning.learner.learnt import LearntVersions
 from service.learning.learner.messages import Published
 from service.models.loaded import LoadedModels
 from service.storage.files import Files
@@ -22,7 +23,7 @@ from tests.service.updates.pendulums import ARM, QUERIES, adopt, at_once, differ
 @pytest.fixture
 def loaded(arm):
     """What a service has in memory: the model as trained."""
-    found = LoadedModels(arm.database, arm.files, capacity=2)
+    found = LoadedModels(arm.storage, LearntVersions(arm.database, arm.files), capacity=2)
     found.get(ARM, None)
     return found
 
@@ -159,7 +160,7 @@ def test_what_is_learnt_while_a_version_is_being_loaded_is_not_lost(arm, loaded,
 
 def test_a_service_that_starts_has_what_the_log_says(arm):
     arm.batches(*range(4))
-    started = LoadedModels(arm.database, arm.files, capacity=2)
+    started = LoadedModels(arm.storage, LearntVersions(arm.database, arm.files), capacity=2)
     assert started.preload() == 1
     found = started.hot(ARM, None)
     assert found.revision == 4
@@ -170,7 +171,7 @@ def test_a_service_that_starts_has_what_the_log_says(arm):
 def test_a_learner_is_woken_for_what_was_loaded_without_all_of_its_log(arm, monkeypatch):
     monkeypatch.setattr(learnt, "MOST_ROWS", 0)
     woken = []
-    started = LoadedModels(arm.database, arm.files, capacity=2)
+    started = LoadedModels(arm.storage, LearntVersions(arm.database, arm.files), capacity=2)
     arm.batches(*range(4))
     started.preload()
     started.learn_from(woken.append)
@@ -185,7 +186,7 @@ def test_a_log_that_cannot_be_read_leaves_the_version_as_trained(arm, caplog):
     arm.batches(0)
     with arm.database.transaction() as session:
         session.connection().exec_driver_sql("UPDATE events SET payload = x'00'")
-    started = LoadedModels(arm.database, arm.files, capacity=2)
+    started = LoadedModels(arm.storage, LearntVersions(arm.database, arm.files), capacity=2)
     started.preload()
     found = started.hot(ARM, None)
     assert found.revision == 0

@@ -12,6 +12,7 @@ from service.journal import snapshots
 from service.learning.learner import course, learnt, recent
 from service.learning.learner import restore as restoring
 from service.learning.learner.course import RewoundError
+from service.learning.learner.learnt import LearntVersions
 from service.learning.learner.restore import advance
 from tests.service.updates.pendulums import (
     ARM,
@@ -151,14 +152,14 @@ def test_where_that_snapshot_is_lost_what_is_left_of_the_log_is_learnt(arm):
 
 
 def test_little_is_learnt_where_a_version_is_loaded_and_the_rest_is_left_to_the_learner(arm, monkeypatch):
-    assert learnt.find(arm.database, arm.files, ARM, 1, arm.base) is None
+    assert LearntVersions(arm.database, arm.files).find(ARM, 1, arm.base) is None
     arm.batches(*range(6))
-    found = learnt.find(arm.database, arm.files, ARM, 1, arm.base)
+    found = LearntVersions(arm.database, arm.files).find(ARM, 1, arm.base)
     assert (found.revision, found.behind) == (6, False)
     same(found.model, at_once(range(6)))
     monkeypatch.setattr(course, "PAGE_ROWS", 10)
     monkeypatch.setattr(learnt, "MOST_ROWS", 20)
-    found = learnt.find(arm.database, arm.files, ARM, 1, arm.base)
+    found = LearntVersions(arm.database, arm.files).find(ARM, 1, arm.base)
     assert (found.revision, found.behind) == (2, True)
     same(found.model, at_once(range(2)))
 
@@ -168,7 +169,7 @@ def test_a_version_that_learns_no_more_has_learnt_what_its_last_snapshot_says(ar
     arm.snapshot(at_most=2)
     arm.publish()
     arm.batches(3)
-    found = learnt.find(arm.database, arm.files, ARM, 1, arm.base)
+    found = LearntVersions(arm.database, arm.files).find(ARM, 1, arm.base)
     assert (found.revision, found.behind) == (2, False)
     same(found.model, at_once(range(2)))
 
@@ -176,7 +177,7 @@ def test_a_version_that_learns_no_more_has_learnt_what_its_last_snapshot_says(ar
 def test_without_a_snapshot_such_a_version_is_as_trained(arm):
     arm.batches(0, 1)
     arm.publish()
-    assert learnt.find(arm.database, arm.files, ARM, 1, arm.base) is None
+    assert LearntVersions(arm.database, arm.files).find(ARM, 1, arm.base) is None
 
 
 # the errors of the last seconds
@@ -192,7 +193,7 @@ def test_the_stated_uncertainty_is_not_below_the_errors_of_the_last_seconds(arm)
     assert recent.floor(arm.database, ARM, 1, 1, 2)[0] == pytest.approx(9.0 - noise)
     assert recent.floor(arm.database, ARM, 2, 5, 2).tolist() == [0.0, 0.0]
     assert recent.floor(arm.database, ARM, 1, 0, 2).tolist() == [0.0, 0.0]
-    found = learnt.find(arm.database, arm.files, ARM, 1, arm.base)
+    found = LearntVersions(arm.database, arm.files).find(ARM, 1, arm.base)
     assert found.model.predict(*QUERIES).tau_std[:, 0].min() >= np.sqrt(0.25 - noise) * (1 - 1e-9)
 
 

@@ -8,6 +8,7 @@ from sqlalchemy import delete
 
 from service.app import create_app
 from service.foundation.errors import NotFoundError
+from service.learning.learner.learnt import LearntVersions
 from service.models import registry
 from service.models.loaded import LoadedModels
 from service.models.registry import Serving
@@ -21,7 +22,7 @@ QUERY = {"q": [0.1, 0.2], "dq": [0.0, 0.0], "ddq": [0.0, 0.0]}
 @pytest.fixture
 def loaded(arm):
     """What a service has in memory."""
-    return LoadedModels(arm.database, arm.files, capacity=4)
+    return LoadedModels(arm.storage, LearntVersions(arm.database, arm.files), capacity=4)
 
 
 def serving(arm):
@@ -114,7 +115,7 @@ def test_the_models_that_changed_last_are_loaded_first(arm):
     arm.publish(candidate=True)
     assert registry.recent(arm.database, 1) == [ARM]
     assert set(registry.recent(arm.database, 5)) == {ARM, "other"}
-    loaded = LoadedModels(arm.database, arm.files, capacity=2)
+    loaded = LoadedModels(arm.storage, LearntVersions(arm.database, arm.files), capacity=2)
     assert loaded.preload() == 2
     assert loaded.hot(ARM, None).version == 1
 

@@ -1,4 +1,4 @@
-"""The table of all metrics, as the documentation has it: `python -m service.web.observability.table`."""
+"""The table of all metrics that docs/monitoring.md has: `python docs/metrics.py` prints it."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import sys
 from collections.abc import Iterator
 
 from service.learning.quality import metrics as learning
-from service.training import metrics as work
+from service.training import metrics as training
 from service.web.observability import system, traffic
 from service.web.observability.metric import MetricKind
 
-KINDS: tuple[MetricKind, ...] = (*traffic.KINDS, *work.KINDS, *learning.KINDS, *system.KINDS)
+KINDS: tuple[MetricKind, ...] = (*traffic.KINDS, *training.KINDS, *learning.KINDS, *system.KINDS)
 """All metrics that /metrics shows besides Prometheus's usual ones of a process."""
 
 
