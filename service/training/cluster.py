@@ -1,7 +1,7 @@
 """The queue of training jobs where a Dask cluster runs them.
 
 The rows of the jobs say all that counts. For each job of this service that waits the scheduler has a ticket: a call of
-a call of `hosting.host`, which some worker makes once it is free. Tickets may be lost or come twice; a job is done by whoever
+`hosting.host`, which some worker makes once it is free. Tickets may be lost or come twice; a job is done by whoever
 changes its row first. The service watches the row, and sees to it that a waiting job has a ticket.
 """
 

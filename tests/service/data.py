@@ -14,16 +14,16 @@ from lipcore.robots import load_robot
 from lipcore.samples import Samples
 from lipcore.simulation import Stream, simulate
 from service.foundation.states import ACTIVE
-
-QUICK = {"hyperparameter_samples": 20, "posterior_samples": 60, "max_iterations": 4}
-"""Options of a fit that takes a fraction of a second."""
-ENDLESS = {"hyperparameter_samples": 200, "posterior_samples": 60, "max_iterations": 10_000}
-"""Options of a fit that takes about half a minute on 200 samples of `panda`: far longer than a test needs to end it."""
 from service.learning.updates import Updates
 from service.models.loaded import LoadedModels
 from service.storage.storage import Storage
 from service.training.queue import JobQueue
 from service.web.observability.readiness import Readiness
+
+QUICK = {"hyperparameter_samples": 20, "posterior_samples": 60, "max_iterations": 4}
+"""Options of a fit that takes a fraction of a second."""
+ENDLESS = {"hyperparameter_samples": 200, "posterior_samples": 60, "max_iterations": 10_000}
+"""Options of a fit that takes about half a minute on 200 samples of `panda`: far longer than a test needs to end it."""
 
 ADDRESS = "http://localhost"
 """Where an in-process client finds the service: one without keys answers to names of this machine only."""
