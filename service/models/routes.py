@@ -53,7 +53,7 @@ def show_version(loaded: LoadedModelsDep, model: str, version: VersionNumber) ->
     responses=responses(NotFoundError, ConflictError),
 )
 def delete_version(loaded: LoadedModelsDep, model: str, version: VersionNumber) -> None:
-    """Delete a version that nothing needs: no alias, not the loaded, no contest and no job. Its number is not given
+    """Delete a version that nothing needs: no alias, not the service, no contest and no job. Its number is not given
     again."""
     deletion.delete_version(loaded, model, version)
 
