@@ -26,6 +26,7 @@ ORDER = (
     "safety.md",
     "numbers.md",
     "method.md",
+    "architecture.md",
     "operations.md",
     "monitoring.md",
     "reverse-proxy.md",
@@ -78,7 +79,8 @@ def pages() -> dict[str, Page]:
 @lru_cache(1)
 def images() -> dict[str, Path]:
     """Every picture by the name that the guide gives it: its path with dashes, which no other file can be named by."""
-    return {_flat(path.relative_to(folder()).as_posix()): path for path in sorted(folder().rglob("*.png"))}
+    paths = sorted(path for kind in ("*.png", "*.svg") for path in folder().rglob(kind))
+    return {_flat(path.relative_to(folder()).as_posix()): path for path in paths}
 
 
 @lru_cache(64)
