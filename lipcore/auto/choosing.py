@@ -1,7 +1,7 @@
 """Choosing an estimator by what it predicts of motion that it has not seen.
 
 The measure is the log predictive density of held-out torque, noise included, summed over the joints, per sample. The
-best is chosen; of those within one standard error of it, the simplest. It then learns all samples.
+best is chosen; unless a simpler one is within one standard error of it, or errs no more. It then learns all samples.
 """
 
 from __future__ import annotations
