@@ -1,7 +1,8 @@
 """Choosing an estimator by what it predicts of motion that it has not seen.
 
 The measure is the log predictive density of held-out torque, noise included, summed over the joints, per sample. The
-best is chosen; unless a simpler one is within one standard error of it, or errs no more. It then learns all samples.
+best is chosen, unless one that knows more of the arm is within one standard error of it, or errs no more. It then
+learns all samples.
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ def _of_all(work: Work, samples: Samples, contest: Contest, chosen: str) -> Torq
 
 
 def _unjudged(work: Work, samples: Samples, reason: str) -> TorqueModel:
-    """Of few samples the simplest estimator that can be trained learns all."""
+    """Of few samples the first estimator that can be trained learns all."""
     table: list[Candidate] = []
     errors: list[Exception] = []
     for name in (RIGID, CHAIN):

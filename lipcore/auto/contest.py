@@ -20,7 +20,8 @@ from lipcore.urdf import RigidBody
 from lipcore.vocabulary import ROBOT_ESTIMATORS, JointType, TorqueConvention
 
 RIGID, CHAIN, BOTH = "rigid-body", "lip-chain", "rigid-body+lip-chain"
-SIMPLEST_FIRST = (RIGID, CHAIN, BOTH)
+MOST_PHYSICS_FIRST = (RIGID, BOTH, CHAIN)
+"""Where two do as well, the earlier one is taken: what knows the arm errs less where nothing was measured."""
 AGAIN, ALL, FEW = "again", "all", "few"
 PLACES = {RIGID: (0, 0.25), BOTH: (0.25, 0.55), CHAIN: (0.55, 0.92), AGAIN: (0.92, 0.97), ALL: (0.97, 1), FEW: (0, 1)}
 """Which share of all the work each fit is, from and to."""
@@ -125,22 +126,22 @@ class Contest:
     def verdict(self) -> tuple[str, str]:
         """The estimator that is chosen, and why."""
         best = self._best()
-        trained = [name for name in SIMPLEST_FIRST if self.entries[name].model is not None]
+        trained = [name for name in MOST_PHYSICS_FIRST if self.entries[name].model is not None]
         for name in trained[: trained.index(best)]:
             if self._ties(name, best):
                 return (
                     name,
-                    f"{best} is ahead by less than one standard error, or errs no less: the simpler one is taken",
+                    f"{best} is ahead by less than one standard error, or errs no less: what knows more of the arm is taken",
                 )
         if len(trained) == 1:
             return best, "no other could be trained"
         return best, "it predicts best what the training did not see"
 
     def table(self) -> list[Candidate]:
-        """How each did, the simplest first."""
+        """How each did, what knows most of the arm first."""
         best = self.entries[self._best()]
         rows = []
-        for name in SIMPLEST_FIRST:
+        for name in MOST_PHYSICS_FIRST:
             entry = self.entries[name]
             row = unjudged(name, entry.seconds, entry.error)
             if entry.answer is not None and best.answer is not None:
@@ -188,10 +189,10 @@ class Contest:
         return 2 * int(np.sum(found.significant & (found.mean < 0))) > self.held.n_joints
 
     def _best(self) -> str:
-        return max(SIMPLEST_FIRST, key=lambda name: self.entries[name].density)
+        return max(MOST_PHYSICS_FIRST, key=lambda name: self.entries[name].density)
 
     def _ties(self, name: str, best: str) -> bool:
-        """Whether a simpler estimator does as well as the best: its log density is within one standard error of it
+        """Whether an estimator does as well as the best: its log density is within one standard error of it
         (the rule of Breiman et al. 1984), or its mean nMSE is no larger.
 
         Log density alone lets a few rows on which an arm was too sure decide for a black box that errs more.

@@ -44,7 +44,7 @@ class Selection(BaseModel):
     chosen: str
     reason: str
     held_out: SelectionHeldOut
-    table: list[SelectionCandidate] = Field(description="All that were trained, the simplest first")
+    table: list[SelectionCandidate] = Field(description="All that were trained, what knows most of the arm first")
 
 
 class Version(BaseModel):

@@ -15,7 +15,7 @@ export function selectionCard({ selection }) {
     held.repeats ? h("p", { class: "banner" }, "All motion of this recording repeats itself, also what was held out: these figures flatter.") : null,
     held.blocks ? judged(selection, held) : null,
     failed.map((each) => h("p", { class: "hint" }, `${each.estimator} could not be trained: ${each.error}`)),
-    held.blocks ? h("p", { class: "hint" }, "The higher the log density, the better what was predicted, its uncertainty too. A simpler estimator is taken where it is within one standard error of the best, or errs no more. It has learnt the held-out samples afterwards.") : null,
+    held.blocks ? h("p", { class: "hint" }, "The higher the log density, the better what was predicted, its uncertainty too. One that knows more of the arm is taken where it is within one standard error of the best, or errs no more. It has learnt the held-out samples afterwards.") : null,
   );
 }
 
