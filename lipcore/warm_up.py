@@ -15,10 +15,7 @@ import torch
 from lipcore.evaluator import Evaluator
 from lipcore.kernels.chain import ChainKernel
 from lipcore.kernels.friction import FrictionKernel
-from lipcore.kernels.gip import GeometricallyInspiredKernel
 from lipcore.kernels.lip import LipKernel
-from lipcore.kernels.lse import LagrangianSEKernel
-from lipcore.kernels.se import SquaredExponentialKernel
 from lipcore.motion import Motion
 
 
@@ -43,17 +40,10 @@ def _energy(kernel: LipKernel | ChainKernel, motion: Motion, tau: torch.Tensor) 
     Evaluator(kernel, both, motion, np.arange(4), [friction], np.ones(10), np.eye(10)).warm_up()
 
 
-def _baselines(motion: Motion, tau: torch.Tensor) -> None:
-    for kernel in (SquaredExponentialKernel(2), GeometricallyInspiredKernel(_TYPES), LagrangianSEKernel(_TYPES)):
-        cross = kernel.cross(kernel.initial(motion, tau), motion)
-        cross.fill(np.zeros((3, 2)), np.empty((3, 2, 2)))
-
-
 _TYPES = ("revolute", "revolute")
 _KERNELS: dict[str, Callable[[Motion, torch.Tensor], None]] = {
     "lip": lambda motion, tau: _energy(LipKernel(_TYPES), motion, tau),
     "lip-chain": lambda motion, tau: _energy(ChainKernel(_TYPES), motion, tau),
-    "baselines": _baselines,
 }
 
 if __name__ == "__main__":
