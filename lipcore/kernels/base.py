@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lipcore.kernels.compiled.cross import Array, Cross, symmetrise
+from lipcore.kernels.compiled.cross import Array, Cross
 from lipcore.kernels.regressor import Regressor
 from lipcore.motion import Motion
 
@@ -166,7 +166,7 @@ class _TorchCross(Cross):
         anchors = (self._anchors.q, self._anchors.v, self._anchors.a)
         rows = State(*(torch.cat(pair, dim=1) for pair in zip(anchors, query, strict=True)))
         out[:] = self._blocks(self._params, rows, State(*query)).permute(2, 0, 1).numpy()
-        symmetrise(out[-1])
+        out[-1] = 0.5 * (out[-1] + out[-1].T)
 
 
 class LinearKernel(TorqueKernel):
