@@ -21,7 +21,6 @@ from lipcore.kernels.friction import FrictionKernel
 from lipcore.motion import Motion
 from lipcore.robots import load_robot
 from lipcore.urdf import RigidBody
-from lipcore.warm_up import warm_up
 from tests.lipcore.problems import random_problem
 from tests.lipcore.test_baseline_kernels import BASELINES, random_case
 
@@ -261,11 +260,6 @@ def test_warm_up_answers_nothing_and_changes_nothing() -> None:
     warm, cold, motion = chain.evaluator(), chain.evaluator(), np.ascontiguousarray(np.stack(asked(chain.query))[:, 0])
     warm.warm_up()
     assert np.array_equal(warm.one(motion)[0], cold.one(motion)[0])
-
-
-def test_warming_up_names_kernels_that_there_are() -> None:
-    with pytest.raises(ValueError, match="expected names out of lip, lip-chain"):
-        warm_up("lip", "gpu")
 
 
 def test_arguments_that_do_not_fit_are_named() -> None:
