@@ -5,9 +5,9 @@ and is affine in their cosines and sines. So T_l has the kernel h_l² with
 
     h_l = Σ_{a≤l} w_{l,a} v_a v'_a R_{l,a},   R_{l,a} = Π_{a<b≤l} p_b(q_b, q'_b)
 
-(DESIGN §2). A prior that does not know where the zero of a joint is has p = σ + α cos(q − q') for revolute joints;
-prismatic joints have p = σ + α q q'. All of it is written in products of the p_b and of their derivatives, never in
-quotients, so a p_b may pass through zero.
+(docs/method.md, section 4). A prior that does not know where the zero of a joint is has p = σ + α cos(q − q') for
+revolute joints; prismatic joints have p = σ + α q q'. All of it is written in products of the p_b and of their
+derivatives, never in quotients, so a p_b may pass through zero.
 """
 
 from __future__ import annotations

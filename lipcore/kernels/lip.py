@@ -71,14 +71,13 @@ class LipKernel(CompiledKernel):
     def potential(self, params: Params, x: State, y: State) -> Derivatives:
         """Kernel of the potential energy V and its derivatives."""
         base = base_kernels(shares(params["potential.logits"]), self.joint_types, x.q, y.q)
-        k, scale = product(base), torch.exp(params["potential.log_scale"])
-        return Derivatives(scale * k.value, scale * k.left, scale * k.right, scale * k.mixed)
+        return product(base, torch.exp(params["potential.log_scale"]))
 
     def kinetic(self, params: Params, link: int, x: State, y: State) -> Derivatives:
         """Position factor of the kinetic energy kernel of `link` (1-based) and its derivatives."""
         logits = params["kinetic.logits"][:link] if self.tied else params[f"kinetic.{link}.logits"]
         base = base_kernels(shares(logits), self.joint_types[:link], x.q[:link], y.q[:link])
-        return product(base.squared())
+        return product(base.squared(), logits.new_ones(()))
 
     def energies(self, params: Params, x: State, y: State) -> Tensor:
         """Covariance of the kinetic and the potential energy at x with torque j at y: (2, n, *batch), J·N·m."""

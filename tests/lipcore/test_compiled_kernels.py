@@ -26,10 +26,10 @@ kernels = pytest.mark.parametrize("kernel", KERNELS)
 robots = pytest.mark.parametrize("joint_types", ROBOTS, ids=lambda kinds: "".join(kind[0] for kind in kinds))
 
 
-def agree(found: torch.Tensor, expected: torch.Tensor, name: str = "") -> None:
-    assert found.shape == expected.shape
+def agree(actual: torch.Tensor, expected: torch.Tensor, name: str = "") -> None:
+    assert actual.shape == expected.shape
     if expected.numel():
-        assert float((found - expected).abs().max()) <= RELATIVE * float(expected.abs().max()), name
+        assert float((actual - expected).abs().max()) <= RELATIVE * float(expected.abs().max()), name
 
 
 def check(problem: Problem) -> None:
@@ -42,10 +42,10 @@ def check(problem: Problem) -> None:
     agree(gram, form.symmetric_gram(params, motion))
 
     weight = torch.from_numpy(np.random.default_rng(1).standard_normal((places, places)))
-    found, expected = (each.gradient(params, motion, weight + weight.T) for each in (kernel, form))
-    assert found.keys() == expected.keys()
-    for name, derivative in expected.items():
-        agree(found[name], derivative, name)
+    compiled, reference = (each.gradient(params, motion, weight + weight.T) for each in (kernel, form))
+    assert compiled.keys() == reference.keys()
+    for name, derivative in reference.items():
+        agree(compiled[name], derivative, name)
 
 
 @robots

@@ -19,7 +19,6 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from lipcore.kernels.compiled.compile import compiled
 from lipcore.kernels.compiled.lanes import LANES, lanes
 
 Array = NDArray[np.float64]
@@ -44,7 +43,7 @@ def _pointing(context: Any, builder: Any, kind: Any, pointer: Any, sizes: Sequen
 
 
 def _numbers(_typing: Any, memory: Any, at: Any, shape: Any) -> tuple[Any, Callable[..., Any]]:
-    kind = types.Array(types.float64, len(shape), "C", aligned=False)
+    kind = types.Array(types.float64, len(shape), "C")
 
     def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         data = context.make_array(memory)(context, builder, arguments[0]).data
@@ -55,6 +54,7 @@ def _numbers(_typing: Any, memory: Any, at: Any, shape: Any) -> tuple[Any, Calla
 
 
 def _lay(_typing: Any, memory: Any, at: Any, shapes: Any) -> tuple[Any, Callable[..., Any]]:
+    # Lanes begin where any number may: their natural alignment is wider
     kinds = [types.Array(lanes, len(shape), "C", aligned=False) for shape in shapes]
     result = types.Tuple([types.Tuple(kinds), types.intp])  # type: ignore[no-untyped-call]
 
@@ -74,9 +74,3 @@ numbers: Callable[[Array, int, tuple[int, ...]], Array] = cast(Any, intrinsic(_n
 """numbers(memory, at, shape): view of a flat array from element `at` on."""
 lay: Callable[[Array, int, tuple[tuple[int, ...], ...]], tuple[tuple[Array, ...], int]] = cast(Any, intrinsic(_lay))
 """lay(memory, at, shapes): views of Lanes from element `at` on, one after the other, and the element after them."""
-
-
-@compiled
-def plane(memory: Array, at: int, rows: int, columns: int) -> Array:
-    """View of the flat array `memory` from element `at` on: (rows, columns)."""
-    return numbers(memory, at, (rows, columns))
