@@ -23,7 +23,7 @@ test: install
 
 # compiles what the parts below would else compile once each, side by side: a minute of one core
 warm-lip: install
-	$(BIN)/python -m lipcore.warm_up lip baselines
+	$(BIN)/python -m lipcore.warm_up lip rigid-body
 
 warm-chain: install
 	$(BIN)/python -m lipcore.warm_up lip-chain

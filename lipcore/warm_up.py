@@ -1,60 +1,68 @@
-"""Compile every kernel ahead of its first use, for images and installations: `python -m lipcore.warm_up [KERNEL …]`.
+"""Compile ahead of the first use, for images and installations: `python -m lipcore.warm_up [ESTIMATOR …]`.
 
 Numba keeps the machine code on disk (`NUMBA_CACHE_DIR`, else beside the source, else below the home); without this the
-first fit on a machine waits some twenty seconds for it.
+first training on a machine waits for it, up to a minute.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
 
-from lipcore.evaluator import Evaluator
-from lipcore.kernels.chain import ChainKernel
-from lipcore.kernels.friction import FrictionKernel
-from lipcore.kernels.gip import GeometricallyInspiredKernel
-from lipcore.kernels.lip import LipKernel
-from lipcore.kernels.lse import LagrangianSEKernel
-from lipcore.kernels.se import SquaredExponentialKernel
+from lipcore.fit_options import FitOptions
+from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.arm_prior import Alternative, Arm
+from lipcore.model import train
 from lipcore.motion import Motion
+from lipcore.samples import Samples
+
+COMPILED = ("lip", "lip-chain", "rigid-body", "rigid-body+lip-chain")
+"""Estimators with compiled terms. What all have in common comes with each."""
+SAMPLES = 60
+LEAST = FitOptions(
+    hyperparameter_samples=20, posterior_samples=40, max_iterations=3, starts=1, device="cpu", search_seconds=0.01
+)
 
 
 def warm_up(*names: str) -> None:
-    """Run every compiled function of these kernels once, on a robot of two joints; of all kernels where none is named.
+    """Train these estimators on a made-up robot of two joints and ask them; all of COMPILED where none is named.
 
-    Raise ValueError for a name that is none.
+    What the machine code does not depend on, as the number of joints or samples, may as well be small. Raise ValueError
+    for a name that is none of COMPILED.
     """
-    if unknown := [name for name in names if name not in _KERNELS]:
-        raise ValueError(f"{unknown[0]!r} is no compiled kernel, expected names out of {', '.join(_KERNELS)}")
-    ones = torch.ones((2, 2), dtype=torch.float64)
-    for name in names or _KERNELS:
-        _KERNELS[name](Motion(ones, ones, ones), ones)
+    if unknown := [name for name in names if name not in COMPILED]:
+        raise ValueError(f"{unknown[0]!r} is no compiled estimator, expected names out of {', '.join(COMPILED)}")
+    for name in names or COMPILED:
+        model = train(_swinging(), ("revolute", "revolute"), name, LEAST)
+        model.warm_up()
+        if model.arm is not None:
+            _of_arm(model.arm)
 
 
-def _energy(kernel: LipKernel | ChainKernel, motion: Motion, tau: torch.Tensor) -> None:
-    params = kernel.initial(motion, tau)
-    kernel.gram(params, motion, motion)
-    kernel.gradient(params, motion, kernel.symmetric_gram(params, motion))
-    friction = FrictionKernel(2)
-    both = {**params, **friction.initial(motion, tau)}
-    Evaluator(kernel, both, motion, np.arange(4), [friction], np.ones(10), np.eye(10)).warm_up()
+def _swinging() -> Samples:
+    """Two joints that swing at frequencies of their own, under gravity."""
+    time, frequency = np.linspace(0.0, 10.0, SAMPLES), np.array([1.0, 1.7])
+    phase = time[:, None] * frequency
+    q, dq, ddq = np.sin(phase), np.cos(phase) * frequency, -np.sin(phase) * frequency**2
+    tau = 3.0 * np.sin(np.cumsum(q, axis=1)) + ddq + 0.1 * dq
+    return Samples(("first", "second"), time, np.zeros(SAMPLES, np.int64), q, dq, ddq, tau)
 
 
-def _baselines(motion: Motion, tau: torch.Tensor) -> None:
-    for kernel in (SquaredExponentialKernel(2), GeometricallyInspiredKernel(_TYPES), LagrangianSEKernel(_TYPES)):
-        cross = kernel.cross(kernel.initial(motion, tau), motion)
-        cross.fill(np.zeros((3, 2)), np.empty((3, 2, 2)))
+def _of_arm(arm: Arm) -> None:
+    """What a training on another recording might take besides: other arms or none, and the energies."""
+    friction = np.zeros((arm.n_joints, 4 if arm.stribeck else 3))
+    one = Alternative(arm.geometry, arm.parameters, np.zeros(arm.n_joints), friction, 0.5)
+    zeros = torch.zeros((1, arm.n_joints), dtype=torch.float64)
+    motion = Motion(zeros, zeros, zeros)
+    for kernel in (ArmKernel(replace(arm, alternatives=others)) for others in ((), (one, one))):
+        kernel.features(motion)
+        kernel.energy_features(motion)
+        kernel.torque(np.zeros(kernel.size), motion)
+        kernel.regressor().fill(motion.arrays()[0], np.empty((kernel.size, arm.n_joints)))
 
-
-_TYPES = ("revolute", "revolute")
-_KERNELS: dict[str, Callable[[Motion, torch.Tensor], None]] = {
-    "lip": lambda motion, tau: _energy(LipKernel(_TYPES), motion, tau),
-    "lip-chain": lambda motion, tau: _energy(ChainKernel(_TYPES), motion, tau),
-    "baselines": _baselines,
-}
 
 if __name__ == "__main__":
     warm_up(*sys.argv[1:])

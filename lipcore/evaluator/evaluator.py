@@ -1,4 +1,4 @@
-"""The compiled evaluator of a compact posterior: NumPy and Numba only once it is made."""
+"""The compiled evaluator of a compact posterior: NumPy and Numba only once it is made (baselines: PyTorch)."""
 
 from __future__ import annotations
 

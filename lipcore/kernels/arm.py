@@ -8,16 +8,8 @@ from torch import Tensor
 
 from lipcore.kernels.arm_prior import KINDS, Arm
 from lipcore.kernels.base import LinearKernel, Params
-from lipcore.kernels.compiled.arm import (
-    PARAMETERS,
-    TABLE,
-    WORK,
-    arm_differences,
-    arm_energies,
-    arm_features,
-    arm_query,
-    arm_torques,
-)
+from lipcore.kernels.compiled.arm import arm_differences, arm_energies, arm_features, arm_query, arm_size, arm_torques
+from lipcore.kernels.compiled.arm_recursion import PARAMETERS
 from lipcore.kernels.compiled.views import Memory
 from lipcore.kernels.friction import friction_features
 from lipcore.kernels.geometry import Geometry
@@ -137,7 +129,7 @@ class ArmRegressor(Regressor):
         self._stribeck = arm.stribeck
         self._others = _stacked(arm) if arm.alternatives else None
         fixed = arm.geometry.constants, arm.geometry.gravity, arm.parameters
-        self._memory = Memory(fixed, (arm.n_joints + 1) * WORK + TABLE)
+        self._memory = Memory(fixed, arm_size(arm.n_joints))
 
     def fill(self, motion: Array, out: Array) -> None:
         """Write Φᵀ of the query, (p, n)."""

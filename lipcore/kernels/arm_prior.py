@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.kernels.compiled.arm import PARAMETERS
+from lipcore.kernels.compiled.arm_recursion import PARAMETERS
 from lipcore.kernels.geometry import Geometry
 from lipcore.samples import Array
 from lipcore.urdf import RigidBody

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lipcore.kernels.compiled.cross import Cross
+from lipcore.kernels.compiled.cross import Array, Cross
 from lipcore.kernels.regressor import Regressor
 from lipcore.motion import Motion
 
@@ -98,15 +98,15 @@ class TorqueKernel(ABC):
 
 
 class PairKernel(TorqueKernel):
-    """A kernel given as a formula for one pair of samples; its gradient comes from automatic differentiation."""
+    """A kernel given as a formula for one pair of samples; PyTorch does the rest, gradients by differentiation."""
 
     @abstractmethod
     def blocks(self, params: Params, x: State, y: State) -> Tensor:
         """Covariance of torque i at x with torque j at y: (n, n, *batch), (N·m)²."""
 
-    @abstractmethod
     def cross(self, params: Params, inducing: Motion) -> Cross:
-        """Compiled covariance of one query with the inducing samples, for serving."""
+        """Covariance of one query with the inducing samples and itself, for serving; on the CPU."""
+        return _TorchCross(self, params, inducing.to("cpu"))
 
     def variance(self, params: Params, x: Motion) -> Tensor:
         """Prior covariance of the torques at each sample: (N, n, n)."""
@@ -149,6 +149,24 @@ class PairKernel(TorqueKernel):
             part[..., : rows.stop - rows.start] *= 0.5
             torch.autograd.backward((part * blocks).sum())
         return {name: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for name, leaf in leaves.items()}
+
+
+class _TorchCross(Cross):
+    """`Cross` of any pair kernel, by its `blocks`: every query waits for PyTorch, about a tenth of a millisecond."""
+
+    def __init__(self, kernel: PairKernel, params: Params, inducing: Motion) -> None:
+        self.size, self.n_joints = len(inducing), kernel.n_joints
+        self._blocks, self._anchors = kernel.blocks, State.paired(inducing)
+        self._params = {name: value.detach().cpu().clone() for name, value in params.items()}
+
+    @torch.no_grad()
+    def fill(self, motion: Array, out: Array) -> None:
+        """Write the covariances of one query; see `Cross.fill`."""
+        query = torch.tensor(motion)[:, :, None]
+        anchors = (self._anchors.q, self._anchors.v, self._anchors.a)
+        rows = State(*(torch.cat(pair, dim=1) for pair in zip(anchors, query, strict=True)))
+        out[:] = self._blocks(self._params, rows, State(*query)).permute(2, 0, 1).numpy()
+        out[-1] = 0.5 * (out[-1] + out[-1].T)
 
 
 class LinearKernel(TorqueKernel):

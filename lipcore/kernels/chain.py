@@ -5,9 +5,9 @@ and is affine in their cosines and sines. So T_l has the kernel h_l² with
 
     h_l = Σ_{a≤l} w_{l,a} v_a v'_a R_{l,a},   R_{l,a} = Π_{a<b≤l} p_b(q_b, q'_b)
 
-(DESIGN §2). A prior that does not know where the zero of a joint is has p = σ + α cos(q − q') for revolute joints;
-prismatic joints have p = σ + α q q'. All of it is written in products of the p_b and of their derivatives, never in
-quotients, so a p_b may pass through zero.
+(docs/method.md, section 4). A prior that does not know where the zero of a joint is has p = σ + α cos(q − q') for
+revolute joints; prismatic joints have p = σ + α q q'. All of it is written in products of the p_b and of their
+derivatives, never in quotients, so a p_b may pass through zero.
 """
 
 from __future__ import annotations
@@ -15,16 +15,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from lipcore.kernels.base import Params, State
-from lipcore.kernels.compiled.chain import chain_gradient, chain_gram
-from lipcore.kernels.compiled.chain_cross import ChainCross
-from lipcore.kernels.compiled.cross import Cross
-from lipcore.kernels.compiled.kernel import Array, CompiledKernel, arrays, inner
+from lipcore.kernels.compiled.chain import chain_cross, chain_gradient, chain_gram, chain_size
+from lipcore.kernels.compiled.kernel import CompiledKernel, Driver
 from lipcore.kernels.energy import potential_blocks, potential_energy_torque
 from lipcore.kernels.polynomial import BaseKernels, Derivatives, base_kernels, chain_sum
 from lipcore.kernels.weights import PRIOR_STD as WEIGHTS_PRIOR_STD
@@ -47,6 +43,8 @@ class ChainKernel(CompiledKernel):
     log s_l; and those of `weights.velocity_weights`.
     """
 
+    driver = Driver(chain_size, chain_gram, chain_gradient, chain_cross)
+
     def __init__(self, joint_types: Sequence[str]) -> None:
         self.joint_types: tuple[JointType, ...] = check_joint_types(joint_types)
         self.n_joints = len(self.joint_types)
@@ -56,28 +54,10 @@ class ChainKernel(CompiledKernel):
         chain = _Chain.build(self._base(params["chain.logits"], x, y), self.weights(params), x, y)
         return potential_blocks(self.potential(params, x, y)) + chain.blocks().movedim((-2, -1), (0, 1))
 
-    def compiled_gram(self, params: Params, x: Motion, y: Motion, symmetric: bool) -> Array:
-        """Gram matrix (N, n, M, n)."""
-        alpha, weights, scales = _contiguous(self._arguments(params))
-        return chain_gram(*arrays(x), *arrays(y), self._prismatic(), alpha, weights, scales, symmetric)
-
-    def compiled_gradient(self, leaves: Params, x: Motion, weight: Array) -> Tensor:
-        """Scalar whose derivatives by `leaves` are those of Σ weight ∘ gram(x, x)."""
-        tensors, both = self._arguments(leaves), (*arrays(x), *arrays(x))
-        alpha, weights, scales = _contiguous(tensors)
-        return inner(tensors, list(chain_gradient(*both, self._prismatic(), alpha, weights, scales, True, weight)))
-
-    def cross(self, params: Params, inducing: Motion) -> Cross:
-        """Compiled covariance of one query with the inducing samples, for serving."""
-        alpha, weights, scales = _contiguous(self._arguments(params))
-        return ChainCross(*arrays(inducing.to("cpu")), self._prismatic(), alpha, weights, scales)
-
-    def _prismatic(self) -> NDArray[np.bool_]:
-        return np.array([kind == "prismatic" for kind in self.joint_types])
-
-    def _arguments(self, params: Params) -> list[Tensor]:
-        """Shares α (n,), velocity weights (n, n) and scales of the potentials (n,)."""
-        return [torch.sigmoid(params["chain.logits"]), self.weights(params), torch.exp(params["potential.log_scales"])]
+    def hyper(self, params: Params) -> tuple[Tensor, Tensor, Tensor]:
+        """Shares (1, n, 3) of the base kernels, scales of the potentials (n,) and velocity weights (n, n)."""
+        shares = self._shares(params["chain.logits"])
+        return shares[None], torch.exp(params["potential.log_scales"]), self.weights(params)
 
     def potential(self, params: Params, x: State, y: State) -> Derivatives:
         """Kernel of the potential energy V and its derivatives."""
@@ -114,14 +94,12 @@ class ChainKernel(CompiledKernel):
         return dict(PRIOR_STD)
 
     def _base(self, logits: Tensor, x: State, y: State) -> BaseKernels:
+        return base_kernels(self._shares(logits), self.joint_types, x.q, y.q)
+
+    def _shares(self, logits: Tensor) -> Tensor:
         alpha = torch.sigmoid(logits)
         revolute = torch.tensor([kind == "revolute" for kind in self.joint_types], device=logits.device)
-        shares = torch.stack([1 - alpha, alpha, torch.where(revolute, alpha, 0.0)], dim=1)
-        return base_kernels(shares, self.joint_types, x.q, y.q)
-
-
-def _contiguous(arguments: list[Tensor]) -> list[Array]:
-    return [np.ascontiguousarray(part.detach().cpu().numpy()) for part in arguments]
+        return torch.stack([1 - alpha, alpha, torch.where(revolute, alpha, 0.0)], dim=1)
 
 
 @dataclass(frozen=True)

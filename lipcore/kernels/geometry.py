@@ -18,7 +18,7 @@ from functools import cached_property
 
 import numpy as np
 
-from lipcore.kernels.compiled.arm import ACROSS, AXIS, CONSTANTS, KIND, PLACE, SCREWS, TURN
+from lipcore.kernels.compiled.arm_recursion import ACROSS, AXIS, CONSTANTS, KIND, PLACE, SCREWS, TURN
 from lipcore.motion import check_joint_types
 from lipcore.samples import Array
 from lipcore.urdf import RigidBody
@@ -100,7 +100,7 @@ class Geometry:
 
     @cached_property
     def constants(self) -> Array:
-        """The geometry as `kernels.compiled.arm` reads it: (n, CONSTANTS)."""
+        """The geometry as `kernels.compiled.arm_recursion` reads it: (n, CONSTANTS)."""
         out = np.zeros((self.n_joints, CONSTANTS))
         for j, (kind, turn, axis) in enumerate(zip(self.joint_types, self.rotation, self.axis, strict=True)):
             along = np.outer(axis, axis)

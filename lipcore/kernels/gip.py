@@ -14,8 +14,6 @@ import torch
 from torch import Tensor
 
 from lipcore.kernels.base import PairKernel, Params, State
-from lipcore.kernels.compiled.cross import Cross
-from lipcore.kernels.compiled.gip_cross import GeometricallyInspiredCross
 from lipcore.kernels.se import independent_blocks, largest_behind, per_joint, power
 from lipcore.motion import Motion, check_joint_types
 from lipcore.vocabulary import JointType
@@ -70,19 +68,6 @@ class GeometricallyInspiredKernel(PairKernel):
         logits = params["gip.logits"] + params["gip.logits_deviation"]
         return independent_blocks(dynamic * self._position(logits, x.q, y.q))
 
-    def cross(self, params: Params, inducing: Motion) -> Cross:
-        """Compiled covariance of one query with the inducing samples, for serving."""
-        fixed = {name: value.detach().cpu() for name, value in params.items()}
-        log_w, log_u = self._log_weights(fixed)
-        return GeometricallyInspiredCross(
-            self.joint_types,
-            inducing,
-            torch.exp(fixed["gip.log_constant"]).numpy(),
-            torch.exp(log_w).numpy(),
-            torch.exp(log_u).numpy(),
-            position_shares(fixed["gip.logits"] + fixed["gip.logits_deviation"]).numpy(),
-        )
-
     def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
         """The measured power from the constant; inertia as arms have it that need as much torque."""
         n, zeros = self.n_joints, tau.new_zeros
@@ -114,7 +99,7 @@ class GeometricallyInspiredKernel(PairKernel):
     def _position(self, logits: Tensor, q: Tensor, q2: Tensor) -> Tensor:
         """Π_b p_{i,b,1} p_{i,b,2} of every joint i: (n, *batch)."""
         first, second = torch.cos(q) * torch.cos(q2), torch.sin(q) * torch.sin(q2)
-        shares = position_shares(logits)
+        shares = _position_shares(logits)
         total = torch.ones_like(first)
         for b, kind in enumerate(self.joint_types):
             one, two = (first[b], second[b]) if kind == "revolute" else (q[b] * q2[b], torch.ones_like(first[b]))
@@ -124,6 +109,6 @@ class GeometricallyInspiredKernel(PairKernel):
         return total
 
 
-def position_shares(logits: Tensor) -> Tensor:
+def _position_shares(logits: Tensor) -> Tensor:
     """Shares (σ, α, β) from the logits of α and β: (..., 2) to (..., 3)."""
     return torch.softmax(torch.cat([torch.zeros_like(logits[..., :1]), logits], dim=-1), dim=-1)

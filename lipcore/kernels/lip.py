@@ -4,16 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from lipcore.kernels.base import Params, State
-from lipcore.kernels.compiled.cross import Cross
-from lipcore.kernels.compiled.kernel import Array, CompiledKernel, arrays, inner
-from lipcore.kernels.compiled.lip import lip_gradient, lip_gram
-from lipcore.kernels.compiled.lip_cross import LipCross
+from lipcore.kernels.compiled.kernel import CompiledKernel, Driver
+from lipcore.kernels.compiled.lip import lip_cross, lip_gradient, lip_gram, lip_size
 from lipcore.kernels.energy import (
     kinetic_blocks,
     kinetic_energy_torque,
@@ -35,6 +31,8 @@ class LipKernel(CompiledKernel):
     parameters to overfit with; without, every link has its own as in the paper.
     """
 
+    driver = Driver(lip_size, lip_gram, lip_gradient, lip_cross)
+
     def __init__(self, joint_types: Sequence[str], tied: bool = True) -> None:
         self.joint_types: tuple[JointType, ...] = check_joint_types(joint_types)
         self.n_joints = len(self.joint_types)
@@ -53,54 +51,33 @@ class LipKernel(CompiledKernel):
             total[:link, :link] += kinetic  # a link's kinetic energy loads only the joints before it
         return total
 
-    def compiled_gram(self, params: Params, x: Motion, y: Motion, symmetric: bool) -> Array:
-        """Gram matrix (N, n, M, n)."""
-        kinetic, weights, potential, scale = (part.detach().numpy() for part in self._arguments(params))
-        return lip_gram(*arrays(x), *arrays(y), self._prismatic(), kinetic, weights, potential, float(scale), symmetric)
+    def hyper(self, params: Params) -> tuple[Tensor, Tensor, Tensor]:
+        """Shares of the kinetic energies, link by link or one for all, then the potential's: (n + 1 or 2, n, 3).
 
-    def compiled_gradient(self, leaves: Params, x: Motion, weight: Array) -> Tensor:
-        """Scalar whose derivatives by `leaves` are those of Σ weight ∘ gram(x, x)."""
-        tensors, both = self._arguments(leaves), (*arrays(x), *arrays(x))
-        kinetic, weights, potential, scale = (part.detach().numpy() for part in tensors)
-        derivatives = lip_gradient(
-            *both, self._prismatic(), kinetic, weights, potential, float(scale), symmetric=True, weight=weight
-        )
-        return inner(tensors, list(derivatives))
-
-    def cross(self, params: Params, inducing: Motion) -> Cross:
-        """Compiled covariance of one query with the inducing samples, for serving."""
-        kinetic, weights, potential, scale = (part.detach().cpu().numpy() for part in self._arguments(params))
-        return LipCross(*arrays(inducing.to("cpu")), self._prismatic(), kinetic, weights, potential, float(scale))
-
-    def _prismatic(self) -> NDArray[np.bool_]:
-        return np.array([kind == "prismatic" for kind in self.joint_types])
-
-    def _arguments(self, params: Params) -> list[Tensor]:
-        """Kinetic shares (n, n, 3) and weights (n, n), link by link; potential shares (n, 3) and scale ()."""
-        n = self.n_joints
-        logits = params["potential.logits"].new_zeros((n, n, 2))
-        for link in range(1, n + 1):
-            own = params["kinetic.logits"] if self.tied else params[f"kinetic.{link}.logits"]
-            logits[link - 1, : len(own)] = own
-        kinetic = shares(logits.reshape(n * n, 2)).reshape(n, n, 3)
-        return [
-            kinetic,
-            self.weights(params),
-            shares(params["potential.logits"]),
-            torch.exp(params["potential.log_scale"]),
-        ]
+        Scales (n,), of which a product over all joints has the last alone; velocity weights (n, n).
+        """
+        potential, n = params["potential.logits"], self.n_joints
+        if self.tied:
+            logits = torch.stack([params["kinetic.logits"], potential])
+        else:
+            links = [params[f"kinetic.{link}.logits"] for link in range(1, n + 1)]
+            logits = torch.stack(
+                [torch.nn.functional.pad(each, (0, 0, 0, n - len(each))) for each in (*links, potential)]
+            )
+        scale = torch.exp(params["potential.log_scale"])
+        scales = torch.nn.functional.pad(scale[None], (n - 1, 0))
+        return shares(logits.reshape(-1, 2)).reshape(len(logits), n, 3), scales, self.weights(params)
 
     def potential(self, params: Params, x: State, y: State) -> Derivatives:
         """Kernel of the potential energy V and its derivatives."""
         base = base_kernels(shares(params["potential.logits"]), self.joint_types, x.q, y.q)
-        k, scale = product(base), torch.exp(params["potential.log_scale"])
-        return Derivatives(scale * k.value, scale * k.left, scale * k.right, scale * k.mixed)
+        return product(base, torch.exp(params["potential.log_scale"]))
 
     def kinetic(self, params: Params, link: int, x: State, y: State) -> Derivatives:
         """Position factor of the kinetic energy kernel of `link` (1-based) and its derivatives."""
         logits = params["kinetic.logits"][:link] if self.tied else params[f"kinetic.{link}.logits"]
         base = base_kernels(shares(logits), self.joint_types[:link], x.q[:link], y.q[:link])
-        return product(base.squared())
+        return product(base.squared(), logits.new_ones(()))
 
     def energies(self, params: Params, x: State, y: State) -> Tensor:
         """Covariance of the kinetic and the potential energy at x with torque j at y: (2, n, *batch), J·N·m."""

@@ -24,8 +24,6 @@ import torch
 from torch import Tensor
 
 from lipcore.kernels.base import PairKernel, Params, State
-from lipcore.kernels.compiled.cross import Cross
-from lipcore.kernels.compiled.lse_cross import LagrangianSECross
 from lipcore.kernels.se import independent_blocks, per_joint, power, spread
 from lipcore.motion import Motion, check_joint_types
 from lipcore.vocabulary import JointType
@@ -60,15 +58,6 @@ class LagrangianSEKernel(PairKernel):
         block = block + kg[:, None] * ((omega - both) * g + d * x.v)
         block = block - (d * y.v)[:, None] * kg
         return block - independent_blocks(k * ((omega + both) * c + d))
-
-    def cross(self, params: Params, inducing: Motion) -> Cross:
-        """Compiled covariance of one query with the inducing samples, for serving."""
-        position, velocity = (
-            torch.exp(-2 * params[f"lse.log_{of}_lengthscales"].detach().cpu()).numpy()
-            for of in ("position", "velocity")
-        )
-        log_scale = float(params["lse.log_scale"].detach())
-        return LagrangianSECross(self.joint_types, inducing, log_scale, position, velocity)
 
     def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
         """Every input's spread, times √(2 n) as distances add up; the scale that gives all torques their power."""

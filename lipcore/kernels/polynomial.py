@@ -78,22 +78,9 @@ def _prismatic(sigma: Tensor, alpha: Tensor, q: Tensor, q2: Tensor) -> BaseKerne
     return BaseKernels(sigma + slope * q * q2, slope * q2, slope * q, slope)
 
 
-def product(base: BaseKernels) -> Derivatives:
-    """Product of the base kernels over all joints, with derivatives, joint by joint.
-
-    Multiplying K by one more joint's p: the old derivatives scale with p, and the new joint adds a row and a column.
-    """
-    value = base.value[0]
-    left, right, mixed = base.left[:1], base.right[:1], base.mixed[:1, None]
-    for b in range(1, base.value.shape[0]):
-        p, lead, trail, both = base.value[b], base.left[b], base.right[b], base.mixed[b]
-        upper = torch.cat([mixed * p, (left * trail)[:, None]], dim=1)
-        lower = torch.cat([right * lead, (value * both)[None]], dim=0)
-        mixed = torch.cat([upper, lower[None]], dim=0)
-        left = torch.cat([left * p, (value * lead)[None]], dim=0)
-        right = torch.cat([right * p, (value * trail)[None]], dim=0)
-        value = value * p
-    return Derivatives(value, left, right, mixed)
+def product(base: BaseKernels, scale: Tensor) -> Derivatives:
+    """scale Π_b p_b with derivatives. scale: ()."""
+    return chain_sum(base, torch.cat([scale.new_zeros(len(base.value) - 1), scale[None]]))
 
 
 def chain_sum(base: BaseKernels, scales: Tensor) -> Derivatives:

@@ -6,8 +6,6 @@ import torch
 from torch import Tensor
 
 from lipcore.kernels.base import PairKernel, Params, State
-from lipcore.kernels.compiled.cross import Cross
-from lipcore.kernels.compiled.se_cross import SquaredExponentialCross
 from lipcore.motion import Motion
 
 SPREAD_SHARE = 0.1
@@ -38,11 +36,6 @@ class SquaredExponentialKernel(PairKernel):
         squares = torch.cat([x.q - y.q, x.v - y.v, x.a - y.a]).square()
         exponent = torch.tensordot(torch.exp(-2 * params["se.log_lengthscales"]), squares, dims=1)
         return independent_blocks(torch.exp(per_joint(params["se.log_scale"], exponent) - 0.5 * exponent))
-
-    def cross(self, params: Params, inducing: Motion) -> Cross:
-        """Compiled covariance of one query with the inducing samples, for serving."""
-        log_scales, log_lengthscales = (params[name].detach().cpu() for name in ("se.log_scale", "se.log_lengthscales"))
-        return SquaredExponentialCross(inducing, log_scales.numpy(), torch.exp(log_lengthscales).numpy())
 
     def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
         """The measured power; every input's spread, times √(3 n) since squared distances add up over 3 n inputs.

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from lipcore.kernels.base import PairKernel, Params, State
 from lipcore.kernels.chain import ChainKernel
-from lipcore.kernels.compiled.cross import Cross
 from lipcore.kernels.lip import LipKernel
 from lipcore.motion import Motion
 from tests.lipcore.oracles import Energy, chain_energies, lip_energies
@@ -44,10 +43,6 @@ class TorchForm(PairKernel):
     def blocks(self, params: Params, x: State, y: State) -> Tensor:
         """Blocks of the kernel itself."""
         return self.kernel.blocks(params, x, y)
-
-    def cross(self, params: Params, inducing: Motion) -> Cross:
-        """Compiled all the same."""
-        return self.kernel.cross(params, inducing)
 
     def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
         """Start of the kernel itself."""

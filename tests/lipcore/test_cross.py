@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from lipcore.kernels.compiled.chain_data import LANES
-from lipcore.kernels.compiled.lip_data import PAIRS
+from lipcore.kernels.compiled.lanes import LANES
 from lipcore.motion import Motion
 from tests.lipcore.oracles import instant, scale_of, torque_terms
 from tests.lipcore.problems import KERNELS, Problem, random_problem
@@ -44,7 +43,7 @@ def crossed(problem: Problem, size: int) -> np.ndarray:
 @robots
 @kernels
 # part of a block of columns, with and without room for the query, exactly one, and several
-@pytest.mark.parametrize("size", [1, LANES - 1, LANES, PAIRS - 1, PAIRS, 2 * PAIRS + 5])
+@pytest.mark.parametrize("size", [1, LANES - 1, LANES, 2 * LANES - 1, 8 * LANES + 5])
 def test_cross_equals_the_gram_matrix(kernel: str, joint_types: tuple[str, ...], size: int) -> None:
     problem, n = random_problem(joint_types, size + 3, seed=size, kernel=kernel), len(joint_types)
     found, asked = crossed(problem, size), problem.motion[size:]

@@ -21,8 +21,8 @@ from lipcore.kernels.friction import FrictionKernel
 from lipcore.motion import Motion
 from lipcore.robots import load_robot
 from lipcore.urdf import RigidBody
-from lipcore.warm_up import warm_up
 from tests.lipcore.problems import random_problem
+from tests.lipcore.test_baseline_kernels import BASELINES, random_case
 
 RELATIVE = 1e-10
 FACTOR = 1.3
@@ -88,28 +88,33 @@ def case(
 ) -> Case:
     """About half of the torques of `samples` are inducing outputs, of the first three samples one and none at all."""
     rng, n = np.random.default_rng(seed), len(joint_types)
-    problem = random_problem(joint_types, samples + queries, seed, kernel or "chain")
-    params, size = dict(problem.params), sum(len(each.features(problem.motion[:1])[0, 0]) for each in linear)
+    if kernel in BASELINES:
+        term, params, motion = random_case(kernel, joint_types, samples + queries)
+    else:
+        problem = random_problem(joint_types, samples + queries, seed, kernel or "chain")
+        term, params, motion = problem.kernel, dict(problem.params), problem.motion
+    size = sum(len(each.features(motion[:1])[0, 0]) for each in linear)
     for each in linear:
-        params |= each.initial(problem.motion, torch.from_numpy(rng.uniform(0.5, 2.0, (samples + queries, n))))
+        params |= each.initial(motion, torch.from_numpy(rng.uniform(0.5, 2.0, (samples + queries, n))))
     chosen = rng.random((samples, n)) < 0.5
     chosen[:2], chosen[2, 1:], chosen[2, 0] = False, False, True
     outputs = np.flatnonzero(chosen) if kernel else np.zeros(0, dtype=np.int64)
     anchors = len(outputs) + size
     root = np.tril(rng.standard_normal((anchors, anchors)) + 4 * np.eye(anchors))
     made = Case(
-        term=problem.kernel if kernel else None,
+        term=term if kernel else None,
         linear=list(linear),
         params=params,
-        inducing=problem.motion[:samples] if kernel else None,
+        inducing=motion[:samples] if kernel else None,
         outputs=outputs,
         weights=rng.standard_normal(anchors),
         root=root,
-        query=problem.motion[samples:],
+        query=motion[samples:],
     )
     _, prior, explained = made.parts()
     # up to half of a variance is explained: an error in that half would show, and little cancels
-    made.root = root * np.sqrt(0.5 / (explained / prior).diagonal(axis1=1, axis2=2).max())
+    diagonals = (part.diagonal(axis1=1, axis2=2) for part in (explained, prior))
+    made.root = root * np.sqrt(0.5 / np.divide(*diagonals).max())
     return made
 
 
@@ -123,6 +128,7 @@ CASES: dict[str, Callable[[], Case]] = {
     "lip": lambda: case(PANDA, "tied", friction(7)),
     "lip-untied": lambda: case(MIXED, "untied", friction(5)),
     "prismatic": lambda: case(MIXED, "chain", friction(5)),
+    **{name: lambda name=name: case(MIXED, name, friction(5)) for name in BASELINES},
     "frictionless": lambda: case(MIXED, "chain"),
     "rigid-body": lambda: case(PANDA, None, (rigid_body("panda"), FrictionKernel(7))),
     "rigid-body alone, from zero": lambda: case(PANDA, None, (rigid_body("panda", prior="zero", gravity=False),)),
@@ -254,11 +260,6 @@ def test_warm_up_answers_nothing_and_changes_nothing() -> None:
     warm, cold, motion = chain.evaluator(), chain.evaluator(), np.ascontiguousarray(np.stack(asked(chain.query))[:, 0])
     warm.warm_up()
     assert np.array_equal(warm.one(motion)[0], cold.one(motion)[0])
-
-
-def test_warming_up_names_kernels_that_there_are() -> None:
-    with pytest.raises(ValueError, match="expected names out of lip, lip-chain, baselines"):
-        warm_up("lip", "gpu")
 
 
 def test_arguments_that_do_not_fit_are_named() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -30,23 +29,6 @@ def test_symmetric_gram_is_the_gram_and_exactly_symmetric(problem: Problem) -> N
     symmetric = problem.kernel.symmetric_gram(problem.params, problem.motion)
     assert torch.equal(symmetric, symmetric.T)
     assert (symmetric - gram).abs().max() <= 1e-13 * gram.abs().max()
-
-
-@pytest.mark.parametrize("name", KERNELS)
-def test_torch_form_of_a_compiled_kernel_is_the_kernel(name: str) -> None:
-    problem = random_problem(JOINTS, samples=9, seed=4, kernel=name)
-    kernel, params, motion = problem.kernel, problem.params, problem.motion
-    weight = torch.from_numpy(np.random.default_rng(0).normal(size=(27, 27)))
-    grams, symmetric, gradients = [], [], []
-    for form in (kernel, TorchForm(kernel)):
-        grams.append(form.gram(params, motion[:4], motion))
-        symmetric.append(form.symmetric_gram(params, motion))
-        gradients.append(form.gradient(params, motion, weight + weight.T))
-    for one, other in (grams, symmetric):
-        assert (one - other).abs().max() <= 1e-13 * one.abs().max()
-    assert gradients[0].keys() == gradients[1].keys()
-    for key, one in gradients[0].items():
-        assert (one - gradients[1][key]).abs().max() <= 1e-11 * max(1.0, float(one.abs().max())), key
 
 
 def test_rows_and_columns_run_sample_by_sample() -> None:

@@ -80,16 +80,6 @@ def test_initial_hyperparameters_have_the_documented_names_and_shapes(kernel: st
     assert {name: tuple(value.shape) for name, value in initial.items()} == lip_shapes(3, kernel == "tied")
 
 
-def test_untied_kernel_with_equal_shapes_in_all_links_is_the_tied_kernel() -> None:
-    problem = random_problem(("revolute", "prismatic", "revolute"), samples=4, seed=3)
-    untied = dict(problem.params)
-    logits = untied.pop("kinetic.logits")
-    untied |= {f"kinetic.{link}.logits": logits[:link] for link in (1, 2, 3)}
-    tied_gram = problem.kernel.gram(problem.params, problem.motion, problem.motion)
-    untied_gram = LipKernel(problem.kernel.joint_types, tied=False).gram(untied, problem.motion, problem.motion)
-    assert torch.allclose(tied_gram, untied_gram, rtol=0, atol=1e-13 * float(tied_gram.abs().max()))
-
-
 def test_unknown_joint_type_is_named() -> None:
     with pytest.raises(ValueError, match=r"joint_types\[1\] is 'planar'"):
         LipKernel(("revolute", "planar"))

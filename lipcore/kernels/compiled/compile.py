@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from numba import config, njit
-from numba.core.compiler import Compiler
 
 _F = TypeVar("_F", bound=Callable[..., object])
 
@@ -53,15 +52,6 @@ def use_cache(environment: MutableMapping[str, str]) -> Path | None:
 use_cache(os.environ)
 
 
-class _NoAlias(Compiler):
-    """Numba's compiler, with arguments that LLVM may take for disjoint; `njit` has no option for it."""
-
-    def define_pipelines(self) -> Any:
-        """Called once, with the flags of the function to compile."""
-        self.state.flags.noalias = True
-        return super().define_pipelines()  # type: ignore[no-untyped-call]
-
-
 def compiled(function: _F) -> _F:
     """Compile `function` with Numba at its first call, without the GIL; division by zero gives what NumPy gives.
 
@@ -72,19 +62,20 @@ def compiled(function: _F) -> _F:
 
 
 def inlined(function: _F) -> _F:
-    """Like `compiled`, and inlined where another compiled function calls it; Python itself cannot call it.
-
-    No element that `function` writes through one array may be reached through another of its arguments. In return,
-    loops become SIMD instructions without a check for overlap at run time.
-    """
-    return _compile(function, forceinline=True, no_cpython_wrapper=True, pipeline_class=_NoAlias)
+    """Like `compiled`, and inlined where another compiled function calls it; Python itself cannot call it."""
+    return _compile(function, forceinline=True, no_cpython_wrapper=True)
 
 
-def _compile(function: _F, **options: Any) -> _F:
+def template(function: _F) -> _F:
+    """Like `inlined`, of a function that is given compiled functions: its caller alone is kept on disk."""
+    return _compile(function, cache=False, forceinline=True, no_cpython_wrapper=True)
+
+
+def _compile(function: _F, cache: bool = True, **options: Any) -> _F:
     # entry points for C are never used, and take a fifth of the compile time
     options |= {"fastmath": _FASTMATH, "error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
     try:
-        dispatcher = njit(cache=True, **options)(function)
+        dispatcher = njit(cache=cache, **options)(function)
     except RuntimeError as error:
         # raised at decoration time, so without this the import itself would fail
         if "no locator available" not in str(error):

@@ -7,8 +7,6 @@ from abc import ABC, abstractmethod
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.kernels.compiled.compile import compiled
-
 Array = NDArray[np.float64]
 
 
@@ -38,11 +36,3 @@ class Cross(ABC):
         """`fill` for N queries: motions (N, 3, n), out (N, S + 1, n, n); the same numbers to the last bit."""
         for motion, block in zip(motions, out, strict=True):
             self.fill(motion, block)
-
-
-@compiled
-def symmetrise(block: Array) -> None:
-    """Take the rounding errors out of a square matrix that is symmetric but for them."""
-    for i in range(block.shape[0]):
-        for j in range(i):
-            block[i, j] = block[j, i] = 0.5 * (block[i, j] + block[j, i])

@@ -1,160 +1,147 @@
-"""Compiled twin of `LipKernel`: the Gram matrix pair by pair, and its derivative by hand-written reverse mode.
+"""The paper's kernel, docs/method.md section 3: Gram matrix, its derivative, and a query's covariances.
 
-One row sample meets a block of column samples at a time. The pairs of a block lie innermost in memory, so that the
-compiler turns every formula into vector instructions, and all that a block needs stays in the core's cache.
-
-Samples enter through six numbers a joint: f, g, f', g', v, a with the base kernel p = c + α f f̃ + β g g̃ (a tilde marks
-the column sample), where f = cos q, g = sin q of a revolute joint and f = q, g = 0 of a prismatic one. Everything after
-p is the same for both, and free of division as in `polynomial`.
+Of the E kernels of positions the last is the potential's. The others are the links', or one for all of them.
 """
 
 from __future__ import annotations
 
-import numpy as np
+from typing import NamedTuple
 
-from lipcore.kernels.compiled.compile import compiled
-from lipcore.kernels.compiled.lip_data import PAIRS, Array, Flags, adjoints, features, scratch
-from lipcore.kernels.compiled.lip_energies import add_kinetic, kinetic, kinetic_reverse, potential, potential_reverse
-from lipcore.kernels.compiled.lip_products import base_reverse, product_reverse, square_reverse
-
-
-@compiled
-def lip_gram(
-    q: Array,
-    v: Array,
-    a: Array,
-    q2: Array,
-    v2: Array,
-    a2: Array,
-    prismatic: Flags,
-    kinetic_shares: Array,
-    weights: Array,
-    potential_shares: Array,
-    potential_scale: float,
-    symmetric: bool,
-) -> Array:
-    """Torque covariance of every row sample with every column sample, (N, n, M, n), (N·m)².
-
-    q, v, a: (N, n) positions, velocities, accelerations of the rows; q2, v2, a2: (M, n) of the columns; prismatic: (n,)
-    joint types; kinetic_shares: (n, n, 3), the (σ, α, β) of joint b for link l at [l, b], b ≤ l; weights: (n, n) lower
-    triangular, velocity weights w of link l in row l; potential_shares: (n, 3); potential_scale: positive.
-
-    The sum of the torque kernels of every link's Π p_b² h² and of scale Π p_b. With `symmetric` both arguments are
-    the same samples: only half of the pairs is evaluated, and the result is symmetric to the last bit.
-    """
-    rows, n = q.shape
-    columns = q2.shape[0]
-    x, y = features(q, v, a, prismatic), features(q2, v2, a2, prismatic)
-    out, s, changes = np.empty((rows, n, columns, n)), scratch(n), changed_links(kinetic_shares)
-    for row in range(rows):
-        for start in range(row if symmetric else 0, columns, PAIRS):
-            width = min(PAIRS, columns - start)
-            _load_columns(y, start, width, s.block)
-            potential(potential_shares, prismatic, x[row], n, width, s)
-            for i in range(n):
-                for j in range(n):
-                    for k in range(width):
-                        s.total[i, j, k] = potential_scale * s.mixed[i, j, k]
-            for link in range(n - 1, -1, -1):
-                kinetic(kinetic_shares[link], prismatic, weights[link], x[row], link + 1, width, changes[link], s)
-                add_kinetic(weights[link], x[row], link + 1, width, s)
-            for i in range(n):
-                for k in range(width):
-                    for j in range(n):
-                        out[row, i, start + k, j] = s.total[i, j, k]
-    if symmetric:
-        _mirror(out.reshape(rows * n, rows * n))
-    return out
+from lipcore.kernels.compiled import pairs
+from lipcore.kernels.compiled.compile import compiled, inlined
+from lipcore.kernels.compiled.joints import Array, Flags, base_adjoint, base_kernels, row
+from lipcore.kernels.compiled.lip_kinetic import (
+    Terms,
+    TermsBack,
+    add_block,
+    block_adjoint,
+    lay_terms,
+    lay_terms_back,
+    link_terms,
+    square,
+    square_adjoint,
+)
+from lipcore.kernels.compiled.pairs import Hyper
+from lipcore.kernels.compiled.products import (
+    ProductBack,
+    Products,
+    lay_back,
+    lay_products,
+    mixed_derivatives,
+    potential_adjoint,
+    prefixes,
+    product_adjoint,
+)
+from lipcore.kernels.compiled.views import lay, numbers
 
 
-@compiled
-def lip_gradient(
-    q: Array,
-    v: Array,
-    a: Array,
-    q2: Array,
-    v2: Array,
-    a2: Array,
-    prismatic: Flags,
-    kinetic_shares: Array,
-    weights: Array,
-    potential_shares: Array,
-    potential_scale: float,
-    symmetric: bool,
-    weight: Array,
-) -> tuple[Array, Array, Array, float]:
-    """Derivative of Σ weight · lip_gram(...) by kinetic_shares, weights, potential_shares and potential_scale.
+class Work(NamedTuple):
+    """What LANES pairs are computed with; Lanes but for `one`."""
 
-    Arguments as of `lip_gram`; weight: (N, n, M, n), a symmetric matrix if `symmetric`. Returns (n, n, 3), (n, n),
-    (n, 3) and a number. The shares of a joint count as independent; joints past a link get zero.
-    """
-    rows, n = q.shape
-    columns = q2.shape[0]
-    x, y = features(q, v, a, prismatic), features(q2, v2, a2, prismatic)
-    s, d, changes = scratch(n), adjoints(n), changed_links(kinetic_shares)
-    # one sum for each pair of a block, added up at the very end
-    d_kinetic, d_potential = np.zeros((n, n, 3, PAIRS)), np.zeros((n, 3, PAIRS))
-    d_weights, d_scale = np.zeros((n, n, PAIRS)), np.zeros(PAIRS)
-    for row in range(rows):
-        for start in range(row if symmetric else 0, columns, PAIRS):
-            width = min(PAIRS, columns - start)
-            _load_columns(y, start, width, s.block)
-            for i in range(n):
-                for k in range(width):
-                    factor = 2.0 if symmetric and start + k > row else 1.0
-                    for j in range(n):
-                        s.total[i, j, k] = factor * weight[row, i, start + k, j]
-            potential(potential_shares, prismatic, x[row], n, width, s)
-            potential_reverse(prismatic, x[row], potential_scale, width, s, d, d_potential, d_scale)
-            for link in range(n - 1, -1, -1):
-                kinetic(kinetic_shares[link], prismatic, weights[link], x[row], link + 1, width, changes[link], s)
-                kinetic_reverse(weights[link], x[row], link + 1, width, s, d, d_weights[link])
-                product_reverse(s.power, link + 1, width, s, d)
-                square_reverse(link + 1, width, s.base, d.base)
-                base_reverse(prismatic, x[row], link + 1, width, s.block, d.base, d_kinetic[link])
-    return (
-        _sum_pairs(d_kinetic).reshape(n, n, 3),
-        _sum_pairs(d_weights).reshape(n, n),
-        _sum_pairs(d_potential).reshape(n, 3),
-        d_scale.sum(),
-    )
+    total: Array  # (n, n) block of the Gram matrix, or the derivatives by it
+    base: Array  # (n, 4) base kernels
+    power: Array  # (n, 4) their squares
+    products: Products
+    terms: Terms
+    one: Array  # (n,) scales of a product over a link's joints: one for its last, else zero
+
+
+class Back(NamedTuple):
+    """Derivatives by it."""
+
+    base: Array
+    products: ProductBack
+    terms: TermsBack
+
+
+@inlined
+def _lay_work(m: Array, at: int, n: int) -> tuple[Work, int]:
+    (total, base, power), at = lay(m, at, ((n, n), (n, 4), (n, 4)))
+    position, at = lay_products(m, at, n)
+    terms, at = lay_terms(m, at, n)
+    return Work(total, base, power, position, terms, numbers(m, at, (n,))), at + n
+
+
+@inlined
+def _lay_back(m: Array, at: int, n: int) -> tuple[Back, int]:
+    (base,), at = lay(m, at, ((n, 4),))
+    position, at = lay_back(m, at, n)
+    terms, at = lay_terms_back(m, at, n)
+    return Back(base, position, terms), at
 
 
 @compiled
-def changed_links(shares: Array) -> Flags:
-    """Whether a link's shares differ from the next link's: where not, its products are those already computed."""
-    n = shares.shape[0]
-    changes = np.ones(n, dtype=np.bool_)
-    for link in range(n - 1):
-        changes[link] = np.any(shares[link, : link + 1] != shares[link + 1, : link + 1])
-    return changes
+def lip_size(n: int) -> int:
+    """See `pairs.work_size`."""
+    return pairs.work_size(_lay_work, _lay_back, n)
+
+
+@inlined
+def _potential(hyper: Hyper, x: Array, y: Array, s: Work) -> None:
+    """H of the potential energy's kernel, its torques' covariance (3)."""
+    n = x.shape[1]
+    base_kernels(hyper.shares[-1], x, y, s.base)
+    prefixes(s.base, n, s.products)
+    mixed_derivatives(s.base, hyper.scales, n, s.products)
+
+
+@inlined
+def _kinetic(hyper: Hyper, link: int, x: Array, y: Array, s: Work) -> None:
+    """What the block of a link is made of; links come from the last to the first."""
+    last, n, m = hyper.shares.shape[0] - 2, x.shape[1], link + 1
+    if link == n - 1 or last > 0:
+        base_kernels(hyper.shares[min(link, last)], x, y, s.base)
+        square(s.base, s.power)
+        prefixes(s.power, m, s.products)
+    s.one[m % n], s.one[link] = 0.0, 1.0
+    mixed_derivatives(s.power, s.one, m, s.products)
+    link_terms(hyper.weights[link], x, y, m, s.products, s.terms)
+
+
+@inlined
+def _covariance(hyper: Hyper, x: Array, y: Array, s: Work) -> None:
+    """The block of the Gram matrix of one row sample and LANES columns."""
+    n = x.shape[1]
+    _potential(hyper, x, y, s)
+    for i in range(n):
+        for j in range(n):
+            s.total[i, j] = s.products.mixed[i, j]
+    for link in range(n - 1, -1, -1):
+        _kinetic(hyper, link, x, y, s)
+        add_block(hyper.weights[link], x, y, link + 1, s.products, s.terms, s.total)
+
+
+@inlined
+def _adjoint(hyper: Hyper, x: Array, y: Array, s: Work, d: Back, dhyper: Hyper) -> None:
+    """Add the derivatives by the hyperparameters, given those by the block."""
+    last, n = hyper.shares.shape[0] - 2, x.shape[1]
+    _potential(hyper, x, y, s)
+    potential_adjoint(s.base, hyper.scales, s.products, s.total, d.products, d.base, dhyper.scales)
+    for b in range(n):
+        base_adjoint(x, y, b, row(d.base, b), dhyper.shares[-1])
+    for link in range(n - 1, -1, -1):
+        m = link + 1
+        _kinetic(hyper, link, x, y, s)
+        given = block_adjoint(hyper.weights[link], x, y, m, s.products, s.terms, s.total, d.terms, dhyper.weights[link])
+        product_adjoint(s.power, s.one, m, s.products, given, d.products, d.base)
+        for b in range(m):
+            by_base = square_adjoint(s.base, b, row(d.base, b))
+            base_adjoint(x, y, b, by_base, dhyper.shares[min(link, last)])
 
 
 @compiled
-def _load_columns(y: Array, start: int, width: int, block: Array) -> None:
-    for c in range(6):
-        for b in range(block.shape[1]):
-            for k in range(width):
-                block[c, b, k] = y[start + k, c, b]
+def lip_gram(m: Array, kernels: int, x: Array, symmetric: bool, out: Array) -> None:
+    """See `pairs.gram`."""
+    pairs.gram(_lay_work, _covariance, m, kernels, x, symmetric, out)
 
 
 @compiled
-def _mirror(matrix: Array) -> None:
-    """Copy the upper triangle onto the lower one, tile by tile to spare the cache."""
-    size, tile = matrix.shape[0], 32
-    for i0 in range(0, size, tile):
-        for j0 in range(i0, size, tile):
-            for i in range(i0, min(i0 + tile, size)):
-                for j in range(max(j0, i + 1), min(j0 + tile, size)):
-                    matrix[j, i] = matrix[i, j]
+def lip_gradient(m: Array, kernels: int, x: Array, weight: Array, sums: Array) -> None:
+    """See `pairs.gradient`."""
+    pairs.gradient(_lay_work, _lay_back, _adjoint, m, kernels, x, weight, sums)
 
 
 @compiled
-def _sum_pairs(values: Array) -> Array:
-    """Sum over the last axis, all others flattened: a loop compiles in a tenth of the time that `sum(axis)` takes."""
-    rows = values.reshape(-1, PAIRS)
-    total = np.zeros(rows.shape[0])
-    for i in range(rows.shape[0]):
-        for k in range(PAIRS):
-            total[i] += rows[i, k]
-    return total
+def lip_cross(m: Array, kernels: int, prismatic: Flags, motions: Array, out: Array) -> None:
+    """See `pairs.cross`."""
+    pairs.cross(_lay_work, _covariance, m, kernels, prismatic, motions, out)

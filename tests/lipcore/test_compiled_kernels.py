@@ -1,0 +1,109 @@
+"""Compiled Gram matrices and their hand-written gradients against the PyTorch form and autograd."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from lipcore.kernels.compiled.lanes import LANES
+from lipcore.motion import Motion
+from tests.lipcore.agreement import opposite
+from tests.lipcore.oracles import shares_of
+from tests.lipcore.problems import KERNELS, Problem, TorchForm, random_problem
+
+RELATIVE = 1e-11
+ROBOTS = [
+    ("revolute",),
+    ("prismatic",),
+    ("revolute",) * 2,
+    ("prismatic",) * 3,
+    ("prismatic", "revolute", "revolute", "prismatic", "revolute"),
+    ("revolute",) * 7,
+]
+
+kernels = pytest.mark.parametrize("kernel", KERNELS)
+robots = pytest.mark.parametrize("joint_types", ROBOTS, ids=lambda kinds: "".join(kind[0] for kind in kinds))
+
+
+def agree(actual: torch.Tensor, expected: torch.Tensor, name: str = "") -> None:
+    assert actual.shape == expected.shape
+    if expected.numel():
+        assert float((actual - expected).abs().max()) <= RELATIVE * float(expected.abs().max()), name
+
+
+def check(problem: Problem) -> None:
+    """All samples with each other and the gradient, and the first third of them with the rest."""
+    kernel, params, motion, third = problem.kernel, problem.params, problem.motion, len(problem.motion) // 3
+    form, places = TorchForm(kernel), len(motion) * kernel.n_joints
+    agree(kernel.gram(params, motion[:third], motion[third:]), form.gram(params, motion[:third], motion[third:]))
+    gram = kernel.symmetric_gram(params, motion)
+    assert torch.equal(gram, gram.T)
+    agree(gram, form.symmetric_gram(params, motion))
+
+    weight = torch.from_numpy(np.random.default_rng(1).standard_normal((places, places)))
+    compiled, reference = (each.gradient(params, motion, weight + weight.T) for each in (kernel, form))
+    assert compiled.keys() == reference.keys()
+    for name, derivative in reference.items():
+        agree(compiled[name], derivative, name)
+
+
+@robots
+@kernels
+# part of a block of columns, exactly one, and several
+@pytest.mark.parametrize("samples", [1, 3, LANES - 1, LANES, LANES + 1, 3 * LANES + 2])
+def test_equal_the_formula_in_pytorch(kernel: str, joint_types: tuple[str, ...], samples: int) -> None:
+    check(random_problem(joint_types, samples, seed=samples, kernel=kernel))
+
+
+@kernels
+def test_many_joints(kernel: str) -> None:
+    problem = random_problem(("revolute", "prismatic", "revolute") * 5, 3, seed=0, kernel=kernel)
+    if kernel == "chain":
+        problem.params["chain.logits"] -= 3.0
+    check(problem)
+
+
+@kernels
+@pytest.mark.parametrize("joint_types", [("revolute",) * 3, ("prismatic", "revolute", "prismatic")])
+@pytest.mark.parametrize("zeros", [(0,), (2,), (0, 2), (0, 1, 2)])
+def test_base_kernels_of_zero(kernel: str, joint_types: tuple[str, ...], zeros: tuple[int, ...]) -> None:
+    """p_b = 0 of one, two or all joints: the derivatives stay exact, as nothing divides by it."""
+    problem = random_problem(joint_types, 2, seed=3, kernel=kernel)
+    logits = torch.full((3, 2), 0.7, dtype=torch.float64)  # σ < α, β: p changes sign
+    for name, value in problem.params.items():
+        if name.endswith("logits"):
+            value[:] = 0.7 if kernel == "chain" else logits[: len(value)]
+    shares = shares_of(logits)
+    if kernel == "chain":
+        alpha = torch.sigmoid(torch.tensor(0.7, dtype=torch.float64))
+        straight = torch.tensor([kind == "prismatic" for kind in joint_types])
+        shares = torch.stack([1 - alpha.expand(3), alpha.expand(3), torch.where(straight, 0.0, alpha)], dim=1)
+    q = problem.motion.q.clone()
+    q[0] = torch.tensor([0.4, 0.9, 1.1])
+    for joint in zeros:
+        q[1, joint] = opposite(joint_types[joint], shares[joint].tolist(), float(q[0, joint]))
+    check(Problem(problem.kernel, problem.params, Motion(q, problem.motion.dq, problem.motion.ddq)))
+
+
+def test_links_may_share_their_shapes_or_not() -> None:
+    """Products are taken over from link to link where all have the same: then the untied kernel is the tied one."""
+    problem = random_problem(("revolute", "prismatic", "revolute"), samples=4, seed=3)
+    untied = dict(problem.params)
+    logits = untied.pop("kinetic.logits")
+    untied |= {f"kinetic.{link}.logits": logits[:link] for link in (1, 2, 3)}
+    other = random_problem(problem.kernel.joint_types, 1, seed=0, kernel="untied").kernel
+    agree(
+        other.gram(untied, problem.motion, problem.motion),
+        problem.kernel.symmetric_gram(problem.params, problem.motion),
+    )
+
+
+@kernels
+def test_no_samples(kernel: str) -> None:
+    problem = random_problem(("revolute",) * 2, 3, seed=0, kernel=kernel)
+    assert problem.kernel.gram(problem.params, problem.motion, problem.motion[:0]).shape == (6, 0)
+    nothing = torch.zeros((0, 0), dtype=torch.float64)
+    assert not any(
+        bool(each.any()) for each in problem.kernel.gradient(problem.params, problem.motion[:0], nothing).values()
+    )
