@@ -17,8 +17,18 @@ from lipcore.metrics import evaluate
 from lipcore.model import TorquePrediction
 from lipcore.online.batch import Rows
 from service.foundation.settings import Settings
-from service.learning.refreshing.contest import MAX_BLOCKS, MIN_BLOCKS, ROWS_PER_BATCH, Block, Contest, sample, surprise
-from service.learning.refreshing.duel import TELL_EVERY_S, Duel, Duels
+from service.learning.learner.contest import (
+    MAX_BLOCKS,
+    MIN_BLOCKS,
+    ROWS_PER_BATCH,
+    TELL_EVERY_S,
+    Block,
+    Contest,
+    Duel,
+    Duels,
+    sample,
+    surprise,
+)
 from tests.service.updates.batches import rows
 
 ONE = np.ones(1)
