@@ -2,10 +2,10 @@
 
 What is compared is the negative log predictive density of a row's torques, summed over the joints, with the noise that
 each version states: it rewards small errors and honest uncertainty alike. The difference of neighbouring rows is
-correlated, because a robot moves on where it was: the standard error therefore comes from the means of blocks of at
-least BLOCK_S seconds, which grow with the contest (from MAX_BLOCKS on, two become one), and whatever correlation is
-left between neighbouring blocks widens it further. Looking again and again would let chance promote in the end: looks
-are taken at `promotion_rows`, at twice as many, at four times as many …, and each asks for more than the one before.
+correlated, because a robot moves on where it was: the standard error is that of `lipcore.paired`, from blocks of at
+least BLOCK_S seconds, which grow with the contest: from MAX_BLOCKS on, two become one. Looking again and again would
+let chance promote in the end: looks are taken at `promotion_rows`, at twice as many, at four times as many …, and each
+asks for more than the one before.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from scipy.special import stdtrit
 
 from lipcore.online.batch import Rows
 from lipcore.online.record import Record
+from lipcore.paired import BLOCK_S, MAX_BLOCKS, Answer, Difference, of_blocks, surprise
 from lipcore.samples import Array
 from service.foundation.settings import Settings
 from service.learning.learner.follower import Follower
@@ -31,16 +32,14 @@ Verdict = Literal["promote", "dismiss"]
 
 ROWS_PER_BATCH = 20
 """Most rows of a batch that are compared: neighbours tell the same, and each costs two predictions."""
-BLOCK_S = 1.0
-"""Shortest block, s of event time."""
-MIN_BLOCKS, MAX_BLOCKS = 30, 64
-"""Fewest blocks that a verdict stands on, and most that are kept."""
+MIN_BLOCKS = 30
+"""Fewest blocks that a verdict stands on."""
 CHANCE = 0.02275
 """Probability that chance alone lies two standard errors above zero, which the first look takes as the bound."""
 PENDING = 2000
 """Events that one follower may be ahead of the other before the oldest is dropped uncompared."""
-TELL_EVERY_S = 30.0
-"""Seconds after which a verdict that nothing has followed from is told again."""
+REPEAT_EVERY_S = 30.0
+"""Seconds after which a verdict that nothing has followed from is sent again."""
 
 
 @dataclass(frozen=True)
@@ -74,11 +73,12 @@ class Contest:
         """A contest without a row."""
         return cls(Record.empty(n_joints), Record.empty(n_joints), {})
 
-    def step(
-        self, time: Array, tau: Array, serving: tuple[Array, ...], candidate: tuple[Array, ...], at: float
-    ) -> Contest:
-        """Add rows with event times (N,) s, measured torques (N, n), and (mean, std, noise std) of both versions."""
-        difference = surprise(tau, *serving) - surprise(tau, *candidate)
+    def step(self, time: Array, tau: Array, serving: Answer, candidate: Answer, at: float) -> Contest:
+        """Add rows with event times (N,) s, measured torques (N, n), and the predictions of both versions.
+
+        at: Unix time, s.
+        """
+        difference = (surprise(tau, serving) - surprise(tau, candidate)).sum(axis=1)
         blocks = dict(self.blocks)
         for number, value in zip(
             np.floor(time / self.length).astype(np.int64).tolist(), difference.tolist(), strict=True
@@ -104,27 +104,12 @@ class Contest:
     @property
     def gain(self) -> float:
         """How much better the candidate predicts a row, mean in nats; NaN without rows."""
-        rows = self.rows
-        return sum(block.total for block in self.blocks.values()) / rows if rows else float("nan")
+        return float(self._difference().mean[0]) if self.blocks else float("nan")
 
     @property
     def standard_error(self) -> float:
-        """Standard error of `gain`, nats; infinite with fewer than two blocks.
-
-        With S_b the sums and N_b the rows of B blocks: se² = B/(B−1) Σ (S_b − N_b gain)² / N², times (1+ρ)/(1−ρ) for
-        the correlation ρ > 0 of neighbouring blocks.
-        """
-        blocks = [self.blocks[number] for number in sorted(self.blocks)]
-        if len(blocks) < 2:
-            return float("inf")
-        gain = self.gain
-        deviation = np.array([block.total - block.rows * gain for block in blocks])
-        squared = float(deviation @ deviation)
-        if squared == 0:
-            return 0.0
-        correlation = min(max(float(deviation[1:] @ deviation[:-1]) / squared, 0.0), 0.9)
-        inflation = (1 + correlation) / (1 - correlation)
-        return float(np.sqrt(len(blocks) / (len(blocks) - 1) * squared * inflation) / self.rows)
+        """Standard error of `gain`, nats; infinite with fewer than two blocks."""
+        return float(self._difference().standard_error[0]) if self.blocks else float("inf")
 
     def judge(self, settings: Settings, at: float) -> tuple[Contest, Verdict | None]:
         """Return the contest after a look at it, and its verdict if there is one; at: Unix time, s.
@@ -149,7 +134,7 @@ class Contest:
         Each look may be wrong half as often as the one before, so that equal versions are taken for different with a
         probability below 2 · CHANCE, however long the contest. Student's quantile accounts for few blocks.
         """
-        return float(-stdtrit(len(self.blocks) - 1, CHANCE / 2**self.looks))
+        return float(-stdtrit(self._difference().freedom[0], CHANCE / 2**self.looks))
 
     def evidence(self) -> dict[str, Any]:
         """What the verdict stands on, as JSON: differences in nats a row, metrics per joint of both versions."""
@@ -163,19 +148,17 @@ class Contest:
             "figures": {"serving": _figures(self.serving), "candidate": _figures(self.candidate)},
         }
 
+    def _difference(self) -> Difference:
+        """Serving's surprise at a row less the candidate's, from the blocks, of which there is at least one."""
+        blocks = [self.blocks[number] for number in sorted(self.blocks)]
+        return of_blocks(np.array([block.rows for block in blocks]), np.array([[block.total] for block in blocks]))
+
 
 def sample(rows: Rows) -> Rows:
     """At most ROWS_PER_BATCH of the rows that teach, evenly."""
     learnt = rows.learnt
     count = min(len(learnt), ROWS_PER_BATCH)
     return learnt.take(np.linspace(0, len(learnt) - 1, count).round().astype(np.int64))
-
-
-def surprise(tau: Array, mean: Array, std: Array, noise_std: Array) -> Array:
-    """Negative log predictive density of each row, summed over its joints, (N,) nats."""
-    variance = std**2 + noise_std**2
-    density = 0.5 * (np.log(2 * np.pi * variance) + (tau - mean) ** 2 / variance)
-    return np.asarray(density.sum(axis=1))
 
 
 def _paired(blocks: Mapping[int, Block]) -> dict[int, Block]:
@@ -192,20 +175,20 @@ def _figures(record: Record) -> dict[str, list[float | None]]:
 
 
 @dataclass(frozen=True)
-class _Answer:
-    """What a follower predicted of rows of an event: mean and std (N, n), noise std (n,); received: Unix time, s."""
+class _Entry:
+    """A follower's prediction of rows of an event; received: Unix time, s."""
 
     rows: Rows
     received: float
-    predicted: tuple[Array, Array, Array]
+    predicted: Answer
 
 
 class Duel:
     """Contest of the version that serves with a candidate; for one thread.
 
-    It hears of each batch from both followers before they learn it, so that both predict it unseen, and compares the
-    batches that both have told of: what one has learnt before the duel began is left out. Where the log is rewound, the
-    contest begins anew.
+    Both followers pass it each batch before they learn it, so that both predict it unseen. Batches that only one has
+    passed, since the other had learnt them before the duel began, are left out. Where the log is rewound, the contest
+    begins anew.
     """
 
     def __init__(self, serving: Follower, candidate: Follower, settings: Settings) -> None:
@@ -213,12 +196,12 @@ class Duel:
         self.verdict: Verdict | None = None
         self._begin(max(serving.number, candidate.number))
         for follower in (serving, candidate):
-            follower.watchers.append(self._hear)
+            follower.watchers.append(self._enter)
 
     def close(self) -> None:
-        """Hear no more."""
+        """Take no more batches from the followers."""
         for follower in (self.serving, self.candidate):
-            follower.watchers.remove(self._hear)
+            follower.watchers.remove(self._enter)
 
     def outcome(self) -> Contested | None:
         """The verdict as a message to the service, once there is one."""
@@ -235,26 +218,27 @@ class Duel:
     def _begin(self, after: int) -> None:
         """Compare what comes after an event."""
         self.contest = Contest.start(self.serving.base.n_joints)
-        self._heard = dict.fromkeys((self.serving, self.candidate), after)
-        self._waiting: dict[Follower, dict[int, _Answer]] = {self.serving: {}, self.candidate: {}}
+        self._reached = dict.fromkeys((self.serving, self.candidate), after)
+        self._waiting: dict[Follower, dict[int, _Entry]] = {self.serving: {}, self.candidate: {}}
 
-    def _hear(self, follower: Follower, arrivals: Sequence[Arrival]) -> None:
+    def _enter(self, follower: Follower, arrivals: Sequence[Arrival]) -> None:
         if self.verdict is not None or not arrivals:
             return
-        # known from the contest's beginning, or heard already: then the follower has gone back
-        if arrivals[0].event.number <= self._heard[follower] and self.contest.rows:
-            self._begin(max(self._heard.values()))
+        # passed before the contest began, or already: then the follower has gone back
+        if arrivals[0].event.number <= self._reached[follower] and self.contest.rows:
+            self._begin(max(self._reached.values()))
         for each in arrivals:
-            if each.event.kind == "batch" and each.event.number > self._heard[follower]:
-                self._answer(follower, each)
-        self._heard[follower] = max(self._heard[follower], arrivals[-1].event.number)
+            if each.event.kind == "batch" and each.event.number > self._reached[follower]:
+                self._predict(follower, each)
+        self._reached[follower] = max(self._reached[follower], arrivals[-1].event.number)
 
-    def _answer(self, follower: Follower, arrival: Arrival) -> None:
+    def _predict(self, follower: Follower, arrival: Arrival) -> None:
         rows, number = sample(arrival.rows), arrival.event.number
         if len(rows) == 0 or (follower.answering is follower.base and follower.number > follower.start):
             return  # nothing to predict, or what has been learnt is not solved for yet
-        found = follower.answering.predict(rows.q, rows.dq, rows.ddq)
-        own = _Answer(rows, arrival.event.received, (found.tau, found.tau_std, found.noise_std))
+        prediction = follower.answering.predict(rows.q, rows.dq, rows.ddq)
+        answer = Answer(prediction.tau, prediction.tau_std, prediction.noise_std)
+        own = _Entry(rows, arrival.event.received, answer)
         other = self._waiting[self.candidate if follower is self.serving else self.serving].pop(number, None)
         if other is not None:
             self._compare(*(own, other) if follower is self.serving else (other, own))
@@ -264,7 +248,7 @@ class Duel:
         if len(waiting) > PENDING:
             del waiting[min(waiting)]
 
-    def _compare(self, serving: _Answer, candidate: _Answer) -> None:
+    def _compare(self, serving: _Entry, candidate: _Entry) -> None:
         if self.verdict is not None:
             return
         rows, at = serving.rows, serving.received
@@ -278,23 +262,23 @@ class Duels:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self._duels: dict[str, list[Duel]] = {}
-        self._told: dict[Duel, float] = {}
+        self._sent: dict[Duel, float] = {}
 
     def arrange(self, model: str, serving: Follower | None, candidates: Sequence[Follower]) -> None:
         """Let these followers of a model be in contest, and no others; contests under way go on."""
         going = {(duel.serving, duel.candidate): duel for duel in self._duels.pop(model, [])}
-        wanted = [] if serving is None else [(serving, candidate) for candidate in candidates]
+        pairs = [] if serving is None else [(serving, candidate) for candidate in candidates]
         for pair, duel in going.items():
-            if pair not in wanted:
+            if pair not in pairs:
                 duel.close()
-                self._told.pop(duel, None)
-        if wanted:
-            self._duels[model] = [going.get(pair) or Duel(*pair, self.settings) for pair in wanted]
+                self._sent.pop(duel, None)
+        if pairs:
+            self._duels[model] = [going.get(pair) or Duel(*pair, self.settings) for pair in pairs]
 
     def outcomes(self) -> Iterator[Contested]:
-        """Verdicts that have not been told yet, or not lately: the service may not have been able to act on them."""
+        """Verdicts that have not been sent yet, or not lately: the service may not have been able to act on them."""
         now = time.monotonic()
         for duel in (each for duels in self._duels.values() for each in duels):
-            if now - self._told.get(duel, -inf) >= TELL_EVERY_S and (found := duel.outcome()) is not None:
-                self._told[duel] = now
-                yield found
+            if now - self._sent.get(duel, -inf) >= REPEAT_EVERY_S and (outcome := duel.outcome()) is not None:
+                self._sent[duel] = now
+                yield outcome
