@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 
-from service.learning.quality import metrics as learning
+from service.learning import metrics as learning
 from service.training import metrics as training
 from service.web.observability import system, traffic
 from service.web.observability.metric import MetricKind

@@ -33,11 +33,12 @@ MOST_CORRELATION = 0.9
 @dataclass(frozen=True)
 class Difference:
     """Mean difference of k figures, each array (k,); standard error and the half width of the 95 % interval are
-    infinite with a single block."""
+    infinite with a single block. freedom: degrees of freedom of the standard error."""
 
     mean: Array
     standard_error: Array
     half_width: Array
+    freedom: Array
 
     @property
     def significant(self) -> NDArray[np.bool_]:
@@ -91,11 +92,17 @@ def compare(samples: Samples, first: Answer, second: Answer) -> Comparison:
     )
 
 
+def surprise(tau: Array, answer: Answer) -> Array:
+    """Negative log predictive density of torques (N, n), nats, noise included: (N, n)."""
+    variance = answer.std**2 + answer.noise_std**2
+    return np.asarray(0.5 * (np.log(2 * np.pi * variance) + (tau - answer.mean) ** 2 / variance))
+
+
 def _figures(tau: Array, answer: Answer) -> tuple[Array, Array, Array]:
     """Squared error, whether the interval holds the measurement, and negative log density, (N, n) each."""
-    error, variance = tau - answer.mean, answer.std**2 + answer.noise_std**2
-    inside = np.abs(error) <= NormalDist().inv_cdf(0.5 + LEVEL / 2) * np.sqrt(variance)
-    return error**2, inside.astype(np.float64), 0.5 * (np.log(2 * np.pi * variance) + error**2 / variance)
+    error, spread = tau - answer.mean, np.hypot(answer.std, answer.noise_std)
+    inside = np.abs(error) <= NormalDist().inv_cdf(0.5 + LEVEL / 2) * spread
+    return error**2, inside.astype(np.float64), surprise(tau, answer)
 
 
 def blocks(samples: Samples) -> NDArray[np.int64]:
@@ -114,23 +121,27 @@ def blocks(samples: Samples) -> NDArray[np.int64]:
 
 
 def difference(values: Array, starts: NDArray[np.int64]) -> Difference:
-    """Mean of paired differences (N, k) in B blocks that begin at the rows `starts` (B,).
+    """Mean of paired differences (N, k) in B blocks that begin at the rows `starts` (B,)."""
+    return of_blocks(np.diff(starts, append=len(values)), np.add.reduceat(values, starts, axis=0))
 
-    With S_b the sums and N_b the rows of the blocks, d_b = S_b - N_b mean and ρ the correlation of neighbouring d_b,
-    corrected for the bias that it has in B blocks and at least 0:
+
+def of_blocks(rows: NDArray[np.int64], sums: Array) -> Difference:
+    """Mean of paired differences of which B >= 1 blocks in their order are known: rows (B,) and sums (B, k).
+
+    With S_b the sums and N_b the rows of the blocks, N = Σ N_b, d_b = S_b - N_b mean and ρ the correlation of
+    neighbouring d_b, corrected for the bias that it has in B blocks and at least 0:
     se² = B/(B-1) Σ d_b² / N² · (1+ρ)/(1-ρ), with B (1-ρ)/(1+ρ) - 1 degrees of freedom, at least 1.
     """
-    mean, count = values.mean(axis=0), len(starts)
+    mean, count = sums.sum(axis=0) / rows.sum(), len(rows)
     if count < 2:
         unknown = np.full_like(mean, np.inf)
-        return Difference(mean, unknown, unknown)
-    rows = np.diff(starts, append=len(values))
-    deviation = np.add.reduceat(values, starts, axis=0) - rows[:, None] * mean
+        return Difference(mean, unknown, unknown, np.ones_like(mean))
+    deviation = sums - rows[:, None] * mean
     squared = np.sum(deviation**2, axis=0)
     neighbours = np.sum(deviation[1:] * deviation[:-1], axis=0)
-    found = np.divide(neighbours, squared, out=np.zeros_like(squared), where=squared > 0)
-    correlation = np.clip(found + (1 + 4 * np.maximum(found, 0)) / count, 0, MOST_CORRELATION)
+    measured = np.divide(neighbours, squared, out=np.zeros_like(squared), where=squared > 0)
+    correlation = np.clip(measured + (1 + 4 * np.maximum(measured, 0)) / count, 0, MOST_CORRELATION)
     inflation = (1 + correlation) / (1 - correlation)
-    standard_error = np.sqrt(count / (count - 1) * squared * inflation) / len(values)
+    standard_error = np.sqrt(count / (count - 1) * squared * inflation) / rows.sum()
     freedom = np.maximum(count / inflation - 1, 1)
-    return Difference(mean, standard_error, stdtrit(freedom, 0.5 + LEVEL / 2) * standard_error)
+    return Difference(mean, standard_error, stdtrit(freedom, 0.5 + LEVEL / 2) * standard_error, freedom)

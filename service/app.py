@@ -22,14 +22,13 @@ from service.foundation.settings import Settings
 from service.guide import routes as guide
 from service.inference import echo
 from service.inference import routes as inference
-from service.learning import routes as observations
+from service.learning import metrics as learning_metrics
 from service.learning.control import routes as control
+from service.learning.ingest import routes as observations
 from service.learning.learner.learnt import LearntVersions
+from service.learning.learners import Learners
 from service.learning.live import routes as live
-from service.learning.quality.metrics import Learning
-from service.learning.refreshing import routes as refreshing
-from service.learning.refreshing.wiring import attach
-from service.learning.updates import Updates
+from service.learning.refresh import attach
 from service.models import archive_routes as archives
 from service.models import registry
 from service.models import routes as models
@@ -86,10 +85,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         lock = hold_home(settings.home)
         torch.set_num_threads(settings.serving_threads)  # here, for this thread and those that come later
-        storage, jobs, updates = await to_thread.run_sync(_open, settings)
+        storage, jobs, learners = await to_thread.run_sync(_open, settings)
         threadpool_limits(settings.serving_threads)  # of BLAS, whose libraries the models have brought in
-        _share(app, storage, jobs, updates)
-        replication = Replication(updates) if storage.database.shared else None
+        _share(app, storage, jobs, learners)
+        replication = Replication(learners) if storage.database.shared else None
         try:
             async with nullcontext() if keyring is None else keyring.watching(storage.database):
                 yield
@@ -97,7 +96,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             async with AsyncExitStack() as rest:
                 rest.callback(lock.close)
                 rest.callback(storage.database.close)
-                rest.push_async_callback(to_thread.run_sync, updates.close)
+                rest.push_async_callback(to_thread.run_sync, learners.close)
                 if replication is not None:
                     rest.push_async_callback(to_thread.run_sync, replication.close)
                 await to_thread.run_sync(jobs.close)  # first: what learns needs the CPU to store its state
@@ -132,7 +131,6 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.include_router(inference.router)
     app.include_router(control.router)
     app.include_router(live.router)
-    app.include_router(refreshing.router)
     app.include_router(oip.router)
     app.include_router(stream.router())
     dashboard.install(app)
@@ -167,7 +165,7 @@ def _add_middleware(
     app.add_middleware(RequestContext, meters=meters, log=log, tracing=settings.opentelemetry)  # the outermost
 
 
-def _open(settings: Settings) -> tuple[Storage, JobQueue, Updates]:
+def _open(settings: Settings) -> tuple[Storage, JobQueue, Learners]:
     """Open the home, finish what an earlier run left, and load the models that are asked for first."""
     sys.setswitchinterval(SWITCH_INTERVAL)
     storage = Storage.open(settings)
@@ -179,28 +177,28 @@ def _open(settings: Settings) -> tuple[Storage, JobQueue, Updates]:
     jobs = queue_of(settings)(storage, lambda model, _: loaded.adopt(model))
     if recovered := jobs.recover():
         logger.warning("queued again after an interruption: %s", ", ".join(recovered))
-    updates = Updates(loaded)
-    attach(updates, jobs)
-    return storage, jobs, updates
+    learners = Learners(loaded)
+    attach(learners, jobs)
+    return storage, jobs, learners
 
 
-def _share(app: FastAPI, storage: Storage, jobs: JobQueue, updates: Updates) -> None:
+def _share(app: FastAPI, storage: Storage, jobs: JobQueue, learners: Learners) -> None:
     """Put the parts where routes ask for them, each for those that it uses."""
-    state, loaded, settings = app.state, updates.loaded, storage.settings
+    state, loaded, settings = app.state, learners.loaded, storage.settings
     looks: dict[str, Look] = {
         "database": lambda _: looking.database(storage),
         "home": lambda _: looking.home(storage),
         **({"files": lambda _: looking.files(storage)} if storage.files.shared else {}),
         "models": loaded.look,
-        "learner": updates.look,
+        "learner": learners.look,
         "training": lambda lasting: jobs_metrics.look(jobs, lasting),
     }
-    state.storage, state.loaded, state.jobs, state.updates = storage, loaded, jobs, updates
+    state.storage, state.loaded, state.jobs, state.learners = storage, loaded, jobs, learners
     state.turns = Turns(CapacityLimiter(settings.max_concurrent_predictions))
     state.readiness = Readiness(looks, state.stopping)
     state.collectors = (
         Traffic(state.meters),
         jobs_metrics.Work(storage.database),
-        Learning(updates),
+        learning_metrics.Learning(learners),
         System(storage, state.readiness),
     )

@@ -19,8 +19,8 @@ from lipcore.model import TorqueModel
 from lipcore.samples import Array, Samples
 from service.cli.demonstration import ServiceProcess
 from service.client import Client
-from service.learning.learning import set_options
-from service.learning.learning_options import LearningOptions
+from service.learning.owner import set_options
+from service.learning.schema import LearningOptions
 from service.models import registry
 from service.storage.database import Database
 from service.storage.files import Files, new_id

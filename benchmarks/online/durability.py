@@ -14,7 +14,7 @@ from benchmarks.online.bed import install, train
 from benchmarks.online.trials import BATCHES, LATE, MODEL, ROWS, TWICE, Tally, Trials, Victim
 from lipcore.robots import load_robot
 from lipcore.simulation import Payload, Stream, simulate
-from service.learning.learning_options import LearningOptions
+from service.learning.schema import LearningOptions
 
 ROBOT, RATE, SPEED = "double-pendulum", 100.0, 5.0
 FIT = {"hyperparameter_samples": 40, "posterior_samples": 100, "max_iterations": 30, "starts": 1}

@@ -26,7 +26,7 @@ from benchmarks.online.scene import Scene, rows_of
 from benchmarks.online.sending import BATCH_ROWS
 from lipcore.model import TorqueModel
 from lipcore.samples import Array, Samples
-from service.learning.learning_options import LearningOptions
+from service.learning.schema import LearningOptions
 
 PARTS = ("flow", "cost", "quality", "fleet")
 """What can be measured, by name."""

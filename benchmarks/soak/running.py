@@ -26,7 +26,7 @@ from benchmarks.soak.memory import MemoryWatch
 from benchmarks.timing import Timing
 from lipcore.model import TorqueModel
 from lipcore.samples import Samples
-from service.learning.learning_options import LearningOptions
+from service.learning.schema import LearningOptions
 
 KINDS = ("predict", "stream", "observe", "upload")
 QUERIES, UPLOADED = 200, 300

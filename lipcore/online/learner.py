@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +19,8 @@ from lipcore.samples import Array
 
 CHUNK = 500
 """Rows whose features are computed together: they take 28 MB at a thousand variables."""
+Novel = Callable[[NDArray[np.bool_]], None]
+"""Called with which of some rows, (N,), lie beyond the basis; see `uncovered`."""
 
 
 class ForgottenError(ValueError):
@@ -86,14 +89,15 @@ class OnlineModel:
             return self
         return replace(self, since=since, reference=max(self.reference, since))
 
-    def learn(self, rows: Rows, own: bool = False) -> OnlineModel:
+    def learn(self, rows: Rows, own: bool = False, novel: Novel | None = None) -> OnlineModel:
         """Learn the rows of code 0, in any order; those from before the regime before this one teach nothing more.
 
         own: whether nobody else has these sums (see `detached`), so that they can be added to where they are: the model
         that this is called of is not to be used again, the last of many is to be made `whole`. The outcome is the same
-        to the last bit.
+        to the last bit. novel: called for the rows as they are learnt, since their features show whether the basis
+        covers them.
         """
-        return self._add(rows.learnt, 1.0, own)
+        return self._add(rows.learnt, 1.0, own, novel)
 
     def unlearn(self, rows: Rows, own: bool = False) -> OnlineModel:
         """Take back rows that were learnt; raise ForgottenError for some from before the regime before this one.
@@ -128,10 +132,6 @@ class OnlineModel:
         _check(forgetting_s)
         return replace(self, forgetting_s=forgetting_s)
 
-    def novel(self, rows: Rows) -> NDArray[np.bool_]:
-        """Which rows the basis does not cover: it leaves more variance of a torque open than its noise has, (N,)."""
-        return uncovered(self.base, rows)
-
     def model(self, floor: Array | None = None) -> TorqueModel:
         """Solve for the model that answers. floor: (n,) (N·m)², which its variances are never below."""
         posterior = self.base.posterior
@@ -152,27 +152,27 @@ class OnlineModel:
                 mirror(regime.statistics)
         return self
 
-    def _add(self, rows: Rows, sign: float, own: bool) -> OnlineModel:
+    def _add(self, rows: Rows, sign: float, own: bool, novel: Novel | None = None) -> OnlineModel:
         if not len(rows):
             return self
         model = self if own else self.detached()
         for first in range(0, len(rows), CHUNK):
-            model = model._add_chunk(rows.take(slice(first, first + CHUNK)), sign)
+            model = model._add_chunk(rows.take(slice(first, first + CHUNK)), sign, novel)
         return model if own else model.whole()
 
-    def _add_chunk(self, rows: Rows, sign: float) -> OnlineModel:
+    def _add_chunk(self, rows: Rows, sign: float, novel: Novel | None) -> OnlineModel:
         latest = max(self.reference, float(rows.time.max()))
         model = self._aged(latest, float(rows.time.min()) if self.since is None else self.since)
         current = rows.time >= model.now.begins
         now, before = model.now, model.before
         if current.any():
-            now = replace(now, statistics=model._told(now.statistics, rows.take(current), sign))
+            now = replace(now, statistics=model._told(now.statistics, rows.take(current), sign, novel))
         if before is not None and (late := ~current & (rows.time >= before.begins)).any():
-            before = replace(before, statistics=model._told(before.statistics, rows.take(late), sign))
+            before = replace(before, statistics=model._told(before.statistics, rows.take(late), sign, novel))
             now = replace(now, centre=before.solve().mean)
         return replace(model, now=now, before=before)
 
-    def _told(self, statistics: Statistics, rows: Rows, sign: float) -> Statistics:
+    def _told(self, statistics: Statistics, rows: Rows, sign: float, novel: Novel | None) -> Statistics:
         """These statistics, overwritten, with what rows say, or without it."""
         posterior, motion = self.base.posterior, rows.motion()
         weights = torch.from_numpy(rows.weight)
@@ -180,6 +180,8 @@ class OnlineModel:
             weights = weights * torch.from_numpy(np.exp((rows.time - self.reference) / self.forgetting_s))
         residual = torch.from_numpy(rows.tau) - posterior.kernel.mean(motion)
         features, open_ = posterior.basis.told(motion)
+        if novel is not None:
+            novel((open_ > posterior.noise_variance).any(1).numpy())
         return add_to(statistics, features, posterior.noise_variance + open_, residual, weights, sign)
 
     def _aged(self, reference: float, since: float) -> OnlineModel:
@@ -194,10 +196,10 @@ class OnlineModel:
 
 
 def uncovered(base: TorqueModel, rows: Rows) -> NDArray[np.bool_]:
-    """Which rows the basis of a version as trained leaves more variance open of than a torque has noise, (N,)."""
+    """Which rows lie beyond a version's basis: it leaves more variance of a torque open than its noise has, (N,)."""
     basis, motion = base.posterior.basis, rows.motion()
-    found = basis.uncovered(motion, basis.features(motion)) > base.posterior.noise_variance
-    novel: NDArray[np.bool_] = found.any(1).numpy()
+    open_ = basis.uncovered(motion, basis.features(motion))
+    novel: NDArray[np.bool_] = (open_ > base.posterior.noise_variance).any(1).numpy()
     return novel
 
 

@@ -17,7 +17,7 @@ from lipcore.online import state
 from lipcore.probing import probe
 from service.foundation.errors import DamagedDataError
 from service.foundation.settings import Settings
-from service.journal.payload import decode
+from service.journal.log import decode
 from service.storage.database import Database, DatasetRow, EventRow, RobotRow, SnapshotRow, VersionRow
 from service.storage.database.sqlite import FILE
 from service.storage.files import Files, FilesUnreachableError

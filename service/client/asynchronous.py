@@ -22,7 +22,7 @@ from service.client.signatures import bound
 from service.client.sync import POLL_SECONDS
 from service.foundation.settings import DEFAULT_URL
 from service.foundation.states import ACTIVE
-from service.learning.control.learning_schema import Learning
+from service.learning.control.schema import Learning
 from service.training.schema import Job
 from service.web.access.credentials import headers_of
 

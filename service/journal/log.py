@@ -1,4 +1,4 @@
-"""The event log of a model: what came, in the order of commits. The learnt state is a function of it.
+"""The event log of a model, in the order of commits. The learnt state is a function of it.
 
 Functions that write are called inside `Database.transaction()`: numbers are given out under its lock, so that they are
 dense and rise in the order of commits, and an event is durable once the transaction has ended.
@@ -7,18 +7,18 @@ dense and rise in the order of commits, and an event is durable once the transac
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
 from sqlalchemy import Select, delete, func, select, update
 from sqlalchemy.orm import Session, undefer
 
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.errors import BusyError, ConflictError
-from service.journal.gaps import Gaps
-from service.journal.payload import encode
 from service.storage.database import EventRow, LearnerRow, LearningRow, SnapshotRow, StreamRow, now
 from service.web.pagination import Page
 from service.web.pagination import newest as newest_rows
@@ -27,6 +27,46 @@ StreamKind = Literal["batches", "frames"]
 EventKind = Literal["batch", "replay", "unlearn", "rollback", "change", "settings"]
 UNTIMED = [CODES.index("non_finite"), CODES.index("time_jump")]
 """Codes of rows whose own time says nothing."""
+MOST_RANGES = 1000
+"""Ranges that are remembered; the lowest are given up first, being the least likely to be filled."""
+ARRAYS = tuple(field.name for field in fields(Rows))
+"""Of the safetensors archive that an event's rows are kept as."""
+
+
+@dataclass(frozen=True)
+class Gaps:
+    """Sequences that a stream misses: ranges [a, b], rising, between the first (lowest) and the last that are there."""
+
+    first: int
+    last: int
+    ranges: tuple[tuple[int, int], ...] = ()
+
+    def arrived(self, first: int, last: int) -> Gaps:
+        """The gaps once `first` to `last` are there too, in whatever order batches arrive."""
+        left: list[tuple[int, int]] = []
+        if last + 1 < self.first:
+            left.append((last + 1, self.first - 1))
+        for a, b in self.ranges:
+            if a < first:
+                left.append((a, min(b, first - 1)))
+            if b > last:
+                left.append((max(a, last + 1), b))
+        if self.last + 1 < first:
+            left.append((self.last + 1, first - 1))
+        return Gaps(min(self.first, first), max(self.last, last), tuple(left[-MOST_RANGES:]))
+
+    def may_hold(self, sequence: int) -> bool:
+        """Whether a sequence may have arrived: not where it is known to be missing."""
+        return self.first <= sequence <= self.last and not any(a <= sequence <= b for a, b in self.ranges)
+
+    def to_json(self) -> dict[str, Any]:
+        """As a stream's row keeps them, which has `last` in a column of its own."""
+        return {"first": self.first, "ranges": [list(pair) for pair in self.ranges]}
+
+    @staticmethod
+    def from_json(missing: dict[str, Any], last: int) -> Gaps:
+        """Read what `to_json` wrote."""
+        return Gaps(missing["first"], last, tuple((a, b) for a, b in missing["ranges"]))
 
 
 @dataclass(frozen=True)
@@ -84,16 +124,16 @@ def find_batch(session: Session, model: str, stream_id: str, sequence: int) -> E
 
 def covering(session: Session, model: str, stream_id: str, sequence: int) -> EventRow | None:
     """The batch that this sequence lies in, of frames or of its own."""
-    found = _of_stream(model, stream_id).where(EventRow.sequence <= sequence).order_by(EventRow.sequence.desc())
-    event = session.scalar(found.limit(1))
+    query = _of_stream(model, stream_id).where(EventRow.sequence <= sequence).order_by(EventRow.sequence.desc())
+    event = session.scalar(query.limit(1))
     return event if event is not None and event.last_sequence is not None and sequence <= event.last_sequence else None
 
 
 def neighbours(session: Session, model: str, stream_id: str, sequence: int) -> tuple[EventRow | None, EventRow | None]:
     """The batches that are kept next below and next above a sequence, with a gap in between or without."""
-    found = _of_stream(model, stream_id)
-    before = found.where(EventRow.sequence < sequence).order_by(EventRow.sequence.desc()).limit(1)
-    after = found.where(EventRow.sequence > sequence).order_by(EventRow.sequence).limit(1)
+    query = _of_stream(model, stream_id)
+    before = query.where(EventRow.sequence < sequence).order_by(EventRow.sequence.desc()).limit(1)
+    after = query.where(EventRow.sequence > sequence).order_by(EventRow.sequence).limit(1)
     return session.scalar(before), session.scalar(after)
 
 
@@ -103,9 +143,9 @@ def stream(session: Session, model: str, stream_id: str) -> StreamRow | None:
 
 
 def is_forgotten(source: StreamRow, sequence: int) -> bool:
-    """Whether a batch may have come that is no longer kept, so that a repetition could not be told from another."""
+    """Whether a batch may have arrived that is no longer kept: whether it is a repetition cannot be known then."""
     gaps = Gaps.from_json(source.missing, source.last)
-    return source.forgotten is not None and sequence <= source.forgotten and gaps.came(sequence)
+    return source.forgotten is not None and sequence <= source.forgotten and gaps.may_hold(sequence)
 
 
 def newest(session: Session, model: str) -> int:
@@ -123,7 +163,7 @@ def events(session: Session, model: str, after: int, limit: int, void: bool = Fa
 
 
 def is_complete(session: Session, model: str, after: int, through: int) -> bool:
-    """Whether every event with after < number <= through is kept: else no state can be told that needs them."""
+    """Whether every event with after < number <= through is kept: without it there is no state that needs them."""
     span = (EventRow.model == model, EventRow.number > after, EventRow.number <= through)
     return session.scalar(select(func.count()).select_from(EventRow).where(*span)) == max(through - after, 0)
 
@@ -191,6 +231,22 @@ def start_of(session: Session, model: str, version: int) -> int:
     return 0 if row is None else row.start
 
 
+def encode(rows: Rows) -> bytes:
+    """Write rows, bit for bit."""
+    return save({name: np.ascontiguousarray(getattr(rows, name)) for name in ARRAYS})
+
+
+def decode(data: bytes) -> Rows:
+    """Read what `encode` wrote; raise ValueError where it is damaged."""
+    try:
+        arrays = load(data)
+    except SafetensorError as error:
+        raise ValueError(f"logged rows cannot be read: {error}") from None
+    if sorted(arrays) != sorted(ARRAYS):
+        raise ValueError(f"logged rows have the arrays {', '.join(sorted(arrays))}, expected {', '.join(ARRAYS)}")
+    return Rows(**arrays)
+
+
 def _of_stream(model: str, stream_id: str) -> Select[EventRow]:
     return select(EventRow).where(EventRow.model == model, EventRow.stream_id == stream_id)
 
@@ -210,7 +266,7 @@ def _append(
 
 
 def _note_arrival(session: Session, model: str, batch: NewBatch, most_streams: int | None) -> None:
-    """Write down in the row of a stream what came, and what has not; a new row for a new stream."""
+    """Note in the row of a stream which sequences are there; a new row for a new stream."""
     source = stream(session, model, batch.stream_id)
     if source is None:
         known = session.scalar(select(func.count()).select_from(StreamRow).where(StreamRow.model == model)) or 0

@@ -1,4 +1,4 @@
-"""Observations as the API takes them, and their acknowledgement."""
+"""Observations as the API takes, acknowledges and refuses them, and the options of learning."""
 
 from __future__ import annotations
 
@@ -9,8 +9,38 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema
 
-from service.foundation.errors import invalid_request
+from service.foundation.errors import ServiceError, invalid_request
 from service.foundation.matrices import to_array
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class LearningOptions(BaseModel):
+    """How a model learns from observations."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+    enabled: bool = Field(True, description="Whether observations are taken at all")
+    forgetting_s: float | None = Field(
+        None,
+        ge=1,
+        allow_inf_nan=False,
+        description="Age in s at which a sample counts 1/e of a new one, in event time; null: nothing is forgotten",
+    )
+    on_change: Literal["hold", "adapt", "learn"] = Field(
+        "hold",
+        description="What follows a detected change of the robot. `hold`: nothing is learnt until its owner decides; "
+        "`adapt`: a new regime begins; `learn`: learning goes on as before",
+    )
+    torque_limits: list[Positive] | None = Field(
+        None, description="Largest |tau| of each joint's actuator in N·m, to tell saturated samples; null: not known"
+    )
+    contact_threshold: Positive = Field(
+        8.0, description="Predictive standard deviations, noise included, beyond which a torque is taken for a contact"
+    )
+    auto_refresh: bool = Field(True, description="Train a new version by itself where motion leaves what is known")
+    auto_promote: bool = Field(True, description="Let such a version answer by itself once it predicts better")
+
 
 MOST_SEQUENCE = 2**53 - 1
 """The largest whole number that every JSON reader takes for what it is."""
@@ -136,3 +166,15 @@ class ObservationResponse(BaseModel):
     )
     derived: Derivation | None = Field(None, description="What was derived because it was not sent")
     held: bool = Field(description="Whether learning stands still until the model's owner has decided about a change")
+
+
+class LearningDisabledError(ServiceError):
+    """The model's owner has switched its learning off."""
+
+    status, code = 409, "learning_disabled"
+
+
+class ExpiredError(ServiceError):
+    """The batch is so old that it is not known any more whether it has been learnt."""
+
+    status, code = 409, "expired"

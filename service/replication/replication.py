@@ -1,19 +1,27 @@
-"""A service beside others: it hears what they change, takes it in, and looks for itself now and then."""
+"""A service beside others: it takes in what they change when they announce it, and looks for itself now and then."""
 
 from __future__ import annotations
 
 import logging
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Collection, Iterable
+from contextlib import closing
 
-from service.learning.updates import Updates
-from service.replication.listening import Listener
-from service.replication.looking import lagging, look
+from sqlalchemy import func, select
+
+from service.foundation.errors import ServiceError
+from service.learning.learners import Learners
+from service.models import moves
+from service.storage.database import Database, EventRow, LearnerRow, VersionRow
 from service.storage.database.notices import Notice
 
 logger = logging.getLogger(__name__)
 
+PAUSE_S = 0.2
+"""Seconds after which the listener looks whether to end."""
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0
+"""Until the listener connects again: each time twice as long."""
 LOOK_S = 5.0
 """Seconds between two looks at everything in memory: notices come in milliseconds, and should one be lost, this."""
 
@@ -21,19 +29,19 @@ LOOK_S = 5.0
 class Replication:
     """Made once the service is, where it shares its database; close it before the service's parts.
 
-    A log that has grown wakes the learner at once, from the thread that hears of it. All else is looked up in another
+    A log that has grown wakes the learner at once, from the listener's thread. All else is looked up in another
     thread, one look at a time, because versions are loaded for it.
     """
 
-    def __init__(self, updates: Updates) -> None:
-        self._updates = updates
+    def __init__(self, learners: Learners) -> None:
+        self._learners = learners
         self._changed = threading.Condition()
         self._models: set[str] = set()
         self._everything = self._ending = False
         self._woken: dict[str, int] = {}
         self._looker = threading.Thread(target=self._run, daemon=True, name="lipserve-replication")
         self._looker.start()
-        self._listener = Listener(updates.database, self._heard, self._missed)
+        self._listener = Listener(learners.database, self._note, self._note_everything)
 
     def close(self) -> None:
         """End both threads."""
@@ -43,7 +51,7 @@ class Replication:
             self._changed.notify_all()
         self._looker.join()
 
-    def _heard(self, notice: Notice) -> None:
+    def _note(self, notice: Notice) -> None:
         if notice.kind == "log":
             self._wake([notice.model])
             return
@@ -51,7 +59,7 @@ class Replication:
             self._models.add(notice.model)
             self._changed.notify_all()
 
-    def _missed(self) -> None:
+    def _note_everything(self) -> None:
         with self._changed:
             self._everything = True
             self._changed.notify_all()
@@ -69,9 +77,9 @@ class Replication:
                 self._everything, self._models = False, set()
             try:
                 if everything:
-                    look(self._updates, None)
+                    look(self._learners, None)
                 elif models:
-                    look(self._updates, models)
+                    look(self._learners, models)
                     self._wake(models)  # roles may have changed
                 if everything or time.monotonic() >= due:
                     self._look_around()
@@ -84,16 +92,119 @@ class Replication:
                     self._changed.wait_for(lambda: self._ending, 1.0)
 
     def _look_around(self) -> None:
-        """Look at all that is in memory, as if nobody had told anything."""
-        look(self._updates, self._known())
-        found = lagging(self._updates)
-        self._wake(model for model, number in found.items() if self._woken.get(model) != number)
-        self._woken = found  # once for an event: who cannot learn it tries again without being told
-        self._updates.follow()
+        """Look at all that is in memory, whatever was announced."""
+        look(self._learners, self._known())
+        behind = lagging(self._learners)
+        self._wake(model for model, number in behind.items() if self._woken.get(model) != number)
+        self._woken = behind  # once for an event: who cannot learn it tries again by itself
+        self._learners.follow()
 
     def _wake(self, models: Iterable[str]) -> None:
         for model in self._known().intersection(models):
-            self._updates.learner.wake(model)
+            self._learners.process.wake(model)
 
     def _known(self) -> set[str]:
-        return {model for model, _ in self._updates.loaded.held()}
+        return {model for model, _ in self._learners.loaded.held()}
+
+
+class Listener:
+    """Receives the notices of other services in a thread of its own, whatever the database does.
+
+    noticed: called with each notice; connected: called whenever it begins to receive: earlier notices may be lost. Both
+    are called in its thread and must not wait.
+    """
+
+    def __init__(self, database: Database, noticed: Callable[[Notice], None], connected: Callable[[], None]) -> None:
+        self._database, self._noticed, self._connected = database, noticed, connected
+        self._ending, self._receiving = threading.Event(), False
+        self._thread = threading.Thread(target=self._run, daemon=True, name="lipserve-notices")
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread."""
+        self._ending.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        pause = FIRST_PAUSE_S
+        while not self._ending.is_set():
+            try:
+                self._listen()
+            except Exception as error:  # whatever it is: there is nobody else to listen
+                logger.warning("notices of other services are not heard now: %s", error)
+            pause = min(2 * pause, LONGEST_PAUSE_S) if not self._receiving else FIRST_PAUSE_S
+            self._ending.wait(pause)
+
+    def _listen(self) -> None:
+        self._receiving = False
+        with closing(self._database.heard(PAUSE_S)) as notices:
+            for notice in notices:
+                if self._ending.is_set():
+                    return
+                if not self._receiving:
+                    self._receiving = True
+                    self._connected()
+                if notice is not None and notice.origin != self._database.origin:
+                    self._noticed(notice)
+
+
+def look(learners: Learners, models: Collection[str] | None) -> None:
+    """Take in which versions of these models serve, have aliases or are gone; of all that are known here where None.
+
+    Not for the event loop: versions are loaded before they answer.
+    """
+    known = {model for model, _ in learners.loaded.held()} | learners.monitors().keys()
+    here = known if models is None else known & set(models)
+    learners.loaded.announce(here)
+    _point(learners, models)
+    _forget(learners, here)
+
+
+def lagging(learners: Learners) -> dict[str, int]:
+    """Models that answer here with less than their log holds, and the number of its newest event."""
+    held = learners.loaded.held()
+    newest = select(func.max(EventRow.number)).where(EventRow.model == LearnerRow.model).scalar_subquery()
+    query = select(LearnerRow.model, LearnerRow.version, LearnerRow.start, newest).where(
+        LearnerRow.role == "serving", LearnerRow.model.in_({model for model, _ in held})
+    )
+    behind: dict[str, int] = {}
+    with learners.database.session() as session:
+        for model, version, start, number in session.execute(query):
+            revision = held.get((model, version))
+            if revision is not None and number is not None and number - start > revision:
+                behind[model] = number
+    return behind
+
+
+def _point(learners: Learners, models: Collection[str] | None) -> None:
+    """Let aliases point where the database says, to versions in memory where the model is in use here."""
+    loaded = learners.loaded
+    used = {model for model, _ in loaded.versions()}
+    moved = moves.pointers(learners.database, models).items() - loaded.aliases().items()
+    for (model, _), version in moved:
+        if model in used:
+            try:
+                loaded.get(model, version)
+            except ServiceError as error:  # the next query for it is answered with the error
+                logger.warning("version %d of model %s, which an alias points to now: %s", version, model, error)
+    with loaded.moving:  # read again: aliases moved here meanwhile are in the database by now
+        loaded.repoint(moves.pointers(learners.database, models), models)
+
+
+def _forget(learners: Learners, models: Collection[str]) -> None:
+    """Answer no more with versions that are gone."""
+    loaded = learners.loaded
+    with loaded.moving:
+        held = {key for key in loaded.held() if key[0] in models}
+        with learners.database.session() as session:
+            rows = session.execute(select(VersionRow.model, VersionRow.version).where(VersionRow.model.in_(models)))
+            kept = {(model, version) for model, version in rows}
+        left = {model for model, _ in kept}
+        for model in models:
+            gone = {version for name, version in held - kept if name == model}
+            serving = loaded.newest(model)
+            # of a model that was deleted and made anew nothing that is known here holds any more
+            everything = model not in left or (serving is not None and serving in gone)
+            if gone or everything:
+                loaded.forget(model, gone, everything)
+                logger.info("another service has deleted %s of model %s", gone or "all versions", model)

@@ -15,7 +15,7 @@ import numpy as np
 
 from service.foundation.errors import ErrorBody, ServiceError, invalid_request
 from service.learning.ingest.frames import Frames, FramesResult
-from service.learning.updates import Updates
+from service.learning.learners import Learners
 from service.models.loaded import Served
 from service.stream.frames import NUMBER, REQUEST
 from service.web.storage_errors import translated
@@ -50,9 +50,9 @@ class Learning:
     stream_id: source of the torques; say: sends a text to the client. For the event loop; logging is done in a thread.
     """
 
-    def __init__(self, updates: Updates, stream_id: str, say: Callable[[str], Awaitable[None]]) -> None:
-        self._updates, self._stream_id, self._say = updates, stream_id, say
-        self._most, self._wait = updates.settings.stream_flush_rows, updates.settings.stream_flush_s
+    def __init__(self, learners: Learners, stream_id: str, say: Callable[[str], Awaitable[None]]) -> None:
+        self._learners, self._stream_id, self._say = learners, stream_id, say
+        self._most, self._wait = learners.settings.stream_flush_rows, learners.settings.stream_flush_s
         # event time goes on evenly though the clock of the host be set while the stream is open
         self._clock = time.time() - perf_counter()
         self._waiting: deque[Taught] = deque()
@@ -130,7 +130,7 @@ class Learning:
         """Log a block; return what there is to say of it."""
         first, through = block[0].sequence, block[-1].sequence
         try:
-            result = await self._updates.threads.run(self._hand_over, block)
+            result = await self._learners.threads.run(self._hand_over, block)
         except ServiceError as error:
             said = error
         except Exception as error:  # the next block may be logged
@@ -155,7 +155,7 @@ class Learning:
         return {"refused": {"first": first, "through": through, "error": body.model_dump()}}
 
     def _hand_over(self, block: list[Taught]) -> FramesResult:
-        return self._updates.observe_frames(self._frames(block))
+        return self._learners.observe_frames(self._frames(block))
 
     def _frames(self, block: list[Taught]) -> Frames:
         served = block[0].served

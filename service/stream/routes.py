@@ -14,7 +14,7 @@ from uvicorn.protocols.utils import ClientDisconnected
 
 from service.foundation.errors import BusyError, NotFoundError, NotReadyError, invalid_request
 from service.inference import checks
-from service.learning.updates import Updates
+from service.learning.learners import Learners
 from service.models.schema import ALIAS
 from service.models.waiting import reached
 from service.stream.conversation import Conversation, Echo
@@ -64,15 +64,15 @@ class EchoRoute:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Talk with one client. What is raised before it is accepted is answered in HTTP."""
-        updates: Updates = scope["app"].state.updates
-        with self.streams.one_more(updates.settings.max_streams):
-            conversation = await self.conversation(updates, scope, receive, send)
+        learners: Learners = scope["app"].state.learners
+        with self.streams.one_more(learners.settings.max_streams):
+            conversation = await self.conversation(learners, scope, receive, send)
             with suppress(ClientDisconnected):  # no error: it went away while it was answered, or its key ended
                 await conversation.run()
 
-    async def conversation(self, updates: Updates, scope: Scope, receive: Receive, send: Send) -> Conversation:
+    async def conversation(self, learners: Learners, scope: Scope, receive: Receive, send: Send) -> Conversation:
         """Return what talks with the client; raise ServiceError where the address is wrong."""
-        return Echo(_connection(scope), receive, send, updates.settings)
+        return Echo(_connection(scope), receive, send, learners.settings)
 
 
 class StreamRoute(EchoRoute):
@@ -80,17 +80,17 @@ class StreamRoute(EchoRoute):
 
     path = PATH
 
-    async def conversation(self, updates: Updates, scope: Scope, receive: Receive, send: Send) -> Conversation:
+    async def conversation(self, learners: Learners, scope: Scope, receive: Receive, send: Send) -> Conversation:
         """Return what talks with the client; raise InvalidRequestError, NotFoundError, UnreadableVersionError or
         RevisionNotReachedError."""
         asked = _parameters(scope["query_string"])
         model, version, alias = scope["path_params"]["model"], asked.version, asked.alias
         # with 0 it waits for nothing but the model to be in memory
-        served = await reached(updates.loaded, model, version, alias, asked.min_revision)
+        served = await reached(learners.loaded, model, version, alias, asked.min_revision)
         pinned = version is not None
         meter = scope["app"].state.meters.stream(served.name)
         given = (served, meter, pinned, asked.std, asked.stream_id, alias)
-        return Session(_connection(scope), receive, send, updates, *given)
+        return Session(_connection(scope), receive, send, learners, *given)
 
 
 class NoRoute:

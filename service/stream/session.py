@@ -12,7 +12,7 @@ from starlette.types import Message, Receive, Send
 
 from service.foundation.errors import ErrorBody, ErrorResponse, ServiceError, invalid_request
 from service.inference import checks
-from service.learning.updates import Updates
+from service.learning.learners import Learners
 from service.models.loaded import Served
 from service.models.moves import SERVING
 from service.stream.conversation import Conversation
@@ -38,7 +38,7 @@ class Session(Conversation):
         connection: StreamProtocol,
         receive: Receive,
         send: Send,
-        updates: Updates,
+        learners: Learners,
         served: Served,
         meter: StreamMeter,
         pinned: bool,
@@ -46,13 +46,13 @@ class Session(Conversation):
         stream_id: str | None = None,
         alias: str | None = None,
     ) -> None:
-        super().__init__(connection, receive, send, updates.settings)
-        self._loaded, self._name = updates.loaded, served.name
+        super().__init__(connection, receive, send, learners.settings)
+        self._loaded, self._name = learners.loaded, served.name
         self._pin = served.version if pinned else None
         self._alias = None if alias == SERVING else alias
         self._std, self._late, self._due = std, 0, inf
-        self._meter, self._deadline = meter, updates.settings.stream_deadline_s
-        self._learning = None if stream_id is None else Learning(updates, stream_id, self.say)
+        self._meter, self._deadline = meter, learners.settings.stream_deadline_s
+        self._learning = None if stream_id is None else Learning(learners, stream_id, self.say)
         self._take(served)
 
     async def run(self) -> None:

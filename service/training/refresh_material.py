@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lipcore.online.batch import Rows
 from lipcore.samples import Array, Samples
 from service.journal import log
-from service.journal.payload import decode
+from service.journal.log import decode
 from service.storage.database import Database
 from service.training.refresh_scope import Scope
 

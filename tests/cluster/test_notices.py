@@ -11,7 +11,7 @@ from sqlalchemy import delete
 
 from service.journal import log
 from service.models import moves, registry
-from service.replication.listening import Listener
+from service.replication.replication import Listener
 from service.storage.database import AlarmRow, Database, DeletedModelRow, EventRow, ModelRow, VersionRow, now
 from service.storage.database.notices import Notice, read
 from tests.cluster.servers import Postgres, Shared

@@ -13,8 +13,8 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 
 from service.app import create_app
-from service.learning.learner.messages import Contested
-from service.learning.refreshing import promotion
+from service.learning import refresh
+from service.learning.learner.publication import Contested
 from service.replication import replication
 from service.storage.database import AlarmRow, EventRow, LearnerRow, ServingRow
 from tests.cluster.pairs import Pair, answers, both, publish, train
@@ -128,7 +128,7 @@ def test_gates_and_detector_of_both_judge_as_one(pair):
     first.post("learning/change", {"decision": "adapt"})
     after = [drive(pupils[number % 2], range(number, number + 1), push=PUSH)[0] for number in range(18, 20)]
     assert [each["held"] for each in after] == [False, False]
-    monitors = [service_of(client).updates.monitor(first.model) for client in pair.clients]
+    monitors = [service_of(client).learners.monitor(first.model) for client in pair.clients]
     assert state(monitors[0]) == state(monitors[1])
     shown = [pupil.get("quality")["windows"][0] for pupil in pupils]
     assert shown[0] == shown[1]
@@ -172,7 +172,7 @@ def test_what_is_deleted_at_one_is_gone_at_the_other(pair, arm):
     second.refused("POST", "predict", 404, "not_found", json=QUERIES | {"version": 1})
     assert first.client.delete(f"/v1/models/{first.model}").status_code == 204
     eventually(lambda: second.client.post(second.url("predict"), json=QUERIES).status_code == 404)
-    assert first.model not in service_of(second.client).updates.monitors()
+    assert first.model not in service_of(second.client).learners.monitors()
     # one of the same name has nothing of the one before
     again = pair.enrol(first.model)
     assert [pupil.predict()["version"] for pupil in again] == [3, 3]
@@ -184,7 +184,7 @@ def test_of_two_services_that_decide_the_same_contest_one_acts(pair, arm):
     publish(services[0].database, services[0].files, pair.trained, first.model, candidate=True)
     said = Contested(first.model, 1, 2, "promote", {"rows": 700, "gain": 0.5, "standard_error": 0.1})
     acted = both(
-        *(partial(promotion.decide, each.database, each.loaded, each.updates.learner.wake, said) for each in services)
+        *(partial(refresh.decide, each.database, each.loaded, each.learners.process.wake, said) for each in services)
     )
     assert sorted(acted) == [False, True]
     eventually(lambda: [pupil.predict()["version"] for pupil in arm] == [2, 2])

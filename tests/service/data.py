@@ -14,7 +14,7 @@ from lipcore.robots import load_robot
 from lipcore.samples import Samples
 from lipcore.simulation import Stream, simulate
 from service.foundation.states import ACTIVE
-from service.learning.updates import Updates
+from service.learning.learners import Learners
 from service.models.loaded import LoadedModels
 from service.storage.storage import Storage
 from service.training.queue import JobQueue
@@ -139,7 +139,7 @@ class Parts:
         self.files, self.disk = self.storage.files, self.storage.disk
         self.loaded: LoadedModels = state.loaded
         self.jobs: JobQueue = state.jobs
-        self.updates: Updates = state.updates
+        self.learners: Learners = state.learners
         self.readiness: Readiness = state.readiness
         self.stopping, self.meters = state.stopping, state.meters
 

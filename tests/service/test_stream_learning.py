@@ -37,7 +37,7 @@ class Model:
         return self.factor * motion[0], np.array([0.5, self.factor]) if std else None
 
 
-class Updates:
+class Learners:
     """Takes frames in place of the log, while `open` is set; fails with the errors it was given first."""
 
     def __init__(self, *errors):
@@ -72,21 +72,21 @@ def served(version=1, revision=0, model=None):
 class Talk:
     """One connection to a session, from the client's side of ASGI."""
 
-    def __init__(self, updates, pinned=False, std=False, stream_id="arm-1", **settings):
-        self.updates, self.messages, self.sent = updates, asyncio.Queue(), asyncio.Queue()
+    def __init__(self, learners, pinned=False, std=False, stream_id="arm-1", **settings):
+        self.learners, self.messages, self.sent = learners, asyncio.Queue(), asyncio.Queue()
         self.said, self.aborted = [], asyncio.Event()
         self.passing = {"bytes": asyncio.Event(), "text": asyncio.Event()}
         for passing in self.passing.values():
             passing.set()
         self.current = served()
         loaded = SimpleNamespace(hot=lambda name, version, alias: self.current)
-        updates.settings, updates.loaded = Settings(**{**QUICK, **settings}), loaded
+        learners.settings, learners.loaded = Settings(**{**QUICK, **settings}), loaded
         self.connection = SimpleNamespace(arrived=perf_counter(), abort=self.aborted.set, scope={"subprotocols": []})
         self.session = Session(
             self.connection,
             self.messages.get,
             self.send,
-            updates,
+            learners,
             self.current,
             Meters().stream("m"),
             pinned,
@@ -146,10 +146,10 @@ def play(scene):
     ("flags", "always", "answered"), [(0, False, False), (STD, False, True), (0, True, True), (STD, True, True)]
 )
 def test_a_frame_with_torque_is_answered_as_without_and_then_learnt(flags, always, answered):
-    updates, began = Updates(), time.time()
+    learners, began = Learners(), time.time()
 
     async def scene():
-        async with Talk(updates, std=always) as talk:
+        async with Talk(learners, std=always) as talk:
             talk.current = served(revision=4, model=Model(3.0))
             talk.put(frame([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]], 9, flags, tau=[7.0, 8.0]))
             answer = await talk.answer()
@@ -158,7 +158,7 @@ def test_a_frame_with_torque_is_answered_as_without_and_then_learnt(flags, alway
             assert await talk.text() == {
                 "learnt": {"through": 9, "accepted": 1, "duplicates": 0, "rejected": {}, "revision": 7}
             }
-            (block,) = updates.blocks
+            (block,) = learners.blocks
             assert (block.model, block.stream_id, block.served) == ("m", "arm-1", talk.current)
             assert block.sequences.tolist() == [9]
             assert began - 1.0 < block.time[0] < time.time() + 1.0
@@ -171,61 +171,61 @@ def test_a_frame_with_torque_is_answered_as_without_and_then_learnt(flags, alway
 
 
 def test_frames_without_torque_are_not_learnt_and_cause_no_texts():
-    updates = Updates()
+    learners = Learners()
 
     async def scene():
-        async with Talk(updates) as talk:
+        async with Talk(learners) as talk:
             talk.put(*[frame(sequence=number) for number in range(5)])
             assert [(await talk.answer()).sequence for _ in range(5)] == [0, 1, 2, 3, 4]
-        assert (updates.blocks, talk.sent.empty()) == ([], True)
+        assert (learners.blocks, talk.sent.empty()) == ([], True)
 
     play(scene)
 
 
 def test_so_many_frames_are_logged_together_and_the_last_at_the_end_untold():
-    updates = Updates()
+    learners = Learners()
 
     async def scene():
-        async with Talk(updates, stream_flush_rows=3, stream_flush_s=NEVER) as talk:
+        async with Talk(learners, stream_flush_rows=3, stream_flush_s=NEVER) as talk:
             await talk.teach(1, 2, 3)
             assert (await talk.text())["learnt"]["through"] == 3
             await talk.teach(5, 8, 13)
             assert (await talk.text())["learnt"]["through"] == 13
             await talk.teach(14, 15)
             await talk.settle()
-            assert updates.sequences == [[1, 2, 3], [5, 8, 13]]
-        assert updates.sequences == [[1, 2, 3], [5, 8, 13], [14, 15]]
+            assert learners.sequences == [[1, 2, 3], [5, 8, 13]]
+        assert learners.sequences == [[1, 2, 3], [5, 8, 13], [14, 15]]
         assert talk.sent.empty()
 
     play(scene)
 
 
 def test_a_few_frames_are_logged_after_a_while():
-    updates = Updates()
+    learners = Learners()
 
     async def scene():
-        async with Talk(updates, stream_flush_s=0.01) as talk:
+        async with Talk(learners, stream_flush_s=0.01) as talk:
             for first in (1, 3):
                 await talk.teach(first, first + 1)
                 through = 0
                 while through < first + 1:  # on a slow machine the two may be logged one by one
                     through = (await talk.text())["learnt"]["through"]
-        assert np.concatenate(updates.sequences).tolist() == [1, 2, 3, 4]
+        assert np.concatenate(learners.sequences).tolist() == [1, 2, 3, 4]
 
     play(scene)
 
 
 def test_blocks_are_logged_one_by_one_in_order_and_a_full_backlog_stops_the_reading():
-    updates = Updates()
-    updates.open.clear()
+    learners = Learners()
+    learners.open.clear()
 
     async def scene():
-        async with Talk(updates, stream_flush_rows=2, stream_flush_s=NEVER) as talk:
+        async with Talk(learners, stream_flush_rows=2, stream_flush_s=NEVER) as talk:
             talk.put(*[frame(sequence=number, tau=TAU) for number in range(60)])
             answered = [await talk.answer() for _ in range(22)]
             await talk.settle()
             assert talk.sent.empty()  # 2 are being logged, 20 wait, the others are not read
-            updates.open.set()
+            learners.open.set()
             texts = []
             while len(answered) < 60 or len(texts) < 30:
                 said = await talk.next()
@@ -235,62 +235,62 @@ def test_blocks_are_logged_one_by_one_in_order_and_a_full_backlog_stops_the_read
                     texts.append(json.loads(said["text"])["learnt"]["through"])
             assert [each.sequence for each in answered] == list(range(60))
             assert texts == list(range(1, 60, 2))
-        assert updates.sequences == [[number, number + 1] for number in range(0, 60, 2)]
-        assert updates.most_at_once == 1
+        assert learners.sequences == [[number, number + 1] for number in range(0, 60, 2)]
+        assert learners.most_at_once == 1
 
     play(scene)
 
 
 def test_what_one_revision_answered_is_logged_together():
-    updates = Updates()
+    learners = Learners()
 
     async def scene():
-        async with Talk(updates, stream_flush_s=NEVER) as talk:
+        async with Talk(learners, stream_flush_s=NEVER) as talk:
             first = talk.current
             await talk.teach(1, 2)
             talk.current = second = served(revision=1, model=Model(2.0))
             await talk.teach(3)
-        assert updates.sequences == [[1, 2], [3]]
-        assert [block.served for block in updates.blocks] == [first, second]
-        np.testing.assert_array_equal(updates.blocks[1].mean, 2.0 * updates.blocks[1].q)
+        assert learners.sequences == [[1, 2], [3]]
+        assert [block.served for block in learners.blocks] == [first, second]
+        np.testing.assert_array_equal(learners.blocks[1].mean, 2.0 * learners.blocks[1].q)
 
     play(scene)
 
 
 def test_frames_that_come_in_one_piece_have_times_one_after_the_other():
-    updates = Updates()
+    learners = Learners()
 
     async def scene():
-        async with Talk(updates, stream_flush_rows=2, stream_flush_s=NEVER) as talk:
+        async with Talk(learners, stream_flush_rows=2, stream_flush_s=NEVER) as talk:
             for first, later in ((1, -9.0), (3, 0.0), (5, 5.0)):
                 talk.connection.arrived += later
                 await talk.teach(first, first + 1)
                 await talk.text()
 
     play(scene)
-    times = np.concatenate([block.time for block in updates.blocks])
+    times = np.concatenate([block.time for block in learners.blocks])
     steps = np.diff(times)
     assert (steps > 0).all()
     np.testing.assert_allclose(steps, [0, 0, 0, 5, 0], atol=1e-3)
 
 
 def test_a_torque_that_is_no_number_is_answered_and_handed_on():
-    updates = Updates()
+    learners = Learners()
 
     async def scene():
-        async with Talk(updates) as talk:
+        async with Talk(learners) as talk:
             talk.put(frame(tau=[np.nan, np.inf]))
             assert (await talk.answer()).error is None
 
     play(scene)
-    np.testing.assert_array_equal(updates.blocks[0].tau, [[np.nan, np.inf]])
+    np.testing.assert_array_equal(learners.blocks[0].tau, [[np.nan, np.inf]])
 
 
 def test_sequences_must_go_up_among_frames_with_torque():
-    updates = Updates()
+    learners = Learners()
 
     async def scene():
-        async with Talk(updates, stream_flush_s=NEVER) as talk:
+        async with Talk(learners, stream_flush_s=NEVER) as talk:
             talk.put(frame([[np.nan, 0]] * 3, 2**32 - 1, tau=TAU))  # an error takes no sequence
             assert (await talk.answer()).flags == ERROR
             seen = await talk.teach(3, 3, 2, 4)
@@ -302,7 +302,7 @@ def test_sequences_must_go_up_among_frames_with_torque():
                 "sequence is 2, expected more than 3, the last one to learn from: count up, or connect again to "
                 "repeat frames"
             )
-        assert updates.sequences == [[3, 4]]
+        assert learners.sequences == [[3, 4]]
 
     play(scene)
 
@@ -315,10 +315,10 @@ def test_sequences_must_go_up_among_frames_with_torque():
     ],
 )
 def test_streams_that_only_ask_refuse_torque_and_go_on(options, said):
-    updates = Updates()
+    learners = Learners()
 
     async def scene():
-        async with Talk(updates, **options) as talk:
+        async with Talk(learners, **options) as talk:
             (refused,) = await talk.teach(1)
             assert refused.flags == ERROR
             assert said in refused.error["message"]
@@ -326,14 +326,14 @@ def test_streams_that_only_ask_refuse_torque_and_go_on(options, said):
             assert (await talk.answer()).error is None
 
     play(scene)
-    assert updates.blocks == []
+    assert learners.blocks == []
 
 
 def test_a_block_that_cannot_be_logged_is_refused_and_the_next_is_learnt(caplog):
-    updates = Updates(ConflictError("learning is held"), invalid_request("tau", 1, "2"), ZeroDivisionError("odd"))
+    learners = Learners(ConflictError("learning is held"), invalid_request("tau", 1, "2"), ZeroDivisionError("odd"))
 
     async def scene():
-        async with Talk(updates, stream_flush_rows=2, stream_flush_s=NEVER) as talk:
+        async with Talk(learners, stream_flush_rows=2, stream_flush_s=NEVER) as talk:
             for first in (1, 3, 5, 7):
                 await talk.teach(first, first + 1)
                 await talk.text()
@@ -357,7 +357,7 @@ def test_a_block_that_cannot_be_logged_is_refused_and_the_next_is_learnt(caplog)
 
 def test_frames_lost_at_the_end_are_in_the_log_of_the_service(caplog):
     async def scene():
-        async with Talk(Updates(ConflictError("learning is held")), stream_flush_s=NEVER) as talk:
+        async with Talk(Learners(ConflictError("learning is held")), stream_flush_s=NEVER) as talk:
             await talk.teach(6, 7)
         assert talk.sent.empty()
 
@@ -366,10 +366,10 @@ def test_frames_lost_at_the_end_are_in_the_log_of_the_service(caplog):
 
 
 def test_an_acknowledgement_waits_for_the_answer_that_is_being_written():
-    updates = Updates()
+    learners = Learners()
 
     async def scene():
-        async with Talk(updates, stream_flush_rows=1) as talk:
+        async with Talk(learners, stream_flush_rows=1) as talk:
             talk.passing["bytes"].clear()
             talk.put(frame(sequence=1, tau=TAU))
             while not talk.session._texts:
@@ -384,30 +384,30 @@ def test_an_acknowledgement_waits_for_the_answer_that_is_being_written():
 
 def test_who_does_not_read_acknowledgements_is_cut_off():
     async def scene():
-        updates = Updates()
-        updates.open.clear()
-        async with Talk(updates, stream_flush_rows=1, stream_write_s=0.01) as talk:
+        learners = Learners()
+        learners.open.clear()
+        async with Talk(learners, stream_flush_rows=1, stream_write_s=0.01) as talk:
             await talk.teach(1)
             talk.passing["text"].clear()
-            updates.open.set()
+            learners.open.set()
             await asyncio.wait_for(talk.aborted.wait(), DEADLINE)
 
     play(scene)
 
 
 def test_a_client_that_is_gone_is_told_nothing_and_logged_all_the_same():
-    updates = Updates()
-    updates.open.clear()
+    learners = Learners()
+    learners.open.clear()
 
     async def scene():
-        async with Talk(updates, stream_flush_rows=2, stream_flush_s=NEVER) as talk:
+        async with Talk(learners, stream_flush_rows=2, stream_flush_s=NEVER) as talk:
             await talk.teach(1, 2, 3)
             talk.messages.put_nowait({"type": "websocket.disconnect", "code": 1006})
             await talk.settle()
             assert not talk.task.done()
-            updates.open.set()
+            learners.open.set()
             await asyncio.wait_for(asyncio.shield(talk.task), DEADLINE)
             assert talk.session._learning is None
-        assert updates.sequences == [[1, 2], [3]]
+        assert learners.sequences == [[1, 2], [3]]
 
     play(scene)

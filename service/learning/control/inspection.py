@@ -1,4 +1,4 @@
-"""Looking into the log: which batches came, what became of their rows, and the rows themselves."""
+"""Looking into the log: its batches, what became of their rows, and the rows themselves."""
 
 from __future__ import annotations
 
@@ -16,42 +16,54 @@ from lipcore.samples import Array
 from lipcore.vocabulary import CODES
 from service.foundation.errors import NotFoundError, not_found
 from service.journal import log
-from service.journal.log import EventKind
-from service.journal.payload import decode
-from service.learning.control.schema import Observation, ObservationDetail, ObservationPage, ObservationRows, Replay
-from service.learning.ingest import identity
-from service.learning.quality.summary import figures
+from service.journal.log import EventKind, decode
+from service.learning.control.schema import (
+    Figures,
+    Observation,
+    ObservationDetail,
+    ObservationPage,
+    ObservationRows,
+    Replay,
+)
+from service.learning.ingest.batches import state
+from service.learning.learners import Learners
 from service.learning.schema import ObservationResponse
-from service.learning.updates import Updates
 from service.models import registry
 from service.storage.database import EventRow
 from service.web.pagination import Page
 
 BATCHES: tuple[EventKind] = ("batch",)
+FIGURES = ("nmse", "rmse", "coverage", "nlpd")
 
 
-def page(updates: Updates, model: str, part: Page, stream_id: str | None, rejected: bool) -> ObservationPage:
+def page(learners: Learners, model: str, part: Page, stream_id: str | None, rejected: bool) -> ObservationPage:
     """List the batches of a model, newest first; raise NotFoundError where there is no such model."""
-    registry.find(updates.database, model, None)
-    with updates.database.session() as session:
+    registry.find(learners.database, model, None)
+    with learners.database.session() as session:
         events, following = log.page(session, model, part, stream_id, rejected, BATCHES)
         return ObservationPage(
             items=[Observation(**_outline(session, event)) for event in events], next_cursor=following
         )
 
 
-def show(updates: Updates, model: str, stream_id: str, sequence: int, rows: bool) -> ObservationDetail:
+def show(learners: Learners, model: str, stream_id: str, sequence: int, rows: bool) -> ObservationDetail:
     """Return a batch with all that is known of it; raise NotFoundError."""
-    registry.find(updates.database, model, None)
-    with updates.database.session() as session:
+    registry.find(learners.database, model, None)
+    with learners.database.session() as session:
         event = find(session, model, stream_id, sequence)
         return ObservationDetail(
             **_outline(session, event),
-            report=None if event.report is None else _said(event.report),
+            report=None if event.report is None else _acknowledged(event.report),
             figures=None if event.record is None else figures(Record.from_json(event.record)),
             replays=[_replay(session, event, each) for each in replays(session, event)],
             observed=_rows(rows_of(event)) if rows else None,
         )
+
+
+def figures(record: Record) -> Figures:
+    """Return the figures of a record, per joint."""
+    metrics = record.metrics()
+    return Figures(rows=record.rows, **{name: metrics[name] for name in FIGURES})
 
 
 def find(session: Session, model: str, stream_id: str, sequence: int) -> EventRow:
@@ -72,7 +84,7 @@ def rows_of(event: EventRow) -> Rows:
 
 
 def replays(session: Session, batch: EventRow) -> Sequence[EventRow]:
-    """Events that have learnt rows of a batch later, the first one first, also those that were undone since."""
+    """Events that have learnt rows of a batch later, in order, also those that were undone since."""
     query = select(EventRow).where(
         EventRow.model == batch.model,
         EventRow.number > batch.number,
@@ -88,7 +100,7 @@ def _outline(session: Session, event: EventRow) -> dict[str, Any]:
         "sequence": event.sequence,
         "last_sequence": event.last_sequence,
         "event": event.number,
-        "state": identity.state(session, event),
+        "state": state(session, event),
         "received_at": _moment(event.received),
         "first_at": None if event.first is None else _moment(event.first),
         "last_at": None if event.last is None else _moment(event.last),
@@ -100,14 +112,14 @@ def _outline(session: Session, event: EventRow) -> dict[str, Any]:
     }
 
 
-def _said(report: dict[str, Any]) -> dict[str, Any]:
-    """The part of a report that the client was told; the rest is for who goes on from there."""
+def _acknowledged(report: dict[str, Any]) -> dict[str, Any]:
+    """The part of a report that acknowledged the batch; the rest is for judging what follows."""
     return {name: value for name, value in report.items() if name in ObservationResponse.model_fields}
 
 
 def _replay(session: Session, batch: EventRow, event: EventRow) -> Replay:
     """A replay is unlearnt with its batch; undone in another way it is by a rollback."""
-    undone = identity.state(session, batch) if batch.void else "rolled_back"
+    undone = state(session, batch) if batch.void else "rolled_back"
     return Replay(
         event=event.number,
         replayed_at=_moment(event.received),

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Query
+from fastapi import APIRouter, Path, Query, Response
+from pydantic import BaseModel, ConfigDict
 
 from service.foundation.errors import (
+    BusyError,
     ConflictError,
     InvalidRequestError,
     NotFoundError,
@@ -14,9 +16,12 @@ from service.foundation.errors import (
     UnreadableVersionError,
     responses,
 )
-from service.learning.control import decisions, inspection, replaying, status, undoing
-from service.learning.control.learning_schema import AlarmPage, ChangeRequest, Decided, Learning
+from service.learning.control import decisions, inspection, status, undoing
 from service.learning.control.schema import (
+    AlarmPage,
+    ChangeRequest,
+    Decided,
+    Learning,
     ObservationDetail,
     ObservationPage,
     Quality,
@@ -26,10 +31,11 @@ from service.learning.control.schema import (
     RolledBack,
     Unlearnt,
 )
-from service.learning.learning_options import LearningOptions
-from service.learning.quality import summary
-from service.learning.schema import MOST_SEQUENCE, StreamId
-from service.learning.updates import UpdatesDep
+from service.learning.learners import LearnersDep
+from service.learning.schema import MOST_SEQUENCE, LearningOptions, StreamId
+from service.training import refreshes
+from service.training.queue import JobQueueDep
+from service.training.schema import Job
 from service.web.pagination import PageQuery
 from service.web.route import Route
 
@@ -42,53 +48,59 @@ router = APIRouter(
 )
 
 
+class RefreshRequest(BaseModel):
+    """Nothing to choose: estimator, options and robot are those of the version that serves."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [{}]})
+
+
 @router.get("/{model}/quality", summary="How well a model predicts what it has not learnt yet")
-def show_quality(updates: UpdatesDep, model: str) -> Quality:
+def show_quality(learners: LearnersDep, model: str) -> Quality:
     """Figures over sliding windows: every row is predicted, compared with what was measured, and learnt only then."""
-    return summary.show(updates, model)
+    return status.quality(learners, model)
 
 
 @router.get("/{model}/observations", summary="List observation batches, newest first")
 def list_observations(
-    updates: UpdatesDep,
+    learners: LearnersDep,
     model: str,
     page: PageQuery,
     stream_id: Annotated[StreamId | None, Query(description="Only batches of this stream")] = None,
     rejected: Annotated[bool, Query(description="Only batches with rows that were kept out")] = False,
 ) -> ObservationPage:
     """One page of the log: which batches came and what became of their rows."""
-    return inspection.page(updates, model, page, stream_id, rejected)
+    return inspection.page(learners, model, page, stream_id, rejected)
 
 
 @router.get(BATCH, summary="One observation batch")
 def show_observation(
-    updates: UpdatesDep,
+    learners: LearnersDep,
     model: str,
     stream_id: StreamId,
     sequence: Sequence,
     rows: Annotated[bool, Query(description="Also answer its rows, each with its code")] = False,
 ) -> ObservationDetail:
     """What was said of a batch when it came, how well it was predicted, and what has become of it."""
-    return inspection.show(updates, model, stream_id, sequence, rows)
+    return inspection.show(learners, model, stream_id, sequence, rows)
 
 
 @router.delete(BATCH, summary="Unlearn an observation batch", responses=responses(ConflictError))
-def unlearn(updates: UpdatesDep, model: str, stream_id: StreamId, sequence: Sequence) -> Unlearnt:
+def unlearn(learners: LearnersDep, model: str, stream_id: StreamId, sequence: Sequence) -> Unlearnt:
     """Take the rows that a batch has taught, and replayed ones, out of what is learnt, exactly. It stays in the log.
 
     Where accelerations are derived, rows at a batch's edge are learnt with the batch beside it, and stay with that.
     """
-    return undoing.unlearn(updates, model, stream_id, sequence)
+    return undoing.unlearn(learners, model, stream_id, sequence)
 
 
 @router.post(
     f"{BATCH}/replay", summary="Learn rejected rows of a batch", responses=responses(ConflictError, TooLargeError)
 )
 def replay(
-    updates: UpdatesDep, model: str, stream_id: StreamId, sequence: Sequence, request: ReplayRequest
+    learners: LearnersDep, model: str, stream_id: StreamId, sequence: Sequence, request: ReplayRequest
 ) -> Replayed:
     """Learn rows after all that were kept out, each once. Rows with the code `time_jump` count as of their arrival."""
-    return replaying.replay(updates, model, stream_id, sequence, request)
+    return decisions.replay(learners, model, stream_id, sequence, request)
 
 
 @router.post(
@@ -96,18 +108,18 @@ def replay(
     summary="Go back to a revision or a version",
     responses=responses(ConflictError, TooLargeError, UnreadableVersionError),
 )
-def rollback(updates: UpdatesDep, model: str, request: RollbackRequest) -> RolledBack:
+def rollback(learners: LearnersDep, model: str, request: RollbackRequest) -> RolledBack:
     """Forget what was learnt since a revision of the version that serves, or let another version serve.
 
     What was unlearnt since stays unlearnt.
     """
-    return undoing.rollback(updates, model, request)
+    return undoing.rollback(learners, model, request)
 
 
 @router.get("/{model}/learning", summary="How a model learns")
-def show_learning(updates: UpdatesDep, model: str) -> Learning:
+def show_learning(learners: LearnersDep, model: str) -> Learning:
     """What is set, how far learning is, what it waits for, and where it can go back to."""
-    return status.show(updates, model)
+    return status.learning(learners, model)
 
 
 @router.put(
@@ -116,10 +128,10 @@ def show_learning(updates: UpdatesDep, model: str) -> Learning:
     responses=responses(TooLargeError),
     openapi_extra={"requestBody": {"content": {"application/json": {"example": EXAMPLE}}}},
 )
-def set_learning(updates: UpdatesDep, model: str, options: LearningOptions) -> Learning:
+def set_learning(learners: LearnersDep, model: str, options: LearningOptions) -> Learning:
     """Set all options, those left out to their defaults. What has been learnt stays."""
-    decisions.set_options(updates, model, options)
-    return status.show(updates, model)
+    decisions.set_options(learners, model, options)
+    return status.learning(learners, model)
 
 
 @router.post(
@@ -127,12 +139,28 @@ def set_learning(updates: UpdatesDep, model: str, options: LearningOptions) -> L
     summary="Decide about a change of the robot",
     responses=responses(ConflictError, TooLargeError),
 )
-def decide(updates: UpdatesDep, model: str, request: ChangeRequest) -> Decided:
+def decide(learners: LearnersDep, model: str, request: ChangeRequest) -> Decided:
     """End the hold that a detected change has led to: adapt to the changed robot, or go on as if nothing had been."""
-    return decisions.decide(updates, model, request)
+    return decisions.decide(learners, model, request)
 
 
 @router.get("/{model}/alarms", summary="List alarms, newest first")
-def list_alarms(updates: UpdatesDep, model: str, page: PageQuery) -> AlarmPage:
+def list_alarms(learners: LearnersDep, model: str, page: PageQuery) -> AlarmPage:
     """One page of what the model's owner should know: changes, motion beyond what is known, new versions."""
-    return decisions.page(updates, model, page)
+    return decisions.alarms(learners, model, page)
+
+
+@router.post(
+    "/{model}/refresh",
+    status_code=202,
+    summary="Train the version that serves anew",
+    responses=responses(NotFoundError, ConflictError, TooLargeError, BusyError),
+)
+def create(queue: JobQueueDep, model: str, request: RefreshRequest, response: Response) -> Job:
+    """Queue a job that trains on the version's data sets and on what has been observed since.
+
+    The version that it makes learns along and answers once it has predicted better than the one that serves.
+    """
+    job = refreshes.ask(queue, model)
+    response.headers["Location"] = f"/v1/jobs/{job.id}"
+    return job

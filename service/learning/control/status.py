@@ -1,58 +1,97 @@
-"""Where the learning of a model stands."""
+"""Where the learning of a model stands, and how well the model predicts."""
 
 from __future__ import annotations
+
+import time
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from lipcore.vocabulary import CODES, LEARNT
 from service.journal import log
-from service.learning import learning
-from service.learning.control import revisions
-from service.learning.control.learning_schema import Candidate, Held, Learning, LearningStatus, Snapshot, Stream
-from service.learning.updates import Status, Updates
+from service.learning import owner
+from service.learning.control import undoing
+from service.learning.control.inspection import figures
+from service.learning.control.schema import (
+    Candidate,
+    Held,
+    Learning,
+    LearningStatus,
+    Quality,
+    QualityWindow,
+    Snapshot,
+    Stream,
+)
+from service.learning.ingest.monitor import Window
+from service.learning.learners import Learners, Status
 from service.storage.database import LearnerRow, StreamRow
 
 MOST_GAPS = 20
 """Gaps of a stream that are listed."""
 
 
-def show(updates: Updates, model: str) -> Learning:
+def learning(learners: Learners, model: str) -> Learning:
     """Return how a model learns and where that stands; raise NotFoundError. Not for the event loop."""
-    served = updates.loaded.get(model, None)
+    served = learners.loaded.get(model, None)
     version = served.version
-    said = updates.status(model, version)
-    with updates.database.session() as session:
+    latest = learners.status(model, version)
+    with learners.database.session() as session:
         start, events = log.start_of(session, model, version), log.newest(session, model)
-        held = learning.held(session, model)
+        held = owner.held(session, model)
         status = LearningStatus(
             version=version,
             revision=events - start,
             published=served.revision,
             lag_events=max(events - start - served.revision, 0),
             events=events,
-            novel_share=novel_share(said),
-            linearisation_error=_linearisation(said),
-            failure=None if said.failed is None else said.failed.error,
+            novel_share=novel_share(latest),
+            linearisation_error=_linearisation(latest),
+            failure=None if latest.failed is None else latest.failed.error,
             held=None if held is None else Held(at=held["at"], evidence=held["evidence"]),
             candidate=_candidate(session, model, version),
             streams=_streams(session, model),
-            reachable=[list(each) for each in revisions.reachable(session, model, version)],
+            reachable=[list(each) for each in undoing.reachable(session, model, version)],
             snapshots=[
                 Snapshot(revision=row.number - start, created_at=row.created_at)
-                for row in revisions.snapshots(session, model, version)
+                for row in undoing.snapshots(session, model, version)
             ],
         )
-        return Learning(model=model, options=learning.options(session, model), status=status)
+        return Learning(model=model, options=owner.options(session, model), status=status)
 
 
-def novel_share(said: Status) -> float | None:
-    """Share of the latest samples beyond the basis of a version, None where the learner has not said."""
-    published = said.published
+def quality(learners: Learners, model: str) -> Quality:
+    """Return how well a model predicts each row before it is learnt, over the windows of the settings.
+
+    Raise NotFoundError. Not for the event loop.
+    """
+    served = learners.loaded.get(model, None)
+    now = time.time()
+    return Quality(
+        model=model,
+        version=served.version,
+        revision=served.revision,
+        joint_names=list(served.model.joint_names),
+        windows=[window(each, now) for each in learners.monitor(model).windows],
+    )
+
+
+def window(sums: Window, now: float) -> QualityWindow:
+    """Return the figures and counts of a window before a Unix time, s."""
+    counts = sums.counts(now)
+    accepted = counts.pop(CODES[LEARNT], 0)
+    return QualityWindow(
+        **figures(sums.record(now)).model_dump(), seconds=sums.seconds, accepted=accepted, rejected=dict(counts)
+    )
+
+
+def novel_share(latest: Status) -> float | None:
+    """Share of the latest samples beyond the basis of a version, None where the learner has not published yet."""
+    published = latest.published
     return None if published is None else published.novel_share
 
 
-def _linearisation(said: Status) -> list[float] | None:
-    published = said.published
+def _linearisation(latest: Status) -> list[float] | None:
+    published = latest.published
     return None if published is None or published.linearisation is None else list(published.linearisation)
 
 
@@ -63,7 +102,7 @@ def _candidate(session: Session, model: str, serving: int) -> Candidate | None:
     version = session.scalar(query.order_by(LearnerRow.version.desc()).limit(1))
     if version is None:
         return None
-    return Candidate(version=version, revision=revisions.current(session, model, version))
+    return Candidate(version=version, revision=undoing.current(session, model, version))
 
 
 def _streams(session: Session, model: str) -> list[Stream]:

@@ -1,23 +1,67 @@
-"""Taking back what was learnt: one batch, or everything since a revision."""
+"""Taking back what was learnt: one batch, or everything since a revision that can be made again."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from service.foundation.errors import ConflictError, invalid_request, problem
 from service.journal import log
-from service.learning.control import inspection, revisions
-from service.learning.control.revisions import Range
-from service.learning.control.schema import RollbackRequest, RolledBack, Unlearnt
-from service.learning.ingest import identity
-from service.learning.updates import Updates
+from service.journal.log import EventKind
+from service.learning.control import inspection
+from service.learning.control.schema import Revised, RollbackRequest, RolledBack, Unlearnt
+from service.learning.ingest.batches import state
+from service.learning.learners import Learners
 from service.models import registry
-from service.storage.database import EventRow, LearnerRow
+from service.storage.database import Database, EventRow, LearnerRow, SnapshotRow
+from service.web.pagination import Page
 
+Range = tuple[int, int]
+PAGE = 100
+ROLLBACKS: tuple[EventKind] = ("rollback",)
 WORDS = {"unlearnt": "has been unlearnt", "rolled_back": "was undone by a rollback"}
+
+
+def serving(database: Database, model: str) -> int:
+    """Return the version that answers where none is named; raise NotFoundError for an unknown model."""
+    return registry.find(database, model, None).version
+
+
+def current(session: Session, model: str, version: int) -> int:
+    """Return the revision of a version once all of the log is learnt."""
+    return log.newest(session, model) - log.start_of(session, model, version)
+
+
+def revised_now(session: Session, model: str, version: int) -> Revised:
+    """Return the revision of a version that contains everything logged so far."""
+    return Revised(model=model, version=version, revision=current(session, model, version))
+
+
+def snapshots(session: Session, model: str, version: int) -> list[SnapshotRow]:
+    """Return the stored states of a version, newest first."""
+    query = select(SnapshotRow).where(SnapshotRow.model == model, SnapshotRow.version == version)
+    return list(session.scalars(query.order_by(SnapshotRow.number.desc())))
+
+
+def reachable(session: Session, model: str, version: int) -> list[Range]:
+    """Return the ranges [first, last] of revisions whose state can be made again, rising.
+
+    That takes the version as trained, or a snapshot, and all events from there; and no rollback may have gone back
+    behind it since: the events that a rollback has undone teach nothing any more, so that their states are gone.
+    """
+    start, newest = log.start_of(session, model, version), log.newest(session, model)
+    bases = sorted({start, *(row.number for row in snapshots(session, model, version) if row.number > start)})
+    ranges: list[Range] = []
+    for base, following in zip(bases, [*bases[1:], newest + 1], strict=True):
+        last = following - 1
+        ranges.append((base, last if log.is_complete(session, model, base, last) else base))
+    for event in _rollbacks(session, model):
+        to = (event.detail or {})["to"]
+        ranges = [part for each in ranges for part in _without(each, to + 1, event.number - 1)]
+    return _joined([(first - start, last - start) for first, last in ranges])
 
 
 def find_learnt(session: Session, model: str, stream_id: str, sequence: int) -> EventRow:
@@ -27,46 +71,46 @@ def find_learnt(session: Session, model: str, stream_id: str, sequence: int) -> 
         together = f"{batch.sequence}: frames {batch.sequence} to {batch.last_sequence} were logged together"
         raise invalid_request("sequence", sequence, together)
     if batch.void:
-        raise ConflictError(f"batch {sequence} of stream {stream_id!r} {WORDS[identity.state(session, batch)]}")
+        raise ConflictError(f"batch {sequence} of stream {stream_id!r} {WORDS[state(session, batch)]}")
     return batch
 
 
-def unlearn(updates: Updates, model: str, stream_id: str, sequence: int) -> Unlearnt:
+def unlearn(learners: Learners, model: str, stream_id: str, sequence: int) -> Unlearnt:
     """Take a batch and what was replayed of it out again; raise NotFoundError or ConflictError."""
-    version = revisions.serving(updates.database, model)
-    with updates.database.turn(model), updates.database.transaction(model) as session:
+    version = serving(learners.database, model)
+    with learners.database.turn(model), learners.database.transaction(model) as session:
         batch = find_learnt(session, model, stream_id, sequence)
         rows = batch.learnt + sum(each.learnt for each in inspection.replays(session, batch) if not each.void)
         trained = select(LearnerRow.version).where(LearnerRow.model == model, LearnerRow.start >= batch.number)
         versions = list(session.scalars(trained.order_by(LearnerRow.version)))
         log.unlearn(session, model, batch, time.time())
-        revised = revisions.revised(session, model, version)
-    updates.learner.wake(model)
+        revised = revised_now(session, model, version)
+    learners.process.wake(model)
     return Unlearnt(**revised.model_dump(), stream_id=stream_id, sequence=sequence, rows=rows, trained=versions)
 
 
-def rollback(updates: Updates, model: str, request: RollbackRequest) -> RolledBack:
+def rollback(learners: Learners, model: str, request: RollbackRequest) -> RolledBack:
     """Go back to a revision of the version that serves, or to another version.
 
     Raise NotFoundError, InvalidRequestError where not exactly one of the two is named or it is not older than what
     serves, ConflictError where nothing reaches back as far.
     """
     if (request.revision is None) == (request.version is None):
-        found = "neither" if request.revision is None else "both"
-        raise invalid_request("revision or version", found, "exactly one of the two")
+        given = "neither" if request.revision is None else "both"
+        raise invalid_request("revision or version", given, "exactly one of the two")
     if request.version is not None:
-        return _to_version(updates, model, request.version)
+        return _to_version(learners, model, request.version)
     assert request.revision is not None
-    return _to_revision(updates, model, request.revision)
+    return _to_revision(learners, model, request.revision)
 
 
-def _to_revision(updates: Updates, model: str, revision: int) -> RolledBack:
-    version = revisions.serving(updates.database, model)
-    with updates.database.turn(model), updates.database.transaction(model) as session:
-        newest = revisions.current(session, model, version)
+def _to_revision(learners: Learners, model: str, revision: int) -> RolledBack:
+    version = serving(learners.database, model)
+    with learners.database.turn(model), learners.database.transaction(model) as session:
+        newest = current(session, model, version)
         if revision >= newest:
             raise invalid_request("revision", revision, f"one below {newest}, the newest of version {version}")
-        _check_reach(revision, version, revisions.reachable(session, model, version))
+        _check_reach(revision, version, reachable(session, model, version))
         to = log.start_of(session, model, version) + revision
         undone = select(func.count()).where(
             EventRow.model == model,
@@ -76,8 +120,8 @@ def _to_revision(updates: Updates, model: str, revision: int) -> RolledBack:
         )
         count = session.scalar(undone) or 0
         log.rollback(session, model, to, time.time())
-        revised = revisions.revised(session, model, version)
-    updates.learner.wake(model)
+        revised = revised_now(session, model, version)
+    learners.process.wake(model)
     return RolledBack(**revised.model_dump(), undone=count, complete=True)
 
 
@@ -98,14 +142,42 @@ def _is_reached(revision: int, ranges: list[Range]) -> bool:
     return any(first <= revision <= last for first, last in ranges)
 
 
-def _to_version(updates: Updates, model: str, version: int) -> RolledBack:
-    if version == revisions.serving(updates.database, model):
+def _to_version(learners: Learners, model: str, version: int) -> RolledBack:
+    if version == serving(learners.database, model):
         raise ConflictError(f"version {version} of model {model!r} serves already")
-    updates.loaded.get(model, version)  # so that the change costs no query anything, or fails before it is made
-    with updates.database.transaction() as session:
+    learners.loaded.get(model, version)  # so that the change costs no query anything, or fails before it is made
+    with learners.database.transaction() as session:
         registry.serve(session, model, version)
-        revised = revisions.revised(session, model, version)
-        complete = _is_reached(revised.revision, revisions.reachable(session, model, version))
-    updates.loaded.adopt(model)
-    updates.learner.wake(model)
+        revised = revised_now(session, model, version)
+        complete = _is_reached(revised.revision, reachable(session, model, version))
+    learners.loaded.adopt(model)
+    learners.process.wake(model)
     return RolledBack(**revised.model_dump(), undone=0, complete=complete)
+
+
+def _rollbacks(session: Session, model: str) -> Iterator[EventRow]:
+    cursor: str | None = None
+    while True:
+        part = Page(after=None if cursor is None else int(cursor), limit=PAGE)
+        events, cursor = log.page(session, model, part, kinds=ROLLBACKS)
+        yield from events
+        if cursor is None:
+            return
+
+
+def _without(span: Range, first: int, last: int) -> Iterator[Range]:
+    """The parts of a range that are left once first to last are taken out."""
+    for a, b in ((span[0], min(span[1], first - 1)), (max(span[0], last + 1), span[1])):
+        if a <= b:
+            yield a, b
+
+
+def _joined(ranges: list[Range]) -> list[Range]:
+    """The same numbers in as few ranges as there can be."""
+    joined: list[Range] = []
+    for first, last in sorted(ranges):
+        if joined and first <= joined[-1][1] + 1:
+            joined[-1] = (joined[-1][0], max(last, joined[-1][1]))
+        else:
+            joined.append((first, last))
+    return joined

@@ -1,8 +1,8 @@
 """Accelerations that were not sent: derived within the stream, across the batches next to each other.
 
 An acceleration stands on the velocities of `half` rows on either side of its row. At the ends of a batch they are those
-of the batches before and after. A row waits, coded `edge`, until both have come, in whatever order; the batch that
-comes last brings it along, so that it is learnt exactly once, and as if the stream had come in one piece.
+of the batches before and after. A row waits, coded `edge`, until both are there, in whatever order; it is decided with
+the later one, so that it is learnt exactly once, and as if the stream were one batch.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lipcore.online.batch import Rows
 from lipcore.samples import Array
 from lipcore.vocabulary import CODES
 from service.foundation.errors import invalid_request
-from service.journal import payload
+from service.journal.log import decode
 from service.storage.database import EventRow
 
 EDGE = CODES.index("edge")
@@ -47,9 +47,9 @@ def complete(session: Session, model: str, stream_id: str, sequence: int, rows: 
     Raise InvalidRequestError where the rows are too slow or too uneven for it.
     """
     rate = _rate(t)
-    known_as = session, model, stream_id, sequence
-    half = _window(*known_as) or acceleration.window(rate)
-    head, tail = (_around(*known_as, way, 2 * half) for way in (-1, 1))
+    key = session, model, stream_id, sequence
+    half = _window(*key) or acceleration.window(rate)
+    head, tail = (_around(*key, way, 2 * half) for way in (-1, 1))
     everything = Rows.concatenate([*head, rows, *tail])
     first = sum(map(len, head))
     own = slice(first, first + len(rows))
@@ -59,8 +59,7 @@ def complete(session: Session, model: str, stream_id: str, sequence: int, rows: 
     other = (place < own.start) | (place >= own.stop)
     # 2 half rows on either side are so few that every window that is complete reaches into the batch: none was before
     decided = known & other & (everything.code == EDGE)
-    found = replace(everything, ddq=ddq)
-    return Derived(found, own, decided, half, rate, half / rate)
+    return Derived(replace(everything, ddq=ddq), own, decided, half, rate, half / rate)
 
 
 def _rate(t: Array) -> float:
@@ -76,8 +75,8 @@ def _rate(t: Array) -> float:
     step = float(np.median(rising)) if len(rising) else 0.0
     run = max(_runs(t, np.isfinite(t), step), key=len)
     if len(run) < 2 or 2 * np.count_nonzero(_even(steps, step)) < len(steps):
-        found = f"uneven, with steps from {steps.min():.3g} to {steps.max():.3g} s"
-        raise invalid_request("t", found, f"steps that differ by at most {JITTER:.0%}, to derive ddq from dq with")
+        spread = f"uneven, with steps from {steps.min():.3g} to {steps.max():.3g} s"
+        raise invalid_request("t", spread, f"steps that differ by at most {JITTER:.0%}, to derive ddq from dq with")
     rate = (len(run) - 1) / float(t[run[-1]] - t[run[0]])
     try:
         acceleration.window(rate * (1 - 1e-9))  # so that rounding leads to no other answer later
@@ -105,8 +104,8 @@ def _slopes(rows: Rows, half: int, rate: float) -> Array:
     for run in _runs(rows.time, usable, 1 / rate):
         if len(run) > 2 * half:
             # a controller samples more evenly than it stamps, and event time is coarse
-            found = derive(np.arange(len(run)) / rate, rows.dq[run], half)
-            ddq[run[found.first : found.first + len(found.ddq)]] = found.ddq
+            slopes = derive(np.arange(len(run)) / rate, rows.dq[run], half)
+            ddq[run[slopes.first : slopes.first + len(slopes.ddq)]] = slopes.ddq
     return ddq
 
 
@@ -120,7 +119,7 @@ def _window(session: Session, model: str, stream_id: str, sequence: int) -> int 
 
 
 def _neighbour(session: Session, model: str, stream_id: str, sequence: int) -> EventRow | None:
-    """The batch of a sequence with its rows, if it came without accelerations, and has not been taken out since."""
+    """The batch of a sequence with its rows, if its accelerations were derived and it still teaches."""
     query = select(EventRow).where(EventRow.model == model, EventRow.stream_id == stream_id)
     event = session.scalar(query.where(EventRow.sequence == sequence).options(undefer(EventRow.payload)))
     if event is None or event.void or event.report is None or event.report["derived"] is None:
@@ -143,7 +142,7 @@ def _around(session: Session, model: str, stream_id: str, sequence: int, way: in
 
 
 def _own(event: EventRow) -> Rows:
-    """The rows that came in a batch, without those that it brought along."""
+    """A batch's own rows, without those that had waited for it."""
     assert event.payload is not None
     first, last = (event.report or {})["own"]
-    return payload.decode(event.payload).take(slice(first, last))
+    return decode(event.payload).take(slice(first, last))

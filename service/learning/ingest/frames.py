@@ -1,4 +1,4 @@
-"""Frames of a stream on their way into the log: they come predicted, one row each, and in order."""
+"""Frames of a stream on their way into the log: rows that are predicted already, one a sequence, in order."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from lipcore.online.batch import Rows
 from lipcore.online.gates import check_rows
 from lipcore.samples import Array
 from service.foundation.errors import ConflictError
-from service.journal import log, payload
-from service.learning.ingest import identity, screening
-from service.learning.ingest.intake import Arrival, Ingest, check_kind, enabled
-from service.learning.quality.monitor import Monitor
+from service.journal import log
+from service.learning.ingest import screening
+from service.learning.ingest.batches import check_kept
+from service.learning.ingest.intake import Arrival, Intake, check_kind, enabled
 from service.models.loaded import Served
 from service.storage.database import EventRow
 
@@ -50,7 +50,7 @@ class Frames:
 class FramesResult:
     """Durable frames. through: highest sequence of them; accepted, rejected (by code): of those that are new.
 
-    duplicates: frames that had come before; revision: answers from it on contain the frames.
+    duplicates: frames that were in the log; revision: answers from it on contain the frames.
     """
 
     through: int
@@ -60,27 +60,28 @@ class FramesResult:
     revision: int
 
 
-def observe_frames(ingest: Ingest, monitor: Monitor, frames: Frames) -> FramesResult:
+def observe_frames(intake: Intake, frames: Frames) -> FramesResult:
     """Log frames; once this returns they are durable. All of them or none.
 
     Raise LearningDisabledError, ConflictError for a sequence that was used for something else or does not rise,
     ExpiredError, BusyError or StorageFullError.
     """
     _check_order(frames)
-    with ingest.turn(monitor, frames.model):
-        with ingest.database.session() as session:
+    monitor = intake.monitor(frames.served)
+    with intake.turn(monitor, frames.model):
+        with intake.database.session() as session:
             options = enabled(session, frames.model)
             source = log.stream(session, frames.model, frames.stream_id)
             check_kind(source, "frames")
             last = -1 if source is None else source.last
             before, _ = log.neighbours(session, frames.model, frames.stream_id, last + 1)
             new = frames.sequences > last
-            known = Repeated(0) if new.all() else _repeated(session, frames, ~new)
-        monitor.counts["duplicates"] += known.frames
+            repeated = Repeated(0) if new.all() else _repeated(session, frames, ~new)
+        monitor.counts["duplicates"] += repeated.frames
         if not new.any():
-            return FramesResult(int(frames.sequences[-1]), 0, known.frames, {}, known.revision)
+            return FramesResult(int(frames.sequences[-1]), 0, repeated.frames, {}, repeated.revision)
         model = frames.served.model
-        bounds = screening.limits(model, options, ingest.settings)
+        bounds = screening.limits(model, options, intake.settings)
         q, dq, ddq, tau = numbers = [np.ascontiguousarray(getattr(frames, name)[new]) for name in NUMBERS]
         # frames are dated by the service as they arrive, so that their times need no check
         weights = spacing.weights(frames.time[new], None if before is None else before.last)
@@ -98,10 +99,10 @@ def observe_frames(ingest: Ingest, monitor: Monitor, frames: Frames) -> FramesRe
             None,
             float(frames.time[-1]),
         )
-        said = {"derived": None, "frames": _ranges(sequences)}
-        report = ingest.append(monitor, frames.served, options, arrival, screened, said)
-    ingest.follow_up(monitor, frames.model)
-    return FramesResult(int(sequences[-1]), report["accepted"], known.frames, report["rejected"], report["revision"])
+        details = {"derived": None, "frames": _ranges(sequences)}
+        report = intake.append(monitor, frames.served, options, arrival, screened, details)
+    intake.follow_up(monitor, frames.model)
+    return FramesResult(int(sequences[-1]), report["accepted"], repeated.frames, report["rejected"], report["revision"])
 
 
 @dataclass(frozen=True)
@@ -139,13 +140,13 @@ def _logged(session: Session, frames: Frames, sequence: int) -> tuple[EventRow, 
     """The batch of frames that a sequence lies in, the place of each of its sequences, and its rows."""
     event = log.covering(session, frames.model, frames.stream_id, sequence)
     if event is None:
-        identity.check_kept(session, frames.model, frames.stream_id, sequence)
+        check_kept(session, frames.model, frames.stream_id, sequence)
         raise _order(frames, sequence)
     data = session.scalar(select(EventRow.payload).where(EventRow.seq == event.seq))
     assert data is not None
     ranges = (event.report or {})["frames"]
     sequences = [number for first, last in ranges for number in range(first, last + 1)]
-    return event, {number: place for place, number in enumerate(sequences)}, payload.decode(data)
+    return event, {number: place for place, number in enumerate(sequences)}, log.decode(data)
 
 
 def _order(frames: Frames, sequence: int) -> ConflictError:
@@ -167,7 +168,7 @@ def _ranges(sequences: NDArray[np.int64]) -> list[list[int]]:
 
 
 def _digest(sequences: NDArray[np.int64], numbers: list[Array]) -> str:
-    found = hashlib.sha256(sequences.astype("<i8").tobytes())
+    content = hashlib.sha256(sequences.astype("<i8").tobytes())
     for values in numbers:
-        found.update(values.astype("<f8").tobytes())
-    return found.hexdigest()
+        content.update(values.astype("<f8").tobytes())
+    return content.hexdigest()

@@ -1,4 +1,4 @@
-"""A batch on its way into the log: identified, checked, predicted, judged, written down in one transaction."""
+"""Where batches and frames are written down: judged in turn, and durable before they are acknowledged."""
 
 from __future__ import annotations
 
@@ -8,31 +8,25 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from lipcore.online.batch import Rows
 from service.foundation.errors import ConflictError, not_found
-from service.foundation.settings import Settings
-from service.journal import alarms, log
+from service.journal import log
 from service.journal.log import NewBatch, StreamKind
 from service.journal.retention import retain
-from service.learning import learning
-from service.learning.errors import LearningDisabledError
-from service.learning.ingest import identity, judging, screening
-from service.learning.ingest.clock import Clock
+from service.learning import owner
+from service.learning.ingest import judging
 from service.learning.ingest.judging import Verdict
-from service.learning.ingest.parsing import Measured, measured
+from service.learning.ingest.monitor import Monitor
 from service.learning.ingest.screening import Screened
-from service.learning.learning_options import LearningOptions
-from service.learning.live.thinning import Judged
-from service.learning.quality.monitor import Monitor
-from service.learning.schema import Derivation, ObservationRequest, ObservationResponse
+from service.learning.schema import LearningDisabledError, LearningOptions
 from service.models import registry
 from service.models.loaded import LoadedModels, Served
-from service.storage.database import Database, EventRow, ModelRow, StreamRow
-from service.storage.disk import Disk
+from service.storage.database import EventRow, ModelRow, StreamRow
 
 logger = logging.getLogger(__name__)
 
@@ -51,7 +45,7 @@ CONSEQUENCES = {
 
 @dataclass(frozen=True)
 class Arrival:
-    """A batch that is new. last_sequence: of its last frame; offset (s), span: see `clock`; received: Unix time, s."""
+    """A batch that is new. last_sequence: of its last frame; offset (s), span: see `Clock`; received: Unix time, s."""
 
     stream_id: str
     kind: StreamKind
@@ -64,44 +58,37 @@ class Arrival:
     received: float
 
 
-class Ingest:
-    """Takes batches of observations; safe from several threads, not for the event loop.
+class Judged(NamedTuple):
+    """A batch that is durable, for those who follow its model live. rows: with their final codes."""
 
-    monitor: gives the monitor of a model that is served. wake: tells the learner that a model's log has grown.
-    show: tells those who follow a model of a batch that is durable.
+    served: Served
+    stream_id: str
+    rows: Rows
+    screened: Screened
+
+
+class Intake:
+    """Appends observations to the logs of models; safe from several threads, not for the event loop.
+
+    monitor: gives the monitor of a model that is served. wake: tells the learner process that a model's log has grown.
+    show: called with each batch once it is durable.
     """
 
     def __init__(
         self,
-        settings: Settings,
-        database: Database,
         loaded: LoadedModels,
         monitor: Callable[[Served], Monitor],
         wake: Callable[[str], None],
-        disk: Disk,
         show: Callable[[Judged], None],
     ) -> None:
-        self.settings, self.database, self.loaded, self.disk = settings, database, loaded, disk
-        self._monitor, self._wake, self._show = monitor, wake, show
-
-    def observe(self, model: str, request: ObservationRequest) -> ObservationResponse:
-        """Take a batch; once this returns it is durable.
-
-        Raise NotFoundError, LearningDisabledError, InvalidRequestError, ConflictError, ExpiredError, BusyError or
-        StorageFullError.
-        """
-        served, received = self.loaded.get(model, None), time.time()
-        came = measured(request, served.model, self.settings)
-        content = identity.digest(came)
-        monitor = self._monitor(served)
-        with self.turn(monitor, model):
-            answer = self._take(monitor, served, request, came, content, received)
-        self.follow_up(monitor, model)
-        return answer
+        storage = loaded.storage
+        self.settings, self.database, self.disk = storage.settings, storage.database, storage.disk
+        self.loaded, self.monitor = loaded, monitor
+        self._wake, self._show = wake, show
 
     @contextmanager
     def turn(self, monitor: Monitor, model: str) -> Iterator[None]:
-        """Be the only one, of all services, that takes something for a model; its monitor knows what others took.
+        """Have a model's log alone, among all threads and services; its monitor is up to the log by then.
 
         Raise StorageUnavailableError where the turn does not come within `database_timeout_s`.
         """
@@ -111,7 +98,7 @@ class Ingest:
             yield
 
     def follow(self, monitor: Monitor, model: str) -> None:
-        """Take in what other services took for a model."""
+        """Bring a monitor up to the batches that other services have logged."""
         if self.database.shared:
             with monitor.lock:
                 self._follow(monitor, model)
@@ -121,37 +108,6 @@ class Ingest:
             with self.database.session() as session:
                 monitor.follow(session, model)
 
-    def _take(
-        self,
-        monitor: Monitor,
-        served: Served,
-        request: ObservationRequest,
-        came: Measured,
-        content: str,
-        received: float,
-    ) -> ObservationResponse:
-        model, stream_id, sequence = known_as = served.name, request.stream_id, request.sequence
-        with self.database.session() as session:
-            options, source = enabled(session, model), log.stream(session, model, stream_id)
-            check_kind(source, "batches")
-            answer = identity.known(session, *known_as, content)
-            if answer is not None:
-                monitor.counts["duplicates"] += 1
-                return answer
-            bounds = screening.limits(served.model, options, self.settings)
-            before, after = log.neighbours(session, *known_as)
-            clock = Clock.of(source, sequence, before, after, received)
-            dated = screening.timed(came, clock, bounds, before.last if before is not None and clock.adjacent else None)
-            rows, own, derived = dated.rows, slice(0, len(came)), None
-            if came.ddq is None and came.t is not None:
-                rows, own, derived = screening.derive(session, *known_as, rows, came.t, bounds)
-        screened = screening.predict(rows, own, derived, served.model)
-        arrival = Arrival(
-            stream_id, "batches", sequence, sequence, content, len(came), dated.offset, dated.span, received
-        )
-        said = {"derived": None if derived is None else Derivation(ddq=derived).model_dump()}
-        return ObservationResponse.model_validate(self.append(monitor, served, options, arrival, screened, said))
-
     def append(
         self,
         monitor: Monitor,
@@ -159,17 +115,17 @@ class Ingest:
         options: LearningOptions,
         arrival: Arrival,
         screened: Screened,
-        said: dict[str, Any],
+        details: dict[str, Any],
     ) -> dict[str, Any]:
-        """Judge a batch and write it down with all that follows from it, in one transaction; the lock is held.
+        """Judge a batch and log it with all that follows from it, in one transaction, in a `turn` of its model.
 
-        Return the report that is kept of it: what is said of every batch, and `said`.
+        Return the report that the log keeps of it: `details`, and what every report has. The batch is durable then.
         """
         model = served.name
         self.disk.take(ROW_NUMBERS * NUMBER_BYTES * served.model.n_joints * arrival.rows)
         with self.database.transaction(model) as session:
             _check_kept(session, served)
-            held = learning.held(session, model) is not None
+            held = owner.held(session, model) is not None
             if monitor.held and not held:
                 monitor.decided()
             usual = partial(monitor.usual, arrival.received)
@@ -191,14 +147,14 @@ class Ingest:
                 record=None if verdict.record is None else verdict.record.to_json(),
             )
             event = log.append_batch(session, model, batch, self.settings.max_observation_streams)
-            event.rows = arrival.rows  # those that had waited came with other batches
+            event.rows = arrival.rows  # without those that had waited, which other batches count
             source = log.stream(session, model, arrival.stream_id)
             assert source is not None
             if source.offset == 0:
                 source.offset = arrival.offset
             if verdict.change is not None:
                 _alarm(session, served, options, verdict, event)
-            report = said | {
+            report = details | {
                 "model": model,
                 "version": served.version,
                 "revision": event.number - log.start_of(session, model, served.version),
@@ -226,18 +182,18 @@ class Ingest:
         return report
 
     def follow_up(self, monitor: Monitor, model: str) -> None:
-        """Do what follows once a batch is durable: it is learnt, and now and then the oldest go."""
+        """Wake the learner for a batch that is durable; every RETAIN_EVERY batches, bring the log within its limits."""
         self._wake(model)
         if monitor.due(RETAIN_EVERY):
             try:
                 retain(self.database, self.settings, model, time.time())
-            except Exception as error:  # what came is logged all the same
+            except Exception as error:  # the batch is logged all the same
                 logger.error("the log of model %s was not brought within its limits", model, exc_info=error)
 
 
 def enabled(session: Session, model: str) -> LearningOptions:
     """How a model learns; raise LearningDisabledError where it does not."""
-    options = learning.options(session, model)
+    options = owner.options(session, model)
     if not options.enabled:
         raise LearningDisabledError(f"learning of model {model!r} is switched off: nothing is logged")
     return options
@@ -253,7 +209,7 @@ def check_kind(source: StreamRow | None, kind: StreamKind) -> None:
 
 
 def _check_kept(session: Session, served: Served) -> None:
-    """Raise an error where a model, or the version that has predicted a batch, was deleted since the batch came."""
+    """Raise an error where a model, or the version that has predicted a batch, has been deleted meanwhile."""
     if registry.exists(session, served.name, served.version):
         return
     if session.scalar(select(ModelRow.name).where(ModelRow.name == served.name)) is None:
@@ -262,7 +218,7 @@ def _check_kept(session: Session, served: Served) -> None:
 
 
 def _alarm(session: Session, served: Served, options: LearningOptions, verdict: Verdict, event: EventRow) -> None:
-    """Tell the owner of a change, and wait for a decision where one is wanted."""
+    """Raise the alarm of a change, and hold learning where the owner is to decide about it."""
     change, names = verdict.change, served.model.joint_names
     assert change is not None
     evidence = verdict.evidence(names) | {"stream_id": event.stream_id, "sequence": event.sequence}
@@ -271,6 +227,6 @@ def _alarm(session: Session, served: Served, options: LearningOptions, verdict: 
         f"the torque of {joints} does not fit what was learnt any more: {evidence['suspect']}? "
         f"{CONSEQUENCES[options.on_change]}"
     )
-    alarms.raise_alarm(session, served.name, "change", message, evidence)
+    owner.raise_alarm(session, served.name, "change", message, evidence)
     if options.on_change == "hold":
-        learning.hold(session, served.name, {"at": change.at, "event": event.number, "evidence": evidence})
+        owner.hold(session, served.name, {"at": change.at, "event": event.number, "evidence": evidence})

@@ -1,26 +1,81 @@
-"""Which predicted rows are learnt: contacts are not, nor what comes after a change that waits for a decision."""
+"""Which predicted rows are learnt: contacts are not, nor rows after a change that waits for a decision."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lipcore.online.batch import Rows
 from lipcore.online.change import RATIO, Change, ChangeDetector, friction_share
-from lipcore.online.gates import is_contact
+from lipcore.online.gates import Patience, is_contact
 from lipcore.online.record import Record
 from lipcore.samples import Array
 from lipcore.vocabulary import CODES, LEARNT
-from service.learning.ingest.contacts import ContactGate
 from service.learning.ingest.screening import Screened
-from service.learning.learning_options import LearningOptions
+from service.learning.schema import LearningOptions
 
 CONTACT, CHANGE = CODES.index("contact"), CODES.index("change")
 MOST_INNOVATIONS = 1000
 """Rows whose innovations are kept to tell friction from a payload."""
+
+
+@dataclass(frozen=True)
+class ContactGate:
+    """Rejects rows far outside a stream's predictive interval for as long as that can be a contact; immutable.
+
+    It stands back while a changed robot is learnt anew.
+
+    patience: how long rows have been contacts. calm: how long they have not, while the gate stands back; else None.
+    """
+
+    patience: Patience
+    calm: Patience | None = None
+
+    @classmethod
+    def start(cls, seconds: float) -> ContactGate:
+        """A gate that keeps contacts out for so long."""
+        return cls(Patience(seconds))
+
+    def to_json(self) -> list[list[Any] | None]:
+        """Its state as numbers and lists; `from_json` gives back the same gate to the last bit."""
+        return [None if each is None else list(astuple(each)[1:]) for each in (self.patience, self.calm)]
+
+    @classmethod
+    def from_json(cls, values: Sequence[Sequence[Any] | None], seconds: float) -> ContactGate:
+        """The gate that `to_json` wrote, with the patience that is set now, s."""
+        patience, calm = (None if each is None else Patience(seconds, *each) for each in values)
+        return cls(patience or Patience(seconds), calm)
+
+    @property
+    def open(self) -> bool:
+        """Whether it stands back: contacts and what has changed cannot be told apart."""
+        return self.calm is not None
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether this has lasted too long for a contact."""
+        return self.patience.exhausted
+
+    @property
+    def began(self) -> float | None:
+        """Event time of the first of the rows that have been contacts for so long, s."""
+        return None if self.patience.last is None else self.patience.last - self.patience.elapsed
+
+    def step(self, time: Array, contact: NDArray[np.bool_]) -> ContactGate:
+        """Follow rows at event times (N,) that are contacts or not; a gate that stood back returns once they fit."""
+        if self.calm is None:
+            return ContactGate(self.patience.step(time, contact))
+        calm = self.calm.step(time, ~contact)
+        return ContactGate.start(calm.seconds) if calm.exhausted else ContactGate(self.patience, calm)
+
+    def stand_back(self) -> ContactGate:
+        """Let everything pass until most rows fit again for as long as the patience lasts."""
+        fresh = Patience(self.patience.seconds)
+        return ContactGate(fresh, fresh)
 
 
 @dataclass(frozen=True)
@@ -50,7 +105,7 @@ class Innovations:
 
 @dataclass(frozen=True)
 class Watch:
-    """What the rows before say: gate of their stream, detector and innovations of the model; immutable."""
+    """State of judging after the rows before: the stream's gate, the model's detector and innovations; immutable."""
 
     gate: ContactGate
     detector: ChangeDetector
@@ -61,10 +116,10 @@ class Watch:
 class Verdict:
     """rows: with their final codes. record: of those that count for quality. watch: for the next rows.
 
-    surprise: mean of e²/s² of the same rows, (n,), with s as it would be without the floor of past errors, which would
-    hide from the detector what it is to find.
+    surprise: mean of e²/s² of the same rows, (n,), with s less the floor of past errors, which would
+    hide a change from the detector.
 
-    change: found with these rows. held: whether these rows had to wait for a decision.
+    change: detected with these rows. held: whether these rows had to wait for a decision.
     """
 
     rows: Rows
@@ -75,7 +130,7 @@ class Verdict:
     held: bool
 
     def evidence(self, joint_names: Sequence[str]) -> dict[str, Any]:
-        """What speaks for the change, for JSON."""
+        """Evidence of the change, for JSON."""
         assert self.change is not None
         return self.change.evidence(joint_names, self.watch.innovations.friction(self.change.at))
 
@@ -97,7 +152,7 @@ def judge(batch: Screened, watch: Watch, held: bool, options: LearningOptions, u
         surprise = (error**2 / (bare**2 + batch.noise_std**2)).mean(axis=0)
         detector, change = detector.step(replace(record, standardised=surprise), float(rows.time.max()))
     if held or watch.gate.open:
-        change = None  # what follows a change that is known
+        change = None  # the consequence of a change that is known
     elif change is None and gate.exhausted:
         change = _lasting(gate, everything, usual(), rows)
     if change is not None and options.on_change == "hold":

@@ -1,4 +1,8 @@
-"""The rows of a batch as they go into the log: timed, checked one by one, and predicted before they are learnt."""
+"""The rows of a batch as they go into the log: dated, checked one by one, and predicted before they are learnt.
+
+Rows are dated in event time: Unix time, counted by the stream's own clock. A stream's offset is fixed once, so that the
+last row of its first batch lies at that batch's arrival. It is 0 where no batch of the stream has had times yet.
+"""
 
 from __future__ import annotations
 
@@ -11,23 +15,110 @@ from sqlalchemy.orm import Session
 from lipcore.model import TorqueModel
 from lipcore.online import spacing
 from lipcore.online.batch import Rows
-from lipcore.online.gates import Limits, check_rows
+from lipcore.online.gates import Limits, check_rows, time_span
 from lipcore.samples import Array
 from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.settings import Settings
 from service.learning.ingest import derivation
-from service.learning.ingest.clock import Clock, span
 from service.learning.ingest.derivation import EDGE
-from service.learning.ingest.parsing import Measured
-from service.learning.learning_options import LearningOptions
-from service.learning.schema import DerivedAcceleration
+from service.learning.schema import DerivedAcceleration, LearningOptions
+from service.storage.database import EventRow, StreamRow
 
 NON_FINITE, LIMIT, TIME_JUMP = (CODES.index(code) for code in ("non_finite", "limit", "time_jump"))
 
+FAR_AHEAD = 86400.0
+"""How far ahead of its arrival a row may be dated, s: as long a recording may be sent in one go."""
+
 
 @dataclass(frozen=True)
-class Timed:
-    """Rows with event times and the codes of `check_rows`. offset: of the stream, s; span: see `clock.span`."""
+class Measured:
+    """N rows as measured, in the model's joint order. t: (N,) by the stream's clock, s; the others (N, n), SI."""
+
+    t: Array | None
+    q: Array
+    dq: Array
+    ddq: Array | None
+    tau: Array
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+
+@dataclass(frozen=True)
+class Clock:
+    """What is known of a stream's time when a batch arrives.
+
+    offset: s, None while it is unknown. after, before: times, by the stream's clock, that the rows must lie between.
+    adjacent: whether `after` is the time of the row right before the batch. arrived: Unix time, s.
+    """
+
+    offset: float | None
+    after: float | None
+    before: float | None
+    adjacent: bool
+    arrived: float
+
+    @staticmethod
+    def of(
+        source: StreamRow | None, sequence: int, before: EventRow | None, after: EventRow | None, arrived: float
+    ) -> Clock:
+        """The clock of a stream, with the batches that are kept next below and above a sequence."""
+        offset = None if source is None or source.offset == 0 else source.offset
+        first, last = _span(after), _span(before)
+        latest = None if offset is None else arrived + FAR_AHEAD - offset
+        bounds = [bound for bound in (latest, None if first is None else first[0]) if bound is not None]
+        adjacent = before is not None and before.last_sequence == sequence - 1
+        return Clock(offset, None if last is None else last[1], min(bounds, default=None), adjacent, arrived)
+
+    def settled(self, t: Array | None, usable: NDArray[np.bool_], gap: float) -> float:
+        """The offset, s, fixed now if these rows (times (N,), those to be believed) are the first that have times."""
+        if self.offset is not None:
+            return self.offset
+        if t is None or not usable.any():
+            return 0.0
+        times = t[usable]
+        runs = np.split(times, np.flatnonzero(np.diff(times) > gap) + 1)
+        # one wrong time at the end, far from all others, must not date them all
+        last = next((run for run in reversed(runs) if len(run) > 1), runs[-1])
+        return self.arrived - float(last[-1])
+
+    def leaps(self, t: Array, usable: NDArray[np.bool_], offset: float, gap: float) -> NDArray[np.bool_]:
+        """Rows (N,) dated later than now, right after a gap, and before another one or at the end: most likely wrong.
+
+        Taken for true, such a time would be the present for all rows to come.
+        """
+        leaping = np.zeros(len(t), dtype=np.bool_)
+        times = t[usable]
+        start = self.after if self.adjacent and self.after is not None else times[:1]
+        after_gap = np.diff(times, prepend=start) > gap
+        alone = after_gap & np.append(after_gap[1:], True)
+        leaping[usable] = alone[: len(times)] & (times + offset > self.arrived + gap)
+        return leaping
+
+    def event_time(self, t: Array | None, offset: float, rows: int) -> Array:
+        """Event times (N,), s, finite: a row without a time has that of the row before it."""
+        if t is None:
+            return np.full(rows, self.arrived)
+        known = np.isfinite(t)
+        place = np.maximum.accumulate(np.where(known, np.arange(rows), 0))
+        times = t[place] + offset
+        return np.where(np.isfinite(times), times, self.arrived)
+
+
+def span(t: Array | None, codes: NDArray[np.uint8]) -> list[float] | None:
+    """First and last time of a batch, by its stream's clock, that its neighbours lie before and after."""
+    times = None if t is None else time_span(t, codes)
+    return None if times is None else list(times)
+
+
+def _span(event: EventRow | None) -> list[float] | None:
+    times: list[float] | None = None if event is None or event.report is None else event.report["span"]
+    return times
+
+
+@dataclass(frozen=True)
+class Dated:
+    """Rows with event times and the codes of `check_rows`. offset: of the stream, s; span: see `span`."""
 
     rows: Rows
     offset: float
@@ -36,9 +127,9 @@ class Timed:
 
 @dataclass(frozen=True)
 class Screened:
-    """Rows and what the model that serves said of those that passed so far.
+    """Rows, and the predictions of the model that serves for those that passed so far.
 
-    own: which of the rows came in this batch, the others had waited for it. predicted: (N,); mean, std, bare: (P, n) of
+    own: which of the rows are of this batch, the others had waited for it. predicted: (N,); mean, std, bare: (P, n) of
     these, bare the standard deviation without the floor that past errors put under `std`. noise_std: (n,).
     """
 
@@ -74,8 +165,8 @@ def limits(model: TorqueModel, options: LearningOptions, settings: Settings) -> 
     )
 
 
-def timed(measured: Measured, clock: Clock, bounds: Limits, previous: float | None) -> Timed:
-    """Check rows one by one, date and weigh them. previous: event time of the row right before them, s, where known.
+def dated(measured: Measured, clock: Clock, bounds: Limits, previous: float | None) -> Dated:
+    """Check, date and weigh rows. previous: event time of the row right before them, s, where it is known.
 
     Weights come from the batch itself where it has a spacing, so that they do not depend on the order of arrival.
     """
@@ -91,34 +182,33 @@ def timed(measured: Measured, clock: Clock, bounds: Limits, previous: float | No
     time = clock.event_time(t, offset, len(measured))
     weights = spacing.weights(time, previous) if t is None or len(measured) == 1 else spacing.evenly(t)
     rows = Rows(time, measured.q, measured.dq, ddq, measured.tau, codes, weights)
-    return Timed(rows, offset, span(t, codes))
+    return Dated(rows, offset, span(t, codes))
 
 
 def derive(
     session: Session, model: str, stream_id: str, sequence: int, rows: Rows, t: Array, bounds: Limits
 ) -> tuple[Rows, slice, DerivedAcceleration]:
-    """Derive the accelerations of a batch: its rows and those of its neighbours that it completes, and which are own.
+    """Derive the accelerations of a batch; return its rows with those that it completes, and which are its own.
 
-    t: (N,) by the stream's own clock, s.
-    Raise InvalidRequestError where they cannot be derived.
+    t: (N,) by the stream's own clock, s. Raise InvalidRequestError where accelerations cannot be derived.
     """
-    found = derivation.complete(session, model, stream_id, sequence, rows, t)
-    everything = found.rows
+    derived = derivation.complete(session, model, stream_id, sequence, rows, t)
+    everything = derived.rows
     codes = everything.code.copy()
     unknown = ~np.isfinite(everything.ddq).all(axis=1)
     codes[unknown & (codes == LEARNT)] = EDGE
-    codes[found.decided] = LEARNT
+    codes[derived.decided] = LEARNT
     fresh = codes == LEARNT
     again = everything.take(fresh)
     codes[fresh] = check_rows(None, again.q, again.dq, again.ddq, again.tau, bounds)
-    chosen = found.decided.copy()
-    chosen[found.own] = True
-    first = int(found.decided[: found.own.start].sum())
-    said = DerivedAcceleration(
-        delay_s=found.delay_s, window=found.window, rate_hz=found.rate, carried=int(found.decided.sum())
+    chosen = derived.decided.copy()
+    chosen[derived.own] = True
+    first = int(derived.decided[: derived.own.start].sum())
+    summary = DerivedAcceleration(
+        delay_s=derived.delay_s, window=derived.window, rate_hz=derived.rate, carried=int(derived.decided.sum())
     )
     checked = replace(everything, code=codes)
-    return checked.take(chosen), slice(first, first + len(rows)), said
+    return checked.take(chosen), slice(first, first + len(rows)), summary
 
 
 def predict(rows: Rows, own: slice, derived: DerivedAcceleration | None, model: TorqueModel) -> Screened:
@@ -130,7 +220,7 @@ def predict(rows: Rows, own: slice, derived: DerivedAcceleration | None, model: 
 
 
 def answered(rows: Rows, mean: Array, std: Array, model: TorqueModel) -> Screened:
-    """Rows that a model has answered when they came: mean, std (N, n)."""
+    """Rows whose predictions are known, since a stream has answered them: mean, std (N, n)."""
     good = rows.code == LEARNT
     mean, std = mean[good], std[good]
     bare = _answers(rows.take(good), model)[1] if model.posterior.floor.any() else std

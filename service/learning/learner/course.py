@@ -1,4 +1,4 @@
-"""Where the log of a model leads: what is learnt next, what a rollback passes over, what an unlearning takes out.
+"""Which events of a model's log are learnt next, which ones a rollback passes over, which ones an unlearning takes out.
 
 All of it is a function of the events up to the one in question, whatever was logged later: the marks `void` of events,
 which later ones set, are not read.
@@ -52,7 +52,7 @@ class Stretch:
 
 
 class RewoundError(Exception):
-    """The state cannot be changed into what the log now says: make it anew, from a snapshot up to event `number`.
+    """The state cannot be changed into that of the log: make it anew, from a snapshot up to event `number`.
 
     number: None for the newest snapshot of all. without: batches that are to be left out on the way, each with the
     number of the event before which that is so.
@@ -66,16 +66,16 @@ class RewoundError(Exception):
 def ahead(session: Session, model: str, start: int, number: int, last: int) -> Stretch:
     """What follows event `number` up to `last` at most; start: that of the version. Raise RewoundError.
 
-    Where a rollback leads back to this event, it is gone to at once: what it undoes is not learnt in vain.
+    Where a rollback leads back to this event, the stretch is that rollback: what it undoes is not learnt in vain.
     """
     rollbacks = _rollbacks(session, model, start, number, last)
     if earlier := [to for to, *_ in rollbacks if to < number]:
         raise RewoundError(min(earlier))
-    here = [(end, said) for to, end, said in rollbacks if to == number]
+    here = [(end, target) for to, end, target in rollbacks if to == number]
     if here:
-        end, said = max(here)
+        end, target = max(here)
         takings = {each.number: each for each in takings_since(session, model, start, number, end)}
-        forgetting = [in_force(session, model, said)] if said < start else None
+        forgetting = [in_force(session, model, target)] if target < start else None
         return Stretch(end, True, [], takings, forgetting, log.is_complete(session, model, number, end))
     stop = min([last, *(to for to, *_ in rollbacks)])
     count = _count(session, model, number, stop)
@@ -89,11 +89,11 @@ def ahead(session: Session, model: str, start: int, number: int, last: int) -> S
 def takings_since(session: Session, model: str, start: int, number: int, end: int) -> list[Taking]:
     """What the unlearnings after event `number`, before `end`, take out of its state."""
     query = select(EventRow).where(*_span(model, number, end - 1), EventRow.kind == "unlearn")
-    found: dict[int, Taking] = {}
+    takings: dict[int, Taking] = {}
     for event in session.scalars(query.order_by(EventRow.number)):
         taking = _taking(session, event, start, number)
-        found.setdefault(taking.batch, taking)  # more than once is once
-    return list(found.values())
+        takings.setdefault(taking.batch, taking)  # more than once is once
+    return list(takings.values())
 
 
 def left_out(session: Session, model: str, start: int, batch: int, end: int) -> dict[int, int]:
@@ -101,13 +101,13 @@ def left_out(session: Session, model: str, start: int, batch: int, end: int) -> 
 
     Besides it those that are unlearnt on the way: then nothing is learnt that would have to be taken out again.
     """
-    found = {batch}
+    batches = {batch}
     while True:
-        query = select(EventRow.detail).where(*_span(model, min(found), end), EventRow.kind == "unlearn")
-        more = {detail["event"] for detail in session.scalars(query) if detail["event"] > start} - found
+        query = select(EventRow.detail).where(*_span(model, min(batches), end), EventRow.kind == "unlearn")
+        more = {detail["event"] for detail in session.scalars(query) if detail["event"] > start} - batches
         if not more:
-            return dict.fromkeys(found, end)
-        found |= more
+            return dict.fromkeys(batches, end)
+        batches |= more
 
 
 def in_force(session: Session, model: str, number: int) -> float | None:
@@ -127,15 +127,15 @@ def batch_of(event: EventRow) -> int:
 
 
 def _rollbacks(session: Session, model: str, start: int, number: int, last: int) -> list[tuple[int, int, int]]:
-    """Where each rollback after an event leads, on what is left of the log by then; its own number; what it says."""
+    """Rollbacks after an event: where each leads on the log that is left by then, its own number, the one it names."""
     query = select(EventRow.number, EventRow.detail).where(*_span(model, number, last), EventRow.kind == "rollback")
-    found: list[tuple[int, int, int]] = []
+    rollbacks: list[tuple[int, int, int]] = []
     for own, detail in session.execute(query.order_by(EventRow.number)):
         to = max(detail["to"], start)
-        for before, until, _ in found:
+        for before, until, _ in rollbacks:
             to = before if before < to < until else to
-        found.append((to, own, detail["to"]))
-    return found
+        rollbacks.append((to, own, detail["to"]))
+    return rollbacks
 
 
 def _count(session: Session, model: str, number: int, stop: int) -> int:

@@ -4,26 +4,26 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy.exc import DBAPIError
 
 from lipcore.arm.linearisation import linearisation_error
 from lipcore.model import TorqueModel
 from lipcore.online import state
-from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.online.revision import Revision
 from lipcore.samples import Array
 from service.foundation.errors import StorageFullError
 from service.foundation.settings import Settings
 from service.journal import log, snapshots
-from service.learning.learner import publication, recent
+from service.learning.learner import publication
 from service.learning.learner.course import RewoundError
-from service.learning.learner.messages import Published
-from service.learning.learner.novelty import Novelty
+from service.learning.learner.learnt import floor
+from service.learning.learner.publication import Published
 from service.learning.learner.restore import Arrival, advance, restore
 from service.storage.database import Database
 from service.storage.disk import Disk
@@ -33,6 +33,25 @@ from service.web.storage_errors import translated
 logger = logging.getLogger(__name__)
 
 Watcher = Callable[["Follower", Sequence[Arrival]], None]
+
+
+class Novelty:
+    """Counts the rows learnt that lie beyond a version's basis. window: number of rows that `share` is taken over."""
+
+    def __init__(self, window: int) -> None:
+        self.rows = 0
+        self._flags: deque[bool] = deque(maxlen=window)
+
+    def add(self, novel: NDArray[np.bool_]) -> None:
+        """Count rows, each of which lies beyond the basis or not, (N,)."""
+        self._flags.extend(novel.tolist())
+        self.rows += int(novel.sum())
+
+    @property
+    def share(self) -> float:
+        """Share of the last rows that do; 0 before there are enough to fill the window."""
+        full = len(self._flags) == self._flags.maxlen
+        return sum(self._flags) / len(self._flags) if full else 0.0
 
 
 class Follower:
@@ -74,7 +93,7 @@ class Follower:
         """Learn the next page, if there is one; `behind` says whether there may be more."""
         began = time.monotonic()
         try:
-            following = advance(self.database, self.known, watch=self._watch)
+            following = advance(self.database, self.known, watch=self._watch, novel=self.novelty.add)
         except RewoundError as error:
             following = restore(
                 self.database, self.files, self.model, self.version, self.base, rewound=error, most_rows=0
@@ -91,9 +110,9 @@ class Follower:
     def publish(self) -> Published:
         """Solve, write the arrays for the service, and return the message that goes with them."""
         began = time.monotonic()
-        floor = recent.floor(self.database, self.model, self.version, self.number, self.base.n_joints)
-        revision = self._solve(floor)
-        path: Path = publication.write(publication.folder(self.files), revision)
+        variance = floor(self.database, self.model, self.version, self.number, self.base.n_joints)
+        revision = self._solve(variance)
+        path = publication.write(publication.folder(self.files), revision)
         ended = time.monotonic()
         message = Published(
             model=self.model,
@@ -123,7 +142,7 @@ class Follower:
     def store_in_turn(self) -> None:
         """Store the state, unless another service has stored what this version has learnt since it was due last.
 
-        Whoever comes first does it for all: they learn the same.
+        The first one does it for all: they learn the same.
         """
         if self.database.shared:
             with self.database.session() as session:
@@ -155,10 +174,10 @@ class Follower:
                 most=self.settings.max_snapshots,
             )
         except (StorageFullError, OSError, DBAPIError) as error:
-            said = translated(error)
-            if said is None:
+            reason = translated(error)
+            if reason is None:
                 raise
-            logger.warning("what version %d of model %s has learnt is not stored: %s", self.version, self.model, said)
+            logger.warning("what version %d of model %s has learnt is not stored: %s", self.version, self.model, reason)
             return
         self._stored = self.number
 
@@ -187,5 +206,3 @@ class Follower:
     def _watch(self, arrivals: Sequence[Arrival]) -> None:
         for watcher in self.watchers:
             watcher(self, arrivals)
-        if arrivals:
-            self.novelty.see(self.known.online, Rows.concatenate([each.rows for each in arrivals]))

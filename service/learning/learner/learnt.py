@@ -1,20 +1,67 @@
-"""What a version has learnt, for the process that serves: as much of it as can be told at once."""
+"""What a version has learnt, for the process that serves: as much of it as can be learnt at once."""
 
 from __future__ import annotations
 
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from lipcore.model import TorqueModel
 from lipcore.online.consolidation import consolidate
+from lipcore.online.floor import error_floor
+from lipcore.online.record import Record
+from lipcore.samples import Array
 from service.journal import log, snapshots
-from service.learning.learner import recent
 from service.learning.learner.restore import Restored, restore
 from service.models.served import Learnt
-from service.storage.database import Database, LearnerRow, ServingRow
+from service.storage.database import Database, EventRow, LearnerRow, ServingRow
 from service.storage.files import Files
 
 MOST_ROWS = 500
 """Rows since the last snapshot that are learnt while a version is loaded, about: for more, a learner is needed."""
+SECONDS = 2.0
+FEWEST_ROWS = 200
+MOST_EVENTS = 500
+"""Batches that are looked at, at most."""
+
+
+def floor(database: Database, model: str, version: int, through: int, n_joints: int) -> Array:
+    """Function variance (N·m)², (n,), that a version's latest errors up to event `through` prove: its std is no lower.
+
+    The batches are those of the last SECONDS before the newest one was received, and more until there are FEWEST_ROWS
+    rows. Like the learnt state, the floor is a function of the log up to that event, whatever was taken back since.
+    """
+    of_version = (EventRow.kind == "batch", EventRow.version == version)
+    upto = (EventRow.model == model, EventRow.number <= through)
+    query = select(EventRow.received, EventRow.record).where(*upto, *of_version).order_by(EventRow.number.desc())
+    with database.session() as session:
+        counts = EventRow.void.is_(False) | EventRow.number.in_(_undone_later(session, model, through))
+        rows = session.execute(query.where(counts).limit(MOST_EVENTS))
+        records = [(received, record) for received, record in rows if record is not None]
+    total = Record.empty(n_joints)
+    for received, record in records:
+        if total.rows >= FEWEST_ROWS and received < records[0][0] - SECONDS:
+            break
+        total += Record.from_json(record)
+    return error_floor(total)
+
+
+def _undone_later(session: Session, model: str, through: int) -> list[int]:
+    """Batches up to event `through` that count there and were taken back since; the newest ones, and seldom any."""
+    kinds = EventRow.kind.in_(("unlearn", "rollback"))
+    query = select(EventRow.number, EventRow.kind, EventRow.detail).where(EventRow.model == model, kinds)
+    later = session.execute(query.where(EventRow.number > through)).all()
+    if not later:
+        return []
+    lowest = min(each.detail["to"] + 1 if each.kind == "rollback" else each.detail["event"] for each in later)
+    before = session.execute(query.where(EventRow.number > lowest, EventRow.number <= through)).all()
+    undone = {each.detail["event"] for each in before if each.kind == "unlearn"}
+    spans = [range(each.detail["to"] + 1, each.number) for each in before if each.kind == "rollback"]
+    void = select(EventRow.number).where(
+        EventRow.model == model, EventRow.kind == "batch", EventRow.void, EventRow.number >= lowest
+    )
+    numbers = session.scalars(void.where(EventRow.number <= through).order_by(EventRow.number.desc()))
+    counted = [each for each in numbers if each not in undone and not any(each in span for span in spans)]
+    return counted[:MOST_EVENTS]
 
 
 class LearntVersions:
@@ -26,7 +73,7 @@ class LearntVersions:
     def find(self, model: str, version: int, base: TorqueModel) -> Learnt | None:
         """Return what a version has learnt, None where that is nothing. base: the version as trained.
 
-        One that neither serves nor is a candidate has learnt what its last snapshot says, less what was unlearnt since.
+        One that neither serves nor is a candidate no longer learns: its last snapshot, less what was unlearnt since.
         """
         state = _restored(self._database, self._files, model, version, base, MOST_ROWS)
         if state is None:
@@ -35,20 +82,20 @@ class LearntVersions:
         behind = newest is not None and known.number < newest
         if known.number == start:
             return Learnt(base, 0, behind)
-        floor = recent.floor(self._database, model, version, known.number, base.n_joints)
-        return Learnt(known.online.model(floor), known.number - start, behind)
+        variance = floor(self._database, model, version, known.number, base.n_joints)
+        return Learnt(known.online.model(variance), known.number - start, behind)
 
     def consolidated(self, model: str, version: int, base: TorqueModel) -> Learnt | None:
         """Return all that a version has learnt as a model that can be saved, None where that is nothing; see `find`.
 
-        It takes the time to learn what has come since the last snapshot.
+        It takes the time to learn the log since the last snapshot.
         """
         state = _restored(self._database, self._files, model, version, base, None)
         if state is None or state[0].number == state[1]:
             return None
         known, start, _ = state
-        floor = recent.floor(self._database, model, version, known.number, base.n_joints)
-        return Learnt(consolidate(known.online, floor), known.number - start, False)
+        variance = floor(self._database, model, version, known.number, base.n_joints)
+        return Learnt(consolidate(known.online, variance), known.number - start, False)
 
 
 def _restored(

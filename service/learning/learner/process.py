@@ -1,4 +1,4 @@
-"""The learner process as the service sees it: woken, heard, and started again when it dies.
+"""The learner process as the service sees it: woken, listened to, and started again when it dies.
 
 Nothing here imports numerics: the process takes its place on the machine before it does, see `training.process`.
 """
@@ -15,11 +15,14 @@ from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from typing import TYPE_CHECKING
 
 from service.compute.process import Place, call, start_process, training_cpus
 from service.foundation.settings import Settings
-from service.learning.learner.messages import Message
 from service.web.observability import logs
+
+if TYPE_CHECKING:  # numerics, see above
+    from service.learning.learner.publication import Message
 
 logger = logging.getLogger(__name__)
 
@@ -60,7 +63,7 @@ class LearnerProcess:
         return None if process is None or not process.is_alive() else process.pid
 
     @property
-    def wanted(self) -> bool:
+    def needed(self) -> bool:
         """Whether there should be a process: a model has been woken, and the service is not closing."""
         return bool(self._threads) and not self._closing
 
@@ -124,7 +127,7 @@ class LearnerProcess:
         return ours, process
 
     def _listen(self, connection: Connection) -> None:
-        """Hand on what the process says, until it has ended."""
+        """Hand on the messages of the process, until it has ended."""
         while True:
             try:
                 message = connection.recv()

@@ -1,15 +1,16 @@
-"""What has been learnt, handed from the learner process to the service through a folder of arrays.
+"""What the learner process tells the service: messages, and the arrays of revisions, which lie in a folder.
 
-The service reads them into memory and removes them: nothing is unpickled or computed there, and reading does without
-the interpreter's lock. Mapping them into memory instead was measured to be worse: to unmap files of 13 MB takes a
-millisecond with that lock held, in whichever thread is the last to let go of them, maybe that of a control loop.
+The service reads the arrays into memory and removes them: nothing is unpickled or computed there, and reading does
+without the interpreter's lock. Mapping them into memory instead was measured to be worse: to unmap files of 13 MB takes
+a millisecond with that lock held, in whichever thread is the last to let go of them, maybe that of a control loop.
 """
 
 from __future__ import annotations
 
 import shutil
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
@@ -19,6 +20,52 @@ from service.storage.files import Files, new_id
 NAMES = tuple(each.name for each in fields(Revision))
 
 
+@dataclass(frozen=True)
+class Published:
+    """A version has learnt up to event `number`; answers of `revision` contain that.
+
+    path: of the arrays, see `write`; samples: weight of the rows learnt in this regime; novel_rows: rows beyond the
+    basis since the process follows the version, novel_share: their share of the last ones; seconds: that learning
+    and solving took; at: Unix time, s; linearisation: error of taking a learnt arm as linear, one number a joint, in
+    units of what is stated, see `lipcore.arm.linearisation`; None without such an arm.
+    """
+
+    model: str
+    version: int
+    revision: int
+    number: int
+    path: Path
+    samples: float
+    novel_rows: int
+    novel_share: float
+    seconds: float
+    at: float
+    linearisation: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Contested:
+    """The contest between the version that serves and a candidate is decided."""
+
+    model: str
+    serving: int
+    candidate: int
+    verdict: Literal["promote", "dismiss"]
+    evidence: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A version cannot learn; it is tried again later. error: why, for people."""
+
+    model: str
+    version: int
+    error: str
+
+
+Message = Published | Contested | Failed
+
+
 def folder(files: Files) -> Path:
     """Where publications lie until they are read."""
     return files.learning / "published"
@@ -26,10 +73,10 @@ def folder(files: Files) -> Path:
 
 def clear(files: Files) -> Path:
     """Remove what nobody has read; return the folder."""
-    found = folder(files)
-    shutil.rmtree(found, ignore_errors=True)
-    found.mkdir(parents=True)
-    return found
+    target = folder(files)
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir(parents=True)
+    return target
 
 
 def write(target: Path, revision: Revision) -> Path:

@@ -27,9 +27,9 @@ from dataclasses import dataclass, field, replace
 from lipcore.model import TorqueModel
 from lipcore.online import state
 from lipcore.online.batch import Rows
-from lipcore.online.learner import ForgottenError, OnlineModel
+from lipcore.online.learner import ForgottenError, Novel, OnlineModel
 from service.journal import log, snapshots
-from service.journal.payload import decode
+from service.journal.log import decode
 from service.learning.learner import course
 from service.learning.learner.course import RewoundError, Stretch, Taking, batch_of
 from service.storage.database import Database, EventRow
@@ -56,7 +56,7 @@ class Restored:
 
     @property
     def settled(self) -> bool:
-        """Whether this is what the log up to `number` says, and not a stage on the way to a later event."""
+        """Whether this is the state of the log up to `number`, and not a stage on the way to a later event."""
         return not any(batch <= self.number < until for batch, until in self.without.items())
 
 
@@ -109,10 +109,17 @@ def restore(
     return settled
 
 
-def advance(database: Database, known: Restored, at_most: int | None = None, watch: Watch | None = None) -> Restored:
+def advance(
+    database: Database,
+    known: Restored,
+    at_most: int | None = None,
+    watch: Watch | None = None,
+    novel: Novel | None = None,
+) -> Restored:
     """Return the state after the next page of events, the very same one where nothing is new.
 
-    watch: is told the batches of the page before they are learnt. Raise RewoundError.
+    watch: called with the batches of the page before they are learnt; novel: see `OnlineModel.learn`.
+    Raise RewoundError.
     """
     with database.session() as session:
         newest = log.newest(session, known.model)
@@ -123,7 +130,7 @@ def advance(database: Database, known: Restored, at_most: int | None = None, wat
         if not part.complete and not known.torn and _has_newer(database, known, at_most):
             raise RewoundError(None)
     if part.is_rollback and any(until < part.end for until in _active(known).values()):
-        raise RewoundError(known.number)  # what was left out was so for the sake of events that are undone
+        raise RewoundError(known.number)  # a batch was left out for the sake of events that are undone
     events = [each for each in part.events if not _is_left_out(known, each)]
     arrivals = [Arrival(each, decode(each.payload)) for each in events if each.payload is not None]
     if watch is not None and arrivals:
@@ -136,7 +143,8 @@ def advance(database: Database, known: Restored, at_most: int | None = None, wat
         for forgetting_s in part.forgetting_s or ():
             online = online.with_forgetting(forgetting_s)
     else:
-        online = _learn(database, known, online, part, {each.event.number: each.rows for each in arrivals})
+        rows = {each.event.number: each.rows for each in arrivals}
+        online = _learn(database, known, online, part, rows, novel)
     online = online.whole() if teaches else online
     return replace(known, online=online, number=part.end, without=_active(replace(known, number=part.end)))
 
@@ -168,14 +176,19 @@ def _begin(
 
 
 def _learn(
-    database: Database, known: Restored, online: OnlineModel, part: Stretch, rows: Mapping[int, Rows]
+    database: Database,
+    known: Restored,
+    online: OnlineModel,
+    part: Stretch,
+    rows: Mapping[int, Rows],
+    novel: Novel | None,
 ) -> OnlineModel:
     """Take in the events of a page, one after the other. online: one whose sums nobody else has, where any teaches."""
     for event in part.events:
         if event.kind == "batch":
             online = online.begin(event.received)
         if event.number in rows:
-            online = online.learn(rows[event.number], own=True)
+            online = online.learn(rows[event.number], own=True, novel=novel)
         elif event.kind == "unlearn":
             online = _take(database, known, online, part.takings[event.number], event.number)
         elif event.kind == "change":

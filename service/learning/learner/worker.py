@@ -14,9 +14,9 @@ from sqlalchemy import select
 from service.foundation.settings import Settings
 from service.journal import snapshots
 from service.learning.learner import publication
+from service.learning.learner.contest import Duels
 from service.learning.learner.follower import Follower
-from service.learning.learner.messages import Failed, Message
-from service.learning.refreshing.duel import Duels
+from service.learning.learner.publication import Failed, Message
 from service.models import registry
 from service.storage.database import Database, LearnerRow
 from service.storage.files import Files
@@ -36,7 +36,7 @@ def run(settings: Settings, connection: Connection) -> None:
     learner = Learner(database, files, settings)
     try:
         with suppress(EOFError, BrokenPipeError):  # the service is gone
-            while (models := _heard(connection, learner.pause())) is not None:
+            while (models := _woken(connection, learner.pause())) is not None:
                 learner.wake(models)
                 for message in learner.turn():
                     connection.send(message)
@@ -45,14 +45,14 @@ def run(settings: Settings, connection: Connection) -> None:
         database.close()
 
 
-def _heard(connection: Connection, seconds: float) -> set[str] | None:
-    """Names of the models that were named within so many seconds, None where it is time to end."""
+def _woken(connection: Connection, seconds: float) -> set[str] | None:
+    """Names of the models that the service wakes within so many seconds, None where it is time to end."""
     models: set[str] = set()
     while connection.poll(None if seconds == inf else seconds):
-        named = connection.recv()
-        if named is None:
+        names = connection.recv()
+        if names is None:
             return None
-        models.update(named)
+        models.update(names)
         seconds = 0.0
     return models
 
@@ -69,7 +69,7 @@ class Learner:
         self._failed: dict[Key, tuple[float, float]] = {}
 
     def wake(self, models: set[str]) -> None:
-        """Say that something has happened to these models."""
+        """Look at these models in the next turn: their logs have grown, or other versions of them learn."""
         self._woken |= models
 
     def pause(self) -> float:
@@ -84,7 +84,7 @@ class Learner:
         return max(0.0, min(times, default=inf) - time.monotonic()) if not self._woken else 0.0
 
     def turn(self) -> Iterator[Message]:
-        """Let every follower do the next thing that is to be done; yield what the service has to know."""
+        """Let every follower do the next thing that is to be done; yield the messages to the service."""
         now = time.monotonic()
         again = {model for (model, _), (at, _) in self._failed.items() if now >= at}
         again |= {model for model, at in self._unread.items() if now >= at}
@@ -94,7 +94,7 @@ class Learner:
         for key, follower in list(self.followers.items()):
             try:
                 yield from self._serve(follower)
-            except Exception as error:  # the others shall learn all the same
+            except Exception as error:  # the others learn all the same
                 yield self._fail(key, error)
         yield from self.duels.outcomes()
 
@@ -151,11 +151,11 @@ class Learner:
         with self.database.session() as session:
             candidates = select(LearnerRow.version).where(LearnerRow.model == model, LearnerRow.role == "candidate")
             known = session.get(LearnerRow, (model, serving.version))
-            found = [version for version in session.scalars(candidates) if version != serving.version]
+            others = [version for version in session.scalars(candidates) if version != serving.version]
         if known is None:  # trained before there was a log
             with self.database.transaction() as session:
                 registry.serve(session, model, serving.version)
-        return [*found, serving.version]
+        return [*others, serving.version]
 
     def _follow(self, key: Key) -> Follower:
         while len(self.followers) >= self.settings.max_learning_models:

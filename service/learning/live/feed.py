@@ -1,4 +1,4 @@
-"""Models as they predict and learn, for any number of readers: each is looked at once for all of them."""
+"""Models as they predict and learn, for any number of readers: each model is looked at once for all of its readers."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from anyio import to_thread
 
 from service.foundation.errors import BusyError, NotFoundError
 from service.foundation.settings import Settings
-from service.learning.live.novelty import Novelty
+from service.learning.ingest.intake import Judged
 from service.learning.live.schema import LiveLost, LiveNovelty, LiveRows, LiveStatus
-from service.learning.live.thinning import Judged, thinned
+from service.learning.live.thinning import Novelty, thinned
 
 logger = logging.getLogger(__name__)
 
@@ -28,15 +28,15 @@ STATUS_S = 1.0
 MOST_WAITING = 1000
 """Batches that may wait for a look; beyond it the oldest are not shown."""
 MOST_UNREAD = 50
-"""Events that wait for a slow reader, some five seconds; beyond it the oldest are lost, and that is said."""
+"""Events that wait for a slow reader, some five seconds; beyond it the oldest are lost, and a `lost` event says so."""
 LONGEST_S = 2.0
-"""Rows are shown as if they had come within this time at most, s: a batch may bring many seconds of them."""
+"""Rows are shown as if they had arrived within this time at most, s: a batch may bring many seconds of them."""
 
 Look = Callable[[list[LiveNovelty], float | None], LiveStatus]
 """Makes a status. Given which rows shown are novel, and how many seconds ago the last status was, None at first."""
 
 
-class Said(NamedTuple):
+class FeedEvent(NamedTuple):
     """An event: its kind, and its data as JSON."""
 
     event: str
@@ -71,7 +71,7 @@ class Feed:
         finally:
             self.open -= 1
 
-    async def follow(self, model: str, look: Look, closing: asyncio.Event) -> AsyncIterator[Said]:
+    async def follow(self, model: str, look: Look, closing: asyncio.Event) -> AsyncIterator[FeedEvent]:
         """Events of a model until the service closes or the model is deleted; a status comes first."""
         followed = self._followed.get(model)
         if followed is None or followed.over:
@@ -81,8 +81,8 @@ class Feed:
             followed.task = asyncio.get_running_loop().create_task(run, context=Context())
         reader = followed.join()
         try:
-            async for said in reader.read():
-                yield said
+            async for event in reader.read():
+                yield event
         finally:
             followed.readers.remove(reader)
             if not followed.readers and self._followed.get(model) is followed:
@@ -90,20 +90,20 @@ class Feed:
 
 
 class Reader:
-    """What one reader has not read yet. closed: nothing more comes."""
+    """The events that one reader has not read yet. closed: there will be no more."""
 
     def __init__(self) -> None:
         self.closed = False
-        self._unread: deque[Said] = deque()
+        self._unread: deque[FeedEvent] = deque()
         self._lost = 0
         self._woken = asyncio.Event()
 
-    def tell(self, said: Said) -> None:
+    def put(self, event: FeedEvent) -> None:
         """Put an event at the end; the oldest goes where there are too many."""
         if len(self._unread) >= MOST_UNREAD:
             self._unread.popleft()
             self._lost += 1
-        self._unread.append(said)
+        self._unread.append(event)
         self._woken.set()
 
     def close(self) -> None:
@@ -111,12 +111,12 @@ class Reader:
         self.closed = True
         self._woken.set()
 
-    async def read(self) -> AsyncIterator[Said]:
-        """What there is, as it comes."""
+    async def read(self) -> AsyncIterator[FeedEvent]:
+        """The events, as they are put in."""
         while True:
             if self._lost:
                 lost, self._lost = self._lost, 0
-                yield Said("lost", LiveLost(events=lost).model_dump_json())
+                yield FeedEvent("lost", LiveLost(events=lost).model_dump_json())
             elif self._unread:
                 yield self._unread.popleft()
             elif self.closed:
@@ -127,7 +127,7 @@ class Reader:
 
 
 class Followed:
-    """One model while somebody follows it. waiting: batches that nobody has been told of. over: nobody is any more."""
+    """One model while it has readers. waiting: batches that are not shown yet. over: it has no readers any more."""
 
     def __init__(self, model: str, look: Look, rows_per_s: float) -> None:
         self.model, self._look, self._rows_per_s = model, look, rows_per_s
@@ -141,20 +141,20 @@ class Followed:
         self._asked = True
 
     def join(self) -> Reader:
-        """One more reader, who is told the status at once."""
+        """Add a reader, who gets a status at once."""
         reader = Reader()
         self.readers.append(reader)
         self._asked = True
         return reader
 
     async def run(self, closing: asyncio.Event) -> None:
-        """Look and tell until nobody listens, or there is nothing to tell any more."""
+        """Look and pass on events until there is no reader left, or the model is deleted, or the service closes."""
         try:
             while self.readers and not closing.is_set():
                 try:
-                    for said in await to_thread.run_sync(self._events):
+                    for event in await to_thread.run_sync(self._events):
                         for reader in self.readers:
-                            reader.tell(said)
+                            reader.put(event)
                 except NotFoundError:  # it was deleted
                     return
                 except Exception:  # of the database: the next look may find it well again
@@ -166,23 +166,23 @@ class Followed:
             for reader in self.readers:
                 reader.close()
 
-    def _events(self) -> list[Said]:
-        """What there is to tell now. For a thread."""
+    def _events(self) -> list[FeedEvent]:
+        """The events of this moment. For a thread."""
         now = monotonic()
-        said = self._status(now) if self._asked or now - (self._status_at or 0.0) >= STATUS_S else []
-        return said + self._rows(now)
+        events = self._status(now) if self._asked or now - (self._status_at or 0.0) >= STATUS_S else []
+        return events + self._rows(now)
 
-    def _rows(self, now: float) -> list[Said]:
+    def _rows(self, now: float) -> list[FeedEvent]:
         batches = [self.waiting.popleft() for _ in range(len(self.waiting))]
         if not batches:
             return []
         passed, self._shown_at = min(now - self._shown_at, LONGEST_S), now
         parts = thinned(batches, max(round(self._rows_per_s * passed), 1))
-        for _, shown in parts:
-            self._novelty.add(shown)
-        return [Said("rows", LiveRows(parts=[part for part, _ in parts]).model_dump_json())]
+        for _, picked in parts:
+            self._novelty.add(picked)
+        return [FeedEvent("rows", LiveRows(parts=[part for part, _ in parts]).model_dump_json())]
 
-    def _status(self, now: float) -> list[Said]:
+    def _status(self, now: float) -> list[FeedEvent]:
         passed = None if self._status_at is None else now - self._status_at
         self._asked, self._status_at = False, now
-        return [Said("status", self._look(self._novelty.look(), passed).model_dump_json())]
+        return [FeedEvent("status", self._look(self._novelty.look(), passed).model_dump_json())]

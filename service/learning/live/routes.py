@@ -1,18 +1,132 @@
-"""The route that follows a model live."""
+"""The route that follows a model live, and the status that it tells once a second."""
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterable
+import asyncio
+import time
+from collections.abc import AsyncIterable, AsyncIterator
+from typing import Annotated
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Depends
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
+from lipcore.vocabulary import CODES
 from service.foundation.errors import BusyError, InvalidRequestError, NotFoundError, responses
-from service.learning.live import events
-from service.learning.updates import UpdatesDep
+from service.journal import log
+from service.learning import owner
+from service.learning.control import decisions, status
+from service.learning.control.schema import Held
+from service.learning.learners import Learners, LearnersDep
+from service.learning.live.schema import LiveAnswers, LiveNovelty, LiveStatus
 from service.web.limits.stopping import StoppingDep
-from service.web.observability.meters import MetersDep
+from service.web.observability.meters import OTHER, Meters, MetersDep, StreamMeter
+from service.web.pagination import Page
 from service.web.route import Route
+
+MOST_ALARMS = 5
+COUNTS = (*CODES, "batches", "duplicates")
+
+
+class LiveLook:
+    """Makes the statuses of one model; not for the event loop."""
+
+    def __init__(self, learners: Learners, meters: Meters, model: str) -> None:
+        self.learners, self.model = learners, model
+        self._answers = Answers(meters, model)
+
+    def __call__(self, novel: list[LiveNovelty], passed: float | None) -> LiveStatus:
+        """Return how it stands; raise NotFoundError where it was deleted. passed: s since the last time."""
+        learners, model = self.learners, self.model
+        served, now = learners.loaded.get(model, None), time.time()
+        monitor, latest = learners.monitor(model), learners.status(model, served.version)
+        with learners.database.session() as session:
+            events = log.newest(session, model) - log.start_of(session, model, served.version)
+            options, held = owner.options(session, model), owner.held(session, model)
+        return LiveStatus(
+            model=model,
+            at=now,
+            version=served.version,
+            revision=served.revision,
+            lag_events=max(events - served.revision, 0),
+            joint_names=list(served.model.joint_names),
+            joint_types=list(served.model.joint_types),
+            torque_convention=served.model.torque_convention,
+            learns=options.enabled,
+            on_change=options.on_change,
+            contact_threshold=options.contact_threshold,
+            held=None if held is None else Held(at=held["at"], evidence=held["evidence"]),
+            failure=None if latest.failed is None else latest.failed.error,
+            novel_share=status.novel_share(latest),
+            novel=novel,
+            counts={name: monitor.counts[name] for name in COUNTS},
+            windows=[status.window(each, now) for each in monitor.windows],
+            answers=self._answers.since(passed),
+            alarms=decisions.alarms(learners, model, Page(after=None, limit=MOST_ALARMS)).items,
+        )
+
+
+class Answers:
+    """Answers of a model's streams, from one look to the next."""
+
+    def __init__(self, meters: Meters, model: str) -> None:
+        self._meters, self._model = meters, model
+        self._before: tuple[list[int], int, int] | None = None
+
+    def since(self, passed: float | None) -> LiveAnswers | None:
+        """Answers since the last look, `passed` s ago; None at the first one."""
+        # read only: meters belong to the event loop, which makes them
+        meter = self._meters.streams().get(self._model)
+        if meter is None and OTHER in self._meters.streams():
+            return None
+        meter = meter or StreamMeter()
+        bounds, now = meter.durations.bounds, (list(meter.durations.counts), sum(meter.refused.values()), meter.late)
+        before, self._before = self._before, now
+        if before is None or passed is None:
+            return None
+        counts = [late - early for late, early in zip(now[0], before[0], strict=True)]
+        return LiveAnswers(
+            seconds=round(passed, 3),
+            count=sum(counts),
+            refused=now[1] - before[1],
+            late=now[2] - before[2],
+            p50_at_most_s=at_most(counts, bounds, 0.5),
+            p99_at_most_s=at_most(counts, bounds, 0.99),
+        )
+
+
+def at_most(counts: list[int], bounds: tuple[float, ...], share: float) -> float | None:
+    """The least bound below which this share of what was counted lies, None where there is none. counts: by bucket."""
+    total, below = sum(counts), 0
+    if not total:
+        return None
+    for count, bound in zip(counts, bounds, strict=False):  # the last bucket has no bound
+        below += count
+        if below >= share * total:
+            return bound
+    return None
+
+
+def _name(learners: LearnersDep, model: str) -> str:
+    return learners.loaded.get(model, None).name
+
+
+async def _followed(learners: LearnersDep, name: Annotated[str, Depends(_name)]) -> AsyncIterator[str]:
+    """The model's name; one more reader is counted while the answer lasts."""
+    with learners.live.one_more(learners.settings.max_live_followers):
+        yield name
+
+
+FollowedDep = Annotated[str, Depends(_followed)]
+
+
+async def events(
+    learners: Learners, meters: Meters, closing: asyncio.Event, model: str
+) -> AsyncIterator[ServerSentEvent]:
+    """`status` at the start and once a second, `rows` as they come; see `schema`."""
+    feed = learners.live
+    async for event in feed.follow(model, LiveLook(learners, meters, model), closing):
+        yield ServerSentEvent(event=event.event, raw_data=event.data)
+
 
 router = APIRouter(
     prefix="/v1/models", tags=["learning"], responses=responses(InvalidRequestError, NotFoundError), route_class=Route
@@ -26,7 +140,7 @@ router = APIRouter(
     responses=responses(BusyError),
 )
 async def follow(
-    updates: UpdatesDep, meters: MetersDep, stopping: StoppingDep, model: events.FollowedDep
+    learners: LearnersDep, meters: MetersDep, stopping: StoppingDep, model: FollowedDep
 ) -> AsyncIterable[ServerSentEvent]:
     """Server-sent events of what streams and batches bring with measured torque, predicted before it is learnt.
 
@@ -36,5 +150,5 @@ async def follow(
     learning waits for a decision. `lost`: so many events were dropped because they were not read in time. The answer
     ends when the model is deleted or the service stops.
     """
-    async for event in events.events(updates, meters, stopping.closing, model):
+    async for event in events(learners, meters, stopping.closing, model):
         yield event

@@ -6,8 +6,7 @@ from pydantic import BaseModel, Field
 
 from lipcore.online.record import LEVEL
 from lipcore.vocabulary import CODES, JointType
-from service.learning.control.learning_schema import Alarm, Held
-from service.learning.control.schema import Nullable, QualityWindow
+from service.learning.control.schema import Alarm, Held, Nullable, QualityWindow
 
 DECIMALS = 6
 """Of torques in `rows` events: millionths of a N·m."""

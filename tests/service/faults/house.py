@@ -12,7 +12,7 @@ import pytest
 
 import lipcore
 from lipcore import FitOptions
-from service.learning.learning_options import LearningOptions
+from service.learning.schema import LearningOptions
 from service.models import registry
 from service.storage.database import Database, LearningRow
 from service.storage.files import Files

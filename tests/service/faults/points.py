@@ -83,7 +83,7 @@ JOBS = [
     *_around_commit("job cancelled while it runs", actions.cancel, "service.training.jobs:cancel"),
 ]
 POINTED = "service.models.loaded:LoadedModels.point"
-APPEND = "service.learning.ingest.intake:Ingest.append"
+APPEND = "service.learning.ingest.intake:Intake.append"
 STORE = "service.journal.snapshots:save"
 LEARNING = [
     Point("observation: row made", actions.observe, Fault("service.journal.log:append_batch", "after"), "nothing"),

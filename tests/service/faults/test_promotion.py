@@ -15,7 +15,7 @@ from tests.service.faults.injection import COMMIT, Fault
 from tests.service.faults.ledger import ARM, predicted, rows
 
 pytestmark = pytest.mark.slow
-DECIDE = "service.learning.refreshing.promotion:decide"
+DECIDE = "service.learning.refresh:decide"
 POINTS = {
     "roles are changed": (Fault("service.models.registry:serve", "after", DECIDE, "itself"), False),
     "before the commit": (Fault(COMMIT, "before", DECIDE, "itself"), False),
@@ -29,13 +29,13 @@ from service.foundation.settings import Settings
 from service.storage.storage import Storage
 from service.learning.learner.learnt import LearntVersions
 from service.models.loaded import LoadedModels
-from service.learning.learner.messages import Contested
-from service.learning.refreshing import promotion
+from service.learning.learner.publication import Contested
+from service.learning import refresh
 
 storage = Storage.open(Settings(home=Path(sys.argv[1])))
 loaded = LoadedModels(storage, LearntVersions(storage.database, storage.files), 2)
 loaded.preload()
-promotion.decide(storage.database, loaded, print, Contested("{ARM}", 1, 2, "promote", {{"rows": 700}}))
+refresh.decide(storage.database, loaded, print, Contested("{ARM}", 1, 2, "promote", {{"rows": 700}}))
 """
 """What a service does with the verdict of a contest, which takes minutes to come to."""
 

@@ -119,9 +119,9 @@ def test_data_sets_have_to_fit(api, arm):
 
 def compared(density, nmse, blocks=30):
     """A comparison with these totals, each a mean and the half width of its interval."""
-    nothing = Difference(np.zeros(1), np.zeros(1), np.zeros(1))
+    nothing = Difference(np.zeros(1), np.zeros(1), np.zeros(1), np.ones(1))
     mean, width = np.array([[density[0], nmse[0]], [density[1], nmse[1]]])
-    return Comparison(nothing, nothing, nothing, nothing, Difference(mean, width / 2, width), blocks)
+    return Comparison(nothing, nothing, nothing, nothing, Difference(mean, width / 2, width, np.full(1, 60.0)), blocks)
 
 
 @pytest.mark.parametrize(

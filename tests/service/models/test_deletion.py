@@ -166,7 +166,7 @@ def test_nothing_of_a_model_is_left_but_its_history(api, arm):
         assert session.get(DeletedModelRow, arm).last_version == 3
     assert not any(place.exists() for place in places)
     assert not list(service.files.learning.glob(f"{kept}*"))
-    assert arm not in service.updates.monitors()
+    assert arm not in service.learners.monitors()
     assert api.get(f"/v1/jobs/{name}").json()["model"] == arm
     for answer in (predict(api, arm), predict(api, arm, alias="production"), predict(api, arm, version=1)):
         error(answer, 404, "not_found")
@@ -205,14 +205,14 @@ def test_a_deleted_version_is_not_published_by_who_still_holds_it(api, arm):
 def test_a_batch_that_was_predicted_by_what_is_deleted_is_not_logged(api, arm):
     service = service_of(api)
     served = service.loaded.get(arm, None)
-    ingest = service.updates._ingest
-    monitor, came = service.updates.monitor(arm), SimpleNamespace(rows=1)
+    intake = service.learners._intake
+    monitor, arrival = service.learners.monitor(arm), SimpleNamespace(rows=1)
     assert delete(api, arm).status_code == 204
     with pytest.raises(NotFoundError, match="no model"):
-        ingest.append(monitor, served, None, came, None, {})
+        intake.append(monitor, served, None, arrival, None, {})
     publish(api, arm)
     with pytest.raises(ConflictError, match=r"version 3 .* was deleted meanwhile"):
-        ingest.append(monitor, served, None, came, None, {})
+        intake.append(monitor, served, None, arrival, None, {})
 
 
 def test_who_asks_for_a_pointer_is_answered_though_it_moves_and_the_version_before_goes(api, arm, monkeypatch):

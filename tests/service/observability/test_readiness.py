@@ -8,7 +8,7 @@ from contextlib import closing
 import pytest
 
 from service.learning.learner.process import LearnerProcess
-from service.learning.updates import RESTART_S
+from service.learning.learners import RESTART_S
 from service.storage import looks
 from service.training.metrics import START_S
 from service.web.observability.readiness import KEPT_S, Readiness

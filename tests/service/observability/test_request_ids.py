@@ -11,7 +11,7 @@ from fastapi.testclient import TestClient
 
 from service.compute.process import Place
 from service.inference import answer as inference
-from service.learning.ingest.threads import IngestThreads
+from service.learning.learners import IngestThreads
 from service.web.observability.context import given_request_id, new_request_id, request_id
 from service.web.observability.meters import Meters
 from service.web.observability.request_log import RequestLog

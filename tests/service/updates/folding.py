@@ -7,7 +7,7 @@ from typing import Any
 
 from lipcore import TorqueModel
 from lipcore.online.learner import ForgottenError, OnlineModel
-from service.journal.payload import decode
+from service.journal.log import decode
 from service.storage.database import EventRow
 
 Without = Mapping[int, int]

@@ -23,7 +23,7 @@ from service.foundation.settings import Settings
 from service.journal import log, snapshots
 from service.journal.log import NewBatch
 from service.learning.learner import publication
-from service.learning.learner.messages import Published
+from service.learning.learner.publication import Published
 from service.learning.learner.restore import Restored, advance, restore
 from service.models import registry
 from service.models.loaded import LoadedModels

@@ -13,7 +13,7 @@ from lipcore.online.learner import OnlineModel
 from lipcore.online.spacing import INDEPENDENT_HZ
 from lipcore.samples import Samples
 from lipcore.vocabulary import CODES
-from service.journal import log, payload
+from service.journal import log
 from tests.service.data import stream
 from tests.service.updates.lessons import QUERIES, RATE, Pupil, School
 
@@ -45,7 +45,7 @@ def logged(school: School, pupil: Pupil) -> list[Rows]:
     """The rows of all batches of a model, in the order of the log."""
     with school.service.database.session() as session:
         found = log.events(session, pupil.model, 0, 10_000, void=True)
-    return [payload.decode(event.payload) for event in found if event.kind == "batch"]
+    return [log.decode(event.payload) for event in found if event.kind == "batch"]
 
 
 def codes(school: School, pupil: Pupil) -> list[str]:

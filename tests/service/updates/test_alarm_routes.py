@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.journal import alarms
+from service.learning import owner
 from tests.service.data import error
 
 
@@ -11,8 +11,8 @@ def test_alarms_are_listed_newest_first(school):
     assert pupil.get("alarms") == {"items": [], "next_cursor": None}
     with school.service.database.transaction() as session:
         for number, kind in enumerate(("change", "novelty", "refresh", "promotion")):
-            alarms.raise_alarm(session, "alarmed", kind, f"message {number}", {"number": number, "joints": ["joint1"]})
-        alarms.raise_alarm(session, "panda-sim", "change", "of another model", {})
+            owner.raise_alarm(session, "alarmed", kind, f"message {number}", {"number": number, "joints": ["joint1"]})
+        owner.raise_alarm(session, "panda-sim", "change", "of another model", {})
     first = pupil.get("alarms", limit=3)
     rest = pupil.get("alarms", limit=3, cursor=first["next_cursor"])
     items = first["items"] + rest["items"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.journal import alarms
+from service.learning import owner
 from service.web.pagination import Page
 from tests.service.updates.batches import MODEL, OTHER, opened
 
@@ -11,12 +11,12 @@ def test_alarms_are_listed_newest_first_for_each_model(home):
     database = opened(home)
     with database.transaction() as session:
         for count, kind in enumerate(("change", "novelty", "refresh")):
-            alarms.raise_alarm(session, MODEL, kind, f"said {count}", {"joints": [count], "share": 0.5})
-        alarms.raise_alarm(session, OTHER, "promotion", "of another", {})
+            owner.raise_alarm(session, MODEL, kind, f"said {count}", {"joints": [count], "share": 0.5})
+        owner.raise_alarm(session, OTHER, "promotion", "of another", {})
 
     def listed(after):
         with database.session() as session:
-            rows, cursor = alarms.page(session, MODEL, Page(after=after, limit=2))
+            rows, cursor = owner.alarms(session, MODEL, Page(after=after, limit=2))
         return [(row.kind, row.message, row.evidence["joints"]) for row in rows], cursor
 
     first, cursor = listed(None)
@@ -29,10 +29,10 @@ def test_an_alarm_goes_where_its_transaction_fails(home):
     database = opened(home)
     try:
         with database.transaction() as session:
-            assert alarms.raise_alarm(session, MODEL, "change", "not so", {}).seq
+            assert owner.raise_alarm(session, MODEL, "change", "not so", {}).seq
             raise InterruptedError
     except InterruptedError:
         pass
     with database.session() as session:
-        assert alarms.page(session, MODEL, Page(after=None, limit=10)) == ([], None)
+        assert owner.alarms(session, MODEL, Page(after=None, limit=10)) == ([], None)
     database.close()

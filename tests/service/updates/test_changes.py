@@ -12,10 +12,9 @@ from lipcore.online.change import ChangeDetector
 from lipcore.online.record import Record
 from service.journal import log
 from service.learning.ingest import judging
-from service.learning.ingest.contacts import ContactGate
-from service.learning.ingest.judging import Innovations, Watch
+from service.learning.ingest.judging import ContactGate, Innovations, Watch
 from service.learning.ingest.screening import Screened
-from service.learning.learning_options import LearningOptions
+from service.learning.schema import LearningOptions
 from tests.service.updates import lessons
 from tests.service.updates.lessons import Pupil
 from tests.service.updates.recordings import codes, part, recording, send

@@ -16,9 +16,18 @@ from scipy.stats import norm
 from lipcore.metrics import evaluate
 from lipcore.model import TorquePrediction
 from lipcore.online.batch import Rows
+from lipcore.paired import MAX_BLOCKS, Answer, surprise
 from service.foundation.settings import Settings
-from service.learning.refreshing.contest import MAX_BLOCKS, MIN_BLOCKS, ROWS_PER_BATCH, Block, Contest, sample, surprise
-from service.learning.refreshing.duel import TELL_EVERY_S, Duel, Duels
+from service.learning.learner.contest import (
+    MIN_BLOCKS,
+    REPEAT_EVERY_S,
+    ROWS_PER_BATCH,
+    Block,
+    Contest,
+    Duel,
+    Duels,
+    sample,
+)
 from tests.service.updates.batches import rows
 
 ONE = np.ones(1)
@@ -48,8 +57,8 @@ def compared(
         # one error explains the difference: that of the candidate where it is worse, else that of the other
         off = noise * np.sqrt(2 * np.abs(part))
         zero, std = np.zeros_like(part), np.zeros_like(part)
-        serving = (np.where(part > 0, off, 0.0), std, noise * ONE)
-        candidate = (np.where(part < 0, off, 0.0), std, noise * ONE)
+        serving = Answer(np.where(part > 0, off, 0.0), std, noise * ONE)
+        candidate = Answer(np.where(part < 0, off, 0.0), std, noise * ONE)
         contest = contest.step(time, zero, serving, candidate, time[-1])
         if settings is not None:
             contest, verdict = contest.judge(settings, time[-1])
@@ -69,7 +78,7 @@ def correlated(count: int, seconds: float, seed: int, every_s: float = 0.05) -> 
 def test_surprise_is_the_negative_log_density_summed_over_joints():
     tau, mean, std, _, _, noise = answers(20, 3, seed=1)
     expected = -norm.logpdf(tau, mean, np.sqrt(std**2 + noise**2)).sum(axis=1)
-    np.testing.assert_allclose(surprise(tau, mean, std, noise), expected, rtol=1e-12)
+    np.testing.assert_allclose(surprise(tau, Answer(mean, std, noise)).sum(axis=1), expected, rtol=1e-12)
 
 
 def test_gain_is_the_mean_difference_and_the_figures_are_those_of_the_rows():
@@ -77,9 +86,9 @@ def test_gain_is_the_mean_difference_and_the_figures_are_those_of_the_rows():
     contest = Contest.start(2)
     for first in range(0, 300, 20):
         part = slice(first, first + 20)
-        old, new = (one[part], std[part], noise), (two[part], other[part], noise)
+        old, new = Answer(one[part], std[part], noise), Answer(two[part], other[part], noise)
         contest = contest.step(np.arange(300.0)[part], tau[part], old, new, 0.0)
-    expected = surprise(tau, one, std, noise) - surprise(tau, two, other, noise)
+    expected = (surprise(tau, Answer(one, std, noise)) - surprise(tau, Answer(two, other, noise))).sum(axis=1)
     assert contest.rows == 300
     assert contest.gain == pytest.approx(expected.mean(), rel=1e-12)
     said = json.loads(json.dumps(contest.evidence()))
@@ -268,7 +277,7 @@ def test_a_verdict_is_told_until_its_roles_have_changed(settings, monkeypatch):
     assert (told.model, told.serving, told.candidate, told.verdict) == ("arm", 1, 2, "promote")
     assert told.evidence["rows"] >= settings.promotion_rows
     assert list(duels.outcomes()) == []
-    later = time.monotonic() + TELL_EVERY_S
+    later = time.monotonic() + REPEAT_EVERY_S
     monkeypatch.setattr(time, "monotonic", lambda: later)
     assert list(duels.outcomes()) == [told]  # nothing has followed from it: the database may have been locked
     duels.arrange("arm", candidate, [])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from service.client import ApiError, Client
-from service.journal import alarms
+from service.learning import owner
 from tests.service.updates.lessons import LESSON
 
 
@@ -40,7 +40,7 @@ def test_what_is_seen(school, client):
     assert seen.observed.tau == tau
     same(client.learning("seen-by-client"), pupil.get("learning"))
     with school.service.database.transaction() as session:
-        alarms.raise_alarm(session, "seen-by-client", "novelty", "beyond", {})
+        owner.raise_alarm(session, "seen-by-client", "novelty", "beyond", {})
     same_items(client.alarms("seen-by-client"), pupil.get("alarms"))
 
 

@@ -126,8 +126,8 @@ def test_a_row_whose_torque_alone_is_wrong_still_serves_its_neighbours(school):
 
 def test_rows_that_waited_are_checked_once_their_acceleration_is_known(school, monkeypatch):
     """A knock at the seam of two batches: its velocities are possible, its acceleration is not."""
-    ingest = school.service.updates._ingest
-    monkeypatch.setattr(ingest, "settings", ingest.settings.model_copy(update={"max_acceleration": 100.0}))
+    intake = school.service.learners._intake
+    monkeypatch.setattr(intake, "settings", intake.settings.model_copy(update={"max_acceleration": 100.0}))
     pupil = school.enrol("knock")
     parts = pieces([30])
     parts[1]["dq"][0] = [45.0, 0.0]
@@ -135,7 +135,7 @@ def test_rows_that_waited_are_checked_once_their_acceleration_is_known(school, m
     said = send(pupil, 1, parts[1])
     assert said["rejected"]["limit"] > 0
     found = logged(school, pupil)[1]
-    beyond = np.abs(np.nan_to_num(found.ddq)).max(axis=1) > ingest.settings.max_acceleration
+    beyond = np.abs(np.nan_to_num(found.ddq)).max(axis=1) > intake.settings.max_acceleration
     assert (found.code[beyond] != 0).all()
     assert beyond[:HALF].any()
 

@@ -19,7 +19,7 @@ import lipcore
 from lipcore.online import state
 from lipcore.online.revision import Revision
 from service.journal import log, snapshots
-from service.learning.learner import course, recent
+from service.learning.learner import course, learnt
 from service.learning.learner.course import RewoundError
 from service.learning.learner.restore import advance, restore
 from service.models import registry
@@ -165,7 +165,7 @@ def make(home: Path, page_rows: int, connection) -> None:
     database, files = Database(home), Files(home)
     base = lipcore.load(files.version_folder(registry.find(database, ARM, 1).folder))
     known = restore(database, files, ARM, 1, base)
-    floor = recent.floor(database, ARM, 1, known.number, 2)
+    floor = learnt.floor(database, ARM, 1, known.number, 2)
     revision = Revision.of(known.online.model(floor))
     arrays = [getattr(revision, each.name) for each in fields(revision)]
     made = [state.dump(known.online), *(np.ascontiguousarray(each).tobytes() for each in arrays)]

@@ -9,12 +9,12 @@ import pytest
 from sqlalchemy import delete, func, select
 
 from lipcore import NotPositiveDefiniteError
+from lipcore.vocabulary import CODES
 from service.learning.learner import follower as following
 from service.learning.learner import publication
 from service.learning.learner import restore as restoring
-from service.learning.learner.follower import Follower
-from service.learning.learner.messages import Failed, Published
-from service.learning.learner.novelty import Novelty
+from service.learning.learner.follower import Follower, Novelty
+from service.learning.learner.publication import Failed, Published
 from service.learning.learner.worker import Learner
 from service.storage.database import LearnerRow, ServingRow, SnapshotRow
 from tests.service.updates.pendulums import ARM, QUERIES, Arm, at_once, record, rows, same, trained
@@ -186,47 +186,37 @@ def test_watchers_see_batches_before_they_are_learnt(arm, follower):
     same(follower.answering, at_once(range(3)))
 
 
-class Basis:
-    """A version whose basis covers speeds up to 10 rad/s."""
-
-    @staticmethod
-    def novel(told):
-        return np.abs(told.dq).max(1) > 10.0
-
-
-def told(count, novel=0):
-    """Rows, the first of which lie beyond the basis."""
-    made = rows(0, size=count)
-    made.dq[:] = 1.0
-    made.dq[:novel] = 11.0
-    return made
+def flags(count, novel=0):
+    """Whether rows lie beyond the basis: the first ones do."""
+    return np.arange(count) < novel
 
 
 def test_motion_beyond_the_basis_is_counted():
     novelty = Novelty(window=80)
-    novelty.see(Basis, told(80))
+    novelty.add(flags(80))
     assert (novelty.rows, novelty.share) == (0, 0.0)
-    strange = told(80, novel=60)
-    strange.code[40:] = 6  # not learnt
-    novelty.see(Basis, strange)
+    novelty.add(flags(40, novel=40))
     assert (novelty.rows, novelty.share) == (40, 0.5)
-    novelty.see(Basis, told(60))
+    novelty.add(flags(60))
     assert (novelty.rows, novelty.share) == (40, 0.25)
 
 
 def test_the_share_of_novel_motion_is_not_told_from_few_rows():
     novelty = Novelty(window=80)
-    novelty.see(Basis, told(76, novel=76))
+    novelty.add(flags(76, novel=76))
     assert (novelty.rows, novelty.share) == (76, 0.0)
-    novelty.see(Basis, told(4, novel=4))
+    novelty.add(flags(4, novel=4))
     assert (novelty.rows, novelty.share) == (80, 1.0)
 
 
-def test_novelty_is_told_with_what_is_published(arm, follower, monkeypatch):
-    monkeypatch.setattr(following.OnlineModel, "novel", lambda self, told: np.ones(len(told), bool))
-    arm.batch(0, size=40)
+def test_novelty_is_told_with_what_is_published(arm, follower):
+    """Motion far faster than the version has seen; rows that are not learnt do not count."""
+    quick = rows(0, size=40)
+    quick.dq[:] = 50.0
+    quick.code[30:] = CODES.index("contact")
+    arm.batch(0, rows=quick)
     message = caught_up(follower).publish()
-    assert (message.novel_rows, message.novel_share) == (40, 0.0)
+    assert (message.novel_rows, message.novel_share) == (30, 0.0)
 
 
 def test_the_error_of_a_learnt_arms_linearisation_is_published(arm, follower, monkeypatch):
@@ -235,7 +225,7 @@ def test_the_error_of_a_learnt_arms_linearisation_is_published(arm, follower, mo
     monkeypatch.setattr(following, "linearisation_error", lambda model: np.array([0.1, 0.7]))
     arm.batch(1)
     assert caught_up(follower).publish().linearisation == (0.0, 0.0)  # both joints are predicted as well as stated
-    monkeypatch.setattr(following.recent, "floor", lambda *_: np.array([0.0, 0.5]))
+    monkeypatch.setattr(following, "floor", lambda *_: np.array([0.0, 0.5]))
     arm.batch(2)
     assert caught_up(follower).publish().linearisation == (0.0, 0.7)
 

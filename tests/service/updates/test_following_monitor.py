@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from lipcore.online.gates import Patience
-from service.learning.ingest.contacts import ContactGate
-from service.learning.quality.monitor import Monitor
+from service.learning.ingest.judging import ContactGate
+from service.learning.ingest.monitor import Monitor
 from tests.service.updates.test_changes import PUSH, RATTLE, WATCHFUL, drive
 
 HIDDEN = ("_gates", "_detector", "held", "number")
@@ -46,14 +46,14 @@ class Beside:
     def agree(self) -> bool:
         with self.school.service.database.session() as session:
             self.follower.follow(session, self.pupil.model)
-        return state(self.follower) == state(self.school.service.updates.monitor(self.pupil.model))
+        return state(self.follower) == state(self.school.service.learners.monitor(self.pupil.model))
 
 
 @pytest.fixture
 def beside(school, request):
     """Both monitors; of a model for each test."""
     pupil = school.enrol(request.node.name.replace("_", "-")[:60], **WATCHFUL, on_change="hold")
-    monitor = school.service.updates.monitor(pupil.model)
+    monitor = school.service.learners.monitor(pupil.model)
     return Beside(school, pupil, Monitor(monitor.joint_names, school.service.settings))
 
 
@@ -86,7 +86,7 @@ def test_a_monitor_of_a_service_that_starts_again_has_the_gates_as_they_were(bes
         names = beside.follower.joint_names
         again = Monitor.rebuilt(session, beside.pupil.model, names, service.settings, time.time())
     assert again._gates["arm"].patience.contacts > 0
-    assert state(again) == state(service.updates.monitor(beside.pupil.model))
+    assert state(again) == state(service.learners.monitor(beside.pupil.model))
 
 
 @pytest.mark.parametrize(

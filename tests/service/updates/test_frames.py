@@ -13,8 +13,8 @@ from lipcore.online.record import Record
 from lipcore.online.spacing import INDEPENDENT_HZ, weights
 from service.foundation.errors import BusyError, ConflictError
 from service.journal import log, retention
-from service.learning.errors import ExpiredError, LearningDisabledError
 from service.learning.ingest.frames import Frames, FramesResult
+from service.learning.schema import ExpiredError, LearningDisabledError
 from tests.service.updates.lessons import apart
 from tests.service.updates.recordings import codes, learnt_from, logged, part, recording, send
 
@@ -44,7 +44,7 @@ def pupil(school):
 @pytest.fixture
 def observe(school, pupil):
     def send_frames(sequences: Any, **more: Any) -> FramesResult:
-        return school.service.updates.observe_frames(frames(school, pupil, sequences, **more))
+        return school.service.learners.observe_frames(frames(school, pupil, sequences, **more))
 
     return send_frames
 
@@ -132,7 +132,7 @@ def test_contacts_are_kept_out(school):
     given = frames(school, pupil, range(10))
     tau = given.tau.copy()
     tau[6] += 1.0
-    found = school.service.updates.observe_frames(frames(school, pupil, range(10), tau=tau))
+    found = school.service.learners.observe_frames(frames(school, pupil, range(10), tau=tau))
     assert found.rejected == {"contact": 1}
 
 
@@ -178,8 +178,8 @@ def test_frames_that_are_no_longer_kept_are_not_taken_for_new(school, pupil, obs
 
 
 def test_there_are_no_more_streams_than_a_model_may_have(school, pupil, observe, monkeypatch):
-    ingest = school.service.updates._ingest
-    monkeypatch.setattr(ingest, "settings", ingest.settings.model_copy(update={"max_observation_streams": 1}))
+    intake = school.service.learners._intake
+    monkeypatch.setattr(intake, "settings", intake.settings.model_copy(update={"max_observation_streams": 1}))
     observe(range(3))
     with pytest.raises(BusyError, match="sources of observations"):
         observe(range(3), stream_id="another")

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.foundation.errors import BusyError, ConflictError
-from service.journal import gaps, log
-from service.journal.gaps import Gaps
+from service.journal import log
+from service.journal.log import Gaps
 from tests.service.updates.batches import MODEL, OTHER, batch, live, opened, source, write
 
 
@@ -70,7 +70,7 @@ def test_the_gaps_are_right_after_every_arrival_in_any_order(sequences):
         known = Gaps.from_json(known.arrived(sequence, sequence).to_json(), known.arrived(sequence, sequence).last)
         seen = set(sequences[:count])
         assert known.to_json() == {"first": min(seen), "ranges": misses(seen)}
-        assert [s for s in range(-1, 27) if known.came(s)] == sorted(seen)
+        assert [s for s in range(-1, 27) if known.may_hold(s)] == sorted(seen)
 
 
 @given(st.lists(st.tuples(st.integers(0, 30), st.integers(0, 5)), min_size=1, max_size=10))
@@ -95,11 +95,11 @@ def test_streams_write_down_their_gaps(tmp_path_factory, sequences):
 
 def test_only_the_newest_of_very_many_gaps_are_remembered():
     known = Gaps(0, 0)
-    for sequence in range(2, 2 * gaps.MOST_RANGES + 6, 2):
+    for sequence in range(2, 2 * log.MOST_RANGES + 6, 2):
         known = known.arrived(sequence, sequence)
-    assert len(known.ranges) == gaps.MOST_RANGES
+    assert len(known.ranges) == log.MOST_RANGES
     assert (known.ranges[0], known.ranges[-1]) == ((5, 5), (2003, 2003))
-    assert known.came(3)  # it may have, for all that is known
+    assert known.may_hold(3)  # it may have, for all that is known
 
 
 def test_a_batch_that_may_have_been_learnt_and_deleted_is_refused_but_one_that_never_came_is_not(database):

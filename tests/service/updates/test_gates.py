@@ -12,7 +12,7 @@ from lipcore.urdf import RigidBody
 from lipcore.vocabulary import CODES
 from service.foundation.settings import Settings
 from service.learning.ingest.screening import limits
-from service.learning.learning_options import LearningOptions
+from service.learning.schema import LearningOptions
 from tests.service.updates.lessons import apart
 from tests.service.updates.recordings import codes, learnt_from, logged, part, recording, send
 

@@ -16,8 +16,8 @@ from sqlalchemy import select
 from service.learning.learner import process as processes
 from service.learning.learner import publication
 from service.learning.learner.learnt import LearntVersions
-from service.learning.learner.messages import Published
 from service.learning.learner.process import LearnerProcess, learner_place
+from service.learning.learner.publication import Published
 from service.models.loaded import LoadedModels
 from service.storage.database import SnapshotRow
 from tests.service.data import DEADLINE, eventually
@@ -31,9 +31,7 @@ class Serving:
 
     def __init__(self, home):
         self.arm = Arm.open(home, learner_niceness=1)
-        self.loaded = LoadedModels(
-            self.arm.database, self.arm.files, LearntVersions(self.arm.database, self.arm.files), capacity=4
-        )
+        self.loaded = LoadedModels(self.arm.storage, LearntVersions(self.arm.database, self.arm.files), capacity=4)
         self.loaded.preload()
         self.messages = []
         self.learner = LearnerProcess(self.arm.settings, self.take)
@@ -206,7 +204,7 @@ def test_it_gives_way_to_serving(serving):
 
 def test_it_takes_its_place_before_numerics_are_imported():
     """Spawning imports the module of the process's function before that runs."""
-    said = "import sys, service.updates.learner.process; print(sorted({'numpy', 'torch', 'scipy'} & set(sys.modules)))"
+    said = "import sys, service.learning.learner.process; print(sorted({'numpy', 'torch', 'scipy'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", said], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
@@ -216,8 +214,8 @@ def test_it_ends_with_the_service(serving, tmp_path):
     script = (
         "import sys, time\n"
         "from pathlib import Path\n"
-        "from service.settings import Settings\n"
-        "from service.updates.learner.process import LearnerProcess\n"
+        "from service.foundation.settings import Settings\n"
+        "from service.learning.learner.process import LearnerProcess\n"
         "if __name__ == '__main__':\n"
         "    learner = LearnerProcess(Settings(home=Path(sys.argv[1])), print)\n"
         "    learner.wake('arm')\n"

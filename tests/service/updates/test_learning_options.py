@@ -6,8 +6,8 @@ import pytest
 from pydantic import ValidationError
 
 from service.foundation.errors import InvalidRequestError, NotFoundError
-from service.learning import learning
-from service.learning.learning_options import LearningOptions
+from service.learning import owner
+from service.learning.schema import LearningOptions
 from tests.service.updates.batches import MODEL, OTHER, batch, everything, opened, roll_back, write
 
 
@@ -20,11 +20,11 @@ def database(home):
 
 def given(database, model=MODEL):
     with database.session() as session:
-        return learning.options(session, model)
+        return owner.options(session, model)
 
 
 def put(database, model=MODEL, **fields):
-    learning.set_options(database, model, LearningOptions(**fields), 2, 500.0)
+    owner.set_options(database, model, LearningOptions(**fields), 2, 500.0)
 
 
 def said(database, model=MODEL):
@@ -121,16 +121,16 @@ def test_every_field_says_what_it_means():
 def test_a_model_holds_still_until_it_is_released(database):
     def held(model=MODEL):
         with database.session() as session:
-            return learning.held(session, model)
+            return owner.held(session, model)
 
     put(database, forgetting_s=60.0)
     assert held() is None
     with database.transaction() as session:
-        learning.hold(session, MODEL, {"event": 7, "joints": [1]})
-        learning.hold(session, OTHER, {"event": 1})
+        owner.hold(session, MODEL, {"event": 7, "joints": [1]})
+        owner.hold(session, OTHER, {"event": 1})
     assert (held(), held(OTHER)) == ({"event": 7, "joints": [1]}, {"event": 1})
     with database.transaction() as session:
-        learning.release(session, MODEL)
-        learning.release(session, "nobody")
+        owner.release(session, MODEL)
+        owner.release(session, "nobody")
     assert (held(), held(OTHER)) == (None, {"event": 1})
     assert given(database) == LearningOptions(forgetting_s=60.0)

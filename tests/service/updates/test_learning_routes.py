@@ -7,7 +7,7 @@ import time
 import pytest
 
 from service.journal import log, snapshots
-from service.learning import learning
+from service.learning import owner
 from service.learning.control import decisions
 from service.storage.database import LearnerRow
 from tests.service.data import error
@@ -36,7 +36,7 @@ def hold(school, pupil):
     at = offset(pupil) + rows * 0.01 - 0.005
     with school.service.database.transaction() as session:
         number = log.newest(session, pupil.model) + 1
-        learning.hold(session, pupil.model, {"at": at, "event": number, "evidence": {"joints": ["joint1"]}})
+        owner.hold(session, pupil.model, {"at": at, "event": number, "evidence": {"joints": ["joint1"]}})
     return at
 
 

@@ -44,7 +44,7 @@ def test_rows_are_told_with_what_was_predicted_before_they_were_learnt(school):
         assert status["counts"]["batches"] == 1
         assert status["windows"][0]["rows"] == status["windows"][0]["accepted"] == LESSON
         assert (status["learns"], status["held"], status["alarms"], status["failure"]) == (True, None, [], None)
-    assert service_of(school.client).updates.live.open == 0
+    assert service_of(school.client).learners.live.open == 0
 
 
 def test_rows_that_are_kept_out_are_counted_and_shown_with_their_code(school):
@@ -82,7 +82,7 @@ def test_a_change_that_waits_for_a_decision_is_told(school):
 
 def test_readers_share_what_is_told_and_nothing_is_kept_without_them(school):
     pupil = school.enrol("shared")
-    feed = school.service.updates.live
+    feed = school.service.learners.live
     pupil.post("observations", lesson(0))
     assert "shared" not in feed._followed
     with following(school.client, "shared") as one, following(school.client, "shared") as other:
@@ -105,7 +105,7 @@ def test_following_ends_when_the_model_is_deleted(school):
 
 def test_no_more_readers_than_may_be(school, monkeypatch):
     school.enrol("crowded")
-    monkeypatch.setattr(school.service.updates.live, "open", school.service.settings.max_live_followers)
+    monkeypatch.setattr(school.service.learners.live, "open", school.service.settings.max_live_followers)
     answer = school.client.get("/v1/models/crowded/live")
     error(answer, 429, "busy")
     assert int(answer.headers["retry-after"]) > 0

@@ -13,11 +13,12 @@ from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES
 from service.foundation.errors import BusyError, NotFoundError
 from service.foundation.settings import Settings
+from service.learning.ingest.intake import Judged
 from service.learning.ingest.screening import Screened
-from service.learning.live import feed, novelty
-from service.learning.live.feed import MOST_UNREAD, Feed, Said
-from service.learning.live.status import at_most
-from service.learning.live.thinning import Judged, pick, thinned
+from service.learning.live import feed, thinning
+from service.learning.live.feed import MOST_UNREAD, Feed, FeedEvent
+from service.learning.live.routes import at_most
+from service.learning.live.thinning import pick, thinned
 from tests.service.updates.batches import rows
 
 CONTACT, EDGE = CODES.index("contact"), CODES.index("edge")
@@ -95,8 +96,8 @@ def test_only_doubtful_rows_are_looked_at_and_not_too_many(monkeypatch):
         looked.append(len(these))
         return np.arange(len(these)) % 2 == 0
 
-    monkeypatch.setattr(novelty, "uncovered", uncovered)
-    gathered = novelty.Novelty()
+    monkeypatch.setattr(thinning, "uncovered", uncovered)
+    gathered = thinning.Novelty()
     for seed in range(4):
         gathered.add(thinned([judged(20, seed=seed, bare=0.05)], 100)[0][1])
     gathered.add(thinned([judged(4, stream_id="two", bare=0.15)], 100)[0][1])
@@ -148,11 +149,11 @@ def test_a_slow_reader_loses_the_oldest_and_is_told(quick):
         closing = asyncio.Event()
         events = quick.follow("arm", Look(), closing)
         first = await anext(events)
-        assert first == Said("status", '{"call":1}')
+        assert first == FeedEvent("status", '{"call":1}')
         (reader,) = quick._followed["arm"].readers
         for number in range(MOST_UNREAD + 5):
-            reader.tell(Said("rows", str(number)))
-        assert await anext(events) == Said("lost", '{"events":5}')
+            reader.put(FeedEvent("rows", str(number)))
+        assert await anext(events) == FeedEvent("lost", '{"events":5}')
         assert (await anext(events)).data == "5"
         closing.set()
         assert [said.data async for said in events if said.event == "rows"][-1] == str(MOST_UNREAD + 4)

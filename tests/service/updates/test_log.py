@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from service.journal import log
-from service.journal.payload import decode, encode
+from service.journal.log import decode, encode
 from service.storage.database import LearnerRow
 from service.web.pagination import Page
 from tests.service.updates.batches import MODEL, OTHER, batch, everything, note, opened, rows, take_back, write

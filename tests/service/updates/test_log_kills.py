@@ -12,7 +12,7 @@ import numpy as np
 
 from service.foundation.settings import Settings
 from service.journal import log
-from service.journal.payload import encode
+from service.journal.log import encode
 from service.storage.database import Database
 from tests.service.data import DEADLINE
 from tests.service.updates.batches import MODEL, batch, everything, opened, rows, source

@@ -13,7 +13,7 @@ import pytest
 
 import lipcore
 from service.journal import log
-from service.learning.learner import recent
+from service.learning.learner import learnt
 from service.learning.learner.restore import restore
 from service.models import registry
 from tests.service.data import DEADLINE, ended, eventually, train, upload
@@ -146,7 +146,7 @@ def test_every_answer_is_whole_one_version_and_revision(story):
         with service.database.session() as session:
             number = log.start_of(session, "arm", version) + answer["revision"]
         online = restore(service.database, service.files, "arm", version, base, number).online
-        expected = online.model(recent.floor(service.database, "arm", version, number, 2)).predict(*queries)
+        expected = online.model(learnt.floor(service.database, "arm", version, number, 2)).predict(*queries)
         np.testing.assert_allclose(answer["tau"], expected.tau, rtol=1e-6, atol=1e-8)
         np.testing.assert_allclose(answer["tau_std"], expected.tau_std, rtol=1e-5, atol=1e-8)
 

@@ -82,7 +82,7 @@ def test_a_batch_sent_again_is_acknowledged_again_and_applied_once(school, pupil
         assert send(pupil, 0, body) == first | {"duplicate": True}
     assert len(logged(school, pupil)) == 2
     assert apart(pupil.settled(2), learnt_from(school, _joined(body, part(recording(), 20, 24)))) < EXACT
-    assert school.service.updates.monitor(pupil.model).counts["duplicates"] == 3
+    assert school.service.learners.monitor(pupil.model).counts["duplicates"] == 3
 
 
 def test_the_same_content_in_another_form_is_the_same_batch(pupil, body):
@@ -229,14 +229,14 @@ def test_a_service_that_starts_again_knows_what_has_come(school, tmp_path):
         pupil = first.enrol("arm")
         said = [pupil.post("observations", lesson(number)) for number in range(3)]
         taught = pupil.settled(3)
-        seen = first.service.updates.monitor("arm").windows[0].record(time.time())
+        seen = first.service.learners.monitor("arm").windows[0].record(time.time())
     with lessons.school(home, school.trained) as second:
         pupil = lessons.Pupil(second.client, "arm")
         for number in range(3):
             assert pupil.post("observations", lesson(number)) == said[number] | {"duplicate": True}
         error(pupil.client.post(pupil.url("observations"), json=lesson(3) | {"sequence": 2}), 409, "conflict")
         assert apart(pupil.settled(3), taught) < EXACT
-        again = second.service.updates.monitor("arm").windows[0].record(time.time())
+        again = second.service.learners.monitor("arm").windows[0].record(time.time())
         assert again.rows == seen.rows == 3 * LESSON
         np.testing.assert_allclose(again.nlpd, seen.nlpd, rtol=1e-12)
         with second.service.database.session() as session:

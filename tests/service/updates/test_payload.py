@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES
-from service.journal.payload import decode, encode
+from service.journal.log import decode, encode
 from tests.service.updates.batches import rows
 
 ANY = st.floats(width=64, allow_nan=True, allow_infinity=True)

@@ -9,8 +9,8 @@ from sqlalchemy import select
 
 import lipcore
 from service.journal import log
-from service.learning.learner.messages import Contested
-from service.learning.refreshing import promotion
+from service.learning import refresh
+from service.learning.learner.publication import Contested
 from service.models import registry
 from service.storage.database import LearnerRow
 from tests.service.updates.lessons import answered
@@ -38,7 +38,7 @@ def decide(school, pupil, candidate=2, verdict="promote", serving=1):
     """Act on a verdict; return whether the candidate answers, and which models the learner was told of."""
     service, woken = school.service, []
     said = Contested(pupil.model, serving, candidate, verdict, EVIDENCE)
-    return promotion.decide(service.database, service.loaded, woken.append, said), woken
+    return refresh.decide(service.database, service.loaded, woken.append, said), woken
 
 
 def roles(school, pupil):

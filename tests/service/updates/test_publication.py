@@ -14,7 +14,7 @@ from lipcore.online.learner import OnlineModel
 from lipcore.online.revision import Revision
 from service.learning.learner import learnt, publication
 from service.learning.learner.learnt import LearntVersions
-from service.learning.learner.messages import Published
+from service.learning.learner.publication import Published
 from service.models.loaded import LoadedModels
 from service.storage.files import Files
 from tests.service.updates.pendulums import ARM, QUERIES, adopt, at_once, differ, predicted, rows, same, trained

@@ -11,8 +11,8 @@ import pytest
 import lipcore
 from service.foundation.states import CANCELLED, FAILED
 from service.journal import log
-from service.learning.learner.messages import Published
-from service.learning.refreshing import refresh
+from service.learning import refresh
+from service.learning.learner.publication import Published
 from service.models import registry
 from service.storage.database import AlarmRow, JobRow, now
 
@@ -97,10 +97,10 @@ def test_an_arm_that_has_left_its_linearisation_is_refreshed(ready):
 def test_a_model_that_is_held_is_not_refreshed(ready):
     school, pupil = ready
     with school.service.database.transaction() as session:
-        refresh.learning.hold(session, pupil.model, {"at": 0.0, "event": 1})
+        refresh.owner.hold(session, pupil.model, {"at": 0.0, "event": 1})
     assert consider(school, pupil) is None
     with school.service.database.transaction() as session:
-        refresh.learning.release(session, pupil.model)
+        refresh.owner.release(session, pupil.model)
     assert consider(school, pupil) is not None
 
 

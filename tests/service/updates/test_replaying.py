@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.journal import log
-from service.journal.payload import decode
+from service.journal.log import decode
 from tests.service.updates.lessons import LESSON, apart, lesson
 
 EQUAL = 1e-8

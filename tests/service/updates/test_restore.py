@@ -9,7 +9,7 @@ import pytest
 
 from lipcore.vocabulary import CODES
 from service.journal import snapshots
-from service.learning.learner import course, learnt, recent
+from service.learning.learner import course, learnt
 from service.learning.learner import restore as restoring
 from service.learning.learner.course import RewoundError
 from service.learning.learner.learnt import LearntVersions
@@ -188,11 +188,11 @@ def test_the_stated_uncertainty_is_not_below_the_errors_of_the_last_seconds(arm)
     for number in range(1, 5):
         arm.batch(number, received=110.0 + number, record=record(0.5))
     noise = trained().noise_std[0] ** 2
-    floor = recent.floor(arm.database, ARM, 1, 5, 2)
+    floor = learnt.floor(arm.database, ARM, 1, 5, 2)
     np.testing.assert_allclose(floor, [0.25 - noise, 0.0], rtol=1e-9)
-    assert recent.floor(arm.database, ARM, 1, 1, 2)[0] == pytest.approx(9.0 - noise)
-    assert recent.floor(arm.database, ARM, 2, 5, 2).tolist() == [0.0, 0.0]
-    assert recent.floor(arm.database, ARM, 1, 0, 2).tolist() == [0.0, 0.0]
+    assert learnt.floor(arm.database, ARM, 1, 1, 2)[0] == pytest.approx(9.0 - noise)
+    assert learnt.floor(arm.database, ARM, 2, 5, 2).tolist() == [0.0, 0.0]
+    assert learnt.floor(arm.database, ARM, 1, 0, 2).tolist() == [0.0, 0.0]
     found = LearntVersions(arm.database, arm.files).find(ARM, 1, arm.base)
     assert found.model.predict(*QUERIES).tau_std[:, 0].min() >= np.sqrt(0.25 - noise) * (1 - 1e-9)
 
@@ -200,5 +200,5 @@ def test_the_stated_uncertainty_is_not_below_the_errors_of_the_last_seconds(arm)
 def test_slow_streams_are_judged_by_enough_rows(arm):
     for number in range(4):
         arm.batch(number, received=100.0 + 60 * number, record=record(1.0 if number < 2 else 0.0))
-    assert recent.floor(arm.database, ARM, 1, 4, 2)[0] == 0.0  # 200 rows without error
-    assert recent.floor(arm.database, ARM, 1, 3, 2)[0] > 0.1
+    assert learnt.floor(arm.database, ARM, 1, 4, 2)[0] == 0.0  # 200 rows without error
+    assert learnt.floor(arm.database, ARM, 1, 3, 2)[0] > 0.1

@@ -6,7 +6,7 @@ import pytest
 
 from service.foundation.settings import Settings
 from service.journal import log, retention
-from service.journal.payload import encode
+from service.journal.log import encode
 from service.storage.database import LearnerRow, ServingRow, SnapshotRow, now
 from tests.service.updates.batches import MODEL, OTHER, batch, everything, note, opened, rows, source, take_back, write
 

@@ -17,7 +17,7 @@ from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from service.client.stream import StreamClient, StreamError
 from service.foundation.settings import Settings
-from service.journal import payload
+from service.journal import log
 from service.storage.database import Database, EventRow
 from tests.service.data import DEADLINE, eventually, stream, train, upload
 from tests.service.server import Server
@@ -68,7 +68,7 @@ def batches(server: Server, stream_id: str) -> list[EventRow]:
 
 def rows(server: Server, stream_id: str) -> Rows:
     """All rows that are durable of a stream."""
-    return Rows.concatenate([payload.decode(event.payload) for event in batches(server, stream_id)])
+    return Rows.concatenate([log.decode(event.payload) for event in batches(server, stream_id)])
 
 
 def sent_once(found: Rows, measured: Measured, indices: list[int]) -> None:

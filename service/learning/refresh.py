@@ -1,10 +1,14 @@
-"""Refreshing the version that serves: asked for, or because motion, or its arm, has left what it can learn."""
+"""Refreshing the version that serves because motion, or its arm, has left what it can learn; and what ends a contest.
+
+A refresh trains a candidate, which learns along. Once it predicts better it takes over without a query that notices,
+or else it is dismissed.
+"""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Literal
@@ -15,20 +19,35 @@ from sqlalchemy.orm import Session
 from service.foundation.errors import BusyError, ConflictError
 from service.foundation.settings import Settings
 from service.foundation.states import ACTIVE
-from service.journal import alarms
-from service.journal.alarms import AlarmKind
-from service.learning import learning
-from service.learning.learner.messages import Published
-from service.learning.refreshing.promotion import CANDIDATE
+from service.learning import owner
+from service.learning.learner.publication import Contested, Published
+from service.learning.learners import Learners
+from service.learning.owner import AlarmKind
 from service.models import registry
+from service.models.loaded import LoadedModels
 from service.storage.database import AlarmRow, Database, LearnerRow, ServingRow
 from service.training import jobs, refreshes
+from service.training import refresh_scope as scope
 from service.training.queue import JobQueue
 from service.training.schema import Job
 
 logger = logging.getLogger(__name__)
 
+CANDIDATE, DISMISSED = "candidate", "dismissed"
 MOST_DOUBLINGS = 10
+
+
+def attach(learners: Learners, queue: JobQueue) -> None:
+    """Let versions be refreshed and promoted by themselves; once, before the first observation is taken."""
+
+    def published(message: Published) -> None:
+        consider(learners.settings, learners.database, queue, message)
+
+    def contested(message: Contested) -> None:
+        decide(learners.database, learners.loaded, learners.process.wake, message)
+
+    learners.when_published.append(published)
+    learners.when_contested.append(contested)
 
 
 @dataclass(frozen=True)
@@ -58,7 +77,7 @@ def consider(settings: Settings, database: Database, queue: JobQueue, published:
     with database.transaction() as session:
         if not _is_due(session, settings, published):  # another thread may have been faster
             return None
-        if not learning.options(session, model).auto_refresh:
+        if not owner.options(session, model).auto_refresh:
             for each in reasons:
                 _raise_once(session, model, each.trigger, f"{each.text}: a refresh would help", each.evidence)
             return None
@@ -72,7 +91,7 @@ def consider(settings: Settings, database: Database, queue: JobQueue, published:
         except BusyError as error:
             logger.warning("model %s is to be refreshed, but %s", model, error.message)
             return None
-        alarms.raise_alarm(session, model, why.trigger, f"{why.text}: it is refreshed", {**why.evidence, "job": job.id})
+        owner.raise_alarm(session, model, why.trigger, f"{why.text}: it is refreshed", {**why.evidence, "job": job.id})
     queue.submit(job.id)
     return jobs.shown(job)
 
@@ -81,7 +100,7 @@ def _is_due(session: Session, settings: Settings, published: Published) -> bool:
     """Whether a refresh may be queued or an alarm be raised now."""
     model, version = published.model, published.version
     serving = session.get(ServingRow, model)
-    if serving is None or serving.version != version or learning.held(session, model) is not None:
+    if serving is None or serving.version != version or owner.held(session, model) is not None:
         return False
     before = list(session.scalars(refreshes.of(model)))
     if any(job.state in ACTIVE for job in before):
@@ -89,7 +108,7 @@ def _is_due(session: Session, settings: Settings, published: Published) -> bool:
     contest = select(LearnerRow.version).where(LearnerRow.model == model, LearnerRow.role == CANDIDATE)
     if session.scalar(contest.limit(1)) is not None:
         return False
-    if not learning.options(session, model).auto_promote and _is_better_known(session, model, version):
+    if not owner.options(session, model).auto_promote and _is_better_known(session, model, version):
         return False
     ended = [_unix(job.finished_at or job.created_at) for job in before]
     earlier = sum(job.request["refresh"]["version"] == version for job in before)
@@ -98,17 +117,17 @@ def _is_due(session: Session, settings: Settings, published: Published) -> bool:
 
 
 def _is_better_known(session: Session, model: str, version: int) -> bool:
-    """Whether the owner has been told of a version that predicts better, and has not let it answer."""
-    told = _alarms(model, "promotion").where(
+    """Whether an alarm has named a version that predicts better, and the owner has not let it answer."""
+    alarms = _alarms(model, "promotion").where(
         AlarmRow.evidence["serving"].as_integer() == version, AlarmRow.evidence["verdict"].as_string() == "promote"
     )
-    return session.scalar(told.limit(1)) is not None
+    return session.scalar(alarms.limit(1)) is not None
 
 
 def _raise_once(session: Session, model: str, kind: AlarmKind, message: str, evidence: dict[str, Any]) -> None:
     known = _alarms(model, kind).where(AlarmRow.evidence["version"].as_integer() == evidence["version"])
     if session.scalar(known.limit(1)) is None:
-        alarms.raise_alarm(session, model, kind, message, evidence)
+        owner.raise_alarm(session, model, kind, message, evidence)
 
 
 def _reasons(settings: Settings, published: Published) -> Iterator[Reason]:
@@ -138,3 +157,55 @@ def _alarms(model: str, kind: AlarmKind) -> Select[int]:
 
 def _unix(moment: str) -> float:
     return datetime.fromisoformat(moment).timestamp()
+
+
+def decide(database: Database, loaded: LoadedModels, wake: Callable[[str], None], contested: Contested) -> bool:
+    """Act on the verdict of a contest; return whether the candidate answers now. Not for the event loop.
+
+    The pointer to the version that serves, the roles of both and the alarm change in one transaction; queries follow by
+    one assignment, once the candidate is in memory with what it has learnt so far. A verdict is void where another
+    version serves by now, or where the candidate is one no more. wake: tells the learner of a model that roles changed.
+    """
+    model, candidate = contested.model, contested.candidate
+    with database.transaction() as session:
+        learner = session.get(LearnerRow, (model, candidate))
+        serving = session.get(ServingRow, model)
+        if learner is None or learner.role != CANDIDATE or serving is None or serving.version != contested.serving:
+            logger.info("the contest of version %d of model %s is void: roles have changed", candidate, model)
+            return False
+        promoted = _act(session, contested, learner)
+    if promoted:
+        loaded.adopt(model)
+    wake(model)
+    return promoted
+
+
+def _act(session: Session, contested: Contested, learner: LearnerRow) -> bool:
+    """Change roles as the verdict says, and note why; return whether the candidate serves."""
+    model, old, new = contested.model, contested.serving, contested.candidate
+    learner.role = DISMISSED  # unless it serves
+    if contested.verdict == "dismiss":
+        _note(session, contested, f"version {new} does not predict better than version {old} and is dismissed", False)
+        return False
+    if scope.taken_back(session, model, learner.start, learner.start):
+        message = f"version {new} is dismissed: part of what it was trained on has been taken back since"
+        _note(session, contested, message, False)
+        return False
+    if not owner.options(session, model).auto_promote:
+        message = f"version {new} predicts better than version {old}: a rollback to version {new} lets it answer"
+        _note(session, contested, message, False)
+        return False
+    registry.serve(session, model, new)
+    _note(session, contested, f"version {new} predicts better than version {old} and answers from now on", True)
+    return True
+
+
+def _note(session: Session, contested: Contested, message: str, promoted: bool) -> None:
+    evidence: dict[str, Any] = {
+        "serving": contested.serving,
+        "candidate": contested.candidate,
+        "verdict": contested.verdict,
+        "promoted": promoted,
+        **contested.evidence,
+    }
+    owner.raise_alarm(session, contested.model, "promotion", message, evidence)

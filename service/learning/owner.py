@@ -1,16 +1,19 @@
-"""How a model learns: what its owner has set, and whether it holds still after a change."""
+"""What a model's owner decides and has to know: options of learning, holds after a change, alarms."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from service.foundation.errors import invalid_request, not_found
 from service.journal import log
-from service.learning.learning_options import LearningOptions
-from service.storage.database import Database, LearningRow, ModelRow
+from service.learning.schema import LearningOptions
+from service.storage.database import AlarmRow, Database, LearningRow, ModelRow, now
+from service.web.pagination import Page, newest
+
+AlarmKind = Literal["change", "novelty", "linearisation", "refresh", "promotion"]
 
 
 def options(session: Session, model: str) -> LearningOptions:
@@ -19,25 +22,25 @@ def options(session: Session, model: str) -> LearningOptions:
     return LearningOptions() if row is None else LearningOptions(**row.options)
 
 
-def set_options(database: Database, model: str, wanted: LearningOptions, n_joints: int, received: float) -> None:
+def set_options(database: Database, model: str, chosen: LearningOptions, n_joints: int, received: float) -> None:
     """Set how a model learns from now on; a new time constant of forgetting is an event of its log.
 
     Raise NotFoundError for a model that does not exist, InvalidRequestError where `torque_limits` is not of its joints.
     """
-    limits = wanted.torque_limits
+    limits = chosen.torque_limits
     if limits is not None and len(limits) != n_joints:
         raise invalid_request(
             "torque_limits", f"a list of {len(limits)}", f"{n_joints} positive numbers, one for each joint in order"
         )
     with database.turn(model), database.transaction(model) as session:
         row = _row(session, model)
-        row.options = wanted.model_dump()
-        if wanted.forgetting_s != log.forgetting(session, model, log.newest(session, model)):
-            log.append(session, model, "settings", {"forgetting_s": wanted.forgetting_s}, received)
+        row.options = chosen.model_dump()
+        if chosen.forgetting_s != log.forgetting(session, model, log.newest(session, model)):
+            log.append(session, model, "settings", {"forgetting_s": chosen.forgetting_s}, received)
 
 
 def hold(session: Session, model: str, detail: dict[str, Any]) -> None:
-    """Let a model hold still: what comes is answered and logged, but not learnt. detail: why."""
+    """Let a model hold still: observations are answered and logged, but not learnt. detail: why."""
     _row(session, model).held = detail
 
 
@@ -52,6 +55,19 @@ def held(session: Session, model: str) -> dict[str, Any] | None:
     """Why a model holds still; None where it learns."""
     row = session.get(LearningRow, model)
     return None if row is None else row.held
+
+
+def raise_alarm(session: Session, model: str, kind: AlarmKind, message: str, evidence: dict[str, Any]) -> AlarmRow:
+    """Add an alarm; it is visible once the session commits."""
+    row = AlarmRow(model=model, kind=kind, at=now(), message=message, evidence=evidence)
+    session.add(row)
+    session.flush()
+    return row
+
+
+def alarms(session: Session, model: str, part: Page) -> tuple[list[AlarmRow], str | None]:
+    """Alarms of a page, newest first, and the cursor after it."""
+    return newest(session, AlarmRow, part, AlarmRow.model == model)
 
 
 def _row(session: Session, model: str) -> LearningRow:

@@ -1,4 +1,4 @@
-"""What a running service keeps in memory of a model that learns; all of it can be told again from the log."""
+"""What a running service keeps in memory of a model that learns; all of it can be rebuilt from the log."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import threading
 from collections import Counter, OrderedDict
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import reduce
+from operator import add
 from typing import Any
 
 import numpy as np
@@ -17,15 +19,47 @@ from lipcore.online.record import Record
 from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.settings import Settings
 from service.journal import log
-from service.learning.ingest.contacts import ContactGate
-from service.learning.ingest.judging import Innovations, Verdict, Watch
-from service.learning.quality.windows import Window
+from service.learning.ingest.judging import ContactGate, Innovations, Verdict, Watch
 from service.storage.database import EventRow
 
+PARTS = 60
+"""Buckets of a window: its length is true to a sixtieth."""
 MOST_EVENTS = 3000
 """Events that the windows are rebuilt from after a start, at most: 0.3 ms each."""
 DETECTOR_S = 60.0
 """Time before a start that the detector of changes is rebuilt from, s: more than it looks back."""
+
+
+class Window:
+    """Records and counts of the last `seconds`, in at most PARTS + 1 buckets. Read it from any thread."""
+
+    def __init__(self, seconds: float, n_joints: int) -> None:
+        self.seconds, self._n_joints = seconds, n_joints
+        self._length = max(seconds / PARTS, 1.0)
+        self._buckets: tuple[tuple[int, Record, Counter[str]], ...] = ()
+
+    def add(self, record: Record | None, counts: Mapping[str, int], at: float) -> None:
+        """Add a batch's record and counts at a Unix time, s. From one thread at a time."""
+        number = int(at // self._length)
+        *rest, last = self._buckets or ((number, Record.empty(self._n_joints), Counter[str]()),)
+        if last[0] != number:
+            rest, last = [*rest, last], (number, Record.empty(self._n_joints), Counter[str]())
+        changed = number, last[1] if record is None else last[1] + record, last[2] + Counter(counts)
+        # another tuple each time: readers keep the one they have
+        self._buckets = tuple(bucket for bucket in (*rest, changed) if self._holds(bucket[0], at))
+
+    def record(self, now: float) -> Record:
+        """Sum of the records within the window before a Unix time, s."""
+        records = (bucket[1] for bucket in self._buckets if self._holds(bucket[0], now))
+        return reduce(add, records, Record.empty(self._n_joints))
+
+    def counts(self, now: float) -> Counter[str]:
+        """Sum of the counts within the window before a Unix time, s."""
+        counts = (bucket[2] for bucket in self._buckets if self._holds(bucket[0], now))
+        return reduce(add, counts, Counter[str]())
+
+    def _holds(self, number: int, now: float) -> bool:
+        return (number + 1) * self._length > now - self.seconds
 
 
 class Monitor:
@@ -36,10 +70,10 @@ class Monitor:
     and that this service has taken. held: whether learning waited for a decision at the last batch. number: of the last
     event that was taken in.
 
-    Several services take batches of one model in turn, and each takes in what the others took before it judges: gates,
-    detector and windows are then the same to the last bit as if one service had taken all, from the first batch on that
-    all of them know. The innovations are those of the batches that this service took itself, because a batch is
-    logged without what was predicted: what tells friction from a payload stands on fewer rows.
+    Several services take batches of one model in turn, and each follows the log before it judges: gates, detector and
+    windows are then the same to the last bit as if one service had taken all, from the first batch on that all of them
+    know. Innovations are those of this service's own batches, because the log has no predictions: friction is told from
+    a payload on fewer rows then.
     """
 
     def __init__(self, joint_names: tuple[str, ...], settings: Settings) -> None:
@@ -66,13 +100,13 @@ class Monitor:
         return made
 
     def follow(self, session: Session, model: str) -> None:
-        """Take in the batches that other services have logged since the last that was taken in; `lock` is held."""
+        """Take in the batches that other services have logged since `number`; `lock` is held."""
         for event in _batches(session, model, EventRow.number > self.number):
             self._remember(event, True)
             self.number = event.number
 
     def watch(self, stream_id: str) -> Watch:
-        """What is known before the next rows of a stream."""
+        """State of judging before the next rows of a stream."""
         gate = self._gates.get(stream_id) or ContactGate.start(self._patience)
         return Watch(gate, self._detector, self._innovations)
 
@@ -115,8 +149,8 @@ class Monitor:
             self.decided()
         self.held, waits = report["held"], report["held"] or report["open"]
         if event.stream_id is not None:
-            if (known := report.get("gate")) is not None:
-                gate = ContactGate.from_json(known, self._patience)
+            if (values := report.get("gate")) is not None:
+                gate = ContactGate.from_json(values, self._patience)
             else:  # logged by an earlier release
                 gate = ContactGate.start(self._patience)
                 gate = gate.stand_back() if waits else gate
@@ -125,8 +159,8 @@ class Monitor:
         if at is None or not recent:
             return
         if record is not None:
-            told = replace(record, standardised=np.array(report["surprise"], np.float64))
-            self._detector, _ = self._detector.step(told, at)
+            judged = replace(record, standardised=np.array(report["surprise"], np.float64))
+            self._detector, _ = self._detector.step(judged, at)
         if not waits:
             self._detector = self._detector.acknowledged()
 
@@ -143,10 +177,10 @@ class Monitor:
 
 def _batches(session: Session, model: str, *conditions: ColumnElement[bool]) -> Iterator[EventRow]:
     """The last batches of a model that meet conditions, as many as are taken in, in order."""
-    found = select(EventRow).where(
+    query = select(EventRow).where(
         EventRow.model == model, EventRow.kind == "batch", EventRow.report.is_not(None), *conditions
     )
-    return reversed(list(session.scalars(found.order_by(EventRow.number.desc()).limit(MOST_EVENTS))))
+    return reversed(list(session.scalars(query.order_by(EventRow.number.desc()).limit(MOST_EVENTS))))
 
 
 def _counts(report: Mapping[str, Any]) -> dict[str, int]:

@@ -10,11 +10,9 @@ from prometheus_client.registry import Collector
 from sqlalchemy import select
 
 from lipcore.vocabulary import CODES
-from service.learning.control import revisions
-from service.learning.control.status import novel_share
-from service.learning.quality import summary
-from service.learning.quality.monitor import Monitor
-from service.learning.updates import Updates
+from service.learning.control import status, undoing
+from service.learning.ingest.monitor import Monitor
+from service.learning.learners import Learners
 from service.models.loaded import Served
 from service.storage.database import StreamRow
 from service.web.observability.metric import MetricKind
@@ -25,8 +23,8 @@ FIGURES = {
     "nlpd": "Mean negative log predictive density, nats",
 }
 QUALITY = {
-    name: MetricKind("gauge", f"lipserve_quality_{name}", said, ("model", "joint", "window"))
-    for name, said in FIGURES.items()
+    name: MetricKind("gauge", f"lipserve_quality_{name}", text, ("model", "joint", "window"))
+    for name, text in FIGURES.items()
 }
 REVISION = MetricKind("gauge", "lipserve_revision", "Revision that answers contain", ("model", "version"))
 NOVEL = MetricKind("gauge", "lipserve_novel_share", "Share of the latest samples that lie beyond the basis", ("model",))
@@ -46,8 +44,8 @@ KINDS = (*QUALITY.values(), REVISION, NOVEL, LAG, ROWS, LOADED)
 class Learning(Collector):
     """The figures of all models of one service that learn. Not for the event loop."""
 
-    def __init__(self, updates: Updates) -> None:
-        self._updates = updates
+    def __init__(self, learners: Learners) -> None:
+        self._learners = learners
 
     def describe(self) -> list[Metric]:
         """Nothing: what there is depends on the models."""
@@ -61,37 +59,37 @@ class Learning(Collector):
             _add_quality(gauges, model, monitor)
             for outcome in CODES:
                 rows.add_metric([model, outcome], monitor.counts[outcome])
-            if (served := self._updates.loaded.hot(model, None)) is None:
+            if (served := self._learners.loaded.hot(model, None)) is None:
                 continue
             revision.add_metric([model, str(served.version)], served.revision)
             lag.add_metric([model], self._lag(served))
-            share = novel_share(self._updates.status(model, served.version))
+            share = status.novel_share(self._learners.status(model, served.version))
             if share is not None:
                 novel.add_metric([model], share)
         yield from (*gauges.values(), revision, novel, lag, rows)
-        yield LOADED.of([((), len(self._updates.loaded.versions()))])
+        yield LOADED.of([((), len(self._learners.loaded.versions()))])
 
     def _monitors(self) -> dict[str, Monitor]:
         """Monitors by model: those there are, and of models in memory that have got observations before the start.
 
         No model is loaded for it, which would drop another one.
         """
-        updates, loaded = self._updates, self._updates.loaded
-        with self._updates.database.session() as session:
+        learners, loaded = self._learners, self._learners.loaded
+        with self._learners.database.session() as session:
             learning = list(session.scalars(select(StreamRow.model).distinct()))
-        fresh = {model: updates.monitor(model) for model in learning if loaded.hot(model, None) is not None}
-        return dict(sorted((updates.monitors() | fresh).items()))
+        fresh = {model: learners.monitor(model) for model in learning if loaded.hot(model, None) is not None}
+        return dict(sorted((learners.monitors() | fresh).items()))
 
     def _lag(self, served: Served) -> int:
-        with self._updates.database.session() as session:
-            return max(revisions.current(session, served.name, served.version) - served.revision, 0)
+        with self._learners.database.session() as session:
+            return max(undoing.current(session, served.name, served.version) - served.revision, 0)
 
 
 def _add_quality(gauges: dict[str, GaugeMetricFamily], model: str, monitor: Monitor) -> None:
     now = time.time()
     for window in monitor.windows:
-        seen = summary.window(window, now)
+        figures = status.window(window, now)
         for name, gauge in gauges.items():
-            for joint, value in zip(monitor.joint_names, getattr(seen, name), strict=True):
+            for joint, value in zip(monitor.joint_names, getattr(figures, name), strict=True):
                 if value is not None:
-                    gauge.add_metric([model, joint, f"{seen.seconds:g}"], value)
+                    gauge.add_metric([model, joint, f"{figures.seconds:g}"], value)

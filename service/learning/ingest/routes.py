@@ -1,0 +1,135 @@
+"""The route of observations: decoded with msgspec and taken in a thread, away from the event loop."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from fastapi import APIRouter
+from msgspec import Meta, Struct
+from numpy.typing import NDArray
+from starlette.types import Scope
+
+from service.foundation.errors import (
+    BusyError,
+    ConflictError,
+    InvalidRequestError,
+    NotFoundError,
+    TooLargeError,
+    responses,
+)
+from service.learning.learners import Learners, LearnersDep
+from service.learning.schema import (
+    MOST_SEQUENCE,
+    ExpiredError,
+    LearningDisabledError,
+    ObservationRequest,
+    ObservationResponse,
+)
+from service.web.hot import Reply, hot_route
+from service.web.route import each_once, is_json
+
+Array = NDArray[np.float64]
+Number = float | None
+Numbers = list[Number | list[Number]]
+"""One row or many; that it is one of the two, and not some of each, is left to be checked."""
+
+
+class Batch(Struct, forbid_unknown_fields=True):
+    """An ObservationRequest as JSON has it: types are right, shapes are left to be checked."""
+
+    stream_id: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z")]
+    sequence: Annotated[int, Meta(ge=0, le=MOST_SEQUENCE)]
+    q: Numbers
+    dq: Numbers
+    tau: Numbers
+    ddq: Numbers | None = None
+    t: float | list[Number] | None = None
+    joint_names: Annotated[list[str], Meta(max_length=1000)] | None = None
+
+    def request(self) -> ObservationRequest | None:
+        """Return the request with arrays, null as NaN, or None where a list is empty or ragged."""
+        try:
+            return ObservationRequest.model_construct(
+                stream_id=self.stream_id,
+                sequence=self.sequence,
+                t=None if self.t is None else np.atleast_1d(np.array(self.t, np.float64)),
+                q=_array(self.q),
+                dq=_array(self.dq),
+                ddq=None if self.ddq is None else _array(self.ddq),
+                tau=_array(self.tau),
+                joint_names=self.joint_names,
+            )
+        except ValueError:
+            return None
+
+
+_decoder = msgspec.json.Decoder(Batch)
+_FIELDS = tuple(name.encode() for name in Batch.__struct_fields__)
+
+
+def decode(body: bytes) -> ObservationRequest | None:
+    """Decode a batch, or return None where anything in it is not as it should be."""
+    try:
+        batch = _decoder.decode(body)
+    except msgspec.MsgspecError:
+        return None
+    return batch.request() if each_once(body, *_FIELDS) else None
+
+
+def _array(values: Numbers) -> Array:
+    if not values:
+        raise ValueError("no rows")
+    return np.array(values, np.float64)
+
+
+hot = APIRouter(
+    prefix="/v1/models",
+    tags=["learning"],
+    responses=responses(
+        InvalidRequestError,
+        NotFoundError,
+        TooLargeError,
+        ConflictError,
+        ExpiredError,
+        LearningDisabledError,
+        BusyError,
+    ),
+)
+"""The application tries it first: what pydantic takes long to read is decoded in a thread."""
+
+
+async def _answer(scope: Scope, body: bytes) -> Reply | None:
+    """Take a batch that can be read as it stands."""
+    if not is_json(scope):
+        return None
+    learners: Learners = scope["app"].state.learners
+    reply = await learners.threads.run(_decoded, learners, scope["path_params"]["model"], body)
+    return None if reply is None else Reply(reply)
+
+
+def _decoded(learners: Learners, model: str, body: bytes) -> bytes | None:
+    request = decode(body)
+    return None if request is None else learners.observe(model, request).model_dump_json().encode()
+
+
+async def observe(learners: LearnersDep, model: str, request: ObservationRequest) -> ObservationResponse:
+    """Take a batch of measured rows to learn from, durable once it is answered, and learnt within a moment.
+
+    Each row is predicted before it is learnt. Rows that cannot be explained are kept and counted, but not learnt. Send
+    a batch again until it is answered: it is applied once. Batches may come in any order. Times must rise within a
+    stream; a robot whose clock was set goes on under another `stream_id`. Of joints in another order, say
+    `joint_names`. Batches of about a tenth of a second to a second serve best.
+    """
+    return await learners.threads.run(learners.observe, model, request)
+
+
+hot.add_api_route(
+    "/{model}/observations",
+    observe,
+    methods=["POST"],
+    summary="Teach a model with measured rows",
+    response_model=ObservationResponse,
+    route_class_override=hot_route(_answer),
+)

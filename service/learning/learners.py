@@ -1,0 +1,219 @@
+"""What a running service needs to learn while it serves: ingest threads, monitors of models, the learner process."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
+from contextvars import copy_context
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, TypeVar
+
+from fastapi import Depends, Request
+
+from service.compute.process import Place
+from service.foundation.errors import BusyError
+from service.foundation.states import PartState
+from service.learning.ingest.batches import observe_batch
+from service.learning.ingest.frames import Frames, FramesResult, observe_frames
+from service.learning.ingest.intake import Intake
+from service.learning.ingest.monitor import Monitor
+from service.learning.learner import publication
+from service.learning.learner.process import LearnerProcess, learner_place
+from service.learning.learner.publication import Contested, Failed, Message, Published
+from service.learning.live.feed import Feed
+from service.learning.schema import ObservationRequest, ObservationResponse
+from service.models.loaded import LoadedModels, Served
+from service.web.observability.readiness import Lasting
+
+logger = logging.getLogger(__name__)
+
+Result = TypeVar("Result")
+MOST_THREADS = 2
+"""Batches taken at the same time; those of one model take turns."""
+MOST_WAITING = 100
+"""Batches that wait for their turn; more are refused, as their rows fill the memory."""
+RESTART_S = 10.0
+"""Time in s within which a learner process that died should have been started again."""
+
+
+class IngestThreads:
+    """Threads that take observations: few, and on Linux of lower priority than all others.
+
+    A batch of 100 rows takes 10 to 40 ms: at the priority of the thread that answers, the 99th percentile of latency
+    doubled beside a 1 kHz stream.
+    """
+
+    def __init__(self, place: Place) -> None:
+        self._threads = ThreadPoolExecutor(MOST_THREADS, "ingest", initializer=_take_place, initargs=(place,))
+        self._waiting = 0
+
+    async def run(self, work: Callable[..., Result], *args: Any) -> Result:
+        """Do work in the next free thread; raise BusyError where too much waits already. For the event loop."""
+        waiting = self._waiting - MOST_THREADS
+        if waiting >= MOST_WAITING:
+            raise BusyError(f"{waiting} batches are waiting to be logged, the most that may: try again later")
+        self._waiting += 1
+        try:
+            # what has begun is done to its end, whether anyone still waits for it or not
+            run = copy_context().run  # what is logged names the request
+            return await asyncio.shield(asyncio.get_running_loop().run_in_executor(self._threads, run, work, *args))
+        finally:
+            self._waiting -= 1
+
+    def close(self) -> None:
+        """Finish what has begun, and take no more."""
+        self._threads.shutdown(cancel_futures=True)
+
+
+def _take_place(place: Place) -> None:
+    if sys.platform != "linux":  # elsewhere it is the process that would give way
+        return
+    try:
+        os.setpriority(os.PRIO_PROCESS, 0, os.getpriority(os.PRIO_PROCESS, 0) + place.niceness)
+        if place.cpus is not None:
+            os.sched_setaffinity(0, place.cpus)
+    except OSError as error:  # a sandbox forbids it: that costs latency, not learning
+        logger.warning("the threads that take observations keep their place among the others: %s", error)
+
+
+@dataclass(frozen=True)
+class Status:
+    """The learner process's latest messages about a version since the service started; None before the first one."""
+
+    published: Published | None = None
+    failed: Failed | None = None
+
+
+class Learners:
+    """Learning of all models; safe from several threads. Close it before the database.
+
+    process: the learner process. threads: those that take observations. live: the feed of those who follow models.
+    when_published, when_contested: called with each such message of the learner process, in its reader's thread, after
+    a revision answers; to be filled before the first batch.
+    """
+
+    def __init__(self, loaded: LoadedModels) -> None:
+        storage = loaded.storage
+        settings, database = storage.settings, storage.database
+        self.settings, self.database, self.loaded = settings, database, loaded
+        self.when_published: list[Callable[[Published], None]] = []
+        self.when_contested: list[Callable[[Contested], None]] = []
+        self.threads = IngestThreads(learner_place(settings))
+        self._lock = threading.Lock()
+        self._monitors: dict[str, Monitor] = {}
+        self._status: dict[tuple[str, int], Status] = {}
+        self.process = LearnerProcess(settings, self._receive)
+        loaded.learn_from(self.process.wake)
+        loaded.when_deleted.append(self.forget)
+        self.live = Feed(settings)
+        self._intake = Intake(loaded, self._monitor, self.process.wake, self.live.note)
+
+    def close(self) -> None:
+        """Finish the batches that have begun, and end the learner process, which stores its state."""
+        self.threads.close()
+        self.process.close()
+
+    def observe(self, model: str, request: ObservationRequest) -> ObservationResponse:
+        """Take a batch of observations; see `batches.observe_batch`. Not for the event loop."""
+        return observe_batch(self._intake, model, request)
+
+    def observe_frames(self, frames: Frames) -> FramesResult:
+        """Take frames of a stream; see `frames.observe_frames`. Not for the event loop."""
+        return observe_frames(self._intake, frames)
+
+    def monitor(self, model: str) -> Monitor:
+        """The monitor of a model, up to the batches that other services have logged by now. Not for the event loop.
+
+        Raise NotFoundError or UnreadableVersionError.
+        """
+        monitor = self._monitor(self.loaded.get(model, None))
+        self._intake.follow(monitor, model)
+        return monitor
+
+    def turn(self, model: str) -> AbstractContextManager[None]:
+        """See `Intake.turn`; raise as `monitor` does. Not for the event loop."""
+        return self._intake.turn(self._monitor(self.loaded.get(model, None)), model)
+
+    def follow(self) -> None:
+        """Bring all monitors up to the batches that other services have logged. Not for the event loop."""
+        for model, monitor in self.monitors().items():
+            self._intake.follow(monitor, model)
+
+    def monitors(self) -> dict[str, Monitor]:
+        """Those of the models that have learnt or have been looked at since the service started."""
+        with self._lock:
+            return dict(self._monitors)
+
+    def forget(self, model: str) -> None:
+        """Keep nothing of a model that has been deleted."""
+        with self._lock:
+            self._monitors.pop(model, None)
+            self._status = {key: status for key, status in self._status.items() if key[0] != model}
+
+    def look(self, lasting: Lasting) -> tuple[PartState, str]:
+        """Whether the learner process runs where something learns, for readiness."""
+        if not self.process.needed:
+            return "ok", "not needed yet"
+        gone = lasting(self.process.pid is None)
+        if gone is None:
+            return "ok", "runs"
+        if gone <= RESTART_S:
+            return "warning", "is being started"
+        return "failed", f"has not run for {gone:.0f} s: observations are stored, but not learnt"
+
+    def status(self, model: str, version: int) -> Status:
+        """The learner process's latest messages about a version."""
+        with self._lock:
+            return self._status.get((model, version), Status())
+
+    def _monitor(self, served: Served) -> Monitor:
+        """The monitor of a model, made when it is first needed, or when another version has other joints."""
+        with self._lock:
+            known = self._monitors.get(served.name)
+            if known is not None and known.joint_names == served.model.joint_names:
+                return known
+            with self.database.session() as session:
+                monitor = Monitor.rebuilt(session, served.name, served.model.joint_names, self.settings, time.time())
+            if known is not None:
+                monitor.lock = known.lock  # batches of a model are logged one at a time, whatever its joints
+            self._monitors[served.name] = monitor
+            return monitor
+
+    def _note(self, message: Published | Failed, **latest: Any) -> None:
+        key = message.model, message.version
+        with self._lock:
+            self._status[key] = replace(self._status.get(key, Status()), **latest)
+
+    def _receive(self, message: Message) -> None:
+        """Act on a message of the learner process; called in its reader's thread."""
+        if isinstance(message, Published):
+            self._publish(message)
+            for call in self.when_published:
+                call(message)
+        elif isinstance(message, Contested):
+            for act in self.when_contested:
+                act(message)
+        elif isinstance(message, Failed):
+            logger.error("version %s of model %s does not learn: %s", message.version, message.model, message.error)
+            self._note(message, failed=message)
+
+    def _publish(self, message: Published) -> None:
+        """Answer with what a version has learnt: an immutable revision takes the place of the one before."""
+        revision = publication.read(message.path)
+        self.loaded.revise(message.model, message.version, message.revision, revision)
+        self._note(message, published=message, failed=None)
+
+
+async def _learners(request: Request) -> Learners:
+    learners: Learners = request.app.state.learners
+    return learners
+
+
+LearnersDep = Annotated[Learners, Depends(_learners)]
