@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lipcore.preparation.errors import PreparationError
-from lipcore.preparation.recipe import Form, Recipe
+from lipcore.preparation.recipe import Form, PreparationError, Recipe
 from lipcore.preparation.resampling import BLOCK, SAME_RATE
 from lipcore.samples import Array
 from lipcore.signals import ORDER, differentiate

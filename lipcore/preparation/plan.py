@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from lipcore.preparation import steps as said
 from lipcore.preparation.causal import CausalFilter
-from lipcore.preparation.errors import PreparationError
 from lipcore.preparation.filtering import QUANTITIES, Work, ZeroPhase, derived, filters, settle, without_delay
 from lipcore.preparation.parts import Kept, OnClock, Part, in_blocks, inner, taken_at
-from lipcore.preparation.recipe import Recipe
+from lipcore.preparation.recipe import PreparationError, Recipe
 from lipcore.preparation.resampling import Clock, clock_of, grid, thinned
 from lipcore.samples import Array
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.preparation.errors import PreparationError
+from lipcore.preparation.recipe import PreparationError
 from lipcore.samples import Array
 
 MAX_RATE = 1e6

@@ -13,8 +13,7 @@ from service.cli import completion
 from service.cli.connecting import connected
 from service.cli.consoles import out, print_json, say
 from service.cli.options import DatasetId, Json, Limit, Url, Yes, confirm, names, pairs
-from service.datasets.asking import Reading
-from service.datasets.media import SUFFIXES
+from service.datasets.asking import SUFFIXES, Reading
 from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:

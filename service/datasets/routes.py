@@ -9,10 +9,9 @@ from anyio import to_thread
 from fastapi import APIRouter, Depends, Query, Request, Response, status
 
 from service.datasets import store
-from service.datasets.media import MEDIA_TYPES, SUFFIXES, UPLOAD_BODY
-from service.datasets.options import UploadOptions
+from service.datasets.asking import MEDIA_TYPES, SUFFIXES
+from service.datasets.options import UPLOAD_BODY, UploadOptions, upload_options
 from service.datasets.preview import MOST_POINTS, Preview
-from service.datasets.query import upload_options
 from service.datasets.schema import Dataset, DatasetPage
 from service.datasets.staging import QUANTITIES
 from service.foundation.errors import (

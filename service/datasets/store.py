@@ -16,11 +16,10 @@ from lipcore.samples import Samples
 from lipcore.vocabulary import JointType
 from service.datasets.mapping.reading import read
 from service.datasets.options import UploadOptions
-from service.datasets.preparing import prepare
 from service.datasets.preview import Preview, preview_file
 from service.datasets.report.making import make_report
 from service.datasets.schema import Dataset, DatasetPage
-from service.datasets.staging import Staged, column, staging
+from service.datasets.staging import Staged, column, prepare, staging
 from service.foundation.errors import ConflictError, not_found
 from service.foundation.states import ACTIVE
 from service.robots.store import profile_of

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from lipcore.samples import Array
-from service.datasets.formats.blocks import block_rows, checked_names, left_out, said
-from service.datasets.formats.table import Table
+from service.datasets.formats.table import Table, block_rows, checked_names, first_line, left_out
 from service.datasets.formats.zips import ERRORS, measure, open_zip
 from service.datasets.options import ReadOptions
 from service.foundation.errors import invalid_data
@@ -94,7 +93,7 @@ def _header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Stored:
             shape, fortran, dtype = read(file)
             offset = file.tell()
     except Exception as error:  # NumPy parses the header as Python text and raises whatever its parser raises
-        raise invalid_data(name, said(error), "a NumPy array") from None
+        raise invalid_data(name, first_line(error), "a NumPy array") from None
     kinds = "U" if name == "joint_names" else "fiu"
     if name in ARRAYS and (dtype.kind not in kinds or not 0 < dtype.itemsize <= 1024 or len(shape) != ARRAYS[name]):
         raise invalid_data(
@@ -256,4 +255,4 @@ def _named(name: str) -> Iterator[None]:
     try:
         yield
     except ERRORS as error:
-        raise invalid_data(name, said(error), EXPECTED) from None
+        raise invalid_data(name, first_line(error), EXPECTED) from None

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.samples import Array
-from service.datasets.mapping.units import TURN
+from service.datasets.mapping.vocabulary import TURN
 from service.foundation.errors import InvalidDataError, invalid_data
 
 CONSTANT = 1e-6

@@ -6,10 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from lipcore.profiles import Profile
 from lipcore.vocabulary import TorqueConvention
 from service.datasets.mapping.recognition import AIM, CANONICAL, Family
-from service.datasets.mapping.robot import Robot
-from service.datasets.mapping.units import factor, is_current
+from service.datasets.mapping.vocabulary import factor, is_current
 from service.datasets.options import EFFORT_CONVENTIONS, Effort, UploadOptions
 from service.foundation.errors import invalid_data, invalid_request
 
@@ -58,7 +58,7 @@ def torque(
     family: Family,
     units: Sequence[str | None],
     options: UploadOptions,
-    robot: Robot | None,
+    robot: Profile | None,
     constants: Sequence[float] | None,
 ) -> Torque:
     """Say what the chosen columns are; raise InvalidDataError where that contradicts itself.
@@ -85,7 +85,7 @@ def torque(
 
 
 def _effort(
-    family: Family, units: Sequence[str | None], options: UploadOptions, robot: Robot | None
+    family: Family, units: Sequence[str | None], options: UploadOptions, robot: Profile | None
 ) -> tuple[Effort, str]:
     said = options.read.effort
     if said is not None:

@@ -6,8 +6,8 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+from lipcore.profiles import Profile
 from service.datasets.mapping.recognition import JOINT, Family, Key
-from service.datasets.mapping.robot import Robot
 from service.datasets.options import UploadOptions
 from service.foundation.errors import InvalidDataError, invalid_data, invalid_request
 
@@ -63,7 +63,7 @@ def arrange(
     positions: Family,
     joint_names: tuple[str, ...] | None,
     options: UploadOptions,
-    robot: Robot | None,
+    robot: Profile | None,
     max_joints: int,
 ) -> Order:
     """Name and order the joints, leave out what the user or the robot leaves out; raise InvalidDataError."""
@@ -153,7 +153,7 @@ def _find(joints: tuple[Joint, ...], name: str, option: str) -> Joint:
 
 
 def _as_robot(
-    joints: tuple[Joint, ...], wanted: tuple[Joint, ...], options: UploadOptions, robot: Robot
+    joints: tuple[Joint, ...], wanted: tuple[Joint, ...], options: UploadOptions, robot: Profile
 ) -> tuple[tuple[Joint, ...], tuple[float, ...] | None, list[str]]:
     """Those of the wanted joints that the robot has, from base to tip and with its names."""
     notes, names = [], robot.joint_names
@@ -189,7 +189,7 @@ def _as_robot(
     return tuple(kept), values, notes
 
 
-def _mismatch(robot: Robot, wanted: Sequence[Joint]) -> InvalidDataError:
+def _mismatch(robot: Profile, wanted: Sequence[Joint]) -> InvalidDataError:
     return invalid_data(
         "joints",
         _shown([joint.name for joint in wanted]),

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from lipcore.profiles import Profile
 from service.datasets.mapping.choice import choose, source, source_or_none
 from service.datasets.mapping.effort import Torque, torque
 from service.datasets.mapping.joints import Joint, arrange
 from service.datasets.mapping.recognition import CANONICAL, Family, clocks, is_episode
-from service.datasets.mapping.robot import Robot
-from service.datasets.mapping.units import KNOWN, factor
+from service.datasets.mapping.vocabulary import KNOWN, factor
 from service.datasets.options import UploadOptions
 from service.foundation.errors import invalid_data, invalid_request
 
@@ -51,7 +51,7 @@ def resolve(
     units: Mapping[str, str],
     joint_names: tuple[str, ...] | None,
     options: UploadOptions,
-    robot: Robot | None,
+    robot: Profile | None,
     max_joints: int,
 ) -> ColumnMap:
     """Find the columns; raise InvalidDataError that says what is missing or doubled, or how to tell what is unclear.

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.profiles import Profile
 from lipcore.samples import Array
 from lipcore.vocabulary import TorqueConvention
 from service.datasets.formats.table import Table
@@ -17,7 +18,6 @@ from service.datasets.mapping import checks
 from service.datasets.mapping.checks import Clockwork, Rows, Seen
 from service.datasets.mapping.choice import MOTION
 from service.datasets.mapping.mapping import ColumnMap, Source, resolve
-from service.datasets.mapping.robot import Robot
 from service.datasets.options import Effort, UploadOptions
 from service.datasets.staging import EPISODE, TIME, Staged, column
 from service.foundation.errors import invalid_data
@@ -42,7 +42,7 @@ class Read:
 
 
 def read(
-    table: Table, folder: Path, options: UploadOptions, robot: Robot | None, settings: Settings, disk: Disk
+    table: Table, folder: Path, options: UploadOptions, robot: Profile | None, settings: Settings, disk: Disk
 ) -> Read:
     """Read a table's columns to files in a folder; raise InvalidDataError, StorageFullError.
 

@@ -8,8 +8,19 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from service.datasets.mapping.units import factor, in_header
-from service.datasets.mapping.words import COMMANDED, DESIRED, FOREIGN, MEASURED, NEUTRAL, Mention, Word, mention, words
+from service.datasets.mapping.vocabulary import (
+    COMMANDED,
+    DESIRED,
+    FOREIGN,
+    MEASURED,
+    NEUTRAL,
+    Mention,
+    Word,
+    factor,
+    in_header,
+    mention,
+    words,
+)
 
 JOINT = "{joint}"
 """In a pattern: where the joint's name or number is."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from service.datasets.report.excitation import SELDOM, SLOW
-from service.datasets.report.schema import (
+from service.datasets.schema import (
     Excitation,
     JointExcitation,
     JointLimits,

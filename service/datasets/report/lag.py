@@ -15,8 +15,8 @@ import numpy as np
 
 from lipcore.samples import Array
 from service.datasets.report.fit import Fit
-from service.datasets.report.parts import Rows
-from service.datasets.report.schema import Lag
+from service.datasets.report.timing import Rows
+from service.datasets.schema import Lag
 
 LARGEST_S = 0.25
 """Largest lag looked for, s."""

@@ -8,18 +8,23 @@ from typing import Any
 import numpy as np
 
 from lipcore.preparation.recipe import Recipe
+from lipcore.profiles import Profile
 from lipcore.samples import Array
-from service.datasets.preparing import Prepared
 from service.datasets.report.advice import advice, in_words, warnings
 from service.datasets.report.excitation import SELDOM, joint_excitation, weights
 from service.datasets.report.fit import make_fit
 from service.datasets.report.lag import Lags, no_lags, shifts
-from service.datasets.report.limits import against_limits, saturation
-from service.datasets.report.noise import noise_or_share, white_noise
-from service.datasets.report.parts import bounds, number_parts, spread, thin
 from service.datasets.report.rigid_body import Found, judge_rigid_bodies
-from service.datasets.report.robot import Limits, Profile, limits_of
-from service.datasets.report.schema import (
+from service.datasets.report.signals import (
+    Limits,
+    against_limits,
+    limits_of,
+    noise_or_share,
+    saturation,
+    white_noise,
+)
+from service.datasets.report.timing import Clock, bounds, look_at_clock, number_parts, spread, thin
+from service.datasets.schema import (
     DatasetReport,
     Excitation,
     JointExcitation,
@@ -28,8 +33,7 @@ from service.datasets.report.schema import (
     JointSaturation,
     Lag,
 )
-from service.datasets.report.timing import Clock, look_at_clock
-from service.datasets.staging import EPISODE, QUANTITIES, Staged, column
+from service.datasets.staging import EPISODE, QUANTITIES, Prepared, Staged, column
 from service.foundation.settings import Settings
 
 WARNING = "warning: "
@@ -51,9 +55,9 @@ def make_report(
     whether torques contain it.
     """
     recipe = recipe or Recipe()
-    names, facts = raw.joint_names, prepared.facts
+    names = raw.joint_names
     limits = limits_of(profile, names)
-    clock = look_at_clock(raw, recipe.gap_steps, facts.repeated)
+    clock = look_at_clock(raw, recipe.gap_steps, prepared.repeated)
     recorded = _look_at_raw(raw, clock, limits)
     found = _look_at_samples(prepared, limits, settings.max_report_rows)
     rigid = _rigid_bodies(profile, limits, prepared, found, gravity)
@@ -72,12 +76,12 @@ def make_report(
     if isinstance(rigid, str):
         reading.append(rigid)
     report = DatasetReport(
-        rows_uploaded=facts.rows,
-        rows=facts.samples,
-        episodes=facts.episodes,
-        rate_hz=facts.rate_hz,
-        gaps=facts.gaps,
-        derived=list(facts.derived),
+        rows_uploaded=raw.rows,
+        rows=prepared.staged.rows,
+        episodes=prepared.episodes,
+        rate_hz=prepared.rate_hz,
+        gaps=prepared.gaps,
+        derived=list(prepared.derived),
         preparation=[str(step["text"]) for step in prepared.steps],
         ranges={
             quantity: {"min": [low for low, _ in pairs], "max": [high for _, high in pairs]}
@@ -155,14 +159,14 @@ def _share(level: float | None, values: Array) -> float | None:
 
 
 def _look_at_samples(prepared: Prepared, limits: Limits | None, most: int) -> _Samples:
-    staged, facts = prepared.staged, prepared.facts
+    staged, rate = prepared.staged, prepared.rate_hz
     part = number_parts(staged.rows, [np.diff(staged.read(EPISODE)) != 0])
     starts, ends = bounds(part)
-    steps = None if facts.rate_hz is None else shifts(facts.rate_hz, int((ends - starts).max()))
+    steps = None if rate is None else shifts(rate, int((ends - starts).max()))
     rows = thin(part, most, 0 if steps is None else int(steps[-1]))
     motion = (staged.table("q", rows), staged.table("dq", rows), staged.table("ddq", rows))
     fit = make_fit(rows, *motion, tau=staged.table("tau", rows), independent=_independent(prepared))
-    lags = None if steps is None or facts.rate_hz is None else Lags(fit, steps, facts.rate_hz)
+    lags = None if steps is None or rate is None else Lags(fit, steps, rate)
     ranges: dict[str, list[tuple[float, float]]] = {quantity: [] for quantity in QUANTITIES}
     levels, left, speeds, torques = np.empty((4, staged.n_joints))
     found, excitation = [], []
@@ -179,7 +183,7 @@ def _look_at_samples(prepared: Prepared, limits: Limits | None, most: int) -> _S
             found.append(lag)
         excitation.append(joint_excitation(joint, name, columns, part, fit, float(left[joint]), limits))
     if lags is None:
-        why = "no times were given" if facts.rate_hz is None else "the contiguous parts are too short"
+        why = "no times were given" if rate is None else "the contiguous parts are too short"
         found = no_lags(staged.joint_names, why)
     else:
         found.insert(0, lags.of_all())
@@ -188,10 +192,10 @@ def _look_at_samples(prepared: Prepared, limits: Limits | None, most: int) -> _S
 
 def _independent(prepared: Prepared) -> float:
     """Samples that count as independent: after a low-pass two a period of its cut-off, else all."""
-    facts = prepared.facts
-    if facts.cutoff_hz is None or facts.rate_hz is None:
-        return float(facts.samples)
-    return facts.samples * min(1.0, 2 * facts.cutoff_hz / facts.rate_hz)
+    samples = float(prepared.staged.rows)
+    if prepared.cutoff_hz is None or prepared.rate_hz is None:
+        return samples
+    return samples * min(1.0, 2 * prepared.cutoff_hz / prepared.rate_hz)
 
 
 def _rigid_bodies(

@@ -21,8 +21,8 @@ from lipcore.motion import Motion
 from lipcore.robots import SimulationUnavailableError
 from lipcore.samples import Array
 from lipcore.urdf import PARAMETERS, RigidBody
-from service.datasets.report.robot import Limits
-from service.datasets.report.schema import WholeExcitation
+from service.datasets.report.signals import Limits
+from service.datasets.schema import WholeExcitation
 
 MOST_EQUATIONS = 14_000
 """Rows times joints of the recording that are looked at: 2000 rows of 7 joints."""

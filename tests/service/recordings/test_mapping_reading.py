@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.datasets.mapping.reading import read
-from service.datasets.mapping.units import factor
+from service.datasets.mapping.vocabulary import factor
 from service.datasets.staging import staging
 from service.foundation.errors import InvalidDataError, StorageFullError
 from service.foundation.settings import Settings

@@ -10,7 +10,6 @@ import pytest
 from lipcore.profiles import profile
 from service.datasets.formats.opening import open_table
 from service.datasets.mapping.reading import read
-from service.datasets.mapping.robot import Robot
 from service.foundation.errors import InvalidDataError
 from service.foundation.settings import Settings
 from service.storage.disk import Disk
@@ -29,7 +28,7 @@ def fields(joints, *more):
 
 @pytest.mark.parametrize("prefix", ["", "ur5e_", "left_"])
 def test_joints_of_a_universal_robot_are_put_in_order(prefix):
-    robot: Robot = profile("ur5e")
+    robot = profile("ur5e")
     names = fields([f"{prefix}{joint}_joint" for joint in UR_ALPHABETICAL], "gripper/position")
     found = mapped(names, options(effort="measured"), robot)
     assert found.joints == robot.joint_names

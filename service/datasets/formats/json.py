@@ -10,9 +10,8 @@ from typing import Any
 
 import msgspec
 
-from service.datasets.formats.blocks import left_out
 from service.datasets.formats.json_rows import Rows, decode
-from service.datasets.formats.table import Table
+from service.datasets.formats.table import Table, left_out
 from service.datasets.options import ReadOptions
 from service.foundation.errors import TooLargeError, invalid_data
 from service.foundation.settings import Settings
@@ -31,8 +30,10 @@ def open_json_lines(path: Path, options: ReadOptions, settings: Settings) -> Ite
 def open_json(path: Path, options: ReadOptions, settings: Settings) -> Iterator[Table]:
     """Open one JSON document as a table; raise InvalidDataError, or TooLargeError as it has to be in memory at once."""
     if (size := path.stat().st_size) > settings.max_json_bytes:
-        said = f"the JSON document has {size} bytes, expected at most {settings.max_json_bytes}"
-        raise TooLargeError(f"{said}: write one object a line (NDJSON), which may be longer")
+        raise TooLargeError(
+            f"the JSON document has {size} bytes, expected at most {settings.max_json_bytes}: write one object a line "
+            "(NDJSON), which may be longer"
+        )
     rows, joint_names, facts = _document(path.read_bytes())
     table = Rows(rows, settings)
     yield Table(table.names, table.blocks(), joint_names=joint_names, facts=facts + table.facts)
