@@ -77,16 +77,16 @@ def settle(rate: float, given: tuple[str, ...], recipe: Recipe) -> Work:
     and otherwise recorded accelerations only where all is to be filtered or samples are late.
     """
     missing = derived(given)
-    wanted = recipe.rate_hz
-    if wanted is not None and wanted > rate * (1 + SAME_RATE):
-        raise PreparationError("rate", f"{wanted:g} Hz", f"at most the recording's, {rate:g} Hz")
-    thins = wanted is not None and wanted < rate * (1 - SAME_RATE)
+    asked_rate = recipe.rate_hz
+    if asked_rate is not None and asked_rate > rate * (1 + SAME_RATE):
+        raise PreparationError("rate", f"{asked_rate:g} Hz", f"at most the recording's, {rate:g} Hz")
+    thins = asked_rate is not None and asked_rate < rate * (1 - SAME_RATE)
     filtered = filters(given, recipe)
     cutoff = recipe.cutoff_hz if filtered else None
     if cutoff is not None and cutoff >= rate / 2 * (1 - 1e-6):  # a rate read off times is never exact
         raise PreparationError("cutoff", f"{cutoff:g} Hz", f"less than half the rate of {rate:g} Hz")
-    if thins and wanted is not None:
-        cutoff = min(cutoff or np.inf, ALIAS * wanted)
+    if thins and asked_rate is not None:
+        cutoff = min(cutoff or np.inf, ALIAS * asked_rate)
     everything = thins or recipe.filtering == "always" or recipe.form == "causal"
     low_passed = tuple(name for name in FILTERED if name in given and (name != "ddq" or everything))
     return Work(
@@ -95,7 +95,7 @@ def settle(rate: float, given: tuple[str, ...], recipe: Recipe) -> Work:
         missing,
         cutoff,
         () if cutoff is None else low_passed,
-        rate / wanted if thins and wanted is not None else 1.0,
+        rate / asked_rate if thins and asked_rate is not None else 1.0,
         _edges(rate, cutoff, recipe),
         recipe.form,
     )

@@ -60,15 +60,15 @@ class OnClock(Kept):
 def in_blocks(causal: CausalFilter, signals: dict[str, Array]) -> Iterator[tuple[str, Array]]:
     """All quantities of one part of one joint, as a live stream has them."""
     rows = len(signals["q"])
-    found = {name: np.empty(rows - 2 * causal.lag) for name in QUANTITIES}
+    columns = {name: np.empty(rows - 2 * causal.lag) for name in QUANTITIES}
     done = 0
     for begin in range(0, rows, BLOCK):
         block = causal.batch({name: values[begin : begin + BLOCK, None] for name, values in signals.items()})
         for name, values in block.items():
-            found[name][done : done + len(values)] = values[:, 0]
+            columns[name][done : done + len(values)] = values[:, 0]
         done += len(block["q"])
     for name in QUANTITIES:
-        yield name, found.pop(name)
+        yield name, columns.pop(name)
 
 
 def inner(part: Part, values: Array) -> Array:

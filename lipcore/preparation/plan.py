@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.preparation import steps as said
+from lipcore.preparation import steps as record
 from lipcore.preparation.causal import CausalFilter
 from lipcore.preparation.filtering import QUANTITIES, Work, ZeroPhase, derived, filters, settle, without_delay
 from lipcore.preparation.parts import Kept, OnClock, Part, in_blocks, inner, taken_at
@@ -39,7 +39,7 @@ class Plan:
 
     t: Array
     episode: NDArray[np.int64]
-    steps: list[said.Step]
+    steps: list[record.Step]
     derived: tuple[str, ...]
     recorded_rate: float | None
     rate: float | None
@@ -80,12 +80,12 @@ class Plan:
             return
         given = QUANTITIES if self._work is None else self._work.given
         read = {name: signals[name] for name in given}
-        found = {name: np.empty(len(self.t)) for name in QUANTITIES}
+        columns = {name: np.empty(len(self.t)) for name in QUANTITIES}
         for part in self._parts:
             for name, values in self._of(part, read):
-                found[name][part.out] = inner(part, values)
+                columns[name][part.out] = inner(part, values)
         for name in QUANTITIES:
-            yield name, found.pop(name)
+            yield name, columns.pop(name)
 
     def _of(self, part: Part, signals: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
         """Samples of one part, before its ends are cut off."""
@@ -125,7 +125,7 @@ def plan(
     """
     given = tuple(name for name in QUANTITIES if name in given)
     to_derive = derived(given)
-    steps: list[said.Step] = []
+    steps: list[record.Step] = []
     rows = _rows(t, episode, missing, steps)
     if t is None:
         _check_times_are_not_needed(given, to_derive, recipe)
@@ -141,21 +141,21 @@ def plan(
         if resamples:
             work = settle(clock.rate, given, recipe)
     if (changes_of_episode := int(np.count_nonzero(np.diff(rows.episode)))) > 0:
-        steps.append(said.split_by_episodes(changes_of_episode + 1))
+        steps.append(record.split_by_episodes(changes_of_episode + 1))
     if clock is not None and clock.gaps:
-        steps.append(said.split_at_gaps(clock.gaps, clock.longest))
+        steps.append(record.split_at_gaps(clock.gaps, clock.longest))
     if clock is not None and work is not None and resamples:
-        steps.append(said.resampled(work.rate, clock.worst, clock.longest))
+        steps.append(record.resampled(work.rate, clock.worst, clock.longest))
     return _lay_out(rows, ends, clock, work, resamples, to_derive, steps)
 
 
-def _rows(t: Array | None, episode: Array | None, missing: NDArray[np.bool_], steps: list[said.Step]) -> _Rows:
+def _rows(t: Array | None, episode: Array | None, missing: NDArray[np.bool_], steps: list[record.Step]) -> _Rows:
     """Leave out rows that are missing, and those whose time was there before."""
     numbers = np.zeros(len(missing)) if episode is None else episode
     count = int(missing.sum())
     first = int(missing.argmax()) + 1 if count else None
     if first is not None:
-        steps.append(said.left_out("missing", count, first))
+        steps.append(record.left_out("missing", count, first))
     kept = ~missing
     repeated = 0
     if t is not None:
@@ -169,7 +169,7 @@ def _rows(t: Array | None, episode: Array | None, missing: NDArray[np.bool_], st
         again = places[1:][same & (step == 0)]
         if repeated := len(again):
             kept[again] = False
-            steps.append(said.left_out("repeated", repeated, int(again[0]) + 1))
+            steps.append(record.left_out("repeated", repeated, int(again[0]) + 1))
     if not kept.any():
         raise PreparationError("rows", 0, "rows without missing values")
     times = np.arange(len(kept), dtype=np.float64) if t is None else t
@@ -201,7 +201,7 @@ def _lay_out(
     work: Work | None,
     resamples: bool,
     to_derive: tuple[str, ...],
-    steps: list[said.Step],
+    steps: list[record.Step],
 ) -> Plan:
     """Say for every contiguous part what of it comes out, and where it comes to lie."""
     causal = CausalFilter(work, 1) if work is not None and work.form == "causal" else None
@@ -233,8 +233,8 @@ def _lay_out(
         raise PreparationError("rows", len(rows.t), _long_enough(work))
     rate = None
     if work is not None:
-        whole = parts[0].taken is None or parts[0].taken.dtype.kind == "i"
-        rate = work.rate / (round(work.every) if whole else work.every)
+        by_rows = parts[0].taken is None or parts[0].taken.dtype.kind == "i"
+        rate = work.rate / (round(work.every) if by_rows else work.every)
         steps += _work_steps(work, late, edges, rate)
     return Plan(
         np.concatenate(times),
@@ -260,16 +260,16 @@ def _lay_out(
     )
 
 
-def _work_steps(work: Work, late: float, edges: int, rate: float) -> list[said.Step]:
+def _work_steps(work: Work, late: float, edges: int, rate: float) -> list[record.Step]:
     steps = []
     if work.cutoff is not None:
-        steps.append(said.low_passed(work, late))
+        steps.append(record.low_passed(work, late))
     if work.derived:
-        steps.append(said.differentiated(work))
+        steps.append(record.differentiated(work))
     if work.cutoff is not None or edges:
-        steps.append(said.trimmed(work, edges))
+        steps.append(record.trimmed(work, edges))
     if work.every > 1:
-        steps.append(said.thinned(work, rate))
+        steps.append(record.thinned(work, rate))
     return steps
 
 

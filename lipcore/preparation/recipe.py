@@ -57,9 +57,9 @@ class Recipe:
         return asdict(self)
 
     @staticmethod
-    def from_json(said: dict[str, Any]) -> Recipe:
+    def from_json(choices: dict[str, Any]) -> Recipe:
         """The inverse of `to_json`; raise ValueError for a name that is unknown."""
         known = [each.name for each in fields(Recipe)]
-        if unknown := sorted(set(said) - set(known)):
+        if unknown := sorted(set(choices) - set(known)):
             raise ValueError(f"recipe has {unknown[0]!r}, expected names out of {', '.join(known)}")
-        return Recipe(**said)
+        return Recipe(**choices)

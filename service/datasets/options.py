@@ -203,28 +203,28 @@ def _number(text: str) -> float:
 def _object(field: str, given: str | None) -> Mapping[str, Any]:
     if given is None:
         return {}
-    found = read_json(given.encode())
-    if not isinstance(found, dict):
+    parsed = read_json(given.encode())
+    if not isinstance(parsed, dict):
         raise invalid_request(field, given, f"a JSON object with any of {', '.join(QUANTITIES)}")
-    for name in found:
+    for name in parsed:
         if name not in QUANTITIES:
-            raise invalid_request(f"{field}.{name}", found[name], f"any of {', '.join(QUANTITIES)}")
-    return found
+            raise invalid_request(f"{field}.{name}", parsed[name], f"any of {', '.join(QUANTITIES)}")
+    return parsed
 
 
 def _columns(given: str | None) -> dict[str, str | tuple[str, ...]]:
-    found: dict[str, str | tuple[str, ...]] = {}
+    columns: dict[str, str | tuple[str, ...]] = {}
     for name, value in _object("columns", given).items():
         several = isinstance(value, list) and 0 < len(value) <= MOST_NAMES
         if not all(isinstance(each, str) and 0 < len(each) <= MOST_NAME for each in (value if several else [value])):
             raise invalid_request(f"columns.{name}", value, "the name of a column, a pattern with {joint}, or a list")
-        found[name] = tuple(value) if several else value
-    return found
+        columns[name] = tuple(value) if several else value
+    return columns
 
 
 def _units(given: str | None) -> dict[str, str]:
-    found = _object("units", given)
-    for name, value in found.items():
+    units = _object("units", given)
+    for name, value in units.items():
         if not isinstance(value, str) or not 0 < len(value) <= MOST_NAME:
             raise invalid_request(f"units.{name}", value, "the name of a unit, such as deg")
-    return dict(found)
+    return dict(units)

@@ -71,10 +71,10 @@ class Staged:
     def read(self, name: str) -> Array:
         """One column, (rows,); raise KeyError where there is none."""
         count = self._rows[name]
-        found: Array = np.fromfile(self.folder / f"{name}.f64", np.float64)
-        if len(found) != count:
-            raise OSError(f"column {name} has {len(found)} rows on disk, expected {count}")
-        return found
+        values: Array = np.fromfile(self.folder / f"{name}.f64", np.float64)
+        if len(values) != count:
+            raise OSError(f"column {name} has {len(values)} rows on disk, expected {count}")
+        return values
 
     def missing(self) -> NDArray[np.bool_]:
         """Rows in which any value is missing, (rows,); looked up once, as that reads all columns."""

@@ -103,18 +103,18 @@ class StampColumn:
 
 def since(stamps: pa.Array, origin: int | None, unit: float) -> tuple[Array, int | None]:
     """Times as integers of a unit in s → seconds since the first one, which is kept exact; and that first one."""
-    whole = pc.fill_null(pc.cast(stamps, pa.int64()), _INT_MIN).to_numpy(zero_copy_only=False)
-    given = whole != _INT_MIN
+    ticks = pc.fill_null(pc.cast(stamps, pa.int64()), _INT_MIN).to_numpy(zero_copy_only=False)
+    given = ticks != _INT_MIN
     if origin is None and given.any():
-        origin = int(whole[given.argmax()])
-    seconds = np.full(len(whole), np.nan)
-    seconds[given] = (whole[given] - (origin or 0)) * unit
+        origin = int(ticks[given.argmax()])
+    seconds = np.full(len(ticks), np.nan)
+    seconds[given] = (ticks[given] - (origin or 0)) * unit
     return seconds, origin
 
 
 def _floats(column: pa.Array) -> Array:
-    found: Array = column.to_numpy(zero_copy_only=False)
-    return found
+    values: Array = column.to_numpy(zero_copy_only=False)
+    return values
 
 
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -172,8 +172,8 @@ class _Time:
         self.origin = None if pa.types.is_timestamp(kind) else 0
 
     def read(self, array: pa.Array, first_row: int) -> list[Array]:
-        whole = pc.cast(array, pa.int32()) if self.small else array
-        seconds, self.origin = since(whole, self.origin, self.unit)
+        times = pc.cast(array, pa.int32()) if self.small else array
+        seconds, self.origin = since(times, self.origin, self.unit)
         return [seconds]
 
 
@@ -233,8 +233,8 @@ def _struct(name: str, kind: pa.DataType, sample: pa.Array, widest: int) -> Node
 def _width(sample: pa.Array) -> int:
     """The usual length of lists, 0 where there is none."""
     lengths = pc.drop_null(pc.list_value_length(sample)).to_numpy()
-    found, counts = np.unique(lengths[lengths > 0], return_counts=True)
-    return int(found[counts.argmax()]) if len(found) and counts.max() >= SAME_LENGTH * counts.sum() else 0
+    widths, counts = np.unique(lengths[lengths > 0], return_counts=True)
+    return int(widths[counts.argmax()]) if len(widths) and counts.max() >= SAME_LENGTH * counts.sum() else 0
 
 
 def _storage(array: pa.Array) -> pa.Array:

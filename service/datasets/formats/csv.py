@@ -108,8 +108,8 @@ def _first_lines(path: Path) -> list[str]:
 def _all_numbers(line: str, delimiter: str | None) -> bool:
     candidates = (_delimiter(delimiter),) if delimiter else (*DELIMITERS, BLANK)
     for candidate in candidates:
-        found = [cell for cell in cells(line, candidate) if cell.strip()]
-        if found and all(_NUMERIC.fullmatch(cell) for cell in found):
+        filled = [cell for cell in cells(line, candidate) if cell.strip()]
+        if filled and all(_NUMERIC.fullmatch(cell) for cell in filled):
             return True
     return False
 
@@ -187,11 +187,11 @@ def _blocks(
 
 def _columns(names: tuple[str, ...], batch: pa.RecordBatch, header: Header) -> list[NumberColumn | StampColumn | None]:
     """How each column is read, judged by its first cells; None where most of them are text."""
-    found: list[NumberColumn | StampColumn | None] = []
+    columns: list[NumberColumn | StampColumn | None] = []
     for name, column in zip(names, batch.columns, strict=True):
         number = NumberColumn(name, decimal_comma=header.delimiter != ",")
-        found.append(number if number.share(column) >= 0.5 else StampColumn.of(name, column))
-    return found
+        columns.append(number if number.share(column) >= 0.5 else StampColumn.of(name, column))
+    return columns
 
 
 def _batches(path: Path, file: IO[bytes] | io.RawIOBase, header: Header) -> Iterator[pa.RecordBatch]:

@@ -81,10 +81,10 @@ def _items(text: bytes) -> list[Any] | Iterator[Any]:
     try:
         return (msgspec.json.decode(each) for each in msgspec.json.decode(text, type=list[msgspec.Raw]))
     except (msgspec.DecodeError, RecursionError):
-        found = decode(text)
-        if type(found) is not list:
+        items = decode(text)
+        if type(items) is not list:
             raise ValueError("no array") from None
-        return found
+        return items
 
 
 def _zipped(keys: list[str], row: Any) -> Any:
@@ -95,29 +95,29 @@ def _columns(document: dict[str, Any]) -> tuple[Iterator[Any], tuple[str, ...] |
     """Rows of an object of arrays."""
     names = document.pop("joint_names", None)
     joint_names = tuple(map(str, names)) if type(names) is list else None
-    found: dict[str, list[Any]] = {}
+    columns: dict[str, list[Any]] = {}
     alone: list[str] = []
-    _gather("", document, found, alone)
-    if not found:
+    _gather("", document, columns, alone)
+    if not columns:
         raise invalid_data("file", ", ".join(alone[:10]) or "an empty object", ARRAYS)
-    lengths = Counter(map(len, found.values()))
+    lengths = Counter(map(len, columns.values()))
     rows = max(lengths, key=lambda length: (lengths[length], length))
-    for name, values in found.items():
+    for name, values in columns.items():
         if len(values) != rows:
             raise invalid_data(name, f"{len(values)} values", f"{rows} values, as most columns have")
     facts = left_out(alone, "they are no arrays")
-    return ({name: values[row] for name, values in found.items()} for row in range(rows)), joint_names, facts
+    return ({name: values[row] for name, values in columns.items()} for row in range(rows)), joint_names, facts
 
 
-def _gather(prefix: str, value: Any, found: dict[str, list[Any]], alone: list[str]) -> None:
+def _gather(prefix: str, value: Any, columns: dict[str, list[Any]], alone: list[str]) -> None:
     if prefix.count(".") > 20:
         raise invalid_data("file", "nested deep", ARRAYS)
     if type(value) is list:
-        found[prefix] = value
+        columns[prefix] = value
     elif type(value) is dict and value and prefix and all(key.isdigit() for key in value):
-        found[prefix] = list(value.values())  # as pandas writes a column: values by the number of their row
+        columns[prefix] = list(value.values())  # as pandas writes a column: values by the number of their row
     elif type(value) is dict:
         for key, part in value.items():
-            _gather(f"{prefix}.{key}" if prefix else key, part, found, alone)
+            _gather(f"{prefix}.{key}" if prefix else key, part, columns, alone)
     else:
         alone.append(prefix)

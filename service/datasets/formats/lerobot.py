@@ -66,8 +66,8 @@ def open_lerobot(path: Path, options: ReadOptions, settings: Settings) -> Iterat
 
 def root_of(names: list[str]) -> str | None:
     """Folder of a LeRobot data set within an archive: "" or "name/"; None where there is none."""
-    found = [name.removesuffix(INFO) for name in names if name == INFO or name.endswith(f"/{INFO}")]
-    return min(found, key=len) if found and min(found, key=len).count("/") <= 1 else None
+    roots = [name.removesuffix(INFO) for name in names if name == INFO or name.endswith(f"/{INFO}")]
+    return min(roots, key=len) if roots and min(roots, key=len).count("/") <= 1 else None
 
 
 class _Files:

@@ -67,11 +67,11 @@ def open_npz(path: Path, options: ReadOptions, settings: Settings) -> Iterator[T
         if len(members) > settings.max_columns:
             raise invalid_data("array", f"{len(members)} arrays", f"at most {settings.max_columns}")
         measure(members, settings)
-        found = {each.name: each for each in (_header(archive, member) for member in members)}
-        rows = _rows(found)
-        used, ignored = _choose(found, rows)
-        joints = found.get("joint_names")
-        step = None if "dt" not in found or "t" in found else _step(archive, found["dt"])
+        arrays = {each.name: each for each in (_header(archive, member) for member in members)}
+        rows = _rows(arrays)
+        used, ignored = _choose(arrays, rows)
+        joints = arrays.get("joint_names")
+        step = None if "dt" not in arrays or "t" in arrays else _step(archive, arrays["dt"])
         names = checked_names((["t"] if step else []) + [name for each in used for name in each.columns()], settings)
         facts = left_out(ignored, f"they are not {rows} numbers, or rows of numbers")
         yield Table(
@@ -109,26 +109,26 @@ def _header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Stored:
     return Stored(name, member, tuple(shape), bool(fortran), dtype, offset)
 
 
-def _rows(found: dict[str, Stored]) -> int:
+def _rows(arrays: dict[str, Stored]) -> int:
     """Samples N: as q has rows, or most arrays."""
-    if "q" in found:
-        return found["q"].shape[0]
-    lengths = Counter(each.shape[0] for each in found.values() if each.dtype.kind in "fiu" and each.shape)
+    if "q" in arrays:
+        return arrays["q"].shape[0]
+    lengths = Counter(each.shape[0] for each in arrays.values() if each.dtype.kind in "fiu" and each.shape)
     if not lengths:
-        raise invalid_data("array", ", ".join(found) or "none", "arrays q (N, n) and tau (N, n)")
+        raise invalid_data("array", ", ".join(arrays) or "none", "arrays q (N, n) and tau (N, n)")
     return max(lengths, key=lambda length: (lengths[length], length))
 
 
-def _choose(found: dict[str, Stored], rows: int) -> tuple[list[Stored], list[str]]:
+def _choose(arrays: dict[str, Stored], rows: int) -> tuple[list[Stored], list[str]]:
     """Arrays that become columns, and the names of those that do not."""
     used, ignored = [], []
-    width = found["q"].shape[1] if "q" in found else None
-    for name, array in found.items():
+    width = arrays["q"].shape[1] if "q" in arrays else None
+    for name, array in arrays.items():
         if name in ARRAYS and (len(array.shape) != 2 or width is not None):
-            wanted = {2: (rows, width), 1: (rows,), 0: ()}[ARRAYS[name]] if name != "joint_names" else (width,)
-            if wanted not in (array.shape, (None,)):
+            shape = {2: (rows, width), 1: (rows,), 0: ()}[ARRAYS[name]] if name != "joint_names" else (width,)
+            if shape not in (array.shape, (None,)):
                 raise invalid_data(
-                    name, f"of shape {array.shape}", f"shape {wanted}, as q has {rows} rows and {width} joints"
+                    name, f"of shape {array.shape}", f"shape {shape}, as q has {rows} rows and {width} joints"
                 )
         if name in ("dt", "joint_names"):
             continue
@@ -226,7 +226,7 @@ class _Clock:
 
 
 def _step(archive: zipfile.ZipFile, array: Stored) -> float:
-    step = float(_whole(archive, array))
+    step = float(_values(archive, array))
     if not 0 < step < np.inf:
         raise invalid_data("dt", step, "a positive number of seconds")
     return step
@@ -234,12 +234,12 @@ def _step(archive: zipfile.ZipFile, array: Stored) -> float:
 
 def _text(archive: zipfile.ZipFile, array: Stored) -> tuple[str, ...]:
     try:
-        return tuple(str(name) for name in _whole(archive, array))
+        return tuple(str(name) for name in _values(archive, array))
     except (SystemError, ValueError):
         raise invalid_data("joint_names", "not Unicode", "plain text") from None
 
 
-def _whole(archive: zipfile.ZipFile, array: Stored) -> np.ndarray[Any, Any]:
+def _values(archive: zipfile.ZipFile, array: Stored) -> np.ndarray[Any, Any]:
     """A small array as it is."""
     size = math.prod(array.shape) * array.dtype.itemsize
     if size > 1024 * 1024:

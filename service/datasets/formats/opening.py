@@ -162,13 +162,13 @@ def open_table(path: Path, kind: str | None, options: ReadOptions, settings: Set
 
 def _kind(path: Path, kind: str | None, settings: Settings) -> str:
     """What a file is to be read as."""
-    found = sniff(path, settings)
-    if found is not None:
-        if (kind, found) == ("json_lines", "json") and not _starts(path, b"["):
+    actual = sniff(path, settings)
+    if actual is not None:
+        if (kind, actual) == ("json_lines", "json") and not _starts(path, b"["):
             with path.open("rb") as file:  # a damaged first line makes lines of JSON look like a document
                 line = file.readline(settings.max_json_line_bytes)
-                return "json_lines" if len(line.strip()) > 1 and line.endswith(b"\n") and file.read(1) else found
-        return found
+                return "json_lines" if len(line.strip()) > 1 and line.endswith(b"\n") and file.read(1) else actual
+        return actual
     other = foreign(path)
     if kind in KINDS and (other is None or (kind in ZIPPED and _starts(path, b"PK"))):
         return kind  # whoever reads that kind says best what is wrong with it

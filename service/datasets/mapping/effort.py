@@ -40,7 +40,7 @@ def named(family: Family) -> Effort:
     return "commanded" if family.rank == AIM else "measured"
 
 
-def prefer(found: Sequence[Family], effort: Effort | None) -> list[Family]:
+def prefer(families: Sequence[Family], effort: Effort | None) -> list[Family]:
     """Those columns that best hold what the effort is said to be: by default measured torque, then current."""
     if effort == "current":
         order: tuple[Effort, ...] = ("current", "measured", "commanded")
@@ -48,8 +48,8 @@ def prefer(found: Sequence[Family], effort: Effort | None) -> list[Family]:
         order = ("commanded", "measured")
     else:
         order = ("measured", "current", "commanded") if effort is None else ("measured", "commanded")
-    for wanted in order:
-        if chosen := [family for family in found if named(family) == wanted]:
+    for effort_of in order:
+        if chosen := [family for family in families if named(family) == effort_of]:
             return chosen
     return []
 
@@ -87,9 +87,9 @@ def torque(
 def _effort(
     family: Family, units: Sequence[str | None], options: UploadOptions, robot: Profile | None
 ) -> tuple[Effort, str]:
-    said = options.read.effort
-    if said is not None:
-        return said, "as the upload says"
+    given = options.read.effort
+    if given is not None:
+        return given, "as the upload says"
     by_name = named(family)
     if by_name != "measured":
         return by_name, "as the columns are called"

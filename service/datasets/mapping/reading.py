@@ -49,39 +49,39 @@ def read(
     Every row of the file becomes one: values that are missing or infinite become NaN, and such rows are left out when
     the recording is prepared, as are those whose time was there in the row before.
     """
-    found = resolve(table.names, table.units, table.joint_names, options, robot, settings.max_joints)
-    reader = _Reader(found, Staged(folder, found.joints, disk), settings)
+    mapped = resolve(table.names, table.units, table.joint_names, options, robot, settings.max_joints)
+    reader = _Reader(mapped, Staged(folder, mapped.joints, disk), settings)
     for block in table.blocks:
         reader.add(block)
     missing = reader.finish()
-    noted = [*table.facts, *found.notes, *reader.notes()]
+    noted = [*table.facts, *mapped.notes, *reader.notes()]
     facts = {
-        "effort": found.torque.effort,
-        "columns": _columns(found, reader.staged),
-        "units": {each.name: each.said for row in found.quantities.values() for each in row if each.said},
-        "unused_columns": list(found.unused),
-        "dropped_joints": list(found.dropped),
-        "torque_constants": None if found.torque.constants is None else list(found.torque.constants),
+        "effort": mapped.torque.effort,
+        "columns": _columns(mapped, reader.staged),
+        "units": {each.name: each.unit for row in mapped.quantities.values() for each in row if each.unit},
+        "unused_columns": list(mapped.unused),
+        "dropped_joints": list(mapped.dropped),
+        "torque_constants": None if mapped.torque.constants is None else list(mapped.torque.constants),
         "rows_read": reader.rows,
         "repeated_stamps": reader.clockwork.repeated,
         "first_repeated_row": reader.clockwork.first_repeated or None,
         "missing_rows": int(missing.sum()),
         "first_missing_row": reader.first_missing,
     }
-    return Read(reader.staged, found.torque.effort, found.torque.convention, missing, facts, noted)
+    return Read(reader.staged, mapped.torque.effort, mapped.torque.convention, missing, facts, noted)
 
 
 class _Reader:
     """Takes block after block; keeps of them what the checks at the end need."""
 
-    def __init__(self, found: ColumnMap, staged: Staged, settings: Settings) -> None:
-        self.found, self.staged, self.settings, self.rows = found, staged, settings, 0
-        self.time = Seen(found.t[0].name) if found.t else None
-        self.time_said = any(each.said is not None for each in found.t)
-        self.clockwork = Clockwork(found.t[0].name if found.t else TIME)
-        self.seen = {quantity: [Seen(each.name) for each in row] for quantity, row in found.quantities.items()}
-        self.left_out = {name: Seen(each.name) for name, each in found.dropped.items()}
-        self.absent = {quantity for quantity in MOTION if quantity in found.quantities}
+    def __init__(self, mapped: ColumnMap, staged: Staged, settings: Settings) -> None:
+        self.mapped, self.staged, self.settings, self.rows = mapped, staged, settings, 0
+        self.time = Seen(mapped.t[0].name) if mapped.t else None
+        self.time_has_unit = any(each.unit is not None for each in mapped.t)
+        self.clockwork = Clockwork(mapped.t[0].name if mapped.t else TIME)
+        self.seen = {quantity: [Seen(each.name) for each in row] for quantity, row in mapped.quantities.items()}
+        self.left_out = {name: Seen(each.name) for name, each in mapped.dropped.items()}
+        self.absent = {quantity for quantity in MOTION if quantity in mapped.quantities}
         """Those of which there was no value yet: perhaps there is none at all."""
         self._missing: list[NDArray[np.bool_]] = []
 
@@ -92,9 +92,9 @@ class _Reader:
         if self.rows > self.settings.max_samples:
             raise invalid_data("rows", self.rows, f"at most {self.settings.max_samples} samples")
         episode = None
-        if self.found.episode is not None:
-            episode = np.ascontiguousarray(block[:, self.found.episode.index])
-            checks.whole(episode, rows, self.found.episode.name)
+        if self.mapped.episode is not None:
+            episode = np.ascontiguousarray(block[:, self.mapped.episode.index])
+            checks.check_episodes(episode, rows, self.mapped.episode.name)
         t = self._time(block, rows)
         if t is not None:
             self.clockwork.look(t, episode, rows)
@@ -107,11 +107,11 @@ class _Reader:
         missing = np.concatenate([*self._missing, np.zeros(0, dtype=np.bool_)])
         seen = [each for row in self.seen.values() for each in row] + ([self.time] if self.time else [])
         checks.check_rows(len(missing), int(missing.sum()), self.clockwork.repeated, self.settings.min_samples, seen)
-        if self.found.t:
-            checks.check_time_unit(self.staged.read(TIME), self.time_said, self.found.t[0].name)
-        joints = list(zip(self.found.joints, self.seen["q"], strict=True))
-        said = all(each.said is not None for each in self.found.quantities["q"])
-        checks.check_positions(joints, self.settings.max_position, said)
+        if self.mapped.t:
+            checks.check_time_unit(self.staged.read(TIME), self.time_has_unit, self.mapped.t[0].name)
+        joints = list(zip(self.mapped.joints, self.seen["q"], strict=True))
+        unit = all(each.unit is not None for each in self.mapped.quantities["q"])
+        checks.check_positions(joints, self.settings.max_position, unit)
         self._check_slopes(missing)
         return missing
 
@@ -137,9 +137,9 @@ class _Reader:
     def _time(self, block: Array, rows: Rows) -> Array | None:
         if self.time is None:
             return None
-        parts = [_scaled(block, each) for each in self.found.t]
+        parts = [_scaled(block, each) for each in self.mapped.t]
         t = parts[0] if len(parts) == 1 else np.sum(parts, axis=0)
-        if not self.time_said:
+        if not self.time_has_unit:
             checks.epoch_unit(t, rows, self.time.name)
         self.time.add(t, rows)
         return t
@@ -153,7 +153,7 @@ class _Reader:
             missing |= np.isnan(t)
         if episode is not None:
             columns[EPISODE] = episode
-        for quantity, row in self.found.quantities.items():
+        for quantity, row in self.mapped.quantities.items():
             values = [_scaled(block, each) for each in row]
             for each, seen in zip(values, self.seen[quantity], strict=True):
                 seen.add(each, rows)
@@ -164,7 +164,7 @@ class _Reader:
             for joint, each in enumerate(values):
                 columns[column(quantity, joint)] = each
                 missing |= np.isnan(each)
-        for name, source in self.found.dropped.items():
+        for name, source in self.mapped.dropped.items():
             self.left_out[name].add(_scaled(block, source), rows)
         self.staged.append(columns)
         self._missing.append(missing)
@@ -179,7 +179,7 @@ class _Reader:
 
     def _check_slopes(self, missing: NDArray[np.bool_]) -> None:
         """Velocities have to be the slopes of positions, accelerations those of velocities: else units are wrong."""
-        if not self.found.t or "dq" not in self.seen:
+        if not self.mapped.t or "dq" not in self.seen:
             return
         t = self.staged.read(TIME)
         episode = self.staged.read(EPISODE) if EPISODE in self.staged else None
@@ -206,12 +206,12 @@ def _scaled(block: Array, source: Source) -> Array:
     return values
 
 
-def _columns(found: ColumnMap, staged: Staged) -> dict[str, list[str]]:
+def _columns(mapped: ColumnMap, staged: Staged) -> dict[str, list[str]]:
     """Names of the file's columns by what they were read as."""
     rows: dict[str, Sequence[Source]] = {
-        TIME: found.t,
-        EPISODE: [found.episode] if found.episode else [],
-        **found.quantities,
+        TIME: mapped.t,
+        EPISODE: [mapped.episode] if mapped.episode else [],
+        **mapped.quantities,
     }
     return {
         name: [each.name for each in row]

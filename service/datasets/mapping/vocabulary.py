@@ -63,10 +63,10 @@ _SUFFIX_WORDS = 4
 @lru_cache(maxsize=1024)
 def plain(unit: str) -> str:
     """A unit without what spellings differ in: case, blanks, signs of multiplication and division, full words."""
-    found = unit.lower()[:_LONGEST]
+    text = unit.lower()[:_LONGEST]
     for spelling, short in _SPELLINGS:
-        found = spelling.sub(short, found)
-    return found
+        text = spelling.sub(short, text)
+    return text
 
 
 def factor(quantity: str, unit: str) -> float | None:
@@ -181,32 +181,32 @@ class Mention:
 
 def words(name: str) -> list[Word]:
     """Cut a name into words and numbers."""
-    found = []
+    cut_words = []
     for piece in _PIECES.finditer(name):
         text, start = piece.group(), piece.start()
         small = text.lower()
         if small in _VOCABULARY or small.isdecimal():
-            found.append(Word(small, start, piece.end()))
+            cut_words.append(Word(small, start, piece.end()))
         elif small.startswith(_JOINT) and small[len(_JOINT) :] in QUANTITY_WORDS:
             cut = start + len(_JOINT)
-            found += [Word(_JOINT, start, cut), Word(small[len(_JOINT) :], cut, piece.end())]
+            cut_words += [Word(_JOINT, start, cut), Word(small[len(_JOINT) :], cut, piece.end())]
         else:
             parts = [Word(m.group().lower(), start + m.start(), start + m.end()) for m in _CAMEL.finditer(text)]
             known = text.isascii() and any(part.text in _VOCABULARY for part in parts)
-            found += parts if known else [Word(small, start, piece.end())]
-    return found
+            cut_words += parts if known else [Word(small, start, piece.end())]
+    return cut_words
 
 
-def mention(found: list[Word]) -> Mention | None:
+def mention(parts: list[Word]) -> Mention | None:
     """The quantity that words speak of: the last one, as `current_position` is a position."""
     last = None
     place = 0
-    while place < len(found):
+    while place < len(parts):
         for length in (3, 2, 1):
-            texts = tuple(word.text for word in found[place : place + length])
-            said = TWO_WORDS.get(texts) if length > 1 else QUANTITY_WORDS.get(texts[0])
-            if said is not None:
-                last = Mention(*said, place, place + length)
+            texts = tuple(word.text for word in parts[place : place + length])
+            meaning = TWO_WORDS.get(texts) if length > 1 else QUANTITY_WORDS.get(texts[0])
+            if meaning is not None:
+                last = Mention(*meaning, place, place + length)
                 place += length - 1
                 break
         place += 1

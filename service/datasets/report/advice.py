@@ -83,10 +83,10 @@ def warnings(
 
 def _late(lags: list[Lag]) -> list[str]:
     """A lag that all joints share is one of clocks or filters; that of one joint alone may be its friction's."""
-    told = [each for each in lags[1:] if each.seconds is not None and (each.cost or 0.0) > LATE and _sure(each)]
+    late = [each for each in lags[1:] if each.seconds is not None and (each.cost or 0.0) > LATE and _sure(each)]
     shared = lags[0]
     if shared.seconds is not None and _sure(shared):
-        alike = [each for each in told if abs(_seconds(each) - shared.seconds) < SURE * _std(each) + _std(shared)]
+        alike = [each for each in late if abs(_seconds(each) - shared.seconds) < SURE * _std(each) + _std(shared)]
         if alike:
             worst = max(each.cost or 0.0 for each in alike)
             side = "after" if shared.seconds > 0 else "before"
@@ -99,7 +99,7 @@ def _late(lags: list[Lag]) -> list[str]:
         f"the torque of {each.joint} comes {1e3 * abs(_seconds(each)):.0f} ms (± {1e3 * _std(each):.0f}) "
         f"{'after' if _seconds(each) > 0 else 'before'} its motion, which other joints do not show: time stamps do not "
         "explain it, filters of this joint or friction that depends on more than speed may"
-        for each in told
+        for each in late
         if (each.cost or 0.0) > VERY_LATE
     ]
 
@@ -123,8 +123,8 @@ def advice(timing: Timing, excitation: Excitation, limits: list[JointLimits], no
     moved = [each for each in joints if each.joint not in still]
     out: list[str] = []
 
-    def say(found: Iterable[str], sentence: Callable[[str], str]) -> None:
-        names = list(found)
+    def say(affected: Iterable[str], sentence: Callable[[str], str]) -> None:
+        names = list(affected)
         if names:
             out.append(sentence(listed(names)))
 
@@ -155,11 +155,11 @@ def advice(timing: Timing, excitation: Excitation, limits: list[JointLimits], no
             "from the others; record motion of several frequencies and amplitudes"
         ),
     )
-    whole = excitation.whole
-    if whole is not None and whole.rank < whole.parameters:
+    bodies = excitation.whole
+    if bodies is not None and bodies.rank < bodies.parameters:
         out.append(
-            f"{whole.parameters - whole.rank} of {whole.parameters} base parameters of the rigid bodies are hardly "
-            f"excited, least that of the body that {whole.weakest_body} moves: record faster motion of all joints at "
+            f"{bodies.parameters - bodies.rank} of {bodies.parameters} base parameters of the rigid bodies are hardly "
+            f"excited, least that of the body that {bodies.weakest_body} moves: record faster motion of all joints at "
             "once, or plan it with `lipserve excite`"
         )
     say(
@@ -207,21 +207,23 @@ def _small(joint: JointExcitation) -> bool:
 
 def in_words(excitation: Excitation) -> str:
     """How well the data determine friction and rigid bodies."""
-    said = []
+    sentences = []
     for term, field in TERMS:
         by = {
             verdict: [each.joint for each in excitation.joints if getattr(each, field).verdict == verdict]
             for verdict in ("well", "poorly", "not determined")
         }
         if len(by["well"]) == len(excitation.joints):
-            said.append(f"{term} is determined well for all joints")
+            sentences.append(f"{term} is determined well for all joints")
         else:
-            said.append(f"{term}: " + ", ".join(f"{verdict} for {listed(who)}" for verdict, who in by.items() if who))
+            sentences.append(
+                f"{term}: " + ", ".join(f"{verdict} for {listed(who)}" for verdict, who in by.items() if who)
+            )
     whole = excitation.whole
     if whole is not None:
-        worth = "none" if whole.condition is None else f"{whole.condition:.3g}"
-        said.append(
-            f"{whole.rank} of {whole.parameters} base parameters of the rigid bodies are excited (condition {worth}), "
+        how = "none" if whole.condition is None else f"{whole.condition:.3g}"
+        sentences.append(
+            f"{whole.rank} of {whole.parameters} base parameters of the rigid bodies are excited (condition {how}), "
             f"the least at {whole.weakest:.2g} of what random motion over the whole range would do"
         )
-    return "; ".join(said)
+    return "; ".join(sentences)

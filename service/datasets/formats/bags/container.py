@@ -74,9 +74,9 @@ class ScannedBag(ABC):
     def messages(self, channel: Channel) -> Iterator[tuple[int, bytes]]:
         """Time of reception in ns and data of every message of a channel's topic and type."""
         unpacking = self.unpacking()
-        for found, time, data in self.scan():
-            if found.topic == channel.topic and found.type == channel.type:
-                yield time, unpacking.message(bytes(data)) if found.encoding == "cdr" else bytes(data)
+        for other, time, data in self.scan():
+            if other.topic == channel.topic and other.type == channel.type:
+                yield time, unpacking.message(bytes(data)) if other.encoding == "cdr" else bytes(data)
 
     def unpacking(self) -> Unpacking:
         """What one pass through the bag may unpack."""

@@ -63,22 +63,22 @@ def _field(line: str, owner: str) -> Field | None:
     line = line.strip()
     if not line or line.startswith(("#", "=", "@")):
         return None
-    found = _LINE.match(line)
-    if found is None:
+    match = _LINE.match(line)
+    if match is None:
         raise ValueError(f"{line[:80]!r} in the definition of {owner}")
-    if found["rest"].lstrip().startswith("="):  # a constant
+    if match["rest"].lstrip().startswith("="):  # a constant
         return None
     count = None
-    if found["count"] is not None:
-        count = SEQUENCE if found["bound"] or not found["count"] else int(found["count"][:9])
-    kind = type_name(found["type"])
+    if match["count"] is not None:
+        count = SEQUENCE if match["bound"] or not match["count"] else int(match["count"][:9])
+    kind = type_name(match["type"])
     if kind in SIZES or kind in ("string", "wstring", "time", "duration"):
-        return Field(found["name"], kind, count)
+        return Field(match["name"], kind, count)
     if kind == "Header":
         kind = "std_msgs/Header"
     elif "/" not in kind:
         kind = f"{owner.partition('/')[0]}/{kind}"
-    return Field(found["name"], kind, count)
+    return Field(match["name"], kind, count)
 
 
 _JOINT_STATE = """std_msgs/Header header

@@ -79,18 +79,18 @@ def read_channel(bag: Bag, channel: Channel, joint_names: tuple[str, ...] | None
         raise invalid_data(f"topic {channel.topic}", f"of {len(joints)} joints", f"at most {settings.max_joints}")
     kept_kinds = np.array([holds(kind, joints) for kind in survey.kinds])
     kept = kept_kinds[survey.kind]
-    found = {
+    holding = {
         each: sum(c for k, c in zip(survey.kinds, counts, strict=True) if holds(k, joints) and each in k.quantities)
         for each in QUANTITIES
     }
-    quantities = tuple(each for each in QUANTITIES if found[each])
+    quantities = tuple(each for each in QUANTITIES if holding[each])
     use_stamps, why = _clock(survey.stamps[kept], survey.received[kept])
     times = survey.stamps if use_stamps else survey.received
     start = int(times[np.argmax(kept)])
     facts = [
         *bag.facts,
         f"topic {channel.topic}: {len(kept)} messages of type {channel.type}",
-        *describe(survey.kinds, counts, joints, found),
+        *describe(survey.kinds, counts, joints, holding),
         f"times are {why}, counted from {start // NS}.{start % NS:09d} s",
     ]
     units = Decoder(channel).source.units
@@ -217,19 +217,19 @@ def _choose(channels: dict[Channel, int], topic: str | None, bag: Bag) -> Channe
     # several publishers of one topic are one recording
     by_name = {(each.topic, each.type): each for each in reversed(known)}
     if topic is not None:
-        found = [each for each in by_name.values() if each.topic == topic]
-        if not found and any(each.topic == topic for each in channels):
+        candidates = [each for each in by_name.values() if each.topic == topic]
+        if not candidates and any(each.topic == topic for each in channels):
             other = next(each for each in channels if each.topic == topic)
             raise invalid_request("topic", f"{topic} of type {other.type} ({other.encoding})", _types())
-        if not found:
+        if not candidates:
             raise invalid_request("topic", topic, f"one of {_listed(known or channels)}")
     else:
-        found = list(by_name.values())
-        if not found:
+        candidates = list(by_name.values())
+        if not candidates:
             raise invalid_data("file", f"a bag of {_listed(channels)}", f"a topic of {_types()}")
-    if len(found) > 1:
+    if len(candidates) > 1:
         raise _ambiguous(known)
-    return found[0]
+    return candidates[0]
 
 
 def _ambiguous(known: dict[Channel, int]) -> InvalidDataError:

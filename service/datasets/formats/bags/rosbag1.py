@@ -97,8 +97,8 @@ def _record(
         yield channels[number], seconds * 1_000_000_000 + nanoseconds, data
     elif kind == CONNECTION:
         (number,) = _U32.unpack(header["conn"])
-        said = _header(data)
-        name, definition = type_name(said["type"].decode()), said["message_definition"].decode(errors="replace")
+        declared = _header(data)
+        name, definition = type_name(declared["type"].decode()), declared["message_definition"].decode(errors="replace")
         channels[number] = Channel(header["topic"].decode(), name, "ros1", definition)
 
 

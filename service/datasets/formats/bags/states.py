@@ -132,10 +132,10 @@ class Decoder:
                 "a bag that holds its messages' definitions, as ROS 2 records them since Iron and in MCAP",
             )
         fields = [each.name for each in self.types[channel.type]]
-        wanted = [name for name in fields if name in self.source.last]
-        if not wanted:
+        ends = [name for name in fields if name in self.source.last]
+        if not ends:
             raise invalid_data(f"definition of {channel.type}", ", ".join(fields)[:200], " or ".join(self.source.last))
-        self.last = wanted[-1]
+        self.last = ends[-1]
         self._forms: list[Form] = []
         self._fields = 0
 
@@ -183,17 +183,17 @@ class Decoder:
             raise self._wrong(number, "without a stamp", "a header with a stamp in s and ns")
         return seconds[0]
 
-    def _wrong(self, number: int, found: str, expected: str) -> InvalidDataError:
-        return invalid_data(f"topic {self.channel.topic}, message {number}", found, expected)
+    def _wrong(self, number: int, value: str, expected: str) -> InvalidDataError:
+        return invalid_data(f"topic {self.channel.topic}, message {number}", value, expected)
 
 
 def _counts(numbers: Mapping[str, tuple[int, int, str]], way: Mapping[str, str]) -> dict[str, int]:
-    found = {each: numbers[path] for each, path in way.items() if path in numbers}
-    return {each: count for each, (_, count, kind) in found.items() if count and kind in _DTYPES}
+    fields = {each: numbers[path] for each, path in way.items() if path in numbers}
+    return {each: count for each, (_, count, kind) in fields.items() if count and kind in _DTYPES}
 
 
-def choose(kinds: Sequence[Kind], counts: Sequence[int], wanted: tuple[str, ...] | None, topic: str) -> tuple[str, ...]:
-    """Joints to read: those `wanted`, or of the set that matters most; raise InvalidDataError.
+def choose(kinds: Sequence[Kind], counts: Sequence[int], given: tuple[str, ...] | None, topic: str) -> tuple[str, ...]:
+    """Joints to read: those `given`, or of the set that matters most; raise InvalidDataError.
 
     kinds and counts: what the messages hold, and how many hold it. A set matters by the messages that tell of all its
     joints, times the square of their number: an arm at 30 Hz more than its gripper at 200 Hz.
@@ -206,11 +206,11 @@ def choose(kinds: Sequence[Kind], counts: Sequence[int], wanted: tuple[str, ...]
             orders.setdefault(frozenset(kind.joints), kind.joints)
     if not numbers:
         raise invalid_data(f"topic {topic}", "without positions", "messages that tell the position of joints")
-    if wanted is not None:
-        if any(each.issuperset(wanted) for each in numbers):
-            return wanted
+    if given is not None:
+        if any(each.issuperset(given) for each in numbers):
+            return given
         known = sorted(set().union(*numbers))
-        raise invalid_data("joint_names", ", ".join(wanted), f"joints out of {_listed(known)}, told together")
+        raise invalid_data("joint_names", ", ".join(given), f"joints out of {_listed(known)}, told together")
 
     def weight(joints: frozenset[str]) -> int:
         return len(joints) ** 2 * sum(count for other, count in numbers.items() if other >= joints)
