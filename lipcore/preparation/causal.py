@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from lipcore.preparation.filtering import QUANTITIES, Work, settle
+from lipcore.preparation.filtering import QUANTITIES, Read, Work, settle
 from lipcore.preparation.recipe import PreparationError, Recipe
-from lipcore.preparation.resampling import SAME_RATE
+from lipcore.preparation.resampling import BLOCK, SAME_RATE
 from lipcore.samples import Array
 from lipcore.signals import ORDER
 
@@ -62,6 +62,21 @@ class CausalFilter:
         if "dq" in self.work.derived:
             middle["dq"] = slope["q"]
         return middle
+
+    def part(self, read: Read) -> Iterator[tuple[str, Array]]:
+        """All quantities, in turn, of one contiguous part of one joint, as a live stream has them: columns (N,)."""
+        self.reset()
+        signals = {name: read(name)[:, None] for name in self.work.given}
+        rows = len(signals["q"])
+        columns = {name: np.empty(rows - 2 * self.lag) for name in QUANTITIES}
+        done = 0
+        for begin in range(0, rows, BLOCK):
+            block = self.batch({name: values[begin : begin + BLOCK] for name, values in signals.items()})
+            for name, values in block.items():
+                columns[name][done : done + len(values)] = values[:, 0]
+            done += len(block["q"])
+        for name in QUANTITIES:
+            yield name, columns.pop(name)
 
     def _checked(self, name: str, rows: Mapping[str, Array]) -> Array:
         values = np.asarray(rows[name], dtype=np.float64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,8 @@ from lipcore.samples import Array
 from lipcore.signals import ORDER, differentiate
 
 QUANTITIES = ("q", "dq", "ddq", "tau")
+Read = Callable[[str], Array]
+"""A quantity → its column, read when it is asked for: no more than one has to be in memory."""
 FILTERED = ("q", "tau", "dq", "ddq")
 """The same, as sentences tell them."""
 SHORTEST = 3 * (2 * ((ORDER + 1) // 2) + 1) + 1
@@ -136,15 +138,15 @@ class ZeroPhase:
         return np.asarray(smooth[edge:-edge])
 
 
-def without_delay(part: Mapping[str, Array], work: Work, low_pass: ZeroPhase | None) -> Iterator[tuple[str, Array]]:
-    """q, dq, ddq, tau, in turn, of one contiguous part: columns (N,) as given, evenly sampled, N ≥ work.shortest.
+def without_delay(read: Read, work: Work, low_pass: ZeroPhase | None) -> Iterator[tuple[str, Array]]:
+    """q, dq, ddq, tau, in turn, of one contiguous part: `read` gives columns (N,), evenly sampled, N ≥ work.shortest.
 
     As in the paper: a Butterworth filter run forwards and backwards, central differences, and dq filtered once more
     before it is differentiated. low_pass: with work's rate and cut-off, None where there is none.
     """
 
     def filtered(name: str) -> Array:
-        return part[name] if low_pass is None or name not in work.low_passed else low_pass(part[name])
+        return read(name) if low_pass is None or name not in work.low_passed else low_pass(read(name))
 
     q = filtered("q")
     yield "q", q

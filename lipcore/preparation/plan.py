@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from lipcore.preparation import steps as record
 from lipcore.preparation.causal import CausalFilter
-from lipcore.preparation.filtering import QUANTITIES, Work, ZeroPhase, derived, filters, settle, without_delay
-from lipcore.preparation.parts import Kept, OnClock, Part, in_blocks, inner, taken_at
+from lipcore.preparation.filtering import QUANTITIES, Read, Work, ZeroPhase, derived, filters, settle, without_delay
 from lipcore.preparation.recipe import PreparationError, Recipe
-from lipcore.preparation.resampling import Clock, clock_of, grid, thinned
+from lipcore.preparation.resampling import Clock, between, clock_of, grid, interpolate, thinned
 from lipcore.samples import Array
 
 BRIDGE = 0.3
@@ -25,6 +24,37 @@ Splitting costs a period at either side. Measured on sums of sinusoids up to 1.6
 tau at 0.06 and 0.05 N·m; at 1 kHz one of 75 ms ddq at 0.7 % and 0.1 %, tau at 0.15 and 0.01 N·m, one of 125 ms 1.8 %
 and 0.6 N·m.
 """
+
+
+@dataclass(frozen=True)
+class Part:
+    """One contiguous part of a recording.
+
+    rows: of those kept; at: even times it is put on, None where its own are even; inner: samples between the ends that
+    are cut off; taken: positions among those, all where None; out: where they come to lie.
+    """
+
+    rows: slice
+    at: Array | None
+    inner: slice
+    taken: NDArray[np.int64] | Array | None
+    out: slice
+
+    def on_clock(self, values: Array, times: Array) -> Array:
+        """Of a column (N,) of the rows kept, with their times (N,), the samples of this part on its even clock."""
+        part = values[self.rows]
+        return part if self.at is None else interpolate(times[self.rows], part, self.at)
+
+    def coming_out(self, values: Array) -> Array:
+        """Of samples of this part, those that come out."""
+        return values[self.inner] if self.taken is None else taken_at(values[self.inner], self.taken)
+
+
+def taken_at(values: Array, positions: NDArray[np.int64] | Array) -> Array:
+    """Values (N,) at whole positions (M,), or between them."""
+    if positions.dtype.kind == "i":
+        return np.asarray(values[positions])
+    return between(values, np.asarray(positions, dtype=np.float64))
 
 
 @dataclass(frozen=True)
@@ -68,35 +98,40 @@ class Plan:
 
     def apply(self, joint: Mapping[str, Array]) -> dict[str, Array]:
         """Of one joint: the quantities given, (N,) each, to all of q, dq, ddq, tau, (M,) each."""
-        return dict(self.columns(joint))
+        return dict(self.columns(joint.__getitem__))
 
-    def columns(self, joint: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
+    def columns(self, read: Read) -> Iterator[tuple[str, Array]]:
         """The same, one quantity after the other: of a recording in one part, no more than one is held at a time."""
-        signals = Kept(joint, self._kept)
+
+        def kept(name: str) -> Array:
+            return read(name) if self._kept is None else read(name)[self._kept]
+
         if len(self._parts) == 1:
             part = self._parts[0]
-            for name, values in self._of(part, signals):
-                yield name, inner(part, values)
+            for name, values in self._of(part, kept):
+                yield name, part.coming_out(values)
             return
         given = QUANTITIES if self._work is None else self._work.given
-        read = {name: signals[name] for name in given}
+        signals = {name: kept(name) for name in given}
         columns = {name: np.empty(len(self.t)) for name in QUANTITIES}
         for part in self._parts:
-            for name, values in self._of(part, read):
-                columns[name][part.out] = inner(part, values)
+            for name, values in self._of(part, signals.__getitem__):
+                columns[name][part.out] = part.coming_out(values)
         for name in QUANTITIES:
             yield name, columns.pop(name)
 
-    def _of(self, part: Part, signals: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
+    def _of(self, part: Part, read: Read) -> Iterator[tuple[str, Array]]:
         """Samples of one part, before its ends are cut off."""
-        one = OnClock(part, signals, self._times)
+
+        def samples(name: str) -> Array:
+            return part.on_clock(read(name), self._times)
+
         if self._work is None:
-            yield from ((name, one[name]) for name in QUANTITIES)
+            yield from ((name, samples(name)) for name in QUANTITIES)
         elif self._causal is None:
-            yield from without_delay(one, self._work, self._low_pass)
+            yield from without_delay(samples, self._work, self._low_pass)
         else:
-            self._causal.reset()
-            yield from in_blocks(self._causal, {name: one[name] for name in self._work.given})
+            yield from self._causal.part(samples)
 
 
 @dataclass(frozen=True)

@@ -142,8 +142,12 @@ def prepare(raw: Staged, folder: Path, recipe: Recipe, min_samples: int, disk: D
     own.mkdir()
     staged = Staged(own, raw.joint_names, raw.disk if disk is None else disk)
     staged.append({TIME: made.t, EPISODE: made.episode.astype(np.float64)})
+
+    def columns(joint: int) -> Iterator[tuple[str, Array]]:
+        return made.columns(lambda quantity: raw.read(column(quantity, joint)))
+
     for joint in range(raw.n_joints):
-        for name, values in made.columns(_Joint(raw, joint)):
+        for name, values in columns(joint):
             staged.append({column(name, joint): values})
     return Prepared(
         staged,
@@ -156,22 +160,6 @@ def prepare(raw: Staged, folder: Path, recipe: Recipe, min_samples: int, disk: D
         missing=made.missing,
         repeated=made.repeated,
     )
-
-
-class _Joint(Mapping[str, Array]):
-    """Columns of one joint by quantity, each read when it is asked for."""
-
-    def __init__(self, raw: Staged, joint: int) -> None:
-        self.raw, self.joint = raw, joint
-
-    def __getitem__(self, name: str) -> Array:
-        return self.raw.read(column(name, self.joint))
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.raw.quantities)
-
-    def __len__(self) -> int:
-        return len(self.raw.quantities)
 
 
 def _or_none(raw: Staged, name: str) -> Array | None:

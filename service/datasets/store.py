@@ -148,14 +148,4 @@ def _array(staged: Staged, name: str) -> NDArray[np.float64] | NDArray[np.int64]
 
 
 def _show(row: DatasetRow) -> Dataset:
-    return Dataset.model_validate(
-        {
-            "id": row.id,
-            "name": row.name,
-            "created_at": row.created_at,
-            "sha256": row.sha256,
-            "joint_names": row.joint_names,
-            "torque_convention": row.torque_convention,
-            "report": row.report,
-        }
-    )
+    return Dataset.model_validate(row, from_attributes=True)

@@ -145,8 +145,7 @@ def _invalid(message: str) -> InvalidDataError:
 
 
 def _show(row: RobotRow) -> Robot:
-    fields = ("id", "name", "created_at", "sha256", "joints")
-    return Robot.model_validate({name: getattr(row, name) for name in fields})
+    return Robot.model_validate(row, from_attributes=True)
 
 
 def _show_profile(profile: Profile) -> RobotProfile:

@@ -18,6 +18,7 @@ MISSING = ("", "NA", "N/A", "<NA>", "na", "null", "NULL", "None")
 _PATTERN = rf"(?i)^(?:{NUMBER}|[+-]?(?:nan|inf(?:inity)?))$"
 _COMMA = r"^([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)$"
 _INT_MIN = np.iinfo(np.int64).min
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
 class NumberColumn:
@@ -115,9 +116,6 @@ def since(stamps: pa.Array, origin: int | None, unit: float) -> tuple[Array, int
 def _floats(column: pa.Array) -> Array:
     values: Array = column.to_numpy(zero_copy_only=False)
     return values
-
-
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
 class Node(Protocol):

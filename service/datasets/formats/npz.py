@@ -144,17 +144,22 @@ def _choose(arrays: dict[str, Stored], rows: int) -> tuple[list[Stored], list[st
 def _blocks(
     archive: zipfile.ZipFile, files: ExitStack, used: list[Stored], rows: int, step: float | None
 ) -> Iterator[Array]:
-    """All arrays side by side, each read on by a reader of its own."""
+    """All arrays side by side, each read on by a reader of its own; step: of times, s, None where they are given."""
     readers = [_Reader(archive, files, each) for each in used]
-    clock = None if step is None else _Clock(step)
     names = [name for each in used for name in each.columns()]
     episode = names.index("episode") if "episode" in names else None
     most = block_rows(len(names) + 1)
+    begin, last = 0, np.nan
     for start in range(0, rows, most):
         block = np.concatenate([each.read(min(most, rows - start)) for each in readers], axis=1)
-        if clock is not None:
-            times = clock.read(len(block), None if episode is None else block[:, episode])
-            block = np.column_stack([times, block])
+        if step is not None:
+            row = np.arange(start, start + len(block))
+            begins = np.zeros(len(row), np.int64)
+            if episode is not None:  # times start anew with every episode
+                changes = np.diff(block[:, episode], prepend=last) != 0
+                begins = np.maximum.accumulate(np.where(changes, row, begin))
+                begin, last = int(begins[-1]), float(block[-1, episode])
+            block = np.column_stack([(row - begins) * step, block])
         yield block
     for each in readers:
         each.finish()
@@ -204,25 +209,6 @@ def _skip(file: IO[bytes], count: int) -> None:
         if not piece:
             return
         count -= piece
-
-
-class _Clock:
-    """Times of even samples, which start anew with every episode."""
-
-    def __init__(self, step: float) -> None:
-        self.step, self.count, self.last = step, 0, np.nan
-
-    def read(self, rows: int, episode: Array | None) -> Array:
-        """Times of the next rows (rows,), s."""
-        index = np.arange(rows) + self.count
-        if episode is not None:
-            new = np.flatnonzero(np.diff(episode, prepend=self.last) != 0)
-            if len(new):
-                starts = np.repeat(np.append(-self.count, new), np.diff(np.append(np.append(0, new), rows)))
-                index = np.arange(rows) - starts
-            self.last = episode[-1]
-        self.count = int(index[-1]) + 1
-        return np.asarray(index * self.step)
 
 
 def _step(archive: zipfile.ZipFile, array: Stored) -> float:

@@ -64,6 +64,15 @@ _FOREIGN = (
     (b"%PDF", "PDF"),
     (b"\xd0\xcf\x11\xe0", "an Office document"),
 )
+Opener = Callable[[Path, ReadOptions, Settings], AbstractContextManager[Table]]
+OPENERS: dict[str, Opener] = {
+    "csv": open_csv,
+    "parquet": open_parquet,
+    "npz": open_npz,
+    "json_lines": open_json_lines,
+    "json": open_json,
+    "lerobot": open_lerobot,
+}
 
 
 def sniff(path: Path, settings: Settings | None = None) -> str | None:
@@ -131,17 +140,6 @@ def _text(head: bytes) -> str | None:
         line, _, rest = (row or line).lstrip("#%"), None, rest.partition("\n")[2]
     marks = [mark for mark in ",;\t| " if mark in line and mark in row] if rest else []
     return "csv" if marks and any(each.isdigit() for each in row) else None
-
-
-Opener = Callable[[Path, ReadOptions, Settings], AbstractContextManager[Table]]
-OPENERS: dict[str, Opener] = {
-    "csv": open_csv,
-    "parquet": open_parquet,
-    "npz": open_npz,
-    "json_lines": open_json_lines,
-    "json": open_json,
-    "lerobot": open_lerobot,
-}
 
 
 @contextmanager

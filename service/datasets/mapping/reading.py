@@ -18,7 +18,7 @@ from service.datasets.mapping import checks
 from service.datasets.mapping.checks import Clockwork, Rows, Seen
 from service.datasets.mapping.choice import MOTION
 from service.datasets.mapping.mapping import ColumnMap, Source, resolve
-from service.datasets.options import Effort, UploadOptions
+from service.datasets.options import UploadOptions
 from service.datasets.staging import EPISODE, TIME, Staged, column
 from service.foundation.errors import invalid_data
 from service.foundation.settings import Settings
@@ -29,14 +29,12 @@ from service.storage.disk import Disk
 class Read:
     """A recording as it was read.
 
-    staged: its columns; missing: (rows,) where any of them is; facts: figures for the report, JSON; noted: sentences
-    that tell what was understood and what was left out.
+    staged: its columns; facts: figures for the report, JSON; noted: sentences that tell what was understood and what
+    was left out.
     """
 
     staged: Staged
-    effort: Effort
     torque_convention: TorqueConvention
-    missing: NDArray[np.bool_]
     facts: dict[str, Any]
     noted: list[str]
 
@@ -53,7 +51,7 @@ def read(
     reader = _Reader(mapped, Staged(folder, mapped.joints, disk), settings)
     for block in table.blocks:
         reader.add(block)
-    missing = reader.finish()
+    reader.finish()
     noted = [*table.facts, *mapped.notes, *reader.notes()]
     facts = {
         "effort": mapped.torque.effort,
@@ -65,10 +63,10 @@ def read(
         "rows_read": reader.rows,
         "repeated_stamps": reader.clockwork.repeated,
         "first_repeated_row": reader.clockwork.first_repeated or None,
-        "missing_rows": int(missing.sum()),
+        "missing_rows": int(reader.staged.missing().sum()),
         "first_missing_row": reader.first_missing,
     }
-    return Read(reader.staged, mapped.torque.effort, mapped.torque.convention, missing, facts, noted)
+    return Read(reader.staged, mapped.torque.convention, facts, noted)
 
 
 class _Reader:
@@ -83,7 +81,6 @@ class _Reader:
         self.left_out = {name: Seen(each.name) for name, each in mapped.dropped.items()}
         self.absent = {quantity for quantity in MOTION if quantity in mapped.quantities}
         """Those of which there was no value yet: perhaps there is none at all."""
-        self._missing: list[NDArray[np.bool_]] = []
 
     def add(self, block: Array) -> None:
         """Take a block (M, columns); raise InvalidDataError."""
@@ -100,11 +97,11 @@ class _Reader:
             self.clockwork.look(t, episode, rows)
         self._stage(block, rows, t, episode)
 
-    def finish(self) -> NDArray[np.bool_]:
-        """Check the whole; return which rows lack something, (rows,). Raise InvalidDataError."""
+    def finish(self) -> None:
+        """Check the whole; raise InvalidDataError."""
         for quantity in self.absent:
             del self.seen[quantity]
-        missing = np.concatenate([*self._missing, np.zeros(0, dtype=np.bool_)])
+        missing = self.staged.missing()
         seen = [each for row in self.seen.values() for each in row] + ([self.time] if self.time else [])
         checks.check_rows(len(missing), int(missing.sum()), self.clockwork.repeated, self.settings.min_samples, seen)
         if self.mapped.t:
@@ -113,7 +110,6 @@ class _Reader:
         unit = all(each.unit is not None for each in self.mapped.quantities["q"])
         checks.check_positions(joints, self.settings.max_position, unit)
         self._check_slopes(missing)
-        return missing
 
     def notes(self) -> list[str]:
         """What of the file is not used after all."""
@@ -146,11 +142,8 @@ class _Reader:
 
     def _stage(self, block: Array, rows: Rows, t: Array | None, episode: Array | None) -> None:
         columns: dict[str, Array] = {}
-        missing = np.zeros(len(block), dtype=np.bool_)
-        before = sum(map(len, self._missing))
         if t is not None:
             columns[TIME] = t
-            missing |= np.isnan(t)
         if episode is not None:
             columns[EPISODE] = episode
         for quantity, row in self.mapped.quantities.items():
@@ -160,22 +153,19 @@ class _Reader:
             if quantity in self.absent:
                 if all(np.isnan(each).all() for each in values):
                     continue
-                self._begin(quantity, before)
+                self._begin(quantity)
             for joint, each in enumerate(values):
                 columns[column(quantity, joint)] = each
-                missing |= np.isnan(each)
         for name, source in self.mapped.dropped.items():
             self.left_out[name].add(_scaled(block, source), rows)
         self.staged.append(columns)
-        self._missing.append(missing)
 
-    def _begin(self, quantity: str, rows: int) -> None:
+    def _begin(self, quantity: str) -> None:
         """The first values of a quantity come late: all rows before lack it."""
         self.absent.discard(quantity)
-        if rows:
+        if before := self.staged.rows:
             for joint in range(self.staged.n_joints):
-                self.staged.append({column(quantity, joint): np.full(rows, np.nan)})
-            self._missing = [np.ones(rows, dtype=np.bool_)]
+                self.staged.append({column(quantity, joint): np.full(before, np.nan)})
 
     def _check_slopes(self, missing: NDArray[np.bool_]) -> None:
         """Velocities have to be the slopes of positions, accelerations those of velocities: else units are wrong."""

@@ -58,6 +58,43 @@ _OPENING = {"]": "[", ")": "("}
 _NUMBERED = re.compile(r"(\d\]?|time|stamp|elapsed|\bt)$", re.IGNORECASE)
 _LONGEST = 40
 _SUFFIX_WORDS = 4
+QUANTITY_WORDS: dict[str, tuple[str, str]] = {
+    **dict.fromkeys(("q", "pos", "position", "positions"), ("q", "position")),
+    **dict.fromkeys(("angle", "angles", "theta", "θ"), ("q", "angle")),
+    **dict.fromkeys(
+        ("dq", "qd", "qdot", "vel", "vels", "velocity", "velocities", "speed", "speeds", "omega", "ω"),
+        ("dq", "velocity"),
+    ),
+    **dict.fromkeys(("ddq", "qdd", "qddot", "acc", "accel", "acceleration", "accelerations"), ("ddq", "acceleration")),
+    **dict.fromkeys(("tau", "torque", "torques", "trq", "moment", "moments", "τ"), ("tau", "torque")),
+    **dict.fromkeys(("effort", "efforts", "eff"), ("tau", "effort")),
+    **dict.fromkeys(("current", "currents", "cur", "iq"), ("tau", "current")),
+}
+"""Quantity by word, and what kind of word it is: an effort may be a torque or a current."""
+TWO_WORDS: dict[tuple[str, ...], tuple[str, str]] = {
+    ("q", "dot"): ("dq", "velocity"),
+    ("q", "dot", "dot"): ("ddq", "acceleration"),
+    ("q", "ddot"): ("ddq", "acceleration"),
+    ("i", "q"): ("tau", "current"),
+    ("observation", "state"): ("q", "position"),
+}
+MEASURED = frozenset(("actual", "act", "measured", "meas", "feedback", "fb", "present", "real", "sensor", "observed"))
+COMMANDED = frozenset(
+    ("target", "desired", "des", "commanded", "command", "cmd", "reference", "ref", "setpoint", "goal", "action")
+)
+DESIRED = "d"
+"""As in Franka's `q_d` and `tau_J_d`: only behind the quantity, as `d` alone may be anything else."""
+NEUTRAL = frozenset(("joint", "joints", "jnt", "j", "axis", "motor", "filtered", "raw", "state", "value", "link"))
+FOREIGN = (
+    frozenset(("tcp", "ee", "eef", "cartesian", "pose", "orientation", "quaternion", "wrench", "twist", "imu"))
+    | {"gyro", "accelerometer", "gravity", "coriolis", "friction", "momentum", "ext", "external", "limit", "limits"}
+    | {"residual", "error", "err", "std", "variance", "hat", "temperature", "temp", "voltage"}
+)
+"""A column with such a word is no position, velocity, acceleration or whole torque of a joint."""
+_VOCABULARY = frozenset(QUANTITY_WORDS) | MEASURED | COMMANDED | NEUTRAL | FOREIGN
+_PIECES = re.compile(r"[^\W\d_]+|\d+")
+_CAMEL = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
+_JOINT = "joint"
 
 
 @lru_cache(maxsize=1024)
@@ -92,8 +129,7 @@ def in_header(name: str) -> Iterator[tuple[str, str]]:
         if before[-1].isspace() or _is_unit(unit):
             yield before.rstrip(), unit
         return
-    words = [each.start() for each in re.finditer(r"[_ ]", name)][-_SUFFIX_WORDS:]
-    for place in words:
+    for place in [each.start() for each in re.finditer(r"[_ ]", name)][-_SUFFIX_WORDS:]:
         before, unit = name[:place], name[place + 1 :]
         # one letter is a unit only where nothing else can be meant: of q1_m, but not of q_m
         single = len(plain(unit)) == 1 and not _NUMBERED.search(before)
@@ -103,61 +139,6 @@ def in_header(name: str) -> Iterator[tuple[str, str]]:
 
 def _is_unit(text: str) -> bool:
     return any(plain(text) in units for units in FACTORS.values())
-
-
-QUANTITY_WORDS: dict[str, tuple[str, str]] = {
-    **dict.fromkeys(("q", "pos", "position", "positions"), ("q", "position")),
-    **dict.fromkeys(("angle", "angles", "theta", "θ"), ("q", "angle")),
-    **dict.fromkeys(
-        ("dq", "qd", "qdot", "vel", "vels", "velocity", "velocities", "speed", "speeds", "omega", "ω"),
-        ("dq", "velocity"),
-    ),
-    **dict.fromkeys(("ddq", "qdd", "qddot", "acc", "accel", "acceleration", "accelerations"), ("ddq", "acceleration")),
-    **dict.fromkeys(("tau", "torque", "torques", "trq", "moment", "moments", "τ"), ("tau", "torque")),
-    **dict.fromkeys(("effort", "efforts", "eff"), ("tau", "effort")),
-    **dict.fromkeys(("current", "currents", "cur", "iq"), ("tau", "current")),
-}
-"""Quantity by word, and what kind of word it is: an effort may be a torque or a current."""
-TWO_WORDS: dict[tuple[str, ...], tuple[str, str]] = {
-    ("q", "dot"): ("dq", "velocity"),
-    ("q", "dot", "dot"): ("ddq", "acceleration"),
-    ("q", "ddot"): ("ddq", "acceleration"),
-    ("i", "q"): ("tau", "current"),
-    ("observation", "state"): ("q", "position"),
-}
-MEASURED = frozenset(("actual", "act", "measured", "meas", "feedback", "fb", "present", "real", "sensor", "observed"))
-COMMANDED = frozenset(
-    ("target", "desired", "des", "commanded", "command", "cmd", "reference", "ref", "setpoint", "goal", "action")
-)
-DESIRED = "d"
-"""As in Franka's `q_d` and `tau_J_d`: only behind the quantity, as `d` alone may be anything else."""
-NEUTRAL = frozenset(("joint", "joints", "jnt", "j", "axis", "motor", "filtered", "raw", "state", "value", "link"))
-FOREIGN = (
-    frozenset(
-        ("tcp", "ee", "eef", "cartesian", "pose", "wrench", "twist", "imu", "error", "err", "ext", "external", "limit")
-    )
-    | frozenset(
-        (
-            "limits",
-            "temperature",
-            "temp",
-            "voltage",
-            "std",
-            "variance",
-            "hat",
-            "gravity",
-            "coriolis",
-            "friction",
-            "gyro",
-        )
-    )
-    | frozenset(("accelerometer", "momentum", "residual", "orientation", "quaternion"))
-)
-"""A column with such a word is no position, velocity, acceleration or whole torque of a joint."""
-_VOCABULARY = frozenset(QUANTITY_WORDS) | MEASURED | COMMANDED | NEUTRAL | FOREIGN
-_PIECES = re.compile(r"[^\W\d_]+|\d+")
-_CAMEL = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
-_JOINT = "joint"
 
 
 @dataclass(frozen=True)

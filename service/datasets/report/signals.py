@@ -14,6 +14,19 @@ from lipcore.vocabulary import JointType
 from service.datasets.report.timing import Rows
 from service.datasets.schema import JointLimits, JointSaturation
 
+AT_LIMIT = 0.99
+"""Share of the torque limit from which on a torque counts as saturated."""
+FLAT_ROWS = 5
+"""Equal extreme torques in a row, while the joint moves, that are no chance."""
+EXTREME = 1e-9
+"""Share of the span that counts as equal to the largest value: rounding of a text file."""
+NORMAL = 1.4826
+"""Standard deviation of normal noise over the median of its size."""
+MOST = 200_000
+"""Differences that are enough for a median."""
+SPREAD_SHARE = 0.1
+"""Of the spread: what stands in where the parts are too short to tell, as in `noise_level`."""
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -58,14 +71,6 @@ def limits_of(profile: Profile | None, names: tuple[str, ...]) -> Limits | None:
         np.where(torque > 0, torque, np.nan),
         by_order=by_order,
     )
-
-
-AT_LIMIT = 0.99
-"""Share of the torque limit from which on a torque counts as saturated."""
-FLAT_ROWS = 5
-"""Equal extreme torques in a row, while the joint moves, that are no chance."""
-EXTREME = 1e-9
-"""Share of the span that counts as equal to the largest value: rounding of a text file."""
 
 
 def against_limits(joint: int, name: str, columns: dict[str, Array], limits: Limits | None) -> JointLimits:
@@ -120,14 +125,6 @@ def _in_runs(mask: np.ndarray) -> int:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
     lengths = edges[1::2] - edges[::2]
     return int(lengths[lengths >= FLAT_ROWS].sum())
-
-
-NORMAL = 1.4826
-"""Standard deviation of normal noise over the median of its size."""
-MOST = 200_000
-"""Differences that are enough for a median."""
-SPREAD_SHARE = 0.1
-"""Of the spread: what stands in where the parts are too short to tell, as in `noise_level`."""
 
 
 def white_noise(values: Array, part: Rows, robust: bool = False) -> float | None:

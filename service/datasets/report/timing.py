@@ -12,6 +12,8 @@ from service.datasets.schema import Gap, Timing
 from service.datasets.staging import EPISODE, TIME, Staged
 
 Rows = NDArray[np.int64]
+MOST_GAPS = 20
+"""Gaps that a report lists."""
 
 
 def number_parts(rows: int, breaks: list[NDArray[np.bool_]]) -> Rows:
@@ -54,10 +56,6 @@ def finite(value: float | np.floating) -> float | None:
 def spread(values: Array) -> float:
     """Standard deviation, 0 where there are no values."""
     return float(values.std()) if len(values) else 0.0
-
-
-MOST_GAPS = 20
-"""Gaps that a report lists."""
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,7 @@ def test_the_recording_of_a_real_panda(tmp_path):
     messages = [store.deserialize_cdr(data, "sensor_msgs/msg/JointState") for (data,) in rows]
     found = from_file(tmp_path, PANDA, "rosbag2", profile("panda"))
     assert found.staged.joint_names == profile("panda").joint_names
-    assert (found.effort, found.torque_convention) == ("measured", "gravity_included")
+    assert (found.facts["effort"], found.torque_convention) == ("measured", "gravity_included")
     for quantity, field in (("q", "position"), ("dq", "velocity"), ("tau", "effort")):
         expected = np.array([getattr(message, field) for message in messages])
         np.testing.assert_array_equal(found.staged.table(quantity), expected)
