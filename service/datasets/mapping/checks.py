@@ -123,11 +123,11 @@ def check_rows(rows: int, missing: int, repeated: int, least: int, seen: list[Se
         raise invalid_data("rows", usable, f"at least {least} samples{left_out}")
 
 
-def check_positions(seen: list[tuple[str, Seen]], max_position: float, unit_said: bool) -> None:
+def check_positions(seen: list[tuple[str, Seen]], max_position: float, unit_given: bool) -> None:
     """Raise InvalidDataError where positions are too large for SI units, or a joint has not moved."""
     farthest = max((each for _, each in seen), key=lambda each: abs(each.far))
     if abs(farthest.far) > max_position:
-        hint = "" if unit_said else ' Then say units={"q": "deg"}'
+        hint = "" if unit_given else ' Then say units={"q": "deg"}'
         raise invalid_data(
             f"{farthest.name}, row {farthest.far_row}",
             f"{farthest.far:g}",
@@ -156,7 +156,7 @@ def _seconds(unit: str) -> str:
 
 
 def check_time_unit(t: Array, given: bool, name: str) -> None:
-    """Raise InvalidDataError where times can hardly be seconds; said: whether somebody says what they are."""
+    """Raise InvalidDataError where times can hardly be seconds; given: whether somebody says what they are."""
     step = np.diff(t[~np.isnan(t)])
     step = step[step > 0]
     usual = float(np.median(step)) if len(step) else 0.0

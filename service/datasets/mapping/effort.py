@@ -19,7 +19,7 @@ MEANINGS: dict[Effort, str] = {
     "current": "motor current, A",
 }
 
-NOTHING_SAID = "as nothing else is said"
+BY_DEFAULT = "as nothing else is said"
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def torque(
     """
     effort, why = _effort(family, units, options, robot)
     notes = [f"{family.pattern} is taken as {MEANINGS[effort]}, {why}"]
-    if why == NOTHING_SAID and family.rank == CANONICAL:
+    if why == BY_DEFAULT and family.rank == CANONICAL:
         notes = []  # as documented
     wrong = next((unit for unit in units if unit is not None and is_current(unit) != (effort == "current")), None)
     if wrong is not None and effort != "current":
@@ -105,7 +105,7 @@ def _effort(
             return "measured", f"as {robot.name} records it"
     if options.torque_convention == "gravity_compensated":
         return "commanded", "by its torque convention"
-    return "measured", NOTHING_SAID
+    return "measured", BY_DEFAULT
 
 
 def _constants(options: UploadOptions, known: Sequence[float] | None, n: int) -> tuple[float, ...]:

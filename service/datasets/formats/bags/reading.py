@@ -188,7 +188,7 @@ def open_bag(path: Path, kind: BagKind, options: ReadOptions, settings: Settings
             zipped = file.read(4) == b"PK\x03\x04"
         if zipped:
             files = stack.enter_context(unpacked_bag(path, settings))
-            bag: Bag = JoinedBags([_open(each, "rosbag2", settings) for each in files])
+            bag: Bag = JoinedBags(path, [_open(each, "rosbag2", settings) for each in files], settings)
         else:
             bag = _open(path, kind, settings)
         channel = _choose(bag.channels(), options.topic, bag)
