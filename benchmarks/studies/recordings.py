@@ -18,8 +18,8 @@ from rich.console import Console
 
 from service.cli.demonstration import ServiceProcess
 from service.client import Client
-from service.datasets import report_tables
 from service.datasets.asking import Reading
+from service.datasets.report import tables
 from service.datasets.schema import Dataset
 from service.foundation.states import SUCCEEDED
 
@@ -33,9 +33,9 @@ SCHUNK = "schunk_liu_althoff.npz", Reading(rate=RATE)
 def tell(dataset: Dataset, console: Console) -> None:
     """Print the report of a data set."""
     console.print(f"\n[bold]{dataset.name}[/bold]")
-    for said in report_tables.overview(dataset.report):
+    for said in tables.overview(dataset.report):
         console.print(f"  {said}", highlight=False, markup=False, soft_wrap=True)
-    for table in report_tables.tables(dataset.report, dataset.joint_names):
+    for table in tables.tables(dataset.report, dataset.joint_names):
         console.print(table)
     if dataset.report.excitation is not None:
         console.print(f"  {dataset.report.excitation.text}", highlight=False, markup=False, soft_wrap=True)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from lipcore.preparation.errors import PreparationError
-from lipcore.preparation.filtering import QUANTITIES, Work, settle
-from lipcore.preparation.recipe import Recipe
-from lipcore.preparation.resampling import SAME_RATE
+from lipcore.preparation.filtering import QUANTITIES, Read, Work, settle
+from lipcore.preparation.recipe import PreparationError, Recipe
+from lipcore.preparation.resampling import BLOCK, SAME_RATE
 from lipcore.samples import Array
 from lipcore.signals import ORDER
 
@@ -56,13 +55,28 @@ class CausalFilter:
             return self._named(known[:0])
         before, now, after = known[:-2], known[1:-1], known[2:]
         slope = self._named((after - before) * (0.5 * self.work.rate))
-        found = self._named(now)
+        middle = self._named(now)
         if "ddq" in self.work.derived:
             bend = self._named((after - 2 * now + before) * self.work.rate**2)
-            found["ddq"] = bend["q"] if "dq" in self.work.derived else slope["dq"]
+            middle["ddq"] = bend["q"] if "dq" in self.work.derived else slope["dq"]
         if "dq" in self.work.derived:
-            found["dq"] = slope["q"]
-        return found
+            middle["dq"] = slope["q"]
+        return middle
+
+    def part(self, read: Read) -> Iterator[tuple[str, Array]]:
+        """All quantities, in turn, of one contiguous part of one joint, as a live stream has them: columns (N,)."""
+        self.reset()
+        signals = {name: read(name)[:, None] for name in self.work.given}
+        rows = len(signals["q"])
+        columns = {name: np.empty(rows - 2 * self.lag) for name in QUANTITIES}
+        done = 0
+        for begin in range(0, rows, BLOCK):
+            block = self.batch({name: values[begin : begin + BLOCK] for name, values in signals.items()})
+            for name, values in block.items():
+                columns[name][done : done + len(values)] = values[:, 0]
+            done += len(block["q"])
+        for name in QUANTITIES:
+            yield name, columns.pop(name)
 
     def _checked(self, name: str, rows: Mapping[str, Array]) -> Array:
         values = np.asarray(rows[name], dtype=np.float64)
@@ -83,8 +97,8 @@ class CausalFilter:
     def _named(self, table: Array) -> dict[str, Array]:
         """Columns of the quantities given; those derived are there, to be replaced."""
         n = self.n_joints
-        found = {name: table[:, index * n : (index + 1) * n] for index, name in enumerate(self.work.given)}
-        return {name: found.get(name, found["q"]) for name in QUANTITIES}
+        columns = {name: table[:, index * n : (index + 1) * n] for index, name in enumerate(self.work.given)}
+        return {name: columns.get(name, columns["q"]) for name in QUANTITIES}
 
     def _group_delay(self) -> float:
         """Of slow motions, in samples: minus the slope of the phase at frequency 0, section by section."""
@@ -132,12 +146,12 @@ class CausalPreparation:
 
     def step(self, row: Mapping[str, Array]) -> dict[str, Array] | None:
         """One more row, (n,) a quantity; q, dq, ddq, tau, (n,) each, or None where nothing comes out with this row."""
-        found = self.batch({name: np.asarray(row[name])[None] for name in self._filter.work.given})
-        return {name: values[0] for name, values in found.items()} if len(found["q"]) else None
+        prepared = self.batch({name: np.asarray(row[name])[None] for name in self._filter.work.given})
+        return {name: values[0] for name, values in prepared.items()} if len(prepared["q"]) else None
 
     def batch(self, rows: Mapping[str, Array]) -> dict[str, Array]:
         """Further rows, (N, n) a quantity; what `step` returns for each of them, (M, n) a quantity, M ≤ N."""
-        found = self._filter.batch(rows)
+        prepared = self._filter.batch(rows)
         first = -self._count % self._every
-        self._count += len(found["q"])
-        return {name: values[first :: self._every] for name, values in found.items()}
+        self._count += len(prepared["q"])
+        return {name: values[first :: self._every] for name, values in prepared.items()}

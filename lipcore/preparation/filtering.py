@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from lipcore.preparation.errors import PreparationError
-from lipcore.preparation.recipe import Form, Recipe
+from lipcore.preparation.recipe import Form, PreparationError, Recipe
 from lipcore.preparation.resampling import BLOCK, SAME_RATE
 from lipcore.samples import Array
 from lipcore.signals import ORDER, differentiate
 
 QUANTITIES = ("q", "dq", "ddq", "tau")
+Read = Callable[[str], Array]
+"""A quantity → its column, read when it is asked for: no more than one has to be in memory."""
 FILTERED = ("q", "tau", "dq", "ddq")
 """The same, as sentences tell them."""
 SHORTEST = 3 * (2 * ((ORDER + 1) // 2) + 1) + 1
@@ -78,16 +79,16 @@ def settle(rate: float, given: tuple[str, ...], recipe: Recipe) -> Work:
     and otherwise recorded accelerations only where all is to be filtered or samples are late.
     """
     missing = derived(given)
-    wanted = recipe.rate_hz
-    if wanted is not None and wanted > rate * (1 + SAME_RATE):
-        raise PreparationError("rate", f"{wanted:g} Hz", f"at most the recording's, {rate:g} Hz")
-    thins = wanted is not None and wanted < rate * (1 - SAME_RATE)
+    asked_rate = recipe.rate_hz
+    if asked_rate is not None and asked_rate > rate * (1 + SAME_RATE):
+        raise PreparationError("rate", f"{asked_rate:g} Hz", f"at most the recording's, {rate:g} Hz")
+    thins = asked_rate is not None and asked_rate < rate * (1 - SAME_RATE)
     filtered = filters(given, recipe)
     cutoff = recipe.cutoff_hz if filtered else None
     if cutoff is not None and cutoff >= rate / 2 * (1 - 1e-6):  # a rate read off times is never exact
         raise PreparationError("cutoff", f"{cutoff:g} Hz", f"less than half the rate of {rate:g} Hz")
-    if thins and wanted is not None:
-        cutoff = min(cutoff or np.inf, ALIAS * wanted)
+    if thins and asked_rate is not None:
+        cutoff = min(cutoff or np.inf, ALIAS * asked_rate)
     everything = thins or recipe.filtering == "always" or recipe.form == "causal"
     low_passed = tuple(name for name in FILTERED if name in given and (name != "ddq" or everything))
     return Work(
@@ -96,7 +97,7 @@ def settle(rate: float, given: tuple[str, ...], recipe: Recipe) -> Work:
         missing,
         cutoff,
         () if cutoff is None else low_passed,
-        rate / wanted if thins and wanted is not None else 1.0,
+        rate / asked_rate if thins and asked_rate is not None else 1.0,
         _edges(rate, cutoff, recipe),
         recipe.form,
     )
@@ -137,15 +138,15 @@ class ZeroPhase:
         return np.asarray(smooth[edge:-edge])
 
 
-def without_delay(part: Mapping[str, Array], work: Work, low_pass: ZeroPhase | None) -> Iterator[tuple[str, Array]]:
-    """q, dq, ddq, tau, in turn, of one contiguous part: columns (N,) as given, evenly sampled, N ≥ work.shortest.
+def without_delay(read: Read, work: Work, low_pass: ZeroPhase | None) -> Iterator[tuple[str, Array]]:
+    """q, dq, ddq, tau, in turn, of one contiguous part: `read` gives columns (N,), evenly sampled, N ≥ work.shortest.
 
     As in the paper: a Butterworth filter run forwards and backwards, central differences, and dq filtered once more
     before it is differentiated. low_pass: with work's rate and cut-off, None where there is none.
     """
 
     def filtered(name: str) -> Array:
-        return part[name] if low_pass is None or name not in work.low_passed else low_pass(part[name])
+        return read(name) if low_pass is None or name not in work.low_passed else low_pass(read(name))
 
     q = filtered("q")
     yield "q", q

@@ -9,13 +9,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.preparation import steps as said
+from lipcore.preparation import steps as record
 from lipcore.preparation.causal import CausalFilter
-from lipcore.preparation.errors import PreparationError
-from lipcore.preparation.filtering import QUANTITIES, Work, ZeroPhase, derived, filters, settle, without_delay
-from lipcore.preparation.parts import Kept, OnClock, Part, in_blocks, inner, taken_at
-from lipcore.preparation.recipe import Recipe
-from lipcore.preparation.resampling import Clock, clock_of, grid, thinned
+from lipcore.preparation.filtering import QUANTITIES, Read, Work, ZeroPhase, derived, filters, settle, without_delay
+from lipcore.preparation.recipe import PreparationError, Recipe
+from lipcore.preparation.resampling import Clock, between, clock_of, grid, interpolate, thinned
 from lipcore.samples import Array
 
 BRIDGE = 0.3
@@ -26,6 +24,37 @@ Splitting costs a period at either side. Measured on sums of sinusoids up to 1.6
 tau at 0.06 and 0.05 N·m; at 1 kHz one of 75 ms ddq at 0.7 % and 0.1 %, tau at 0.15 and 0.01 N·m, one of 125 ms 1.8 %
 and 0.6 N·m.
 """
+
+
+@dataclass(frozen=True)
+class Part:
+    """One contiguous part of a recording.
+
+    rows: of those kept; at: even times it is put on, None where its own are even; inner: samples between the ends that
+    are cut off; taken: positions among those, all where None; out: where they come to lie.
+    """
+
+    rows: slice
+    at: Array | None
+    inner: slice
+    taken: NDArray[np.int64] | Array | None
+    out: slice
+
+    def on_clock(self, values: Array, times: Array) -> Array:
+        """Of a column (N,) of the rows kept, with their times (N,), the samples of this part on its even clock."""
+        part = values[self.rows]
+        return part if self.at is None else interpolate(times[self.rows], part, self.at)
+
+    def coming_out(self, values: Array) -> Array:
+        """Of samples of this part, those that come out."""
+        return values[self.inner] if self.taken is None else taken_at(values[self.inner], self.taken)
+
+
+def taken_at(values: Array, positions: NDArray[np.int64] | Array) -> Array:
+    """Values (N,) at whole positions (M,), or between them."""
+    if positions.dtype.kind == "i":
+        return np.asarray(values[positions])
+    return between(values, np.asarray(positions, dtype=np.float64))
 
 
 @dataclass(frozen=True)
@@ -40,7 +69,7 @@ class Plan:
 
     t: Array
     episode: NDArray[np.int64]
-    steps: list[said.Step]
+    steps: list[record.Step]
     derived: tuple[str, ...]
     recorded_rate: float | None
     rate: float | None
@@ -69,35 +98,40 @@ class Plan:
 
     def apply(self, joint: Mapping[str, Array]) -> dict[str, Array]:
         """Of one joint: the quantities given, (N,) each, to all of q, dq, ddq, tau, (M,) each."""
-        return dict(self.columns(joint))
+        return dict(self.columns(joint.__getitem__))
 
-    def columns(self, joint: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
+    def columns(self, read: Read) -> Iterator[tuple[str, Array]]:
         """The same, one quantity after the other: of a recording in one part, no more than one is held at a time."""
-        signals = Kept(joint, self._kept)
+
+        def kept(name: str) -> Array:
+            return read(name) if self._kept is None else read(name)[self._kept]
+
         if len(self._parts) == 1:
             part = self._parts[0]
-            for name, values in self._of(part, signals):
-                yield name, inner(part, values)
+            for name, values in self._of(part, kept):
+                yield name, part.coming_out(values)
             return
         given = QUANTITIES if self._work is None else self._work.given
-        read = {name: signals[name] for name in given}
-        found = {name: np.empty(len(self.t)) for name in QUANTITIES}
+        signals = {name: kept(name) for name in given}
+        columns = {name: np.empty(len(self.t)) for name in QUANTITIES}
         for part in self._parts:
-            for name, values in self._of(part, read):
-                found[name][part.out] = inner(part, values)
+            for name, values in self._of(part, signals.__getitem__):
+                columns[name][part.out] = part.coming_out(values)
         for name in QUANTITIES:
-            yield name, found.pop(name)
+            yield name, columns.pop(name)
 
-    def _of(self, part: Part, signals: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
+    def _of(self, part: Part, read: Read) -> Iterator[tuple[str, Array]]:
         """Samples of one part, before its ends are cut off."""
-        one = OnClock(part, signals, self._times)
+
+        def samples(name: str) -> Array:
+            return part.on_clock(read(name), self._times)
+
         if self._work is None:
-            yield from ((name, one[name]) for name in QUANTITIES)
+            yield from ((name, samples(name)) for name in QUANTITIES)
         elif self._causal is None:
-            yield from without_delay(one, self._work, self._low_pass)
+            yield from without_delay(samples, self._work, self._low_pass)
         else:
-            self._causal.reset()
-            yield from in_blocks(self._causal, {name: one[name] for name in self._work.given})
+            yield from self._causal.part(samples)
 
 
 @dataclass(frozen=True)
@@ -126,7 +160,7 @@ def plan(
     """
     given = tuple(name for name in QUANTITIES if name in given)
     to_derive = derived(given)
-    steps: list[said.Step] = []
+    steps: list[record.Step] = []
     rows = _rows(t, episode, missing, steps)
     if t is None:
         _check_times_are_not_needed(given, to_derive, recipe)
@@ -142,21 +176,21 @@ def plan(
         if resamples:
             work = settle(clock.rate, given, recipe)
     if (changes_of_episode := int(np.count_nonzero(np.diff(rows.episode)))) > 0:
-        steps.append(said.split_by_episodes(changes_of_episode + 1))
+        steps.append(record.split_by_episodes(changes_of_episode + 1))
     if clock is not None and clock.gaps:
-        steps.append(said.split_at_gaps(clock.gaps, clock.longest))
+        steps.append(record.split_at_gaps(clock.gaps, clock.longest))
     if clock is not None and work is not None and resamples:
-        steps.append(said.resampled(work.rate, clock.worst, clock.longest))
+        steps.append(record.resampled(work.rate, clock.worst, clock.longest))
     return _lay_out(rows, ends, clock, work, resamples, to_derive, steps)
 
 
-def _rows(t: Array | None, episode: Array | None, missing: NDArray[np.bool_], steps: list[said.Step]) -> _Rows:
+def _rows(t: Array | None, episode: Array | None, missing: NDArray[np.bool_], steps: list[record.Step]) -> _Rows:
     """Leave out rows that are missing, and those whose time was there before."""
     numbers = np.zeros(len(missing)) if episode is None else episode
     count = int(missing.sum())
     first = int(missing.argmax()) + 1 if count else None
     if first is not None:
-        steps.append(said.left_out("missing", count, first))
+        steps.append(record.left_out("missing", count, first))
     kept = ~missing
     repeated = 0
     if t is not None:
@@ -170,7 +204,7 @@ def _rows(t: Array | None, episode: Array | None, missing: NDArray[np.bool_], st
         again = places[1:][same & (step == 0)]
         if repeated := len(again):
             kept[again] = False
-            steps.append(said.left_out("repeated", repeated, int(again[0]) + 1))
+            steps.append(record.left_out("repeated", repeated, int(again[0]) + 1))
     if not kept.any():
         raise PreparationError("rows", 0, "rows without missing values")
     times = np.arange(len(kept), dtype=np.float64) if t is None else t
@@ -202,7 +236,7 @@ def _lay_out(
     work: Work | None,
     resamples: bool,
     to_derive: tuple[str, ...],
-    steps: list[said.Step],
+    steps: list[record.Step],
 ) -> Plan:
     """Say for every contiguous part what of it comes out, and where it comes to lie."""
     causal = CausalFilter(work, 1) if work is not None and work.form == "causal" else None
@@ -234,8 +268,8 @@ def _lay_out(
         raise PreparationError("rows", len(rows.t), _long_enough(work))
     rate = None
     if work is not None:
-        whole = parts[0].taken is None or parts[0].taken.dtype.kind == "i"
-        rate = work.rate / (round(work.every) if whole else work.every)
+        by_rows = parts[0].taken is None or parts[0].taken.dtype.kind == "i"
+        rate = work.rate / (round(work.every) if by_rows else work.every)
         steps += _work_steps(work, late, edges, rate)
     return Plan(
         np.concatenate(times),
@@ -261,16 +295,16 @@ def _lay_out(
     )
 
 
-def _work_steps(work: Work, late: float, edges: int, rate: float) -> list[said.Step]:
+def _work_steps(work: Work, late: float, edges: int, rate: float) -> list[record.Step]:
     steps = []
     if work.cutoff is not None:
-        steps.append(said.low_passed(work, late))
+        steps.append(record.low_passed(work, late))
     if work.derived:
-        steps.append(said.differentiated(work))
+        steps.append(record.differentiated(work))
     if work.cutoff is not None or edges:
-        steps.append(said.trimmed(work, edges))
+        steps.append(record.trimmed(work, edges))
     if work.every > 1:
-        steps.append(said.thinned(work, rate))
+        steps.append(record.thinned(work, rate))
     return steps
 
 

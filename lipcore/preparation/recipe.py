@@ -1,4 +1,4 @@
-"""What is to be done with a recording before it is learnt from."""
+"""What is to be done with a recording before it is learnt from, and what it may be refused for."""
 
 from __future__ import annotations
 
@@ -11,6 +11,14 @@ Form = Literal["acausal", "causal"]
 """acausal: without delay, from what came before and after, for recordings; causal: as a live stream can, late."""
 Filtering = Literal["derived", "always", "never"]
 """When signals are low-passed: where velocity or acceleration is derived (as in the paper), always, or never."""
+
+
+class PreparationError(ValueError):
+    """A recording cannot be prepared as asked: `field` is `value`, but `expected` was expected."""
+
+    def __init__(self, field: str, value: object, expected: str) -> None:
+        super().__init__(f"{field} is {value}, expected {expected}")
+        self.field, self.value, self.expected = field, value, expected
 
 
 @dataclass(frozen=True)
@@ -49,9 +57,9 @@ class Recipe:
         return asdict(self)
 
     @staticmethod
-    def from_json(said: dict[str, Any]) -> Recipe:
+    def from_json(choices: dict[str, Any]) -> Recipe:
         """The inverse of `to_json`; raise ValueError for a name that is unknown."""
         known = [each.name for each in fields(Recipe)]
-        if unknown := sorted(set(said) - set(known)):
+        if unknown := sorted(set(choices) - set(known)):
             raise ValueError(f"recipe has {unknown[0]!r}, expected names out of {', '.join(known)}")
-        return Recipe(**said)
+        return Recipe(**choices)

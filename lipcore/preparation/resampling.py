@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.preparation.errors import PreparationError
+from lipcore.preparation.recipe import PreparationError
 from lipcore.samples import Array
 
 MAX_RATE = 1e6
@@ -86,15 +86,15 @@ def interpolate(t: Array, values: Array, at: Array) -> Array:
 
     if len(t) == 1:
         return np.repeat(values, len(at))
-    found = np.empty(len(at))
+    values_at = np.empty(len(at))
     for begin in range(0, len(t) - 1, BLOCK):
         end = min(begin + BLOCK, len(t) - 1)
         around = slice(max(0, begin - AROUND), end + AROUND + 1)
         last = len(at) if end == len(t) - 1 else int(np.searchsorted(at, t[end]))
         inside = slice(int(np.searchsorted(at, t[begin])) if begin else 0, last)
         curve = Akima1DInterpolator(t[around] - t[begin], values[around])
-        found[inside] = curve(np.clip(at[inside], t[begin], t[end]) - t[begin])
-    return found
+        values_at[inside] = curve(np.clip(at[inside], t[begin], t[end]) - t[begin])
+    return values_at
 
 
 def between(values: Array, positions: Array) -> Array:
@@ -102,19 +102,19 @@ def between(values: Array, positions: Array) -> Array:
     count = min(6, len(values))
     first = np.clip(np.floor(positions).astype(np.int64) - (count // 2 - 1), 0, len(values) - count)
     place = positions - first
-    found = np.zeros(len(positions))
+    values_at = np.zeros(len(positions))
     for one in range(count):
         weight = np.ones(len(positions))
         for other in range(count):
             if other != one:
                 weight *= (place - other) / (one - other)
-        found += weight * values[first + one]
-    return found
+        values_at += weight * values[first + one]
+    return values_at
 
 
 def thinned(count: int, every: float) -> NDArray[np.int64] | Array:
     """Positions among `count` even samples of every `every`-th, from the first on; whole numbers where it is one."""
-    whole = round(every)
-    if abs(every / whole - 1) <= SAME_RATE:
-        return np.arange(0, count, whole)
+    apart = round(every)
+    if abs(every / apart - 1) <= SAME_RATE:
+        return np.arange(0, count, apart)
     return np.asarray(np.arange(int((count - 1) / every + 1e-9) + 1) * every)

@@ -13,8 +13,7 @@ from service.cli import completion
 from service.cli.connecting import connected
 from service.cli.consoles import out, print_json, say
 from service.cli.options import DatasetId, Json, Limit, Url, Yes, confirm, names, pairs
-from service.datasets.asking import Reading
-from service.datasets.media import SUFFIXES
+from service.datasets.asking import SUFFIXES, Reading
 from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
@@ -149,13 +148,13 @@ def delete(
 
 
 def _print(dataset: Dataset) -> None:
-    from service.datasets import report_tables  # noqa: PLC0415 - takes long to import; help needs none
+    from service.datasets.report import tables  # noqa: PLC0415 - takes long to import; help needs none
 
     report = dataset.report
     out.print(f"[bold]{dataset.id}[/bold]  {escape(dataset.name)}  torque: {dataset.torque_convention}")
-    for said in report_tables.overview(report):
+    for said in tables.overview(report):
         say(f"  {said}")
-    for table in report_tables.tables(report, dataset.joint_names):
+    for table in tables.tables(report, dataset.joint_names):
         out.print(table)
     if report.excitation is not None:
         say(f"  {report.excitation.text}")

@@ -4,10 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Any, Literal
 
-from lipcore.preparation.recipe import Recipe
+from fastapi import Query
+
+from lipcore.preparation.recipe import Filtering, Form, Recipe
+from lipcore.signals import CUTOFF
 from lipcore.vocabulary import TorqueConvention
+from service.datasets.asking import MEDIA_TYPES, SUFFIXES
+from service.foundation.errors import invalid_request
+from service.web.route import read_json
 
 Effort = Literal["measured", "commanded", "current"]
 """What the effort of a recording is: measured torque, gravity included; commanded torque, what is added to gravity
@@ -51,3 +57,174 @@ class UploadOptions:
     torque_convention: TorqueConvention | None = None
     joints: tuple[str, ...] | None = None
     drop_joints: tuple[str, ...] = ()
+
+
+QUANTITIES = ("t", "episode", "q", "dq", "ddq", "tau")
+MOST_TEXT = 8000
+MOST_NAMES = 1000
+MOST_NAME = 200
+
+Text = Annotated[str | None, Query(max_length=200)]
+Names = Annotated[str | None, Query(max_length=MOST_TEXT)]
+Positive = Annotated[float | None, Query(gt=0, le=1e6, allow_inf_nan=False)]
+
+
+_BINARY = {"schema": {"type": "string", "format": "binary"}}
+UPLOAD_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "description": "A recording with at least positions, torques and times. Canonical columns are `t` (s), "
+        "`q1..qn`, `dq1..`, `ddq1..`, `tau1..`, optional `episode`, in SI units; other names and units are recognised "
+        "or declared by `columns` and `units`. `dq` and `ddq` may be absent and are then derived. NPZ holds `q`, `dq`, "
+        "`ddq`, `tau` (N, n), `t` or `dt`, `episode`, `joint_names`; bags hold `sensor_msgs/JointState` or the states "
+        "of a Franka; a zip is the directory of a LeRobot data set or of a rosbag2.",
+        "content": {
+            "text/csv": {"schema": {"type": "string"}, "example": "t,q1,dq1,ddq1,tau1\n0.0,0.1,0.0,0.2,1.5\n"},
+            "application/x-ndjson": {
+                "schema": {"type": "string"},
+                "example": '{"t": 0.0, "q": [0.1], "dq": [0.0], "tau": [1.5]}\n',
+            },
+            **{kind: _BINARY for kind in MEDIA_TYPES if kind not in ("text/csv", "application/x-ndjson")},
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "required": ["file"],
+                    "properties": {
+                        "file": {
+                            "type": "string",
+                            "format": "binary",
+                            "description": f"A file whose name ends in {', '.join(SUFFIXES)}",
+                        }
+                    },
+                }
+            },
+        },
+    }
+}
+
+
+async def upload_options(
+    joint_names: Annotated[Names, Query(description="Names of joints 1..n, separated by commas")] = None,
+    robot: Annotated[
+        Text, Query(description="A profile such as panda, or the id of an uploaded URDF: its limits, joints, effort")
+    ] = None,
+    torque_convention: Annotated[
+        TorqueConvention | None,
+        Query(
+            description="Whether `tau` is the whole joint torque or what is added to gravity; by default what the "
+            "effort of the robot means, else the whole"
+        ),
+    ] = None,
+    effort: Annotated[
+        Effort | None,
+        Query(
+            description="What the column of torque holds: measured torque, gravity included; commanded torque without "
+            "gravity; or motor current, A, which needs torque constants. By default what the robot's profile says"
+        ),
+    ] = None,
+    torque_constants: Annotated[
+        Names, Query(description="N·m/A of joints 1..n, separated by commas, for motor currents")
+    ] = None,
+    joints: Annotated[Names, Query(description="Joints to keep, in this order; all by default")] = None,
+    drop_joints: Annotated[Names, Query(description="Joints to leave out: grippers, those that are locked")] = None,
+    columns: Annotated[
+        Names,
+        Query(
+            description="What the file calls its columns, as JSON: for `t`, `episode`, `q`, `dq`, `ddq`, `tau` a "
+            'pattern such as `{"q": "{joint}/position"}`, or a list of names. Found out where not given'
+        ),
+    ] = None,
+    units: Annotated[
+        Names,
+        Query(description='Units of columns as JSON, such as `{"q": "deg", "t": "ms"}`; SI, or as the header says'),
+    ] = None,
+    topic: Annotated[Text, Query(description="Topic of a bag, where several could be read")] = None,
+    delimiter: Annotated[
+        str | None, Query(min_length=1, max_length=1, description="Of a CSV; found out where not given")
+    ] = None,
+    cutoff: Annotated[float, Query(gt=0, le=1000, allow_inf_nan=False, description="Of the low-pass, Hz")] = CUTOFF,
+    filtering: Annotated[
+        Filtering,
+        Query(description="When signals are low-passed: where velocity or acceleration is `derived`, always, or never"),
+    ] = "derived",
+    form: Annotated[
+        Form, Query(description="`causal` prepares as a live stream could be, late; `acausal` without delay")
+    ] = "acausal",
+    rate: Annotated[Positive, Query(description="Of the samples that come out, Hz; as recorded by default")] = None,
+    gap: Annotated[
+        float,
+        Query(gt=1, le=1e6, allow_inf_nan=False, description="A step of time that splits a recording, in usual steps"),
+    ] = 1.5,
+    trim: Annotated[
+        float | None,
+        Query(
+            ge=0,
+            le=1e6,
+            allow_inf_nan=False,
+            description="Cut off at both ends of every part, s; what the filter spoils by default",
+        ),
+    ] = None,
+) -> UploadOptions:
+    """How an upload is read and prepared; raise InvalidRequestError."""
+    constants = None if torque_constants is None else tuple(_number(part) for part in torque_constants.split(","))
+    read = ReadOptions(
+        columns=_columns(columns),
+        units=_units(units),
+        topic=topic,
+        delimiter=delimiter,
+        joint_names=_names("joint_names", joint_names),
+        effort=effort,
+        torque_constants=constants,
+    )
+    recipe = Recipe(cutoff_hz=cutoff, filtering=filtering, form=form, rate_hz=rate, trim_s=trim, gap_steps=gap)
+    dropped = _names("drop_joints", drop_joints)
+    return UploadOptions(read, recipe, robot, torque_convention, _names("joints", joints), dropped or ())
+
+
+def _names(field: str, given: str | None) -> tuple[str, ...] | None:
+    if given is None:
+        return None
+    names = tuple(part.strip() for part in given.split(","))
+    if len(names) > MOST_NAMES:
+        raise invalid_request(field, f"{len(names)} names", f"at most {MOST_NAMES}")
+    return names
+
+
+def _number(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not 0 < abs(value) < 1e6:
+        raise invalid_request("torque_constants", text, "numbers of N·m/A, separated by commas")
+    return value
+
+
+def _object(field: str, given: str | None) -> Mapping[str, Any]:
+    if given is None:
+        return {}
+    parsed = read_json(given.encode())
+    if not isinstance(parsed, dict):
+        raise invalid_request(field, given, f"a JSON object with any of {', '.join(QUANTITIES)}")
+    for name in parsed:
+        if name not in QUANTITIES:
+            raise invalid_request(f"{field}.{name}", parsed[name], f"any of {', '.join(QUANTITIES)}")
+    return parsed
+
+
+def _columns(given: str | None) -> dict[str, str | tuple[str, ...]]:
+    columns: dict[str, str | tuple[str, ...]] = {}
+    for name, value in _object("columns", given).items():
+        several = isinstance(value, list) and 0 < len(value) <= MOST_NAMES
+        if not all(isinstance(each, str) and 0 < len(each) <= MOST_NAME for each in (value if several else [value])):
+            raise invalid_request(f"columns.{name}", value, "the name of a column, a pattern with {joint}, or a list")
+        columns[name] = tuple(value) if several else value
+    return columns
+
+
+def _units(given: str | None) -> dict[str, str]:
+    units = _object("units", given)
+    for name, value in units.items():
+        if not isinstance(value, str) or not 0 < len(value) <= MOST_NAME:
+            raise invalid_request(f"units.{name}", value, "the name of a unit, such as deg")
+    return dict(units)

@@ -76,8 +76,8 @@ def extremes(count: int, quantity: str, read: ReadRows, points: int) -> list[tup
     if points < 2:
         raise ValueError(f"points is {points}, expected at least 2")
     if count <= points:
-        whole = read(quantity, 0, count)
-        return [(np.arange(count, dtype=np.int64), column) for column in whole.T]
+        every_row = read(quantity, 0, count)
+        return [(np.arange(count, dtype=np.int64), column) for column in every_row.T]
     rows, values = [], []
     for first, last in pairwise(np.linspace(0, count, points // 2 + 1).astype(np.int64).tolist()):
         stretch = read(quantity, first, last)

@@ -9,10 +9,9 @@ from anyio import to_thread
 from fastapi import APIRouter, Depends, Query, Request, Response, status
 
 from service.datasets import store
-from service.datasets.media import MEDIA_TYPES, SUFFIXES, UPLOAD_BODY
-from service.datasets.options import UploadOptions
+from service.datasets.asking import MEDIA_TYPES, SUFFIXES
+from service.datasets.options import UPLOAD_BODY, UploadOptions, upload_options
 from service.datasets.preview import MOST_POINTS, Preview
-from service.datasets.query import upload_options
 from service.datasets.schema import Dataset, DatasetPage
 from service.datasets.staging import QUANTITIES
 from service.foundation.errors import (
@@ -61,8 +60,8 @@ async def upload(
     path = storage.files.upload()
     try:
         kind, file_name = await receive_to(request, path, KINDS, storage.disk)
-        said = (sorted(request.query_params.multi_items()), kind, file_name)
-        named = await to_thread.run_sync(partial(identity, idempotency_key, *said, file=path))
+        asked = (sorted(request.query_params.multi_items()), kind, file_name)
+        named = await to_thread.run_sync(partial(identity, idempotency_key, *asked, file=path))
         called = name or file_name or "unnamed"
         dataset = await to_thread.run_sync(store.add, storage, path, kind, called, options, named, limiter=turns)
     finally:
@@ -97,11 +96,11 @@ def preview(
     points: Annotated[int, Query(ge=2, le=MOST_POINTS, description="Most points of one column")] = MOST_POINTS,
 ) -> Preview:
     """Columns thinned so that the largest and smallest values stay."""
-    wanted = [name.strip() for name in quantities.split(",")]
-    for name in wanted:
-        if name not in QUANTITIES or wanted.count(name) > 1:
+    names = [name.strip() for name in quantities.split(",")]
+    for name in names:
+        if name not in QUANTITIES or names.count(name) > 1:
             raise invalid_request("quantities", name, f"each of {', '.join(QUANTITIES)} at most once")
-    return store.preview(storage, dataset, wanted, points)
+    return store.preview(storage, dataset, names, points)
 
 
 @router.delete(

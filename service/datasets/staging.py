@@ -1,4 +1,4 @@
-"""Columns of a recording on disk, one file each: no more than one has to be in memory, however long the recording."""
+"""Columns of a recording on disk, one file each, as read and as prepared: no more than a few have to be in memory."""
 
 from __future__ import annotations
 
@@ -6,16 +6,23 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.preparation.plan import plan
+from lipcore.preparation.recipe import PreparationError, Recipe
 from lipcore.samples import Array
+from service.foundation.errors import invalid_data
 from service.storage.disk import Disk
 
 TIME, EPISODE = "t", "episode"
 QUANTITIES = ("q", "dq", "ddq", "tau")
+FOLDER = "prepared"
+"""Of prepared columns: those that were read have the same names."""
 
 
 def column(quantity: str, joint: int) -> str:
@@ -64,10 +71,10 @@ class Staged:
     def read(self, name: str) -> Array:
         """One column, (rows,); raise KeyError where there is none."""
         count = self._rows[name]
-        found: Array = np.fromfile(self.folder / f"{name}.f64", np.float64)
-        if len(found) != count:
-            raise OSError(f"column {name} has {len(found)} rows on disk, expected {count}")
-        return found
+        values: Array = np.fromfile(self.folder / f"{name}.f64", np.float64)
+        if len(values) != count:
+            raise OSError(f"column {name} has {len(values)} rows on disk, expected {count}")
+        return values
 
     def missing(self) -> NDArray[np.bool_]:
         """Rows in which any value is missing, (rows,); looked up once, as that reads all columns."""
@@ -94,3 +101,66 @@ def staging(folder: Path) -> Iterator[Path]:
         yield path
     finally:
         shutil.rmtree(path, ignore_errors=True)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Samples ready to learn from, and how they came about.
+
+    staged: `t`, `episode` and all of q, dq, ddq, tau, finite, (M,) each; steps: what was done, in order, each a JSON
+    object with `step`, its parameters and `text`, a sentence; episodes: contiguous parts; rate_hz: of the samples, None
+    without times; cutoff_hz: of the low-pass, None where none was used; derived: of "dq" and "ddq", those derived;
+    gaps: places in time where the recording was split; missing, repeated: rows left out for missing values, and as
+    their time stamp was there before.
+    """
+
+    staged: Staged
+    steps: list[dict[str, Any]]
+    episodes: int
+    rate_hz: float | None
+    cutoff_hz: float | None
+    derived: tuple[str, ...]
+    gaps: int
+    missing: int
+    repeated: int
+
+
+def prepare(raw: Staged, folder: Path, recipe: Recipe, min_samples: int, disk: Disk | None = None) -> Prepared:
+    """Prepare staged columns, NaN where a value is missing, in a folder of their own below `folder`.
+
+    A few columns are in memory at a time. Raise InvalidDataError where the recording does not allow what the recipe
+    asks for, or where fewer than min_samples come out; StorageFullError.
+    """
+    try:
+        made = plan(_or_none(raw, TIME), _or_none(raw, EPISODE), raw.missing(), raw.quantities, recipe)
+    except PreparationError as error:
+        raise invalid_data(error.field, error.value, error.expected) from None
+    if len(made) < min_samples:
+        why = "trimming the filter's edges" if made.cutoff is not None else "leaving out what cannot be used"
+        raise invalid_data("rows", len(made), f"at least {min_samples} samples after {why}")
+    own = folder / FOLDER
+    own.mkdir()
+    staged = Staged(own, raw.joint_names, raw.disk if disk is None else disk)
+    staged.append({TIME: made.t, EPISODE: made.episode.astype(np.float64)})
+
+    def columns(joint: int) -> Iterator[tuple[str, Array]]:
+        return made.columns(lambda quantity: raw.read(column(quantity, joint)))
+
+    for joint in range(raw.n_joints):
+        for name, values in columns(joint):
+            staged.append({column(name, joint): values})
+    return Prepared(
+        staged,
+        made.steps,
+        episodes=made.episodes,
+        rate_hz=made.rate,
+        cutoff_hz=made.cutoff,
+        derived=made.derived,
+        gaps=made.gaps,
+        missing=made.missing,
+        repeated=made.repeated,
+    )
+
+
+def _or_none(raw: Staged, name: str) -> Array | None:
+    return raw.read(name) if name in raw else None

@@ -16,11 +16,10 @@ from lipcore.samples import Samples
 from lipcore.vocabulary import JointType
 from service.datasets.mapping.reading import read
 from service.datasets.options import UploadOptions
-from service.datasets.preparing import prepare
 from service.datasets.preview import Preview, preview_file
 from service.datasets.report.making import make_report
 from service.datasets.schema import Dataset, DatasetPage
-from service.datasets.staging import Staged, column, staging
+from service.datasets.staging import Staged, column, prepare, staging
 from service.foundation.errors import ConflictError, not_found
 from service.foundation.states import ACTIVE
 from service.robots.store import profile_of
@@ -51,12 +50,12 @@ def add(
     profile = None if options.robot is None else profile_of(storage.database, options.robot)
     with staging(storage.files.uploads) as folder:
         with open_table(upload, kind, options.read, settings) as table:
-            found = read(table, folder, options, profile, settings, disk)
-        prepared = prepare(found.staged, folder, options.recipe, settings.min_samples, disk)
-        gravity = found.torque_convention == "gravity_included"
-        report = make_report(found.staged, prepared, profile, found.noted, settings, options.recipe, gravity)
-        report["source"] = found.facts
-        report["joint_types"] = None if profile is None else _joint_types(profile, found.staged.joint_names)
+            recording = read(table, folder, options, profile, settings, disk)
+        prepared = prepare(recording.staged, folder, options.recipe, settings.min_samples, disk)
+        gravity = recording.torque_convention == "gravity_included"
+        report = make_report(recording.staged, prepared, profile, recording.noted, settings, options.recipe, gravity)
+        report["source"] = recording.facts
+        report["joint_types"] = None if profile is None else _joint_types(profile, recording.staged.joint_names)
         staged = prepared.staged
         disk.take(sample_file.size(staged.rows, staged.n_joints))
         dataset = new_id("ds")
@@ -66,7 +65,7 @@ def add(
         name=name,
         created_at=now(),
         sha256=digest,
-        torque_convention=found.torque_convention,
+        torque_convention=recording.torque_convention,
         joint_names=list(staged.joint_names),
         rows=staged.rows,
         report=report,
@@ -142,21 +141,11 @@ def _array(staged: Staged, name: str) -> NDArray[np.float64] | NDArray[np.int64]
     """One array of the samples, filled column by column."""
     if name in ("t", "episode"):
         return staged.read(name)
-    found = np.empty((staged.rows, staged.n_joints))
+    values = np.empty((staged.rows, staged.n_joints))
     for joint in range(staged.n_joints):
-        found[:, joint] = staged.read(column(name, joint))
-    return found
+        values[:, joint] = staged.read(column(name, joint))
+    return values
 
 
 def _show(row: DatasetRow) -> Dataset:
-    return Dataset.model_validate(
-        {
-            "id": row.id,
-            "name": row.name,
-            "created_at": row.created_at,
-            "sha256": row.sha256,
-            "joint_names": row.joint_names,
-            "torque_convention": row.torque_convention,
-            "report": row.report,
-        }
-    )
+    return Dataset.model_validate(row, from_attributes=True)

@@ -17,7 +17,6 @@ from service.foundation.errors import (
     responses,
 )
 from service.foundation.names import NameForPeople
-from service.robots import profiles as shown_profiles
 from service.robots import store
 from service.robots.schema import UPLOAD_BODY, ProfileList, Robot, RobotPage, RobotProfile
 from service.storage.storage import StorageDep
@@ -60,13 +59,13 @@ def list_robots(storage: StorageDep, page: PageQuery) -> RobotPage:
 @router.get("/profiles", summary="List the robots known by name")
 def profiles() -> ProfileList:
     """Joints, limits and the meaning of effort of each. Uploads may name any as their robot, jobs those with a URDF."""
-    return ProfileList(items=shown_profiles.every())
+    return ProfileList(items=store.list_profiles())
 
 
 @router.get("/profiles/{name}", summary="One robot known by name, or uploaded", responses=responses(NotFoundError))
 def profile(storage: StorageDep, name: str) -> RobotProfile:
     """Joints, limits and the meaning of effort of a robot, by its name or the id of an uploaded URDF."""
-    return shown_profiles.show(storage.database, name)
+    return store.show_profile(storage.database, name)
 
 
 @router.get("/{robot}", summary="One uploaded robot", responses=responses(NotFoundError))

@@ -1,8 +1,9 @@
-"""Storing and finding robots, and fitting them to the joints of data."""
+"""Robots known by name and uploaded: storing and finding them, and fitting them to the joints of data."""
 
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -10,15 +11,23 @@ from sqlalchemy import select
 from sqlalchemy.orm import undefer
 
 from lipcore import profiles
+from lipcore.motion import Array
 from lipcore.profiles import Profile
 from lipcore.profiles.names import is_number
 from lipcore.profiles.reading import read_limits
 from lipcore.robots import ROBOTS, UnknownRobotError, profile_urdf
 from lipcore.urdf import MOVABLE, RigidBody, UrdfError, describe
-from service.foundation.errors import ConflictError, InvalidDataError, invalid_request, not_found, problem
+from service.foundation.errors import (
+    ConflictError,
+    InvalidDataError,
+    InvalidRequestError,
+    invalid_request,
+    not_found,
+    problem,
+)
 from service.foundation.names import LONGEST, for_people
 from service.foundation.states import ACTIVE
-from service.robots.schema import Robot, RobotPage
+from service.robots.schema import ProfileJoint, Robot, RobotPage, RobotProfile
 from service.storage.database import Database, JobRow, RobotRow, now
 from service.storage.files import new_id
 from service.web.pagination import Page, newest
@@ -28,18 +37,18 @@ def add(database: Database, content: bytes, name: str | None) -> Robot:
     """Check a URDF and store it; raise InvalidDataError saying what is wrong with it."""
     try:
         urdf = content.decode("utf-8-sig")
-        said = describe(urdf)
-        read_limits(urdf, said.joint_names)
+        described = describe(urdf)
+        read_limits(urdf, described.joint_names)
     except UnicodeDecodeError as error:
         raise _invalid(f"the URDF is not text in UTF-8: {error.reason} at byte {error.start}") from None
     except UrdfError as error:
         raise _invalid(str(error)) from None
     row = RobotRow(
         id=new_id("urdf"),
-        name=name or for_people("robot name", said.name[:LONGEST] or "unnamed"),
+        name=name or for_people("robot name", described.name[:LONGEST] or "unnamed"),
         created_at=now(),
         sha256=hashlib.sha256(urdf.encode()).hexdigest(),
-        joints=[{"name": joint.name, "type": MOVABLE[joint.kind]} for joint in said.joints],
+        joints=[{"name": joint.name, "type": MOVABLE[joint.kind]} for joint in described.joints],
         urdf=urdf,
     )
     with database.transaction() as session:
@@ -61,6 +70,20 @@ def page(database: Database, part: Page) -> RobotPage:
     with database.session() as session:
         rows, following = newest(session, RobotRow, part)
     return RobotPage(items=[_show(row) for row in rows], next_cursor=following)
+
+
+def list_profiles() -> list[RobotProfile]:
+    """Every robot that is known by name."""
+    return [_show_profile(profile) for profile in profiles.profiles()]
+
+
+def show_profile(database: Database, robot: str) -> RobotProfile:
+    """The profile of a robot by its name or the id of its uploaded URDF; raise NotFoundError."""
+    try:
+        profile = profile_of(database, robot)
+    except InvalidRequestError:
+        raise not_found("robot", robot) from None
+    return _show_profile(profile)
 
 
 def delete(database: Database, robot: str) -> None:
@@ -122,5 +145,38 @@ def _invalid(message: str) -> InvalidDataError:
 
 
 def _show(row: RobotRow) -> Robot:
-    fields = ("id", "name", "created_at", "sha256", "joints")
-    return Robot.model_validate({name: getattr(row, name) for name in fields})
+    return Robot.model_validate(row, from_attributes=True)
+
+
+def _show_profile(profile: Profile) -> RobotProfile:
+    """A profile as the API shows it: what is infinite or not known is null."""
+    joints = [
+        ProfileJoint(
+            name=name,
+            type=profile.joint_types[joint],
+            aliases=list(profile.joint_aliases[joint]),
+            turns_freely=bool(math.isinf(profile.lower[joint]) and math.isinf(profile.upper[joint])),
+            lower=_number(profile.lower, joint),
+            upper=_number(profile.upper, joint),
+            max_speed=_number(profile.speed, joint),
+            max_acceleration=_number(profile.acceleration, joint),
+            max_torque=_number(profile.torque, joint),
+            torque_constant=_number(profile.torque_constants, joint),
+        )
+        for joint, name in enumerate(profile.joint_names)
+    ]
+    return RobotProfile(
+        name=profile.name,
+        title=profile.title,
+        joints=joints,
+        effort=profile.effort,
+        effort_note=profile.effort_note,
+        source=profile.source,
+        urdf_available=profile.urdf is not None,
+        urdf_note=None if profile.urdf is not None else profile.why_no_urdf(),
+    )
+
+
+def _number(values: Array | None, joint: int) -> float | None:
+    value = math.nan if values is None else float(values[joint])
+    return value if math.isfinite(value) else None

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from scipy.signal import butter, freqz_sos
 
 from lipcore.preparation.causal import CausalPreparation
-from lipcore.preparation.errors import PreparationError
 from lipcore.preparation.plan import plan
-from lipcore.preparation.recipe import Recipe
+from lipcore.preparation.recipe import PreparationError, Recipe
 from tests.lipcore.test_preparation_plan import ALL, RATE, chosen, motion
 
 CAUSAL = Recipe(form="causal")

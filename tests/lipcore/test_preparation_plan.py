@@ -10,9 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import butter, sosfiltfilt
 
-from lipcore.preparation.errors import PreparationError
 from lipcore.preparation.plan import plan
-from lipcore.preparation.recipe import Recipe
+from lipcore.preparation.recipe import PreparationError, Recipe
 
 RATE = 90.0
 """Hz; a period of the cut-off is 22.5 samples, far from a whole number, where rounding would decide."""

@@ -12,8 +12,7 @@ from lipcore.preparation.recipe import Recipe
 from service.datasets.formats.opening import open_table
 from service.datasets.mapping.reading import read
 from service.datasets.options import ReadOptions, UploadOptions
-from service.datasets.preparing import prepare
-from service.datasets.staging import staging
+from service.datasets.staging import prepare, staging
 from service.foundation.errors import InvalidDataError, TooLargeError
 from service.foundation.settings import Settings
 from service.storage.disk import Disk

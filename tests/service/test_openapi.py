@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from service.datasets.media import MEDIA_TYPES
+from service.datasets.asking import MEDIA_TYPES
 
 METHODS = ("get", "post", "put", "patch", "delete")
 ERROR = {"$ref": "#/components/schemas/ErrorResponse"}

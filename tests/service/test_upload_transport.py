@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.datasets.media import MEDIA_TYPES, SUFFIXES
+from service.datasets.asking import MEDIA_TYPES, SUFFIXES
 from tests.service.data import columns, csv, error, post, stream
 from tests.service.refusal import nothing_stays, refused
 

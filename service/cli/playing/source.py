@@ -17,8 +17,7 @@ from service.cli.errors import CommandError
 from service.datasets.formats.opening import open_table
 from service.datasets.mapping.reading import read
 from service.datasets.options import UploadOptions
-from service.datasets.preparing import prepare
-from service.datasets.staging import Staged
+from service.datasets.staging import Staged, prepare
 from service.foundation.errors import ServiceError
 from service.foundation.settings import Settings
 from service.storage.disk import Disk

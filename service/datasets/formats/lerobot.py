@@ -14,11 +14,10 @@ from typing import IO, Any
 import numpy as np
 
 from lipcore.samples import Array
-from service.datasets.formats.blocks import checked_names, said
 from service.datasets.formats.json_rows import decode
 from service.datasets.formats.parquet import ParquetSource
-from service.datasets.formats.table import Table
-from service.datasets.formats.zips import ERRORS, measure, open_zip
+from service.datasets.formats.table import Table, checked_names, first_line
+from service.datasets.formats.zips import ERRORS, by_numbers, measure, open_zip
 from service.datasets.options import ReadOptions
 from service.foundation.errors import ServiceError, TooLargeError, invalid_data
 from service.foundation.settings import Settings
@@ -47,7 +46,7 @@ def open_lerobot(path: Path, options: ReadOptions, settings: Settings) -> Iterat
         if root is None:
             raise invalid_data("member", "no meta/info.json", EXPECTED)
         info = _info(archive, f"{root}{INFO}")
-        files = sorted((n for n in names if n.startswith(f"{root}data/") and n.endswith(".parquet")), key=_order)
+        files = sorted((n for n in names if n.startswith(f"{root}data/") and n.endswith(".parquet")), key=by_numbers)
         if not files:
             raise invalid_data("member", f"no {root}data/…parquet", EXPECTED)
         measure([archive.getinfo(name) for name in files], settings)
@@ -67,8 +66,8 @@ def open_lerobot(path: Path, options: ReadOptions, settings: Settings) -> Iterat
 
 def root_of(names: list[str]) -> str | None:
     """Folder of a LeRobot data set within an archive: "" or "name/"; None where there is none."""
-    found = [name.removesuffix(INFO) for name in names if name == INFO or name.endswith(f"/{INFO}")]
-    return min(found, key=len) if found and min(found, key=len).count("/") <= 1 else None
+    roots = [name.removesuffix(INFO) for name in names if name == INFO or name.endswith(f"/{INFO}")]
+    return min(roots, key=len) if roots and min(roots, key=len).count("/") <= 1 else None
 
 
 class _Files:
@@ -96,22 +95,18 @@ class _Files:
             with self.opened(name) as source:
                 if tuple(source.names) != columns:
                     raise invalid_data(name, f"columns {', '.join(source.names)[:150]}", "those of the first file")
-                blocks = source.blocks()
-                while True:
-                    try:
-                        block = next(blocks, None)
-                    except ServiceError as error:
-                        raise _within(name, error) from None
-                    if block is None:
-                        break
-                    yield block if clock is None else np.column_stack([block[:, clock[0]] * clock[1], block])
+                try:
+                    for block in source.blocks():
+                        yield block if clock is None else np.column_stack([block[:, clock[0]] * clock[1], block])
+                except ServiceError as error:
+                    raise _within(name, error) from None
 
     def _unpack(self, name: str, file: IO[bytes]) -> None:
         try:
             with self.archive.open(name) as member:
                 shutil.copyfileobj(member, file, 1024 * 1024)
         except ERRORS as error:
-            raise invalid_data(name, said(error), "a member that can be unpacked") from None
+            raise invalid_data(name, first_line(error), "a member that can be unpacked") from None
 
     def _rename(self, feature: str, names: list[str]) -> list[str]:
         """The names of a feature's columns; `names` are those by position."""
@@ -135,7 +130,7 @@ def _info(archive: zipfile.ZipFile, name: str) -> dict[str, Any]:
             text = member.read(MAX_INFO + 1)
         info = decode(text) if len(text) <= MAX_INFO else None
     except ERRORS as error:
-        raise invalid_data(name, said(error), EXPECTED) from None
+        raise invalid_data(name, first_line(error), EXPECTED) from None
     if not isinstance(info, dict):
         raise invalid_data(name, info, f"an object, of at most {MAX_INFO} bytes")
     return info
@@ -161,11 +156,6 @@ def _clock(columns: tuple[str, ...], info: dict[str, Any], facts: list[str]) -> 
 def _text(info: dict[str, Any], key: str) -> str:
     value = info.get(key)
     return value[:50] if isinstance(value, str) and value.isprintable() else "unknown"
-
-
-def _order(name: str) -> list[int]:
-    """Chunks and files by their numbers."""
-    return [int(number) for number in re.findall(r"[0-9]{1,18}", name)]
 
 
 def _within(name: str, error: ServiceError) -> ServiceError:

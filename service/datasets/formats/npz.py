@@ -15,8 +15,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from lipcore.samples import Array
-from service.datasets.formats.blocks import block_rows, checked_names, left_out, said
-from service.datasets.formats.table import Table
+from service.datasets.formats.table import Table, block_rows, checked_names, first_line, left_out
 from service.datasets.formats.zips import ERRORS, measure, open_zip
 from service.datasets.options import ReadOptions
 from service.foundation.errors import invalid_data
@@ -68,11 +67,11 @@ def open_npz(path: Path, options: ReadOptions, settings: Settings) -> Iterator[T
         if len(members) > settings.max_columns:
             raise invalid_data("array", f"{len(members)} arrays", f"at most {settings.max_columns}")
         measure(members, settings)
-        found = {each.name: each for each in (_header(archive, member) for member in members)}
-        rows = _rows(found)
-        used, ignored = _choose(found, rows)
-        joints = found.get("joint_names")
-        step = None if "dt" not in found or "t" in found else _step(archive, found["dt"])
+        arrays = {each.name: each for each in (_header(archive, member) for member in members)}
+        rows = _rows(arrays)
+        used, ignored = _choose(arrays, rows)
+        joints = arrays.get("joint_names")
+        step = None if "dt" not in arrays or "t" in arrays else _step(archive, arrays["dt"])
         names = checked_names((["t"] if step else []) + [name for each in used for name in each.columns()], settings)
         facts = left_out(ignored, f"they are not {rows} numbers, or rows of numbers")
         yield Table(
@@ -94,7 +93,7 @@ def _header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Stored:
             shape, fortran, dtype = read(file)
             offset = file.tell()
     except Exception as error:  # NumPy parses the header as Python text and raises whatever its parser raises
-        raise invalid_data(name, said(error), "a NumPy array") from None
+        raise invalid_data(name, first_line(error), "a NumPy array") from None
     kinds = "U" if name == "joint_names" else "fiu"
     if name in ARRAYS and (dtype.kind not in kinds or not 0 < dtype.itemsize <= 1024 or len(shape) != ARRAYS[name]):
         raise invalid_data(
@@ -110,26 +109,26 @@ def _header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Stored:
     return Stored(name, member, tuple(shape), bool(fortran), dtype, offset)
 
 
-def _rows(found: dict[str, Stored]) -> int:
+def _rows(arrays: dict[str, Stored]) -> int:
     """Samples N: as q has rows, or most arrays."""
-    if "q" in found:
-        return found["q"].shape[0]
-    lengths = Counter(each.shape[0] for each in found.values() if each.dtype.kind in "fiu" and each.shape)
+    if "q" in arrays:
+        return arrays["q"].shape[0]
+    lengths = Counter(each.shape[0] for each in arrays.values() if each.dtype.kind in "fiu" and each.shape)
     if not lengths:
-        raise invalid_data("array", ", ".join(found) or "none", "arrays q (N, n) and tau (N, n)")
+        raise invalid_data("array", ", ".join(arrays) or "none", "arrays q (N, n) and tau (N, n)")
     return max(lengths, key=lambda length: (lengths[length], length))
 
 
-def _choose(found: dict[str, Stored], rows: int) -> tuple[list[Stored], list[str]]:
+def _choose(arrays: dict[str, Stored], rows: int) -> tuple[list[Stored], list[str]]:
     """Arrays that become columns, and the names of those that do not."""
     used, ignored = [], []
-    width = found["q"].shape[1] if "q" in found else None
-    for name, array in found.items():
+    width = arrays["q"].shape[1] if "q" in arrays else None
+    for name, array in arrays.items():
         if name in ARRAYS and (len(array.shape) != 2 or width is not None):
-            wanted = {2: (rows, width), 1: (rows,), 0: ()}[ARRAYS[name]] if name != "joint_names" else (width,)
-            if wanted not in (array.shape, (None,)):
+            shape = {2: (rows, width), 1: (rows,), 0: ()}[ARRAYS[name]] if name != "joint_names" else (width,)
+            if shape not in (array.shape, (None,)):
                 raise invalid_data(
-                    name, f"of shape {array.shape}", f"shape {wanted}, as q has {rows} rows and {width} joints"
+                    name, f"of shape {array.shape}", f"shape {shape}, as q has {rows} rows and {width} joints"
                 )
         if name in ("dt", "joint_names"):
             continue
@@ -145,17 +144,22 @@ def _choose(found: dict[str, Stored], rows: int) -> tuple[list[Stored], list[str
 def _blocks(
     archive: zipfile.ZipFile, files: ExitStack, used: list[Stored], rows: int, step: float | None
 ) -> Iterator[Array]:
-    """All arrays side by side, each read on by a reader of its own."""
+    """All arrays side by side, each read on by a reader of its own; step: of times, s, None where they are given."""
     readers = [_Reader(archive, files, each) for each in used]
-    clock = None if step is None else _Clock(step)
     names = [name for each in used for name in each.columns()]
     episode = names.index("episode") if "episode" in names else None
     most = block_rows(len(names) + 1)
+    begin, last = 0, np.nan
     for start in range(0, rows, most):
         block = np.concatenate([each.read(min(most, rows - start)) for each in readers], axis=1)
-        if clock is not None:
-            times = clock.read(len(block), None if episode is None else block[:, episode])
-            block = np.column_stack([times, block])
+        if step is not None:
+            row = np.arange(start, start + len(block))
+            begins = np.zeros(len(row), np.int64)
+            if episode is not None:  # times start anew with every episode
+                changes = np.diff(block[:, episode], prepend=last) != 0
+                begins = np.maximum.accumulate(np.where(changes, row, begin))
+                begin, last = int(begins[-1]), float(block[-1, episode])
+            block = np.column_stack([(row - begins) * step, block])
         yield block
     for each in readers:
         each.finish()
@@ -207,27 +211,8 @@ def _skip(file: IO[bytes], count: int) -> None:
         count -= piece
 
 
-class _Clock:
-    """Times of even samples, which start anew with every episode."""
-
-    def __init__(self, step: float) -> None:
-        self.step, self.count, self.last = step, 0, np.nan
-
-    def read(self, rows: int, episode: Array | None) -> Array:
-        """Times of the next rows (rows,), s."""
-        index = np.arange(rows) + self.count
-        if episode is not None:
-            new = np.flatnonzero(np.diff(episode, prepend=self.last) != 0)
-            if len(new):
-                starts = np.repeat(np.append(-self.count, new), np.diff(np.append(np.append(0, new), rows)))
-                index = np.arange(rows) - starts
-            self.last = episode[-1]
-        self.count = int(index[-1]) + 1
-        return np.asarray(index * self.step)
-
-
 def _step(archive: zipfile.ZipFile, array: Stored) -> float:
-    step = float(_whole(archive, array))
+    step = float(_values(archive, array))
     if not 0 < step < np.inf:
         raise invalid_data("dt", step, "a positive number of seconds")
     return step
@@ -235,12 +220,12 @@ def _step(archive: zipfile.ZipFile, array: Stored) -> float:
 
 def _text(archive: zipfile.ZipFile, array: Stored) -> tuple[str, ...]:
     try:
-        return tuple(str(name) for name in _whole(archive, array))
+        return tuple(str(name) for name in _values(archive, array))
     except (SystemError, ValueError):
         raise invalid_data("joint_names", "not Unicode", "plain text") from None
 
 
-def _whole(archive: zipfile.ZipFile, array: Stored) -> np.ndarray[Any, Any]:
+def _values(archive: zipfile.ZipFile, array: Stored) -> np.ndarray[Any, Any]:
     """A small array as it is."""
     size = math.prod(array.shape) * array.dtype.itemsize
     if size > 1024 * 1024:
@@ -256,4 +241,4 @@ def _named(name: str) -> Iterator[None]:
     try:
         yield
     except ERRORS as error:
-        raise invalid_data(name, said(error), EXPECTED) from None
+        raise invalid_data(name, first_line(error), EXPECTED) from None

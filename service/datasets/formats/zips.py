@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+import errno
 import io
+import re
 import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
 
-from service.datasets.formats.blocks import said
+import pyarrow as pa
+
+from service.datasets.formats.table import first_line
 from service.foundation.errors import TooLargeError, invalid_data
 from service.foundation.settings import Settings
 
 READ_BYTES = 16 * 1024 * 1024
 """Largest single read from the file: no list of members is longer, whatever the archive says."""
+PIECE = 1024 * 1024
 ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError, ValueError)
 """What zipfile raises of a damaged archive: RuntimeError of a password, NotImplementedError of other compressions."""
+BAG_ENDINGS = (".db3", ".mcap", ".bag", ".db3.zstd", ".mcap.zstd")
+"""Names of the files of a bag."""
+_COMPLETE = "a complete zip archive"
 
 
 @contextmanager
@@ -26,7 +35,7 @@ def open_zip(path: Path, settings: Settings, expected: str) -> Iterator[zipfile.
         try:
             archive = zipfile.ZipFile(_Bounded(raw))
         except ERRORS as error:
-            text = said(error)
+            text = first_line(error)
             raise invalid_data("file", "no zip archive" if "not a zip file" in text else text, expected) from None
         with archive:
             members = archive.infolist()
@@ -53,6 +62,58 @@ def measure(members: list[zipfile.ZipInfo], settings: Settings) -> None:
     total = sum(member.file_size for member in members)
     if total > settings.max_unpacked_bytes:
         raise TooLargeError(f"the archive unpacks to {total} bytes, expected at most {settings.max_unpacked_bytes}")
+
+
+def by_numbers(name: str) -> list[int]:
+    """What names are sorted by whose writers number their files: chunk_0/file_2, …, chunk_0/file_10."""
+    return [int(number) for number in re.findall(r"[0-9]{1,18}", name)]
+
+
+@contextmanager
+def unpacked_bag(path: Path, settings: Settings) -> Iterator[list[Path]]:
+    """The files of a zipped bag in the order of their recording, in a folder that is removed at the end.
+
+    They have names of our own there. Raise InvalidDataError, or TooLargeError.
+    """
+    with TemporaryDirectory(dir=path.parent) as folder:
+        with open_zip(path, settings, _COMPLETE) as archive:
+            try:
+                files = _unpack(archive, Path(folder), settings)
+            except ERRORS as error:
+                if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+                    raise  # of our disk, not of the archive
+                raise invalid_data("file", first_line(error), _COMPLETE) from None
+        yield files
+
+
+def _unpack(archive: zipfile.ZipFile, folder: Path, settings: Settings) -> list[Path]:
+    files = []
+    room = settings.max_unpacked_bytes
+    for index, member in enumerate(_bag_members(archive, settings)):
+        file = folder / f"{index}.bag"
+        packed = member.filename.endswith(".zstd")
+        with archive.open(member) as source, file.open("xb") as target:
+            stream = pa.CompressedInputStream(pa.PythonFile(source, "r"), "zstd") if packed else source
+            while piece := stream.read(PIECE):
+                room -= len(piece)
+                if room < 0:
+                    raise TooLargeError(f"the archive unpacks to more than {settings.max_unpacked_bytes} bytes")
+                target.write(piece)
+        files.append(file)
+    return files
+
+
+def _bag_members(archive: zipfile.ZipFile, settings: Settings) -> list[zipfile.ZipInfo]:
+    """The files of one bag; recorders number those that they split a recording into: name_0.db3, …, name_10.db3."""
+    members = [member for member in archive.infolist() if member.filename.endswith(BAG_ENDINGS)]
+    if not members:
+        raise invalid_data("file", f"an archive without a file named {', '.join(BAG_ENDINGS)}", "a complete bag")
+    measure(members, settings)
+    if len(folders := sorted({str(PurePosixPath(member.filename).parent) for member in members})) > 1:
+        raise invalid_data("file", f"bags in folders {', '.join(folders[:5])}", "one bag")
+    return sorted(
+        members, key=lambda each: (by_numbers(PurePosixPath(each.filename).name.split(".")[0])[-1:], each.filename)
+    )
 
 
 class _Bounded(io.BufferedReader):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.samples import Array
-from service.datasets.mapping.units import TURN
+from service.datasets.mapping.vocabulary import TURN
 from service.foundation.errors import InvalidDataError, invalid_data
 
 CONSTANT = 1e-6
@@ -98,7 +98,7 @@ class Clockwork:
             self.repeated += len(again)
 
 
-def whole(values: Array, rows: Rows, name: str) -> None:
+def check_episodes(values: Array, rows: Rows, name: str) -> None:
     """Raise InvalidDataError where a number of an episode is not whole."""
     wrong = ~np.isfinite(values) | (values != np.floor(values)) | (np.abs(values) > 2**53)
     if wrong.any():
@@ -123,11 +123,11 @@ def check_rows(rows: int, missing: int, repeated: int, least: int, seen: list[Se
         raise invalid_data("rows", usable, f"at least {least} samples{left_out}")
 
 
-def check_positions(seen: list[tuple[str, Seen]], max_position: float, unit_said: bool) -> None:
+def check_positions(seen: list[tuple[str, Seen]], max_position: float, unit_given: bool) -> None:
     """Raise InvalidDataError where positions are too large for SI units, or a joint has not moved."""
     farthest = max((each for _, each in seen), key=lambda each: abs(each.far))
     if abs(farthest.far) > max_position:
-        hint = "" if unit_said else ' Then say units={"q": "deg"}'
+        hint = "" if unit_given else ' Then say units={"q": "deg"}'
         raise invalid_data(
             f"{farthest.name}, row {farthest.far_row}",
             f"{farthest.far:g}",
@@ -155,12 +155,12 @@ def _seconds(unit: str) -> str:
     return f'seconds, or its unit: units={{"t": "{unit}"}} if it is {unit}, "s" if it is s'
 
 
-def check_time_unit(t: Array, said: bool, name: str) -> None:
-    """Raise InvalidDataError where times can hardly be seconds; said: whether somebody says what they are."""
+def check_time_unit(t: Array, given: bool, name: str) -> None:
+    """Raise InvalidDataError where times can hardly be seconds; given: whether somebody says what they are."""
     step = np.diff(t[~np.isnan(t)])
     step = step[step > 0]
     usual = float(np.median(step)) if len(step) else 0.0
-    if said or usual < SLOWEST:
+    if given or usual < SLOWEST:
         return
     unit = "ms" if usual < 500 else "us" if usual < 500e3 else "ns"  # of rates from 2 to 1000 Hz
     raise invalid_data(name, f"in steps of {usual:g}", _seconds(unit))
@@ -187,8 +187,8 @@ def slope_ratio(t: Array, values: Array, derivative: Array) -> float | None:
         return None
     steps = np.diff(t) * (derivative[1:] + derivative[:-1]) / 2
     integral = np.concatenate([[0.0], np.cumsum(steps)])
-    expected, found = values[WINDOW:] - values[:-WINDOW], integral[WINDOW:] - integral[:-WINDOW]
-    product, size, other = float(expected @ found), float(expected @ expected), float(found @ found)
+    expected, integrated = values[WINDOW:] - values[:-WINDOW], integral[WINDOW:] - integral[:-WINDOW]
+    product, size, other = float(expected @ integrated), float(expected @ expected), float(integrated @ integrated)
     if not product**2 > AGREEMENT**2 * size * other:
         return None
     return product / size

@@ -28,7 +28,7 @@ _MOST_LISTED = 6
 
 
 @dataclass(frozen=True)
-class Found:
+class Families:
     """Families of columns. positions: those that say which joints there are; given: those that the user named."""
 
     names: Sequence[str]
@@ -72,15 +72,15 @@ class Found:
         if quantity in MOTION and self.positions.rank != AIM:
             # what was aimed at is not how the robot moved
             rivals = [each for each in rivals if each.rank != AIM]
-        whole = [each for each in rivals if covers(each, joints)]
-        if not whole:
+        covering = [each for each in rivals if covers(each, joints)]
+        if not covering:
             return self._none_complete(quantity, rivals, joints)
         if quantity == "tau":
-            torques, whole = whole, prefer(whole, self.options.read.effort)
-            if not whole:
+            torques, covering = covering, prefer(covering, self.options.read.effort)
+            if not covering:
                 listed = ", ".join(each.pattern for each in torques[:_MOST_LISTED])
                 raise invalid_data("effort", self.options.read.effort, f"what {listed} holds by its name or unit")
-        best = best_of(whole)
+        best = best_of(covering)
         if quantity != "tau" and best[0].rank == CANONICAL:
             extra = [member for key, member in best[0].members.items() if key not in self.positions.members]
             if extra and self.positions.rank == CANONICAL:
@@ -96,9 +96,9 @@ class Found:
             self._check_complete(max(parts, key=lambda each: (-each.rank, len(each.members))), joints)
         if quantity in MOTION:
             return None
-        said = f"tau1..tau{len(joints)}, as there are q1..q{len(joints)}"
+        expected = f"tau1..tau{len(joints)}, as there are q1..q{len(joints)}"
         raise invalid_data(
-            "column tau1", "missing", f"{said}; or {columns_hint({'tau': '…{joint}…'})} if called otherwise"
+            "column tau1", "missing", f"{expected}; or {columns_hint({'tau': '…{joint}…'})} if called otherwise"
         )
 
     def _check_complete(self, family: Family, joints: Sequence[Joint]) -> None:
@@ -116,16 +116,16 @@ class Found:
             )
 
 
-def choose(names: Sequence[str], options: UploadOptions) -> Found:
+def choose(names: Sequence[str], options: UploadOptions) -> Families:
     """Sort a file's columns; raise InvalidDataError without positions, or where several could be them."""
     given = {
-        quantity: _given(quantity, said, names)
-        for quantity, said in options.read.columns.items()
+        quantity: _given(quantity, named, names)
+        for quantity, named in options.read.columns.items()
         if quantity not in ("t", "episode")
     }
     others = tuple(families(names))
     if "q" in given:
-        return Found(names, given["q"], others, given, options)
+        return Families(names, given["q"], others, given, options)
     rivals = [each for each in others if each.quantity == "q"]
     if not rivals:
         hint = columns_hint({"q": "…{joint}…"})
@@ -138,7 +138,7 @@ def choose(names: Sequence[str], options: UploadOptions) -> Found:
         best = with_torque or best
     if len(best) > 1:
         raise unclear("q", best)
-    return Found(names, best[0], others, given, options)
+    return Families(names, best[0], others, given, options)
 
 
 def best_of(rivals: Sequence[Family]) -> list[Family]:
@@ -172,10 +172,10 @@ def source_or_none(family: Family, joint: Joint) -> Member | None:
 
 def source(family: Family, joint: Joint) -> Member:
     """A joint's column of a family that has one; raise KeyError otherwise."""
-    found = source_or_none(family, joint)
-    if found is None:
+    member = source_or_none(family, joint)
+    if member is None:
         raise KeyError(joint.name)
-    return found
+    return member
 
 
 def covers(family: Family, joints: Sequence[Joint]) -> bool:
@@ -183,30 +183,30 @@ def covers(family: Family, joints: Sequence[Joint]) -> bool:
     return all(source_or_none(family, joint) is not None for joint in joints)
 
 
-def _given(quantity: str, said: str | tuple[str, ...], names: Sequence[str]) -> Family:
+def _given(quantity: str, columns: str | tuple[str, ...], names: Sequence[str]) -> Family:
     """The columns that a user names: by a pattern, or one by one."""
     field = f"columns.{quantity}"
     if quantity not in MEANT:
-        raise invalid_request(field, said, f"one of t, episode, {', '.join(MEANT)}")
-    if isinstance(said, str):
-        if said.count(JOINT) > 1:
-            raise invalid_request(field, said, f"{JOINT} once")
-        family = unfold(said, names, quantity)
+        raise invalid_request(field, columns, f"one of t, episode, {', '.join(MEANT)}")
+    if isinstance(columns, str):
+        if columns.count(JOINT) > 1:
+            raise invalid_request(field, columns, f"{JOINT} once")
+        family = unfold(columns, names, quantity)
         if not family.members:
-            raise invalid_data(field, said, f"a pattern of the file's columns: {', '.join(names[:_MOST_LISTED])}…")
+            raise invalid_data(field, columns, f"a pattern of the file's columns: {', '.join(names[:_MOST_LISTED])}…")
         return family
-    out = Family(quantity, quantity, ", ".join(said), 1, listed=True)
-    labels = [next((s.joint for s in sightings(each) if s.quantity == quantity), "") for each in said]
-    found = keys(labels)
-    distinct = len(set(found)) == len(found) and all(labels)
-    for place, name in enumerate(said):
+    out = Family(quantity, quantity, ", ".join(columns), 1, listed=True)
+    labels = [next((s.joint for s in sightings(each) if s.quantity == quantity), "") for each in columns]
+    joint_keys = keys(labels)
+    distinct = len(set(joint_keys)) == len(joint_keys) and all(labels)
+    for place, name in enumerate(columns):
         if name not in names:
             raise invalid_data(
                 f"{field}[{place}]", name, f"one of the file's columns: {', '.join(names[:_MOST_LISTED])}…"
             )
         seen = next((s for s in sightings(name) if s.quantity == quantity), None)
         label = labels[place] if distinct else str(place + 1)
-        out.members[found[place] if distinct else place + 1] = Member(
+        out.members[joint_keys[place] if distinct else place + 1] = Member(
             names.index(name), label, seen.unit if seen else None
         )
         out.kind = seen.kind if seen else out.kind

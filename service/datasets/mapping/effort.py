@@ -6,10 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from lipcore.profiles import Profile
 from lipcore.vocabulary import TorqueConvention
 from service.datasets.mapping.recognition import AIM, CANONICAL, Family
-from service.datasets.mapping.robot import Robot
-from service.datasets.mapping.units import factor, is_current
+from service.datasets.mapping.vocabulary import factor, is_current
 from service.datasets.options import EFFORT_CONVENTIONS, Effort, UploadOptions
 from service.foundation.errors import invalid_data, invalid_request
 
@@ -19,7 +19,7 @@ MEANINGS: dict[Effort, str] = {
     "current": "motor current, A",
 }
 
-NOTHING_SAID = "as nothing else is said"
+BY_DEFAULT = "as nothing else is said"
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def named(family: Family) -> Effort:
     return "commanded" if family.rank == AIM else "measured"
 
 
-def prefer(found: Sequence[Family], effort: Effort | None) -> list[Family]:
+def prefer(families: Sequence[Family], effort: Effort | None) -> list[Family]:
     """Those columns that best hold what the effort is said to be: by default measured torque, then current."""
     if effort == "current":
         order: tuple[Effort, ...] = ("current", "measured", "commanded")
@@ -48,8 +48,8 @@ def prefer(found: Sequence[Family], effort: Effort | None) -> list[Family]:
         order = ("commanded", "measured")
     else:
         order = ("measured", "current", "commanded") if effort is None else ("measured", "commanded")
-    for wanted in order:
-        if chosen := [family for family in found if named(family) == wanted]:
+    for effort_of in order:
+        if chosen := [family for family in families if named(family) == effort_of]:
             return chosen
     return []
 
@@ -58,7 +58,7 @@ def torque(
     family: Family,
     units: Sequence[str | None],
     options: UploadOptions,
-    robot: Robot | None,
+    robot: Profile | None,
     constants: Sequence[float] | None,
 ) -> Torque:
     """Say what the chosen columns are; raise InvalidDataError where that contradicts itself.
@@ -67,7 +67,7 @@ def torque(
     """
     effort, why = _effort(family, units, options, robot)
     notes = [f"{family.pattern} is taken as {MEANINGS[effort]}, {why}"]
-    if why == NOTHING_SAID and family.rank == CANONICAL:
+    if why == BY_DEFAULT and family.rank == CANONICAL:
         notes = []  # as documented
     wrong = next((unit for unit in units if unit is not None and is_current(unit) != (effort == "current")), None)
     if wrong is not None and effort != "current":
@@ -85,11 +85,11 @@ def torque(
 
 
 def _effort(
-    family: Family, units: Sequence[str | None], options: UploadOptions, robot: Robot | None
+    family: Family, units: Sequence[str | None], options: UploadOptions, robot: Profile | None
 ) -> tuple[Effort, str]:
-    said = options.read.effort
-    if said is not None:
-        return said, "as the upload says"
+    given = options.read.effort
+    if given is not None:
+        return given, "as the upload says"
     by_name = named(family)
     if by_name != "measured":
         return by_name, "as the columns are called"
@@ -105,7 +105,7 @@ def _effort(
             return "measured", f"as {robot.name} records it"
     if options.torque_convention == "gravity_compensated":
         return "commanded", "by its torque convention"
-    return "measured", NOTHING_SAID
+    return "measured", BY_DEFAULT
 
 
 def _constants(options: UploadOptions, known: Sequence[float] | None, n: int) -> tuple[float, ...]:

@@ -6,8 +6,8 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+from lipcore.profiles import Profile
 from service.datasets.mapping.recognition import JOINT, Family, Key
-from service.datasets.mapping.robot import Robot
 from service.datasets.options import UploadOptions
 from service.foundation.errors import InvalidDataError, invalid_data, invalid_request
 
@@ -63,19 +63,19 @@ def arrange(
     positions: Family,
     joint_names: tuple[str, ...] | None,
     options: UploadOptions,
-    robot: Robot | None,
+    robot: Profile | None,
     max_joints: int,
 ) -> Order:
     """Name and order the joints, leave out what the user or the robot leaves out; raise InvalidDataError."""
     _check_numbers(positions)
     joints = _named(order_of(positions), joint_names, options)
-    wanted, left_out = _wanted(joints, options)
+    chosen, left_out = _chosen(joints, options)
     notes: list[str] = []
     constants = None
-    kept: tuple[Joint, ...] = wanted
+    kept: tuple[Joint, ...] = chosen
     if robot is not None:
-        kept, constants, notes = _as_robot(joints, wanted, options, robot)
-        left_out += tuple(joint for joint in wanted if joint.index not in {each.index for each in kept})
+        kept, constants, notes = _as_robot(joints, chosen, options, robot)
+        left_out += tuple(joint for joint in chosen if joint.index not in {each.index for each in kept})
     if not 1 <= len(kept) <= max_joints:
         raise invalid_data("joints", len(kept), f"1 to {max_joints}")
     if robot is None and _alphabetical(kept):
@@ -106,10 +106,10 @@ def _check_numbers(positions: Family) -> None:
     labels = [member.label for member in positions.members.values()]
     if positions.listed or not all(label.isdecimal() for label in labels):
         return
-    found = sorted(key for key in positions.members if isinstance(key, int))
+    numbers = sorted(key for key in positions.members if isinstance(key, int))
     first = min(map(int, labels))
     # from 0 or from 1 on; `missing` is the number as the file would write it
-    missing = next((place for place, key in enumerate(found, start=1) if key != place), None)
+    missing = next((place for place, key in enumerate(numbers, start=1) if key != place), None)
     if missing is not None:
         name = positions.pattern.replace(JOINT, str(missing - (first == 0)))
         raise invalid_data(f"column {name}", "missing", f"positions of joints {first or 1} to {max(map(int, labels))}")
@@ -136,12 +136,12 @@ def _named(joints: tuple[Joint, ...], joint_names: tuple[str, ...] | None, optio
     return joints
 
 
-def _wanted(joints: tuple[Joint, ...], options: UploadOptions) -> tuple[tuple[Joint, ...], tuple[Joint, ...]]:
+def _chosen(joints: tuple[Joint, ...], options: UploadOptions) -> tuple[tuple[Joint, ...], tuple[Joint, ...]]:
     dropped = [_find(joints, name, "drop_joints") for name in options.drop_joints]
-    chosen = list(joints) if options.joints is None else [_find(joints, name, "joints") for name in options.joints]
-    if len({joint.index for joint in chosen}) < len(chosen):
+    asked = list(joints) if options.joints is None else [_find(joints, name, "joints") for name in options.joints]
+    if len({joint.index for joint in asked}) < len(asked):
         raise invalid_request("joints", ", ".join(options.joints or ()), "every joint once")
-    kept = tuple(joint for joint in chosen if joint not in dropped)
+    kept = tuple(joint for joint in asked if joint not in dropped)
     return kept, tuple(joint for joint in joints if joint not in kept)
 
 
@@ -153,29 +153,29 @@ def _find(joints: tuple[Joint, ...], name: str, option: str) -> Joint:
 
 
 def _as_robot(
-    joints: tuple[Joint, ...], wanted: tuple[Joint, ...], options: UploadOptions, robot: Robot
+    joints: tuple[Joint, ...], chosen: tuple[Joint, ...], options: UploadOptions, robot: Profile
 ) -> tuple[tuple[Joint, ...], tuple[float, ...] | None, list[str]]:
-    """Those of the wanted joints that the robot has, from base to tip and with its names."""
+    """Those of the chosen joints that the robot has, from base to tip and with its names."""
     notes, names = [], robot.joint_names
     constants = None if robot.torque_constants is None else list(robot.torque_constants)
     places = robot.order_of([joint.name for joint in joints])
     if places is None and options.read.joint_names is not None:
         places = robot.order_of([joint.label for joint in joints])
     if places is None:
-        if len(wanted) != len(names) or not (options.read.joint_names or all(isinstance(j.key, int) for j in wanted)):
-            raise _mismatch(robot, wanted)
-        ordered = list(wanted)
+        if len(chosen) != len(names) or not (options.read.joint_names or all(isinstance(j.key, int) for j in chosen)):
+            raise _mismatch(robot, chosen)
+        ordered = list(chosen)
         notes.append(f"joints are taken as those of {robot.name} in order")
     else:
         ordered = [joints[place] for place in places]
     called = {joint.index: place for place, joint in enumerate(ordered)} if len(ordered) == len(names) else {}
-    kept = [joint for joint in ordered if joint in wanted]
-    others = [joint for joint in wanted if joint not in ordered]
+    kept = [joint for joint in ordered if joint in chosen]
+    others = [joint for joint in chosen if joint not in ordered]
     if options.joints is not None:
-        if [joint for joint in wanted if joint in kept] != kept:
+        if [joint for joint in chosen if joint in kept] != kept:
             expected = f"the order of {robot.name}: {_shown([joint.name for joint in kept])}"
             raise invalid_request("joints", ", ".join(options.joints), expected)
-        kept, others = list(wanted), []
+        kept, others = list(chosen), []
     if others:
         notes.append(f"left out, as {robot.name} has no such joints: {_shown([joint.name for joint in others])}")
     if options.read.joint_names is None:
@@ -189,10 +189,10 @@ def _as_robot(
     return tuple(kept), values, notes
 
 
-def _mismatch(robot: Robot, wanted: Sequence[Joint]) -> InvalidDataError:
+def _mismatch(robot: Profile, chosen: Sequence[Joint]) -> InvalidDataError:
     return invalid_data(
         "joints",
-        _shown([joint.name for joint in wanted]),
+        _shown([joint.name for joint in chosen]),
         f"those of {robot.name}, {_shown(robot.joint_names)}: say joint_names as the robot has them, in the file's "
         "order, or leave other joints out with drop_joints",
     )

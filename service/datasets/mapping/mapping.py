@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from lipcore.profiles import Profile
 from service.datasets.mapping.choice import choose, source, source_or_none
 from service.datasets.mapping.effort import Torque, torque
 from service.datasets.mapping.joints import Joint, arrange
 from service.datasets.mapping.recognition import CANONICAL, Family, clocks, is_episode
-from service.datasets.mapping.robot import Robot
-from service.datasets.mapping.units import KNOWN, factor
+from service.datasets.mapping.vocabulary import KNOWN, factor
 from service.datasets.options import UploadOptions
 from service.foundation.errors import invalid_data, invalid_request
 
@@ -20,12 +20,12 @@ LISTED = 8
 
 @dataclass(frozen=True)
 class Source:
-    """A column of the file: its index and name there, SI units in one of its unit; said: the unit, None for SI."""
+    """A column of the file: its index and name there, SI units in one of its unit; unit: as given, None for SI."""
 
     index: int
     name: str
     factor: float = 1.0
-    said: str | None = None
+    unit: str | None = None
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def resolve(
     units: Mapping[str, str],
     joint_names: tuple[str, ...] | None,
     options: UploadOptions,
-    robot: Robot | None,
+    robot: Profile | None,
     max_joints: int,
 ) -> ColumnMap:
     """Find the columns; raise InvalidDataError that says what is missing or doubled, or how to tell what is unclear.
@@ -59,23 +59,23 @@ def resolve(
     units: of columns by name, where the file says them; joint_names: of joints 1..n, where it says them.
     """
     _check_options(names, options)
-    found = choose(names, options)
-    order = arrange(found.positions, joint_names, options, robot, max_joints)
-    chosen = found.complete(order.kept)
+    families = choose(names, options)
+    order = arrange(families.positions, joint_names, options, robot, max_joints)
+    chosen = families.complete(order.kept)
     quantities = {
         quantity: tuple(_source(names, units, options, family, joint) for joint in order.kept)
         for quantity, family in chosen.items()
     }
     tau = chosen["tau"]
-    said = [each.said for each in quantities["tau"]]
-    meaning = torque(tau, said, options, robot, order.constants)
+    tau_units = [each.unit for each in quantities["tau"]]
+    meaning = torque(tau, tau_units, options, robot, order.constants)
     if meaning.constants is not None:
         quantities["tau"] = tuple(
-            Source(each.index, each.name, each.factor * constant, each.said)
+            Source(each.index, each.name, each.factor * constant, each.unit)
             for each, constant in zip(quantities["tau"], meaning.constants, strict=True)
         )
     times, episode = _time(names, units, options), _episode(names, options)
-    dropped = {each.name: _source(names, units, options, found.positions, each) for each in order.dropped}
+    dropped = {each.name: _source(names, units, options, families.positions, each) for each in order.dropped}
     read = [*(each for row in quantities.values() for each in row), *times, *([episode] if episode else [])]
     used = {each.index for each in read}
     if len(used) < len(read):
@@ -83,7 +83,7 @@ def resolve(
     left_out = [source_or_none(family, joint) for family in chosen.values() for joint in order.dropped]
     used |= {each.index for each in left_out if each is not None}
     unused = tuple(name for index, name in enumerate(names) if index not in used)
-    notes = [*order.notes, *_told(chosen, quantities, times, episode), *found.notes(chosen), *meaning.notes]
+    notes = [*order.notes, *_notes(chosen, quantities, times, episode), *families.notes(chosen), *meaning.notes]
     if unused:
         notes.append(f"{len(unused)} columns are not used: {_listed(unused)}")
     return ColumnMap(
@@ -111,15 +111,15 @@ def _scaled(index: int, name: str, quantity: str, unit: str | None) -> Source:
 
 def _time(names: Sequence[str], units: Mapping[str, str], options: UploadOptions) -> tuple[Source, ...]:
     given, unit = options.read.columns.get("t"), options.read.units.get("t")
-    found = clocks(names)
+    times = clocks(names)
     if given is not None:
         name = _single("t", given, names)
         parts: tuple[tuple[int, str | None], ...] = ((names.index(name), None),)
-        parts = next((clock.parts for clock in found if clock.parts[0][0] == parts[0][0]), parts)
-    elif not found:
+        parts = next((clock.parts for clock in times if clock.parts[0][0] == parts[0][0]), parts)
+    elif not times:
         return ()
     else:
-        best = [clock for clock in found if clock.rank == found[0].rank]
+        best = [clock for clock in times if clock.rank == times[0].rank]
         if len(best) > 1:
             listed = _listed([clock.name for clock in best])
             raise invalid_data("time", listed, f'one of them: columns={{"t": "{best[0].name}"}}')
@@ -139,8 +139,8 @@ def _episode(names: Sequence[str], options: UploadOptions) -> Source | None:
     if (given := options.read.columns.get("episode")) is not None:
         name = _single("episode", given, names)
         return Source(names.index(name), name)
-    found = [index for index, name in enumerate(names) if is_episode(name)]
-    exact = [index for index in found if names[index] == "episode"] or found
+    indices = [index for index, name in enumerate(names) if is_episode(name)]
+    exact = [index for index in indices if names[index] == "episode"] or indices
     if len(exact) > 1:
         listed = [names[index] for index in exact]
         if len(set(listed)) < len(listed):
@@ -164,7 +164,7 @@ def _check_options(names: Sequence[str], options: UploadOptions) -> None:
             raise invalid_request(f"units.{name}", unit, f"the unit of one of {', '.join(KNOWN)}, or of a column")
 
 
-def _told(
+def _notes(
     chosen: Mapping[str, Family],
     quantities: Mapping[str, Sequence[Source]],
     times: Sequence[Source],
@@ -175,12 +175,12 @@ def _told(
     for quantity, row in quantities.items():
         if chosen[quantity].rank != CANONICAL:
             out.append(f"{quantity} is read from {chosen[quantity].pattern}")
-        said = sorted({each.said for each in row if each.said is not None})
-        if said and any(each.factor != 1.0 for each in row):
-            out.append(f"{quantity} is converted from {', '.join(said)}")
+        units = sorted({each.unit for each in row if each.unit is not None})
+        if units and any(each.factor != 1.0 for each in row):
+            out.append(f"{quantity} is converted from {', '.join(units)}")
     if times and (len(times) > 1 or times[0].name != "t" or times[0].factor != 1.0):
-        said = [f" in {each.said}" if each.said else "" for each in times]
-        out.append("t is read from " + " and ".join(e.name + s for e, s in zip(times, said, strict=True)))
+        units = [f" in {each.unit}" if each.unit else "" for each in times]
+        out.append("t is read from " + " and ".join(e.name + s for e, s in zip(times, units, strict=True)))
     if episode is not None and episode.name != "episode":
         out.append(f"episode is read from {episode.name}")
     return out

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.profiles import Profile
 from lipcore.samples import Array
 from lipcore.vocabulary import TorqueConvention
 from service.datasets.formats.table import Table
@@ -17,8 +18,7 @@ from service.datasets.mapping import checks
 from service.datasets.mapping.checks import Clockwork, Rows, Seen
 from service.datasets.mapping.choice import MOTION
 from service.datasets.mapping.mapping import ColumnMap, Source, resolve
-from service.datasets.mapping.robot import Robot
-from service.datasets.options import Effort, UploadOptions
+from service.datasets.options import UploadOptions
 from service.datasets.staging import EPISODE, TIME, Staged, column
 from service.foundation.errors import invalid_data
 from service.foundation.settings import Settings
@@ -29,61 +29,58 @@ from service.storage.disk import Disk
 class Read:
     """A recording as it was read.
 
-    staged: its columns; missing: (rows,) where any of them is; facts: figures for the report, JSON; noted: sentences
-    that tell what was understood and what was left out.
+    staged: its columns; facts: figures for the report, JSON; noted: sentences that tell what was understood and what
+    was left out.
     """
 
     staged: Staged
-    effort: Effort
     torque_convention: TorqueConvention
-    missing: NDArray[np.bool_]
     facts: dict[str, Any]
     noted: list[str]
 
 
 def read(
-    table: Table, folder: Path, options: UploadOptions, robot: Robot | None, settings: Settings, disk: Disk
+    table: Table, folder: Path, options: UploadOptions, robot: Profile | None, settings: Settings, disk: Disk
 ) -> Read:
     """Read a table's columns to files in a folder; raise InvalidDataError, StorageFullError.
 
     Every row of the file becomes one: values that are missing or infinite become NaN, and such rows are left out when
     the recording is prepared, as are those whose time was there in the row before.
     """
-    found = resolve(table.names, table.units, table.joint_names, options, robot, settings.max_joints)
-    reader = _Reader(found, Staged(folder, found.joints, disk), settings)
+    mapped = resolve(table.names, table.units, table.joint_names, options, robot, settings.max_joints)
+    reader = _Reader(mapped, Staged(folder, mapped.joints, disk), settings)
     for block in table.blocks:
         reader.add(block)
-    missing = reader.finish()
-    noted = [*table.facts, *found.notes, *reader.notes()]
+    reader.finish()
+    noted = [*table.facts, *mapped.notes, *reader.notes()]
     facts = {
-        "effort": found.torque.effort,
-        "columns": _columns(found, reader.staged),
-        "units": {each.name: each.said for row in found.quantities.values() for each in row if each.said},
-        "unused_columns": list(found.unused),
-        "dropped_joints": list(found.dropped),
-        "torque_constants": None if found.torque.constants is None else list(found.torque.constants),
+        "effort": mapped.torque.effort,
+        "columns": _columns(mapped, reader.staged),
+        "units": {each.name: each.unit for row in mapped.quantities.values() for each in row if each.unit},
+        "unused_columns": list(mapped.unused),
+        "dropped_joints": list(mapped.dropped),
+        "torque_constants": None if mapped.torque.constants is None else list(mapped.torque.constants),
         "rows_read": reader.rows,
         "repeated_stamps": reader.clockwork.repeated,
         "first_repeated_row": reader.clockwork.first_repeated or None,
-        "missing_rows": int(missing.sum()),
+        "missing_rows": int(reader.staged.missing().sum()),
         "first_missing_row": reader.first_missing,
     }
-    return Read(reader.staged, found.torque.effort, found.torque.convention, missing, facts, noted)
+    return Read(reader.staged, mapped.torque.convention, facts, noted)
 
 
 class _Reader:
     """Takes block after block; keeps of them what the checks at the end need."""
 
-    def __init__(self, found: ColumnMap, staged: Staged, settings: Settings) -> None:
-        self.found, self.staged, self.settings, self.rows = found, staged, settings, 0
-        self.time = Seen(found.t[0].name) if found.t else None
-        self.time_said = any(each.said is not None for each in found.t)
-        self.clockwork = Clockwork(found.t[0].name if found.t else TIME)
-        self.seen = {quantity: [Seen(each.name) for each in row] for quantity, row in found.quantities.items()}
-        self.left_out = {name: Seen(each.name) for name, each in found.dropped.items()}
-        self.absent = {quantity for quantity in MOTION if quantity in found.quantities}
+    def __init__(self, mapped: ColumnMap, staged: Staged, settings: Settings) -> None:
+        self.mapped, self.staged, self.settings, self.rows = mapped, staged, settings, 0
+        self.time = Seen(mapped.t[0].name) if mapped.t else None
+        self.time_has_unit = any(each.unit is not None for each in mapped.t)
+        self.clockwork = Clockwork(mapped.t[0].name if mapped.t else TIME)
+        self.seen = {quantity: [Seen(each.name) for each in row] for quantity, row in mapped.quantities.items()}
+        self.left_out = {name: Seen(each.name) for name, each in mapped.dropped.items()}
+        self.absent = {quantity for quantity in MOTION if quantity in mapped.quantities}
         """Those of which there was no value yet: perhaps there is none at all."""
-        self._missing: list[NDArray[np.bool_]] = []
 
     def add(self, block: Array) -> None:
         """Take a block (M, columns); raise InvalidDataError."""
@@ -92,28 +89,27 @@ class _Reader:
         if self.rows > self.settings.max_samples:
             raise invalid_data("rows", self.rows, f"at most {self.settings.max_samples} samples")
         episode = None
-        if self.found.episode is not None:
-            episode = np.ascontiguousarray(block[:, self.found.episode.index])
-            checks.whole(episode, rows, self.found.episode.name)
+        if self.mapped.episode is not None:
+            episode = np.ascontiguousarray(block[:, self.mapped.episode.index])
+            checks.check_episodes(episode, rows, self.mapped.episode.name)
         t = self._time(block, rows)
         if t is not None:
             self.clockwork.look(t, episode, rows)
         self._stage(block, rows, t, episode)
 
-    def finish(self) -> NDArray[np.bool_]:
-        """Check the whole; return which rows lack something, (rows,). Raise InvalidDataError."""
+    def finish(self) -> None:
+        """Check the whole; raise InvalidDataError."""
         for quantity in self.absent:
             del self.seen[quantity]
-        missing = np.concatenate([*self._missing, np.zeros(0, dtype=np.bool_)])
+        missing = self.staged.missing()
         seen = [each for row in self.seen.values() for each in row] + ([self.time] if self.time else [])
         checks.check_rows(len(missing), int(missing.sum()), self.clockwork.repeated, self.settings.min_samples, seen)
-        if self.found.t:
-            checks.check_time_unit(self.staged.read(TIME), self.time_said, self.found.t[0].name)
-        joints = list(zip(self.found.joints, self.seen["q"], strict=True))
-        said = all(each.said is not None for each in self.found.quantities["q"])
-        checks.check_positions(joints, self.settings.max_position, said)
+        if self.mapped.t:
+            checks.check_time_unit(self.staged.read(TIME), self.time_has_unit, self.mapped.t[0].name)
+        joints = list(zip(self.mapped.joints, self.seen["q"], strict=True))
+        unit = all(each.unit is not None for each in self.mapped.quantities["q"])
+        checks.check_positions(joints, self.settings.max_position, unit)
         self._check_slopes(missing)
-        return missing
 
     def notes(self) -> list[str]:
         """What of the file is not used after all."""
@@ -137,49 +133,43 @@ class _Reader:
     def _time(self, block: Array, rows: Rows) -> Array | None:
         if self.time is None:
             return None
-        parts = [_scaled(block, each) for each in self.found.t]
+        parts = [_scaled(block, each) for each in self.mapped.t]
         t = parts[0] if len(parts) == 1 else np.sum(parts, axis=0)
-        if not self.time_said:
+        if not self.time_has_unit:
             checks.epoch_unit(t, rows, self.time.name)
         self.time.add(t, rows)
         return t
 
     def _stage(self, block: Array, rows: Rows, t: Array | None, episode: Array | None) -> None:
         columns: dict[str, Array] = {}
-        missing = np.zeros(len(block), dtype=np.bool_)
-        before = sum(map(len, self._missing))
         if t is not None:
             columns[TIME] = t
-            missing |= np.isnan(t)
         if episode is not None:
             columns[EPISODE] = episode
-        for quantity, row in self.found.quantities.items():
+        for quantity, row in self.mapped.quantities.items():
             values = [_scaled(block, each) for each in row]
             for each, seen in zip(values, self.seen[quantity], strict=True):
                 seen.add(each, rows)
             if quantity in self.absent:
                 if all(np.isnan(each).all() for each in values):
                     continue
-                self._begin(quantity, before)
+                self._begin(quantity)
             for joint, each in enumerate(values):
                 columns[column(quantity, joint)] = each
-                missing |= np.isnan(each)
-        for name, source in self.found.dropped.items():
+        for name, source in self.mapped.dropped.items():
             self.left_out[name].add(_scaled(block, source), rows)
         self.staged.append(columns)
-        self._missing.append(missing)
 
-    def _begin(self, quantity: str, rows: int) -> None:
+    def _begin(self, quantity: str) -> None:
         """The first values of a quantity come late: all rows before lack it."""
         self.absent.discard(quantity)
-        if rows:
+        if before := self.staged.rows:
             for joint in range(self.staged.n_joints):
-                self.staged.append({column(quantity, joint): np.full(rows, np.nan)})
-            self._missing = [np.ones(rows, dtype=np.bool_)]
+                self.staged.append({column(quantity, joint): np.full(before, np.nan)})
 
     def _check_slopes(self, missing: NDArray[np.bool_]) -> None:
         """Velocities have to be the slopes of positions, accelerations those of velocities: else units are wrong."""
-        if not self.found.t or "dq" not in self.seen:
+        if not self.mapped.t or "dq" not in self.seen:
             return
         t = self.staged.read(TIME)
         episode = self.staged.read(EPISODE) if EPISODE in self.staged else None
@@ -206,12 +196,12 @@ def _scaled(block: Array, source: Source) -> Array:
     return values
 
 
-def _columns(found: ColumnMap, staged: Staged) -> dict[str, list[str]]:
+def _columns(mapped: ColumnMap, staged: Staged) -> dict[str, list[str]]:
     """Names of the file's columns by what they were read as."""
     rows: dict[str, Sequence[Source]] = {
-        TIME: found.t,
-        EPISODE: [found.episode] if found.episode else [],
-        **found.quantities,
+        TIME: mapped.t,
+        EPISODE: [mapped.episode] if mapped.episode else [],
+        **mapped.quantities,
     }
     return {
         name: [each.name for each in row]

@@ -8,8 +8,19 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from service.datasets.mapping.units import factor, in_header
-from service.datasets.mapping.words import COMMANDED, DESIRED, FOREIGN, MEASURED, NEUTRAL, Mention, Word, mention, words
+from service.datasets.mapping.vocabulary import (
+    COMMANDED,
+    DESIRED,
+    FOREIGN,
+    MEASURED,
+    NEUTRAL,
+    Mention,
+    Word,
+    factor,
+    in_header,
+    mention,
+    words,
+)
 
 JOINT = "{joint}"
 """In a pattern: where the joint's name or number is."""
@@ -94,29 +105,31 @@ def sightings(name: str) -> list[Sighting]:
     if len(name) > _LONGEST:
         return []
     for before, unit in in_header(name):
-        found = _parse(before, unit, name[len(before) :])
-        if found and (factor(found[0].quantity, unit) is not None or name[len(before) :].lstrip()[:1] in ("[", "(")):
-            return found
+        parsed = _parse(before, unit, name[len(before) :])
+        if parsed and (factor(parsed[0].quantity, unit) is not None or name[len(before) :].lstrip()[:1] in ("[", "(")):
+            return parsed
     return _parse(name, None, "")
 
 
 def unfold(pattern: str, names: Sequence[str], quantity: str) -> Family:
     """The columns that a user's pattern stands for."""
     before, _, after = pattern.partition(JOINT)
-    found = [
+    matches = [
         (index, name[len(before) : len(name) - len(after)])
         for index, name in enumerate(names)
         if name.startswith(before) and name.endswith(after) and len(name) > len(before) + len(after)
     ]
     if JOINT not in pattern:
-        found = [(index, "") for index, name in enumerate(names) if name == pattern]
-    seen = next((s for index, _ in found for s in sightings(names[index]) if s.quantity == quantity), None)
+        matches = [(index, "") for index, name in enumerate(names) if name == pattern]
+    seen = next((s for index, _ in matches for s in sightings(names[index]) if s.quantity == quantity), None)
     kind, rank = (quantity, PLAIN) if seen is None else (seen.kind, AIM if seen.rank == AIM else PLAIN)
-    units = [_unit_of(names[index]) for index, _ in found]
-    said = [Sighting(quantity, kind, pattern, label, rank, unit) for (_, label), unit in zip(found, units, strict=True)]
-    if not said:
+    units = [_unit_of(names[index]) for index, _ in matches]
+    alike = [
+        Sighting(quantity, kind, pattern, label, rank, unit) for (_, label), unit in zip(matches, units, strict=True)
+    ]
+    if not alike:
         return Family(quantity, kind, pattern, PLAIN)
-    return _family([(index, each) for (index, _), each in zip(found, said, strict=True)])
+    return _family([(index, each) for (index, _), each in zip(matches, alike, strict=True)])
 
 
 def _unit_of(name: str) -> str | None:
@@ -139,43 +152,43 @@ def _family(group: list[tuple[int, Sighting]]) -> Family:
 
 
 def _parse(name: str, unit: str | None, ending: str) -> list[Sighting]:
-    found = words(name)
-    said = mention(found)
-    if said is None or any(word.text in FOREIGN for word in found):
+    parts = words(name)
+    subject = mention(parts)
+    if subject is None or any(word.text in FOREIGN for word in parts):
         return []
-    behind = found[said.last :]
-    inner = _inner_unit(said, behind) if unit is None else ()
+    behind = parts[subject.last :]
+    inner = _inner_unit(subject, behind) if unit is None else ()
     unit = " ".join(inner) or unit
     # a desired value is marked behind its quantity: q_d, tau_J_d
-    aimed = any(word.text in COMMANDED for word in found) or any(word.text == DESIRED for word in behind[:2])
-    measured = any(word.text in MEASURED for word in found)
+    aimed = any(word.text in COMMANDED for word in parts) or any(word.text == DESIRED for word in behind[:2])
+    measured = any(word.text in MEASURED for word in parts)
     out = []
-    for start, end in _joints(name, found, said, inner):
+    for start, end in _joints(name, parts, subject, inner):
         pattern = (name[:start] + JOINT + name[end:] if end > start else name) + ending
         canonical = _CANONICAL.fullmatch(pattern.removesuffix(ending).rstrip()) is not None
         rank = AIM if aimed else CANONICAL if canonical else 1 if measured else PLAIN
-        out.append(Sighting(said.quantity, said.kind, pattern, name[start:end], rank, unit))
+        out.append(Sighting(subject.quantity, subject.kind, pattern, name[start:end], rank, unit))
     return out
 
 
-def _inner_unit(said: Mention, behind: list[Word]) -> tuple[str, ...]:
+def _inner_unit(subject: Mention, behind: list[Word]) -> tuple[str, ...]:
     """Words between a quantity and a joint's number that are a unit: of `pos_deg_1`, `vel_rad_s_1`."""
     texts = [word.text for word in behind]
     for end in range(len(texts) - 1, 0, -1):
         unit = " ".join(texts[:end])
-        if len(unit) > 1 and factor(said.quantity, unit) is not None:
+        if len(unit) > 1 and factor(subject.quantity, unit) is not None:
             return tuple(texts[:end])
     return ()
 
 
-def _joints(name: str, found: list[Word], said: Mention, unit: tuple[str, ...]) -> list[tuple[int, int]]:
+def _joints(name: str, parts: list[Word], subject: Mention, unit: tuple[str, ...]) -> list[tuple[int, int]]:
     """Where a joint may be named: first the likeliest."""
     besides = MEASURED | COMMANDED | NEUTRAL | {DESIRED, *unit}
-    behind = [word for word in found[said.last :] if word.text not in besides]
+    behind = [word for word in parts[subject.last :] if word.text not in besides]
     if len(behind) == 1 and behind[0].text.isdecimal():
         return [(behind[0].start, behind[0].end)]
     out = []
-    ahead = found[: said.first]
+    ahead = parts[: subject.first]
     while ahead and ahead[-1].text in _ADJECTIVES:
         ahead = ahead[:-1]
     while ahead and ahead[0].text in _ADJECTIVES:
@@ -232,8 +245,8 @@ def clocks(names: Sequence[str]) -> list[Clock]:
                 last = _PATHS.split(before.strip().lower())[-1].strip()
                 if _TIMES.fullmatch(last) and (unit is None or factor("t", unit) is not None):
                     # rostopic writes nanoseconds
-                    said = "ns" if unit is None and (name == "%time" or name.startswith("field.header")) else unit
-                    out.append(Clock(name, 1 if last == "stamp" else 2, ((index, said),)))
+                    stamp_unit = "ns" if unit is None and (name == "%time" or name.startswith("field.header")) else unit
+                    out.append(Clock(name, 1 if last == "stamp" else 2, ((index, stamp_unit),)))
                     break
     return sorted(out, key=lambda clock: clock.rank)
 
@@ -254,6 +267,6 @@ def _halved(names: Sequence[str]) -> tuple[list[Clock], set[int]]:
     return out, {index for clock in out for index, _ in clock.parts}
 
 
-def columns_hint(found: Mapping[str, str]) -> str:
+def columns_hint(columns: Mapping[str, str]) -> str:
     """How to say what columns are called: the option `columns`."""
-    return f"columns={json.dumps(dict(found), ensure_ascii=False)}"
+    return f"columns={json.dumps(dict(columns), ensure_ascii=False)}"

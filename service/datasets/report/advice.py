@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 from service.datasets.report.excitation import SELDOM, SLOW
-from service.datasets.report.schema import (
+from service.datasets.schema import (
     Excitation,
     JointExcitation,
     JointLimits,
@@ -83,37 +83,25 @@ def warnings(
 
 def _late(lags: list[Lag]) -> list[str]:
     """A lag that all joints share is one of clocks or filters; that of one joint alone may be its friction's."""
-    told = [each for each in lags[1:] if each.seconds is not None and (each.cost or 0.0) > LATE and _sure(each)]
-    shared = lags[0]
-    if shared.seconds is not None and _sure(shared):
-        alike = [each for each in told if abs(_seconds(each) - shared.seconds) < SURE * _std(each) + _std(shared)]
+    (_, shared, shared_std, _), *others = (
+        (each.joint, each.seconds or 0.0, each.std_s or 0.0, each.cost or 0.0) for each in lags
+    )
+    late = [each for each in others if each[3] > LATE and abs(each[1]) > SURE * each[2]]
+    if abs(shared) > SURE * shared_std:
+        alike = [cost for _, seconds, std, cost in late if abs(seconds - shared) < SURE * std + shared_std]
         if alike:
-            worst = max(each.cost or 0.0 for each in alike)
-            side = "after" if shared.seconds > 0 else "before"
             return [
-                f"torque and motion are not of the same time: torque comes {1e3 * abs(shared.seconds):.1f} ms "
-                f"(± {1e3 * _std(shared):.1f}) {side} motion, which turns up to {worst:.1%} of a joint's torque "
-                "variance into error; use signals of one clock, filtered alike"
+                f"torque and motion are not of the same time: torque comes {1e3 * abs(shared):.1f} ms "
+                f"(± {1e3 * shared_std:.1f}) {'after' if shared > 0 else 'before'} motion, which turns up to "
+                f"{max(alike):.1%} of a joint's torque variance into error; use signals of one clock, filtered alike"
             ]
     return [
-        f"the torque of {each.joint} comes {1e3 * abs(_seconds(each)):.0f} ms (± {1e3 * _std(each):.0f}) "
-        f"{'after' if _seconds(each) > 0 else 'before'} its motion, which other joints do not show: time stamps do not "
+        f"the torque of {joint} comes {1e3 * abs(seconds):.0f} ms (± {1e3 * std:.0f}) "
+        f"{'after' if seconds > 0 else 'before'} its motion, which other joints do not show: time stamps do not "
         "explain it, filters of this joint or friction that depends on more than speed may"
-        for each in told
-        if (each.cost or 0.0) > VERY_LATE
+        for joint, seconds, std, cost in late
+        if cost > VERY_LATE
     ]
-
-
-def _sure(lag: Lag) -> bool:
-    return abs(_seconds(lag)) > SURE * _std(lag)
-
-
-def _seconds(lag: Lag) -> float:
-    return lag.seconds or 0.0
-
-
-def _std(lag: Lag) -> float:
-    return lag.std_s or 0.0
 
 
 def advice(timing: Timing, excitation: Excitation, limits: list[JointLimits], noise: list[JointNoise]) -> list[str]:
@@ -121,84 +109,58 @@ def advice(timing: Timing, excitation: Excitation, limits: list[JointLimits], no
     joints = excitation.joints
     still = [each.joint for each in joints if each.span < STILL]
     moved = [each for each in joints if each.joint not in still]
-    out: list[str] = []
-
-    def say(found: Iterable[str], sentence: Callable[[str], str]) -> None:
-        names = list(found)
-        if names:
-            out.append(sentence(listed(names)))
-
-    say(
-        still,
-        lambda names: f"{names}: moved less than {STILL:g} rad or m; move it, or leave it out with `drop_joints`",
-    )
-    _say_friction(moved, say)
-    say(
-        (each.joint for each in moved if _small(each)),
-        lambda names: (
-            f"{names}: moved through a small part of the range; move it further, as gravity and inertia "
-            "elsewhere are extrapolated"
-        ),
-    )
+    one_way = [each.joint for each in moved if min(each.forwards, each.backwards) < SELDOM]
+    both_ways = [each for each in moved if each.joint not in one_way]
     slow = {each.joint for each in limits if each.speed_used is not None and each.speed_used < LITTLE}
-    say(
-        (each.joint for each in moved if each.joint in slow),
-        lambda names: (
-            f"{names}: slower than {LITTLE:.0%} of the limit of speed throughout; record faster motion, "
-            "if that is what the model is for"
+    needs = [
+        (still, f"moved less than {STILL:g} rad or m; move it, or leave it out with `drop_joints`"),
+        (one_way, "moved in one direction only; record motion in both so that Coulomb friction shows"),
+        (
+            [each.joint for each in both_ways if min(each.slow_forwards, each.slow_backwards) < SELDOM],
+            f"hardly ever below {SLOW:g} rad/s (m/s) in both directions; record slow motions in both directions so "
+            "that Coulomb friction shows",
         ),
-    )
-    say(
-        (each.joint for each in moved if each.collinear > COLLINEAR),
-        lambda names: (
-            f"{names}: motion is so regular that one of velocity, its sign, acceleration and gravity follows "
-            "from the others; record motion of several frequencies and amplitudes"
+        (
+            [each.joint for each in both_ways if "not determined" in (each.viscous.verdict, each.coulomb.verdict)],
+            "viscous and Coulomb friction cannot be told from the rest; record longer, at several speeds in both "
+            "directions",
         ),
-    )
-    whole = excitation.whole
-    if whole is not None and whole.rank < whole.parameters:
+        (
+            [each.joint for each in both_ways if each.offset.verdict == "not determined"],
+            "a constant torque cannot be told from gravity; move it through more of its range",
+        ),
+        (
+            [each.joint for each in moved if _small(each)],
+            "moved through a small part of the range; move it further, as gravity and inertia elsewhere are "
+            "extrapolated",
+        ),
+        (
+            [each.joint for each in moved if each.joint in slow],
+            f"slower than {LITTLE:.0%} of the limit of speed throughout; record faster motion, if that is what the "
+            "model is for",
+        ),
+        (
+            [each.joint for each in moved if each.collinear > COLLINEAR],
+            "motion is so regular that one of velocity, its sign, acceleration and gravity follows from the others; "
+            "record motion of several frequencies and amplitudes",
+        ),
+    ]
+    out = [f"{listed(names)}: {need}" for names, need in needs if names]
+    bodies = excitation.whole
+    if bodies is not None and bodies.rank < bodies.parameters:
         out.append(
-            f"{whole.parameters - whole.rank} of {whole.parameters} base parameters of the rigid bodies are hardly "
-            f"excited, least that of the body that {whole.weakest_body} moves: record faster motion of all joints at "
+            f"{bodies.parameters - bodies.rank} of {bodies.parameters} base parameters of the rigid bodies are hardly "
+            f"excited, least that of the body that {bodies.weakest_body} moves: record faster motion of all joints at "
             "once, or plan it with `lipserve excite`"
         )
-    say(
-        (each.joint for each in noise if (each.torque_share or 0.0) > LOUD),
-        lambda names: (
-            f"{names}: noise is more than {LOUD:.0%} of the torque's spread; record larger or faster motion, and longer"
-        ),
-    )
+    if loud := [each.joint for each in noise if (each.torque_share or 0.0) > LOUD]:
+        out.append(
+            f"{listed(loud)}: noise is more than {LOUD:.0%} of the torque's spread; record larger or faster motion, "
+            "and longer"
+        )
     if timing.duration_s is not None and timing.duration_s < SHORT_S:
         out.append(f"{timing.duration_s:.3g} s in all: record some minutes, so that a part can be held out to judge by")
     return out
-
-
-def _say_friction(moved: list[JointExcitation], say: Callable[[Iterable[str], Callable[[str], str]], None]) -> None:
-    """What friction lacks, joint by joint."""
-    one_way = [each.joint for each in moved if min(each.forwards, each.backwards) < SELDOM]
-    say(
-        one_way,
-        lambda names: f"{names}: moved in one direction only; record motion in both so that Coulomb friction shows",
-    )
-    rest = [each for each in moved if each.joint not in one_way]
-    say(
-        (each.joint for each in rest if min(each.slow_forwards, each.slow_backwards) < SELDOM),
-        lambda names: (
-            f"{names}: hardly ever below {SLOW:g} rad/s (m/s) in both directions; record slow motions in "
-            "both directions so that Coulomb friction shows"
-        ),
-    )
-    say(
-        (each.joint for each in rest if "not determined" in (each.viscous.verdict, each.coulomb.verdict)),
-        lambda names: (
-            f"{names}: viscous and Coulomb friction cannot be told from the rest; record longer, at several "
-            "speeds in both directions"
-        ),
-    )
-    say(
-        (each.joint for each in rest if each.offset.verdict == "not determined"),
-        lambda names: f"{names}: a constant torque cannot be told from gravity; move it through more of its range",
-    )
 
 
 def _small(joint: JointExcitation) -> bool:
@@ -207,21 +169,23 @@ def _small(joint: JointExcitation) -> bool:
 
 def in_words(excitation: Excitation) -> str:
     """How well the data determine friction and rigid bodies."""
-    said = []
+    sentences = []
     for term, field in TERMS:
         by = {
             verdict: [each.joint for each in excitation.joints if getattr(each, field).verdict == verdict]
             for verdict in ("well", "poorly", "not determined")
         }
         if len(by["well"]) == len(excitation.joints):
-            said.append(f"{term} is determined well for all joints")
+            sentences.append(f"{term} is determined well for all joints")
         else:
-            said.append(f"{term}: " + ", ".join(f"{verdict} for {listed(who)}" for verdict, who in by.items() if who))
+            sentences.append(
+                f"{term}: " + ", ".join(f"{verdict} for {listed(who)}" for verdict, who in by.items() if who)
+            )
     whole = excitation.whole
     if whole is not None:
-        worth = "none" if whole.condition is None else f"{whole.condition:.3g}"
-        said.append(
-            f"{whole.rank} of {whole.parameters} base parameters of the rigid bodies are excited (condition {worth}), "
+        how = "none" if whole.condition is None else f"{whole.condition:.3g}"
+        sentences.append(
+            f"{whole.rank} of {whole.parameters} base parameters of the rigid bodies are excited (condition {how}), "
             f"the least at {whole.weakest:.2g} of what random motion over the whole range would do"
         )
-    return "; ".join(said)
+    return "; ".join(sentences)

@@ -14,9 +14,9 @@ import numpy as np
 from lipcore.kernels.friction import FRICTION_TERMS, SIGN_WIDTH
 from lipcore.samples import Array
 from service.datasets.report.fit import OWN, Fit, friction_terms, own_features
-from service.datasets.report.parts import Rows, spread
-from service.datasets.report.robot import Limits
-from service.datasets.report.schema import JointExcitation, Verdict, Weight
+from service.datasets.report.signals import Limits
+from service.datasets.report.timing import Rows, spread
+from service.datasets.schema import JointExcitation, Verdict, Weight
 
 DETERMINED: tuple[tuple[float, Verdict], ...] = ((0.02, "well"), (0.1, "poorly"))
 """Largest share of the torque's spread that a weight's standard deviation may stand for, by verdict."""

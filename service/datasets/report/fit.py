@@ -14,7 +14,7 @@ import numpy as np
 
 from lipcore.kernels.friction import SIGN_WIDTH
 from lipcore.samples import Array
-from service.datasets.report.parts import Rows
+from service.datasets.report.timing import Rows
 
 OWN = 5
 """Features of each joint alone."""

@@ -15,8 +15,8 @@ import numpy as np
 
 from lipcore.samples import Array
 from service.datasets.report.fit import Fit
-from service.datasets.report.parts import Rows
-from service.datasets.report.schema import Lag
+from service.datasets.report.timing import Rows
+from service.datasets.schema import Lag
 
 LARGEST_S = 0.25
 """Largest lag looked for, s."""
@@ -51,7 +51,7 @@ class Lags:
     def __init__(self, fit: Fit, steps: Rows, rate: float) -> None:
         self.fit, self.steps, self.rate = fit, steps, rate
         self._blocks = np.linspace(0, len(fit.rows), EIGHTHS + 1).astype(np.int64)
-        self._told: list[tuple[float, float]] = []
+        self._known: list[tuple[float, float]] = []
 
     def of_joint(self, name: str, tau: Array) -> tuple[Lag, float]:
         """Lag of a joint with torque tau (M,) at all rows, and the fit's residual standard deviation at that."""
@@ -68,14 +68,14 @@ class Lags:
         cost = max(0.0, total[middle] / len(squares) - best) / variance
         lag = self._judge(name, curves, cost, best / variance)
         if lag.seconds is not None and lag.std_s is not None:
-            self._told.append((lag.seconds, lag.std_s))
+            self._known.append((lag.seconds, lag.std_s))
         return lag, float(np.sqrt(best))
 
     def of_all(self) -> Lag:
         """What the joints that tell a lag say together, as one clock would have it; less sure where they disagree."""
-        if not self._told:
+        if not self._known:
             return _unknown(None, "no joint tells")
-        seconds, std = np.array(self._told).T
+        seconds, std = np.array(self._known).T
         weight = 1 / (std**2 + FINEST_S**2)
         mean = float(weight @ seconds / weight.sum())
         misfit = float(weight @ (seconds - mean) ** 2) / max(1, len(seconds) - 1)
@@ -91,14 +91,14 @@ class Lags:
             return _unknown(
                 name, "one shift of time explains the torque about as well as another: record faster motion"
             )
-        found = np.array([self._lowest(curve) for curve in curves])
-        if np.isnan(found).any():
+        lowest = np.array([self._lowest(curve) for curve in curves])
+        if np.isnan(lowest).any():
             return _unknown(name, "no shift of time is better than its neighbours: record faster motion")
-        left_out = found[1:]
+        left_out = lowest[1:]
         std = CAUTION * float(np.sqrt((EIGHTHS - 1) / EIGHTHS * np.sum((left_out - left_out.mean()) ** 2)))
         if std > UNSURE_S:
             return _unknown(name, f"parts of the recording differ by {1e3 * std:.0f} ms: record faster motion")
-        return Lag(joint=name, seconds=float(found[0]), std_s=std, cost=cost, reason=None)
+        return Lag(joint=name, seconds=float(lowest[0]), std_s=std, cost=cost, reason=None)
 
     def _lowest(self, curve: Array) -> float:
         """Lowest point of a curve over the shifts, s; NaN at its ends."""

@@ -8,18 +8,23 @@ from typing import Any
 import numpy as np
 
 from lipcore.preparation.recipe import Recipe
+from lipcore.profiles import Profile
 from lipcore.samples import Array
-from service.datasets.preparing import Prepared
 from service.datasets.report.advice import advice, in_words, warnings
 from service.datasets.report.excitation import SELDOM, joint_excitation, weights
 from service.datasets.report.fit import make_fit
 from service.datasets.report.lag import Lags, no_lags, shifts
-from service.datasets.report.limits import against_limits, saturation
-from service.datasets.report.noise import noise_or_share, white_noise
-from service.datasets.report.parts import bounds, number_parts, spread, thin
-from service.datasets.report.rigid_body import Found, judge_rigid_bodies
-from service.datasets.report.robot import Limits, Profile, limits_of
-from service.datasets.report.schema import (
+from service.datasets.report.rigid_body import RigidExcitation, judge_rigid_bodies
+from service.datasets.report.signals import (
+    Limits,
+    against_limits,
+    limits_of,
+    noise_or_share,
+    saturation,
+    white_noise,
+)
+from service.datasets.report.timing import Clock, bounds, look_at_clock, number_parts, spread, thin
+from service.datasets.schema import (
     DatasetReport,
     Excitation,
     JointExcitation,
@@ -28,8 +33,7 @@ from service.datasets.report.schema import (
     JointSaturation,
     Lag,
 )
-from service.datasets.report.timing import Clock, look_at_clock
-from service.datasets.staging import EPISODE, QUANTITIES, Staged, column
+from service.datasets.staging import EPISODE, QUANTITIES, Prepared, Staged, column
 from service.foundation.settings import Settings
 
 WARNING = "warning: "
@@ -51,20 +55,20 @@ def make_report(
     whether torques contain it.
     """
     recipe = recipe or Recipe()
-    names, facts = raw.joint_names, prepared.facts
+    names = raw.joint_names
     limits = limits_of(profile, names)
-    clock = look_at_clock(raw, recipe.gap_steps, facts.repeated)
+    clock = look_at_clock(raw, recipe.gap_steps, prepared.repeated)
     recorded = _look_at_raw(raw, clock, limits)
-    found = _look_at_samples(prepared, limits, settings.max_report_rows)
-    rigid = _rigid_bodies(profile, limits, prepared, found, gravity)
-    excitation = _excitation(found, rigid)
+    samples = _look_at_samples(prepared, limits, settings.max_report_rows)
+    rigid = _rigid_bodies(profile, limits, prepared, samples, gravity)
+    excitation = _excitation(samples, rigid)
     constant = [
         f"tau{joint + 1} is constant: nothing can be learnt about this joint's torque"
-        for joint, (low, high) in enumerate(found.ranges["tau"])
+        for joint, (low, high) in enumerate(samples.ranges["tau"])
         if low == high
     ]
-    reading = [said for said in noted if not said.startswith(WARNING)]
-    warned = [said.removeprefix(WARNING) for said in noted if said.startswith(WARNING)]
+    reading = [note for note in noted if not note.startswith(WARNING)]
+    warned = [note.removeprefix(WARNING) for note in noted if note.startswith(WARNING)]
     if profile is not None and limits is None:
         reading.append(f"the joints of robot {profile.name} are not those of the data: limits were not compared")
     if profile is not None and limits is not None and limits.by_order:
@@ -72,19 +76,21 @@ def make_report(
     if isinstance(rigid, str):
         reading.append(rigid)
     report = DatasetReport(
-        rows_uploaded=facts.rows,
-        rows=facts.samples,
-        episodes=facts.episodes,
-        rate_hz=facts.rate_hz,
-        gaps=facts.gaps,
-        derived=list(facts.derived),
+        rows_uploaded=raw.rows,
+        rows=prepared.staged.rows,
+        episodes=prepared.episodes,
+        rate_hz=prepared.rate_hz,
+        gaps=prepared.gaps,
+        derived=list(prepared.derived),
         preparation=[str(step["text"]) for step in prepared.steps],
         ranges={
             quantity: {"min": [low for low, _ in pairs], "max": [high for _, high in pairs]}
-            for quantity, pairs in found.ranges.items()
+            for quantity, pairs in samples.ranges.items()
         },
-        torque_noise_estimate=found.noise,
-        warnings=warned + constant + warnings(clock.timing, recorded.saturation, recorded.limits, found.lags, raw.rows),
+        torque_noise_estimate=samples.noise,
+        warnings=warned
+        + constant
+        + warnings(clock.timing, recorded.saturation, recorded.limits, samples.lags, raw.rows),
         reading=reading,
         recipe=recipe.to_json(),
         steps=prepared.steps,
@@ -92,7 +98,7 @@ def make_report(
         timing=clock.timing,
         saturation=recorded.saturation,
         limits=recorded.limits,
-        lag=found.lags,
+        lag=samples.lags,
         noise=recorded.noise,
         excitation=excitation,
         advice=advice(clock.timing, excitation, recorded.limits, recorded.noise),
@@ -155,17 +161,17 @@ def _share(level: float | None, values: Array) -> float | None:
 
 
 def _look_at_samples(prepared: Prepared, limits: Limits | None, most: int) -> _Samples:
-    staged, facts = prepared.staged, prepared.facts
+    staged, rate = prepared.staged, prepared.rate_hz
     part = number_parts(staged.rows, [np.diff(staged.read(EPISODE)) != 0])
     starts, ends = bounds(part)
-    steps = None if facts.rate_hz is None else shifts(facts.rate_hz, int((ends - starts).max()))
+    steps = None if rate is None else shifts(rate, int((ends - starts).max()))
     rows = thin(part, most, 0 if steps is None else int(steps[-1]))
     motion = (staged.table("q", rows), staged.table("dq", rows), staged.table("ddq", rows))
     fit = make_fit(rows, *motion, tau=staged.table("tau", rows), independent=_independent(prepared))
-    lags = None if steps is None or facts.rate_hz is None else Lags(fit, steps, facts.rate_hz)
+    lags = None if steps is None or rate is None else Lags(fit, steps, rate)
     ranges: dict[str, list[tuple[float, float]]] = {quantity: [] for quantity in QUANTITIES}
     levels, left, speeds, torques = np.empty((4, staged.n_joints))
-    found, excitation = [], []
+    joint_lags, excitation = [], []
     for joint, name in enumerate(staged.joint_names):
         columns = {quantity: staged.read(column(quantity, joint)) for quantity in QUANTITIES}
         for quantity, values in columns.items():
@@ -176,42 +182,44 @@ def _look_at_samples(prepared: Prepared, limits: Limits | None, most: int) -> _S
             left[joint] = np.sqrt(np.mean(fit.residuals(columns["tau"][rows, None]) ** 2))
         else:
             lag, left[joint] = lags.of_joint(name, columns["tau"])
-            found.append(lag)
+            joint_lags.append(lag)
         excitation.append(joint_excitation(joint, name, columns, part, fit, float(left[joint]), limits))
     if lags is None:
-        why = "no times were given" if facts.rate_hz is None else "the contiguous parts are too short"
-        found = no_lags(staged.joint_names, why)
+        why = "no times were given" if rate is None else "the contiguous parts are too short"
+        joint_lags = no_lags(staged.joint_names, why)
     else:
-        found.insert(0, lags.of_all())
-    return _Samples(ranges, levels.tolist(), left, speeds, torques, found, excitation, motion)
+        joint_lags.insert(0, lags.of_all())
+    return _Samples(ranges, levels.tolist(), left, speeds, torques, joint_lags, excitation, motion)
 
 
 def _independent(prepared: Prepared) -> float:
     """Samples that count as independent: after a low-pass two a period of its cut-off, else all."""
-    facts = prepared.facts
-    if facts.cutoff_hz is None or facts.rate_hz is None:
-        return float(facts.samples)
-    return facts.samples * min(1.0, 2 * facts.cutoff_hz / facts.rate_hz)
+    samples = float(prepared.staged.rows)
+    if prepared.cutoff_hz is None or prepared.rate_hz is None:
+        return samples
+    return samples * min(1.0, 2 * prepared.cutoff_hz / prepared.rate_hz)
 
 
 def _rigid_bodies(
-    profile: Profile | None, limits: Limits | None, prepared: Prepared, found: _Samples, gravity: bool
-) -> Found | str | None:
+    profile: Profile | None, limits: Limits | None, prepared: Prepared, samples: _Samples, gravity: bool
+) -> RigidExcitation | str | None:
     if profile is None or limits is None or profile.urdf is None:
         return None
     names, independent = prepared.staged.joint_names, _independent(prepared)
-    return judge_rigid_bodies(profile.urdf, profile.name, names, limits, found.motion, found.left, independent, gravity)
+    return judge_rigid_bodies(
+        profile.urdf, profile.name, names, limits, samples.motion, samples.left, independent, gravity
+    )
 
 
-def _excitation(found: _Samples, rigid: Found | str | None) -> Excitation:
+def _excitation(samples: _Samples, rigid: RigidExcitation | str | None) -> Excitation:
     """What motion alone says, and instead of its judgement of friction that beside rigid bodies where there are any."""
-    if not isinstance(rigid, Found):
-        out = Excitation(friction_beside="any motion", joints=found.excitation, whole=None, text="")
+    if not isinstance(rigid, RigidExcitation):
+        out = Excitation(friction_beside="any motion", joints=samples.excitation, whole=None, text="")
     else:
         joints = [
             each.model_copy(update=weights(stds, speed, torque, min(each.forwards, each.backwards) < SELDOM))
             for each, stds, speed, torque in zip(
-                found.excitation, rigid.friction.tolist(), found.speeds, found.torques, strict=True
+                samples.excitation, rigid.friction.tolist(), samples.speeds, samples.torques, strict=True
             )
         ]
         out = Excitation(friction_beside="rigid bodies", joints=joints, whole=rigid.whole, text="")

@@ -21,8 +21,8 @@ from lipcore.motion import Motion
 from lipcore.robots import SimulationUnavailableError
 from lipcore.samples import Array
 from lipcore.urdf import PARAMETERS, RigidBody
-from service.datasets.report.robot import Limits
-from service.datasets.report.schema import WholeExcitation
+from service.datasets.report.signals import Limits
+from service.datasets.schema import WholeExcitation
 
 MOST_EQUATIONS = 14_000
 """Rows times joints of the recording that are looked at: 2000 rows of 7 joints."""
@@ -42,7 +42,7 @@ TERMS = len(FRICTION_TERMS)
 
 
 @dataclass(frozen=True)
-class Found:
+class RigidExcitation:
     """What the URDF tells of a recording. friction: std of each joint's weights in the order FRICTION_TERMS, (n, 3)."""
 
     whole: WholeExcitation
@@ -69,7 +69,7 @@ def judge_rigid_bodies(
     noise: Array,
     independent: float,
     gravity: bool,
-) -> Found | str:
+) -> RigidExcitation | str:
     """Judge rows of motion q, dq, ddq, (R, n) each; a sentence says why where the URDF cannot be used for these joints.
 
     noise: std of what is left of each joint's torque, (n,) N·m; independent: samples that the rows stand for; gravity:
@@ -104,7 +104,7 @@ def judge_rigid_bodies(
         weakest=float(shares[0]),
         weakest_body=names[int(np.square(weakest).sum(axis=0).argmax())],
     )
-    return Found(whole, _friction_stds(information * independent / len(q), reference.back))
+    return RigidExcitation(whole, _friction_stds(information * independent / len(q), reference.back))
 
 
 def _reference(kernel: ArmKernel, limits: Limits) -> _Reference:

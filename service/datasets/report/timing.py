@@ -1,4 +1,4 @@
-"""When samples were taken: rate, jitter, gaps; and which raw rows follow each other without any of these."""
+"""When samples were taken: rate, jitter, gaps; contiguous parts between these, and few rows that stand for many."""
 
 from __future__ import annotations
 
@@ -8,12 +8,54 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.samples import Array
-from service.datasets.report.parts import Rows, finite, number_parts
-from service.datasets.report.schema import Gap, Timing
+from service.datasets.schema import Gap, Timing
 from service.datasets.staging import EPISODE, TIME, Staged
 
+Rows = NDArray[np.int64]
 MOST_GAPS = 20
 """Gaps that a report lists."""
+
+
+def number_parts(rows: int, breaks: list[NDArray[np.bool_]]) -> Rows:
+    """Number of the part that each row belongs to, from 0, (rows,).
+
+    breaks: (rows - 1,) each, true where a row does not follow the one before.
+    """
+    part = np.zeros(rows, np.int64)
+    if rows > 1 and breaks:
+        np.cumsum(np.logical_or.reduce(breaks), out=part[1:])
+    return part
+
+
+def bounds(part: Rows) -> tuple[Rows, Rows]:
+    """First rows of the parts, and the rows after their last ones, (P,) each."""
+    if len(part) == 0:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    changes = np.flatnonzero(np.diff(part)) + 1
+    return np.concatenate([[0], changes]), np.concatenate([changes, [len(part)]])
+
+
+def thin(part: Rows, most: int, margin: int = 0) -> Rows:
+    """At most `most` rows, evenly spread over all that are `margin` rows and more from either end of their part."""
+    starts, ends = bounds(part)
+    starts, inner = starts + margin, np.maximum(0, ends - starts - 2 * margin)
+    before = np.concatenate([[0], np.cumsum(inner)])
+    total = int(before[-1])
+    if total == 0:
+        return np.zeros(0, np.int64)
+    chosen = np.arange(total) if total <= most else np.linspace(0, total - 1, most).astype(np.int64)
+    home = np.searchsorted(before, chosen, side="right") - 1
+    return np.asarray(starts[home] + chosen - before[home], np.int64)
+
+
+def finite(value: float | np.floating) -> float | None:
+    """A number for JSON: None where it is infinite or none."""
+    return float(value) if np.isfinite(value) else None
+
+
+def spread(values: Array) -> float:
+    """Standard deviation, 0 where there are no values."""
+    return float(values.std()) if len(values) else 0.0
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.datasets.formats.bags.opening import BagKind, open_bag
+from service.datasets.formats.bags.reading import BagKind, open_bag
 from service.datasets.options import ReadOptions
 from service.foundation.settings import Settings
 

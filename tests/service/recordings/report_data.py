@@ -13,10 +13,9 @@ import numpy as np
 from lipcore.preparation.recipe import Recipe
 from lipcore.robots import Robot, load_robot, profile_urdf
 from lipcore.simulation import inverse_dynamics
-from service.datasets.preparing import prepare
 from service.datasets.report.making import make_report
-from service.datasets.report.schema import DatasetReport
-from service.datasets.staging import Staged, column
+from service.datasets.schema import DatasetReport
+from service.datasets.staging import Staged, column, prepare
 from service.foundation.settings import Settings
 from service.storage.disk import Disk
 

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from service.datasets.formats.bags.opening import open_bag
+from service.datasets.formats.bags.reading import open_bag
 from service.datasets.options import ReadOptions
 from service.foundation.errors import InvalidDataError, InvalidRequestError, TooLargeError
 from service.foundation.settings import Settings

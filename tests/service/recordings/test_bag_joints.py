@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.datasets.formats.bags.joints import choose, holds
-from service.datasets.formats.bags.states import Kind
+from service.datasets.formats.bags.states import Kind, choose, holds
 from service.datasets.options import ReadOptions
 from service.foundation.errors import InvalidDataError
 from service.foundation.settings import Settings

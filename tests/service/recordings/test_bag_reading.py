@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from service.datasets.formats.bags import reading
-from service.datasets.formats.bags.opening import open_bag
+from service.datasets.formats.bags.reading import open_bag
 from service.datasets.options import ReadOptions
 from service.foundation.settings import Settings
 from tests.service.recordings.bag_writers import (

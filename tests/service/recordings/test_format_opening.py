@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from service.datasets.formats.sniff import KINDS, sniff
+from service.datasets.formats.opening import KINDS, sniff
 from service.foundation.errors import InvalidDataError, TooLargeError
 from tests.service.recordings.reading import read, refused
 from tests.service.recordings.test_format_lerobot import dataset, zipped

@@ -12,8 +12,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from service.datasets.formats import parquet_pages
-from service.datasets.formats.parquet_pages import check_pages
+from service.datasets.formats import parquet as module
+from service.datasets.formats.parquet import check_pages
 from service.foundation.errors import InvalidDataError, TooLargeError
 from service.foundation.settings import Settings
 from tests.service.recordings.reading import read, refused
@@ -196,7 +196,7 @@ def huge_page(body, size):
 def test_a_page_that_unpacks_to_too_much_is_refused_before_it_is_read(tmp_path, monkeypatch):
     body = parquet({"t": np.zeros(100_000)}, compression="zstd", use_dictionary=False)
     assert len(body) < 3_000
-    monkeypatch.setattr(parquet_pages, "MAX_PAGE", 100_000)
+    monkeypatch.setattr(module, "MAX_PAGE", 100_000)
     field, value, expected = refused(tmp_path, body, "parquet")
     assert field == "t"
     assert value.startswith("page 1 of 1600")
@@ -207,6 +207,23 @@ def test_a_page_that_declares_two_gigabytes_is_refused(tmp_path):
     body = parquet({"t": RNG.normal(size=200_000)}, use_dictionary=False, compression="none")
     page = pq.ParquetFile(io.BytesIO(body)).metadata.row_group(0).column(0).data_page_offset
     header = b"\x15\x00\x15\xfe\xff\xff\xff\x0f\x15\x80\x01\x00"  # 2147483647 bytes, 64 of them packed
+    assert refused(tmp_path, body[:page] + header + body[page + len(header) :], "parquet")[:2] == (
+        "t", "page 1 of 2147483647 bytes",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "again",
+    [
+        pytest.param(b"\x06\x04\x80\x01", id="the size once more as a number of 64 bits, which Arrow passes over"),
+        pytest.param(b"\x05\x84\x80\x08\xfe\xff\xff\xff\x0f", id="field 65538, which Arrow counts as the second"),
+    ],
+)
+def test_a_header_that_says_its_size_twice_counts_as_arrow_reads_it(tmp_path, again):
+    body = parquet({"t": RNG.normal(size=200_000)}, use_dictionary=False, compression="none")
+    page = pq.ParquetFile(io.BytesIO(body)).metadata.row_group(0).column(0).data_page_offset
+    first = b"\xfe\xff\xff\xff\x0f" if again[0] == 6 else b"\x80\x01"
+    header = b"\x15\x00\x15" + first + b"\x15\x80\x01" + again + b"\x00"
     assert refused(tmp_path, body[:page] + header + body[page + len(header) :], "parquet")[:2] == (
         "t", "page 1 of 2147483647 bytes",
     )  # fmt: skip

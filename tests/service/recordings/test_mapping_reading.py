@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.datasets.mapping.reading import read
-from service.datasets.mapping.units import factor
+from service.datasets.mapping.vocabulary import factor
 from service.datasets.staging import staging
 from service.foundation.errors import InvalidDataError, StorageFullError
 from service.foundation.settings import Settings
@@ -58,8 +58,8 @@ def test_columns_are_staged_as_they_were_recorded(reading):
         np.testing.assert_array_equal(found.staged.table(name), data[name])
     np.testing.assert_array_equal(found.staged.read("t"), data["t"])
     np.testing.assert_array_equal(found.staged.read("episode"), np.repeat([4.0, 2.0], 100))
-    assert (found.effort, found.torque_convention) == ("measured", "gravity_included")
-    assert not found.missing.any()
+    assert (found.facts["effort"], found.torque_convention) == ("measured", "gravity_included")
+    assert not found.staged.missing().any()
     assert found.facts["rows_read"] == 200
     assert found.facts["columns"]["q"] == ["q1", "q2"]
 
@@ -76,7 +76,7 @@ def test_blocks_of_any_size_give_the_same(tmp_path_factory, block):
         assert found.facts["repeated_stamps"] == 1
         assert found.facts["first_repeated_row"] == 61
         assert (found.facts["missing_rows"], found.facts["first_missing_row"]) == (2, 6)
-        assert np.flatnonzero(found.missing).tolist() == [5, 70]
+        assert np.flatnonzero(found.staged.missing()).tolist() == [5, 70]
         assert found.staged.rows == 120
         assert np.isnan(found.staged.read("tau2")[70])
 
@@ -131,7 +131,7 @@ def test_currents_become_torques(reading):
     del columns["tau1"], columns["tau2"]
     found = reading(columns, options(torque_constants=(0.5, -2.0)))
     np.testing.assert_array_equal(found.staged.table("tau"), data["tau"] * [0.5, -2.0])
-    assert (found.effort, found.facts["torque_constants"]) == ("current", [0.5, -2.0])
+    assert (found.facts["effort"], found.facts["torque_constants"]) == ("current", [0.5, -2.0])
     arm = Arm(("a", "b"), "current", (3.0, 4.0))
     np.testing.assert_array_equal(reading(columns, robot=arm).staged.table("tau"), data["tau"] * [3.0, 4.0])
 
@@ -149,7 +149,7 @@ def test_missing_and_infinite_values_are_counted(reading):
     for name, row, value in (("q1", 10, np.nan), ("tau2", 10, np.inf), ("t", 3, -np.inf), ("dq2", 150, np.nan)):
         columns[name][row] = value
     found = reading(columns)
-    assert np.flatnonzero(found.missing).tolist() == [3, 10, 150]
+    assert np.flatnonzero(found.staged.missing()).tolist() == [3, 10, 150]
     assert (found.facts["missing_rows"], found.facts["first_missing_row"]) == (3, 4)
     for name in ("q1", "tau2", "t", "dq2"):
         assert np.isnan(found.staged.read(name)).sum() == 1
@@ -181,7 +181,7 @@ def test_velocities_without_values_are_as_not_given(reading, start):
         found = reading(columns)
         assert found.staged.quantities == ("q", "ddq", "tau")
         assert "dq has no values and is taken as not given" in found.noted
-        assert not found.missing.any()
+        assert not found.staged.missing().any()
 
 
 def test_velocities_that_begin_late_lack_rows_before(reading):
@@ -189,7 +189,7 @@ def test_velocities_that_begin_late_lack_rows_before(reading):
     for name in ("dq1", "dq2"):
         columns[name][:90] = np.nan
     found = reading(columns)
-    assert found.missing.tolist() == [True] * 90 + [False] * 110
+    assert found.staged.missing().tolist() == [True] * 90 + [False] * 110
     np.testing.assert_array_equal(found.staged.read("dq2"), columns["dq2"])
     assert found.facts["first_missing_row"] == 1
 

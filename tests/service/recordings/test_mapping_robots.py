@@ -10,7 +10,6 @@ import pytest
 from lipcore.profiles import profile
 from service.datasets.formats.opening import open_table
 from service.datasets.mapping.reading import read
-from service.datasets.mapping.robot import Robot
 from service.foundation.errors import InvalidDataError
 from service.foundation.settings import Settings
 from service.storage.disk import Disk
@@ -29,7 +28,7 @@ def fields(joints, *more):
 
 @pytest.mark.parametrize("prefix", ["", "ur5e_", "left_"])
 def test_joints_of_a_universal_robot_are_put_in_order(prefix):
-    robot: Robot = profile("ur5e")
+    robot = profile("ur5e")
     names = fields([f"{prefix}{joint}_joint" for joint in UR_ALPHABETICAL], "gripper/position")
     found = mapped(names, options(effort="measured"), robot)
     assert found.joints == robot.joint_names
@@ -76,7 +75,7 @@ def test_the_recording_of_a_real_panda(tmp_path):
     messages = [store.deserialize_cdr(data, "sensor_msgs/msg/JointState") for (data,) in rows]
     found = from_file(tmp_path, PANDA, "rosbag2", profile("panda"))
     assert found.staged.joint_names == profile("panda").joint_names
-    assert (found.effort, found.torque_convention) == ("measured", "gravity_included")
+    assert (found.facts["effort"], found.torque_convention) == ("measured", "gravity_included")
     for quantity, field in (("q", "position"), ("dq", "velocity"), ("tau", "effort")):
         expected = np.array([getattr(message, field) for message in messages])
         np.testing.assert_array_equal(found.staged.table(quantity), expected)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -11,8 +10,7 @@ from scipy.interpolate import Akima1DInterpolator
 from scipy.signal import butter, sosfiltfilt
 
 from lipcore.preparation.recipe import Recipe
-from service.datasets.preparing import prepare
-from service.datasets.staging import QUANTITIES, Staged, column
+from service.datasets.staging import QUANTITIES, Staged, column, prepare
 from service.foundation.errors import InvalidDataError
 from service.foundation.settings import Settings
 from service.storage.disk import Disk
@@ -52,7 +50,7 @@ def test_every_joint_comes_out_with_all_quantities_beside_what_was_read(staged, 
     made = prepared.staged
     assert made.joint_names == NAMES
     assert made.quantities == QUANTITIES
-    assert made.rows == prepared.facts.samples == len(made.read("t")) == len(made.read("episode")) == ROWS - 46
+    assert made.rows == len(made.read("t")) == len(made.read("episode")) == ROWS - 46
     for joint in range(3):
         true = signals(made.read("t"), joint)
         for name in QUANTITIES:
@@ -72,24 +70,14 @@ def test_facts(staged, tmp_path):
     raw_tau[[10, 11]] = np.nan, np.inf
     raw.folder.joinpath("tau2.f64").write_bytes(raw_tau.tobytes())
     prepared = prepare(raw, tmp_path, Recipe(rate_hz=30), 30)
-    said = asdict(prepared.facts)
-    assert said.pop("rate_hz") == pytest.approx(30, rel=1e-3)
-    assert said.pop("recorded_rate_hz") == pytest.approx(90, rel=1e-3)
-    edges = said.pop("edges")
+    assert prepared.rate_hz == pytest.approx(30, rel=1e-3)
+    edges = prepared.steps[-2]["samples"]
     assert edges == pytest.approx(6 * 23, abs=6)
-    assert said.pop("samples") == pytest.approx((ROWS - edges) / 3, abs=3)
-    assert said == {
-        "rows": ROWS,
-        "episodes": 3,
-        "gaps": 1,
-        "missing": 2,
-        "first_missing": 11,
-        "repeated": 1,
-        "derived": ("ddq",),
-        "resampled": True,
-        "cutoff_hz": 4.0,
-        "delay_s": 0.0,
-    }
+    assert prepared.staged.rows == pytest.approx((ROWS - edges) / 3, abs=3)
+    assert (prepared.episodes, prepared.gaps, prepared.missing, prepared.repeated) == (3, 1, 2, 1)
+    assert (prepared.derived, prepared.cutoff_hz) == (("ddq",), 4.0)
+    assert [step["first_row"] for step in prepared.steps[:2]] == [11, 651]
+    assert prepared.steps[4]["rate_hz"] == pytest.approx(90, rel=1e-3)
     assert [step["step"] for step in prepared.steps] == [
         "leave_out",
         "leave_out",
@@ -127,7 +115,7 @@ def test_what_is_complete_passes_unchanged(staged, tmp_path):
     raw = staged(QUANTITIES, None)
     prepared = prepare(raw, tmp_path, Recipe(), 30)
     assert prepared.steps == []
-    assert prepared.facts.rate_hz is None
+    assert prepared.rate_hz is None
     np.testing.assert_array_equal(prepared.staged.read("t"), np.arange(ROWS))
     for joint in range(3):
         for name in QUANTITIES:
@@ -140,7 +128,7 @@ def test_a_run_of_missing_values_in_one_joint_leaves_these_rows_out_of_all(stage
     damaged[100:150] = np.nan
     raw.folder.joinpath("ddq3.f64").write_bytes(damaged.tobytes())
     prepared = prepare(raw, tmp_path, Recipe(), 30)
-    assert (prepared.facts.missing, prepared.facts.gaps, prepared.staged.rows) == (50, 1, ROWS - 50)
+    assert (prepared.missing, prepared.gaps, prepared.staged.rows) == (50, 1, ROWS - 50)
     np.testing.assert_array_equal(prepared.staged.read("q1"), np.delete(raw.read("q1"), np.s_[100:150]))
 
 

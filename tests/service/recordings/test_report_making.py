@@ -9,9 +9,9 @@ import pytest
 
 from lipcore.preparation.recipe import Recipe
 from lipcore.signals import low_pass, noise_level
-from service.datasets.preparing import prepare
 from service.datasets.report.making import make_report
-from service.datasets.report.schema import DatasetReport
+from service.datasets.schema import DatasetReport
+from service.datasets.staging import prepare
 from service.foundation.settings import Settings
 from tests.lipcore.test_real_data import SCHUNK
 from tests.service.recordings.report_data import profile_of, recording, report_on, staged

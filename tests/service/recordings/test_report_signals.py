@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from lipcore.preparation.recipe import Recipe
-from service.datasets.report.limits import against_limits, saturation
-from service.datasets.report.robot import limits_of
-from service.datasets.report.schema import DatasetReport
+from service.datasets.report.signals import against_limits, limits_of, saturation
 from service.datasets.report.timing import look_at_clock
+from service.datasets.schema import DatasetReport
 from tests.service.recordings.report_data import FakeProfile, recording, report_on, staged
 
 PENDULUM = ("joint1", "joint2")

@@ -9,7 +9,8 @@ from __future__ import annotations
 import bz2
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from typing import NamedTuple, Protocol
+from pathlib import Path
+from typing import NamedTuple
 
 import pyarrow as pa
 
@@ -34,26 +35,28 @@ class Channel(NamedTuple):
     definition: str | None
 
 
-class Bag(Protocol):
-    """A bag. facts: what was found on the way, complete once it was read through."""
+class Bag(ABC):
+    """A bag in one file. facts: what was noticed on the way, complete once it was read through."""
 
-    facts: list[str]
+    def __init__(self, path: Path, settings: Settings) -> None:
+        self.path, self.settings = path, settings
+        self.facts: list[str] = []
 
+    @abstractmethod
     def channels(self) -> dict[Channel, int]:
-        """Number of messages of every channel; raise InvalidDataError."""
-        ...
+        """Number of messages of every channel that has any; raise InvalidDataError."""
 
+    @abstractmethod
     def messages(self, channel: Channel) -> Iterator[tuple[int, bytes]]:
         """Time of reception in ns and data of every message of a channel's topic and type."""
-        ...
+
+    def unpacking(self) -> Unpacking:
+        """What one pass through the bag may unpack."""
+        return Unpacking(self.settings.max_bag_part_bytes, self.settings.max_unpacked_bytes)
 
 
-class ScannedBag(ABC):
+class ScannedBag(Bag):
     """A bag that is read from front to back; `scan` says how."""
-
-    def __init__(self, settings: Settings) -> None:
-        self.settings = settings
-        self.facts: list[str] = []
 
     @abstractmethod
     def scan(self) -> Iterator[tuple[Channel, int, Data]]:
@@ -74,21 +77,17 @@ class ScannedBag(ABC):
     def messages(self, channel: Channel) -> Iterator[tuple[int, bytes]]:
         """Time of reception in ns and data of every message of a channel's topic and type."""
         unpacking = self.unpacking()
-        for found, time, data in self.scan():
-            if found.topic == channel.topic and found.type == channel.type:
-                yield time, unpacking.message(bytes(data)) if found.encoding == "cdr" else bytes(data)
-
-    def unpacking(self) -> Unpacking:
-        """What one pass through the bag may unpack."""
-        return Unpacking(self.settings.max_bag_part_bytes, self.settings.max_unpacked_bytes)
+        for other, time, data in self.scan():
+            if other.topic == channel.topic and other.type == channel.type:
+                yield time, unpacking.message(bytes(data)) if other.encoding == "cdr" else bytes(data)
 
 
-class JoinedBags:
-    """The files that one recording was split into, one after the other."""
+class JoinedBags(Bag):
+    """The files that one recording was split into, one after the other; path: of the archive that they were in."""
 
-    def __init__(self, bags: list[Bag]) -> None:
+    def __init__(self, path: Path, bags: list[Bag], settings: Settings) -> None:
+        super().__init__(path, settings)
         self.bags = bags
-        self.facts: list[str] = []
 
     def channels(self) -> dict[Channel, int]:
         """Number of messages of every channel of all files."""

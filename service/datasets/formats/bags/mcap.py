@@ -6,12 +6,10 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator
-from pathlib import Path
 from struct import Struct
 from typing import BinaryIO
 
 from service.datasets.formats.bags.container import Channel, Data, ScannedBag, Unpacking, damaged, type_name
-from service.foundation.settings import Settings
 
 MAGIC = b"\x89MCAP0\r\n"
 LATEST = 1 << 63
@@ -23,10 +21,6 @@ _TEXT_DEFINITIONS = ("ros2msg", "ros1msg")
 
 class Mcap(ScannedBag):
     """An MCAP file; raise InvalidDataError where it is none."""
-
-    def __init__(self, path: Path, settings: Settings) -> None:
-        super().__init__(settings)
-        self.path = path
 
     def scan(self) -> Iterator[tuple[Channel, int, Data]]:
         """Channel, time of reception in ns and data of every message, up to where the file was cut off."""

@@ -1,22 +1,39 @@
-"""From the messages of one channel to a table: read once to see what they hold, and once more for the numbers."""
+"""A bag of any kind as a table: the topic that tells the joints' state is chosen, and its messages are read twice, once
+to see what they hold, once more for the numbers."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.samples import Array
-from service.datasets.formats.bags.container import Bag, Channel
-from service.datasets.formats.bags.joints import MOST_KINDS, choose, describe, holds
-from service.datasets.formats.bags.states import Decoder, Form, Kind
-from service.datasets.formats.blocks import checked_names
-from service.datasets.formats.table import BLOCK_ROWS, Table
-from service.foundation.errors import invalid_data
+from service.datasets.formats.bags import mcap, rosbag1, sqlite
+from service.datasets.formats.bags.container import Bag, Channel, JoinedBags
+from service.datasets.formats.bags.states import (
+    ENCODINGS,
+    MOST_KINDS,
+    SOURCES,
+    Decoder,
+    Form,
+    Kind,
+    choose,
+    describe,
+    holds,
+)
+from service.datasets.formats.table import BLOCK_ROWS, Table, checked_names
+from service.datasets.formats.zips import unpacked_bag
+from service.datasets.options import ReadOptions
+from service.foundation.errors import InvalidDataError, invalid_data, invalid_request, readable
 from service.foundation.settings import Settings
 
+BagKind = Literal["rosbag1", "rosbag2", "mcap"]
+KINDS = {"rosbag1": "a rosbag of ROS 1", "rosbag2": "a rosbag2: a .db3 file, or a zip of its folder", "mcap": "an MCAP"}
 QUANTITIES = ("position", "velocity", "acceleration", "effort")
 BATCH_BYTES = 4 * 1024 * 1024
 """Messages that are taken together; their copies and their block take several times that."""
@@ -62,18 +79,18 @@ def read_channel(bag: Bag, channel: Channel, joint_names: tuple[str, ...] | None
         raise invalid_data(f"topic {channel.topic}", f"of {len(joints)} joints", f"at most {settings.max_joints}")
     kept_kinds = np.array([holds(kind, joints) for kind in survey.kinds])
     kept = kept_kinds[survey.kind]
-    found = {
+    holding = {
         each: sum(c for k, c in zip(survey.kinds, counts, strict=True) if holds(k, joints) and each in k.quantities)
         for each in QUANTITIES
     }
-    quantities = tuple(each for each in QUANTITIES if found[each])
+    quantities = tuple(each for each in QUANTITIES if holding[each])
     use_stamps, why = _clock(survey.stamps[kept], survey.received[kept])
     times = survey.stamps if use_stamps else survey.received
     start = int(times[np.argmax(kept)])
     facts = [
         *bag.facts,
         f"topic {channel.topic}: {len(kept)} messages of type {channel.type}",
-        *describe(survey.kinds, counts, joints, found),
+        *describe(survey.kinds, counts, joints, holding),
         f"times are {why}, counted from {start // NS}.{start % NS:09d} s",
     ]
     units = Decoder(channel).source.units
@@ -157,3 +174,78 @@ def _blocks(
                     block[rows, 1 + index * n : 1 + (index + 1) * n] = form.values(data, quantity)[:, order]
         if kept.any():
             yield block[kept]
+
+
+@contextmanager
+def open_bag(path: Path, kind: BagKind, options: ReadOptions, settings: Settings) -> Iterator[Table]:
+    """The joints' states in a bag, as a table with columns `t` in s and `<joint>/position`, `/velocity`, `/effort`.
+
+    kind: `rosbag2` is an sqlite3 file or the zip of a folder, of sqlite3 or MCAP files. Raise InvalidDataError,
+    InvalidRequestError where the topic is not clear, or TooLargeError.
+    """
+    with ExitStack() as stack:
+        with path.open("rb") as file:
+            zipped = file.read(4) == b"PK\x03\x04"
+        if zipped:
+            files = stack.enter_context(unpacked_bag(path, settings))
+            bag: Bag = JoinedBags(path, [_open(each, "rosbag2", settings) for each in files], settings)
+        else:
+            bag = _open(path, kind, settings)
+        channel = _choose(bag.channels(), options.topic, bag)
+        yield read_channel(bag, channel, options.joint_names, settings)
+
+
+def _open(path: Path, kind: str, settings: Settings) -> Bag:
+    with path.open("rb") as file:
+        start = file.read(16)
+    if start.startswith(mcap.MAGIC):
+        return mcap.Mcap(path, settings)
+    if start.startswith(rosbag1.MAGIC):
+        return rosbag1.Rosbag1(path, settings)
+    if start.startswith(sqlite.MAGIC):
+        return sqlite.SqliteBag(path, settings)
+    if not start:
+        raise invalid_data("file", "empty", KINDS[kind])
+    raise invalid_data("file", f"no bag: it begins with {start!r}", KINDS[kind])
+
+
+def _choose(channels: dict[Channel, int], topic: str | None, bag: Bag) -> Channel:
+    """The channel to read; the bag's messages tell which there are."""
+    if not channels:
+        raise invalid_data("file", "; ".join(["a bag without messages", *bag.facts]), "joint states")
+    known = {each: count for each, count in channels.items() if each.type in SOURCES and each.encoding in ENCODINGS}
+    # several publishers of one topic are one recording
+    by_name = {(each.topic, each.type): each for each in reversed(known)}
+    if topic is not None:
+        candidates = [each for each in by_name.values() if each.topic == topic]
+        if not candidates and any(each.topic == topic for each in channels):
+            other = next(each for each in channels if each.topic == topic)
+            raise invalid_request("topic", f"{topic} of type {other.type} ({other.encoding})", _types())
+        if not candidates:
+            raise invalid_request("topic", topic, f"one of {_listed(known or channels)}")
+    else:
+        candidates = list(by_name.values())
+        if not candidates:
+            raise invalid_data("file", f"a bag of {_listed(channels)}", f"a topic of {_types()}")
+    if len(candidates) > 1:
+        raise _ambiguous(known)
+    return candidates[0]
+
+
+def _ambiguous(known: dict[Channel, int]) -> InvalidDataError:
+    return invalid_data("topic", "not given", f"the option topic, one of {_listed(known)}")
+
+
+def _types() -> str:
+    return f"type {', '.join(SOURCES)}, as CDR or of ROS 1"
+
+
+def _listed(channels: dict[Channel, int]) -> str:
+    counts: dict[tuple[str, str], int] = {}
+    for each, count in channels.items():
+        counts[each.topic, each.type] = counts.get((each.topic, each.type), 0) + count
+    listed = [
+        f"{readable(topic[:100])} ({readable(name[:100])}, {count} messages)"
+        for (topic, name), count in list(counts.items())[:20]
+    ]
+    return ", ".join(listed) + (f" and {len(counts) - 20} more" if len(counts) > 20 else "")

@@ -5,12 +5,10 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Iterator
-from pathlib import Path
 from struct import Struct
 from typing import BinaryIO
 
 from service.datasets.formats.bags.container import Channel, Data, ScannedBag, Unpacking, damaged, type_name
-from service.foundation.settings import Settings
 
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG_HEADER, CHUNK, CONNECTION = 0x02, 0x03, 0x05, 0x07
@@ -20,10 +18,6 @@ _U32, _TIME = Struct("<I"), Struct("<II")
 
 class Rosbag1(ScannedBag):
     """A bag of ROS 1; raise InvalidDataError where it is none."""
-
-    def __init__(self, path: Path, settings: Settings) -> None:
-        super().__init__(settings)
-        self.path = path
 
     def scan(self) -> Iterator[tuple[Channel, int, Data]]:
         """Channel, time of reception in ns and data of every message, up to where the file was cut off."""
@@ -97,8 +91,8 @@ def _record(
         yield channels[number], seconds * 1_000_000_000 + nanoseconds, data
     elif kind == CONNECTION:
         (number,) = _U32.unpack(header["conn"])
-        said = _header(data)
-        name, definition = type_name(said["type"].decode()), said["message_definition"].decode(errors="replace")
+        declared = _header(data)
+        name, definition = type_name(declared["type"].decode()), declared["message_definition"].decode(errors="replace")
         channels[number] = Channel(header["topic"].decode(), name, "ros1", definition)
 
 

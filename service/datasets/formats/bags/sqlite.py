@@ -5,10 +5,8 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
-from pathlib import Path
 
-from service.datasets.formats.bags.container import Channel, Unpacking, damaged, type_name
-from service.foundation.settings import Settings
+from service.datasets.formats.bags.container import Bag, Channel, damaged, type_name
 
 MAGIC = b"SQLite format 3\x00"
 
@@ -17,12 +15,8 @@ ERRORS = (sqlite3.Error, UnicodeDecodeError)
 """What sqlite3 raises of a damaged file: its own messages may quote bytes that are no text."""
 
 
-class SqliteBag:
+class SqliteBag(Bag):
     """One sqlite3 file of a rosbag2; raise InvalidDataError where it is none."""
-
-    def __init__(self, path: Path, settings: Settings) -> None:
-        self.path, self.settings = path, settings
-        self.facts: list[str] = []
 
     def channels(self) -> dict[Channel, int]:
         """Number of messages of every channel that has any."""
@@ -43,7 +37,7 @@ class SqliteBag:
 
     def messages(self, channel: Channel) -> Iterator[tuple[int, bytes]]:
         """Time of reception in ns and data of every message of a channel's topic and type."""
-        unpacking = Unpacking(self.settings.max_bag_part_bytes, self.settings.max_unpacked_bytes)
+        unpacking = self.unpacking()
         try:
             with closing(self._connect()) as database:
                 rows = database.execute(

@@ -1,8 +1,9 @@
-"""Messages that tell the state of a robot's joints: which there are, and what of them is position, velocity, effort."""
+"""Messages that tell the state of a robot's joints: what of them is position, velocity, effort, and of which joints, in
+which order, as the messages of a channel may tell of different ones."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,15 +11,26 @@ from numpy.typing import NDArray
 
 from lipcore.samples import Array
 from service.datasets.formats.bags.container import Channel
-from service.datasets.formats.bags.definitions import Types, parse, well_known
-from service.datasets.formats.bags.layout import Layout, lay_out
-from service.foundation.errors import InvalidDataError, invalid_data
+from service.datasets.formats.bags.layout import Layout, Types, lay_out, parse, well_known
+from service.foundation.errors import InvalidDataError, invalid_data, readable
 
 ENCODINGS = ("cdr", "ros1")
 MOST_LAYOUTS = 64
 """Layouts that are remembered of a channel; most have one."""
 MOST_FIELDS = 50_000_000
 """Fields of a channel that are looked at one by one, because the layouts keep changing: about a minute of them."""
+MOST_KINDS = 1000
+"""Sets of joints that the messages of a channel may tell of."""
+_SECONDS = ((1, "int32"), (1, "uint32"))
+_DTYPES = {
+    "float32": "f4",
+    "float64": "f8",
+    **{f"{sign}int{bits}": f"{sign[:1] or 'i'}{bits // 8}" for sign in ("", "u") for bits in (8, 16, 32, 64)},
+    "bool": "u1",
+    "byte": "u1",
+    "char": "u1",
+}
+"""NumPy's types of numbers in messages."""
 _JOINT_STATE = {"position": "position", "velocity": "velocity", "effort": "effort"}
 _POINT = {
     "position": "positions",
@@ -120,10 +132,10 @@ class Decoder:
                 "a bag that holds its messages' definitions, as ROS 2 records them since Iron and in MCAP",
             )
         fields = [each.name for each in self.types[channel.type]]
-        wanted = [name for name in fields if name in self.source.last]
-        if not wanted:
+        ends = [name for name in fields if name in self.source.last]
+        if not ends:
             raise invalid_data(f"definition of {channel.type}", ", ".join(fields)[:200], " or ".join(self.source.last))
-        self.last = wanted[-1]
+        self.last = ends[-1]
         self._forms: list[Form] = []
         self._fields = 0
 
@@ -171,22 +183,69 @@ class Decoder:
             raise self._wrong(number, "without a stamp", "a header with a stamp in s and ns")
         return seconds[0]
 
-    def _wrong(self, number: int, found: str, expected: str) -> InvalidDataError:
-        return invalid_data(f"topic {self.channel.topic}, message {number}", found, expected)
+    def _wrong(self, number: int, value: str, expected: str) -> InvalidDataError:
+        return invalid_data(f"topic {self.channel.topic}, message {number}", value, expected)
 
 
 def _counts(numbers: Mapping[str, tuple[int, int, str]], way: Mapping[str, str]) -> dict[str, int]:
-    found = {each: numbers[path] for each, path in way.items() if path in numbers}
-    return {each: count for each, (_, count, kind) in found.items() if count and kind in _DTYPES}
+    fields = {each: numbers[path] for each, path in way.items() if path in numbers}
+    return {each: count for each, (_, count, kind) in fields.items() if count and kind in _DTYPES}
 
 
-_SECONDS = ((1, "int32"), (1, "uint32"))
-_DTYPES = {
-    "float32": "f4",
-    "float64": "f8",
-    **{f"{sign}int{bits}": f"{sign[:1] or 'i'}{bits // 8}" for sign in ("", "u") for bits in (8, 16, 32, 64)},
-    "bool": "u1",
-    "byte": "u1",
-    "char": "u1",
-}
-"""NumPy's types of numbers in messages."""
+def choose(kinds: Sequence[Kind], counts: Sequence[int], given: tuple[str, ...] | None, topic: str) -> tuple[str, ...]:
+    """Joints to read: those `given`, or of the set that matters most; raise InvalidDataError.
+
+    kinds and counts: what the messages hold, and how many hold it. A set matters by the messages that tell of all its
+    joints, times the square of their number: an arm at 30 Hz more than its gripper at 200 Hz.
+    """
+    numbers: dict[frozenset[str], int] = {}
+    orders: dict[frozenset[str], tuple[str, ...]] = {}
+    for kind, count in sorted(zip(kinds, counts, strict=True), key=lambda each: -each[1]):
+        if "position" in kind.quantities:
+            numbers[frozenset(kind.joints)] = numbers.get(frozenset(kind.joints), 0) + count
+            orders.setdefault(frozenset(kind.joints), kind.joints)
+    if not numbers:
+        raise invalid_data(f"topic {topic}", "without positions", "messages that tell the position of joints")
+    if given is not None:
+        if any(each.issuperset(given) for each in numbers):
+            return given
+        known = sorted(set().union(*numbers))
+        raise invalid_data("joint_names", ", ".join(given), f"joints out of {_listed(known)}, told together")
+
+    def weight(joints: frozenset[str]) -> int:
+        return len(joints) ** 2 * sum(count for other, count in numbers.items() if other >= joints)
+
+    return orders[max(numbers, key=weight)]
+
+
+def describe(
+    kinds: Sequence[Kind], counts: Sequence[int], joints: tuple[str, ...], quantities: Mapping[str, int]
+) -> list[str]:
+    """What is to be told of the choice, in sentences. quantities: number of messages that hold each."""
+    facts = []
+    read = [(kind, count) for kind, count in zip(kinds, counts, strict=True) if holds(kind, joints)]
+    total, kept = sum(counts), sum(count for _, count in read)
+    if kept < total:
+        others = {joint for kind in kinds for joint in kind.joints} - set(joints)
+        also = f" (others tell of {_listed(sorted(others))})" if others else ""
+        facts.append(f"{total - kept} of {total} messages do not tell of all joints and were left out{also}")
+    elif others := {joint for kind, _ in read for joint in kind.joints} - set(joints):
+        facts.append(f"joints {_listed(sorted(others))} were left out")
+    orders = {tuple(joint for joint in kind.joints if joint in joints) for kind, _ in read}
+    if len(orders) > 1:
+        facts.append(f"the joints come in {len(orders)} orders: they were matched by name in every message")
+    facts += [
+        f"{kept - count} of {kept} messages have no {quantity}"
+        for quantity, count in quantities.items()
+        if 0 < count < kept
+    ]
+    return facts
+
+
+def holds(kind: Kind, joints: tuple[str, ...]) -> bool:
+    """Whether messages of a kind tell the position of all these joints."""
+    return "position" in kind.quantities and set(kind.joints).issuperset(joints)
+
+
+def _listed(joints: Sequence[str]) -> str:
+    return ", ".join(readable(joint[:100]) for joint in joints[:20]) + (" …" if len(joints) > 20 else "")

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from rich.table import Table
 
-from service.datasets.report.schema import DatasetReport, JointExcitation, Weight
+from service.datasets.schema import DatasetReport, JointExcitation, Weight
 
 NOTHING = "–"
 

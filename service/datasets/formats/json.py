@@ -10,9 +10,8 @@ from typing import Any
 
 import msgspec
 
-from service.datasets.formats.blocks import left_out
 from service.datasets.formats.json_rows import Rows, decode
-from service.datasets.formats.table import Table
+from service.datasets.formats.table import Table, left_out
 from service.datasets.options import ReadOptions
 from service.foundation.errors import TooLargeError, invalid_data
 from service.foundation.settings import Settings
@@ -31,8 +30,10 @@ def open_json_lines(path: Path, options: ReadOptions, settings: Settings) -> Ite
 def open_json(path: Path, options: ReadOptions, settings: Settings) -> Iterator[Table]:
     """Open one JSON document as a table; raise InvalidDataError, or TooLargeError as it has to be in memory at once."""
     if (size := path.stat().st_size) > settings.max_json_bytes:
-        said = f"the JSON document has {size} bytes, expected at most {settings.max_json_bytes}"
-        raise TooLargeError(f"{said}: write one object a line (NDJSON), which may be longer")
+        raise TooLargeError(
+            f"the JSON document has {size} bytes, expected at most {settings.max_json_bytes}: write one object a line "
+            "(NDJSON), which may be longer"
+        )
     rows, joint_names, facts = _document(path.read_bytes())
     table = Rows(rows, settings)
     yield Table(table.names, table.blocks(), joint_names=joint_names, facts=facts + table.facts)
@@ -80,10 +81,10 @@ def _items(text: bytes) -> list[Any] | Iterator[Any]:
     try:
         return (msgspec.json.decode(each) for each in msgspec.json.decode(text, type=list[msgspec.Raw]))
     except (msgspec.DecodeError, RecursionError):
-        found = decode(text)
-        if type(found) is not list:
+        items = decode(text)
+        if type(items) is not list:
             raise ValueError("no array") from None
-        return found
+        return items
 
 
 def _zipped(keys: list[str], row: Any) -> Any:
@@ -94,29 +95,29 @@ def _columns(document: dict[str, Any]) -> tuple[Iterator[Any], tuple[str, ...] |
     """Rows of an object of arrays."""
     names = document.pop("joint_names", None)
     joint_names = tuple(map(str, names)) if type(names) is list else None
-    found: dict[str, list[Any]] = {}
+    columns: dict[str, list[Any]] = {}
     alone: list[str] = []
-    _gather("", document, found, alone)
-    if not found:
+    _gather("", document, columns, alone)
+    if not columns:
         raise invalid_data("file", ", ".join(alone[:10]) or "an empty object", ARRAYS)
-    lengths = Counter(map(len, found.values()))
+    lengths = Counter(map(len, columns.values()))
     rows = max(lengths, key=lambda length: (lengths[length], length))
-    for name, values in found.items():
+    for name, values in columns.items():
         if len(values) != rows:
             raise invalid_data(name, f"{len(values)} values", f"{rows} values, as most columns have")
     facts = left_out(alone, "they are no arrays")
-    return ({name: values[row] for name, values in found.items()} for row in range(rows)), joint_names, facts
+    return ({name: values[row] for name, values in columns.items()} for row in range(rows)), joint_names, facts
 
 
-def _gather(prefix: str, value: Any, found: dict[str, list[Any]], alone: list[str]) -> None:
+def _gather(prefix: str, value: Any, columns: dict[str, list[Any]], alone: list[str]) -> None:
     if prefix.count(".") > 20:
         raise invalid_data("file", "nested deep", ARRAYS)
     if type(value) is list:
-        found[prefix] = value
+        columns[prefix] = value
     elif type(value) is dict and value and prefix and all(key.isdigit() for key in value):
-        found[prefix] = list(value.values())  # as pandas writes a column: values by the number of their row
+        columns[prefix] = list(value.values())  # as pandas writes a column: values by the number of their row
     elif type(value) is dict:
         for key, part in value.items():
-            _gather(f"{prefix}.{key}" if prefix else key, part, found, alone)
+            _gather(f"{prefix}.{key}" if prefix else key, part, columns, alone)
     else:
         alone.append(prefix)

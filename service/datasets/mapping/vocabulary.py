@@ -1,0 +1,194 @@
+"""The words and units in columns' names: `tau_J1`, `jointPosition1` and `panda_joint1/position [deg]` alike."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+
+TURN = 2 * math.pi
+_LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+_ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": TURN / 360, "rev": TURN, "turn": TURN}
+_POSITIONS = _ANGLES | _LENGTHS
+CURRENTS = {"a": 1.0, "ma": 1e-3}
+_TORQUES = {
+    **{"nm": 1.0, "mnm": 1e-3, "nmm": 1e-3, "ncm": 1e-2, "knm": 1e3, "kgfcm": 0.0980665, "kgfm": 9.80665},
+    **{"n": 1.0, "kn": 1e3},
+}
+FACTORS: dict[str, dict[str, float]] = {
+    "t": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
+    "q": _POSITIONS,
+    "dq": {f"{unit}s{end}": factor for unit, factor in _POSITIONS.items() for end in ("", "1")}
+    | {"rpm": TURN / 60, "revmin": TURN / 60, "1min": TURN / 60, "min1": TURN / 60},
+    "ddq": {f"{unit}s{end}": factor for unit, factor in _POSITIONS.items() for end in ("2", "s")} | {"rpms": TURN / 60},
+    "tau": _TORQUES | CURRENTS,
+}
+"""SI units in one of each unit by quantity, units as `plain` writes them: rad/s and rad_s are rads."""
+KNOWN = {
+    "t": "s, ms, us, ns or min",
+    "q": "rad, mrad, deg, rev, m, cm or mm",
+    "dq": "rad/s, deg/s, rev/s, rpm, m/s or mm/s",
+    "ddq": "rad/s^2, deg/s^2, rev/s^2, rpm/s, m/s^2 or mm/s^2",
+    "tau": "N*m, mN*m, N*cm, N*mm, kgf*cm, N, or A or mA of motor current",
+}
+"""What to tell users of the units of a quantity."""
+
+_SPELLINGS = (
+    (re.compile(r"[µμ]"), "u"),
+    (re.compile(r"²"), "2"),
+    (re.compile(r"°|degrees?"), "deg"),
+    (re.compile(r"radians?"), "rad"),
+    (re.compile(r"revolutions?|revs"), "rev"),
+    (re.compile(r"turns"), "turn"),
+    (re.compile(r"millisec(onds?)?|msec"), "ms"),
+    (re.compile(r"microsec(onds?)?|usec"), "us"),
+    (re.compile(r"nanosec(onds?)?|nsec"), "ns"),
+    (re.compile(r"sec(onds?|s)?"), "s"),
+    (re.compile(r"minutes?"), "min"),
+    (re.compile(r"met(er|re)s?"), "m"),
+    (re.compile(r"newtons?"), "n"),
+    (re.compile(r"milliamp(ere)?s?"), "ma"),
+    (re.compile(r"amp(ere)?s?"), "a"),
+    (re.compile(r"per"), ""),
+    (re.compile(r"[\s_/*·⋅.^−-]"), ""),
+)
+_OPENING = {"]": "[", ")": "("}
+_NUMBERED = re.compile(r"(\d\]?|time|stamp|elapsed|\bt)$", re.IGNORECASE)
+_LONGEST = 40
+_SUFFIX_WORDS = 4
+QUANTITY_WORDS: dict[str, tuple[str, str]] = {
+    **dict.fromkeys(("q", "pos", "position", "positions"), ("q", "position")),
+    **dict.fromkeys(("angle", "angles", "theta", "θ"), ("q", "angle")),
+    **dict.fromkeys(
+        ("dq", "qd", "qdot", "vel", "vels", "velocity", "velocities", "speed", "speeds", "omega", "ω"),
+        ("dq", "velocity"),
+    ),
+    **dict.fromkeys(("ddq", "qdd", "qddot", "acc", "accel", "acceleration", "accelerations"), ("ddq", "acceleration")),
+    **dict.fromkeys(("tau", "torque", "torques", "trq", "moment", "moments", "τ"), ("tau", "torque")),
+    **dict.fromkeys(("effort", "efforts", "eff"), ("tau", "effort")),
+    **dict.fromkeys(("current", "currents", "cur", "iq"), ("tau", "current")),
+}
+"""Quantity by word, and what kind of word it is: an effort may be a torque or a current."""
+TWO_WORDS: dict[tuple[str, ...], tuple[str, str]] = {
+    ("q", "dot"): ("dq", "velocity"),
+    ("q", "dot", "dot"): ("ddq", "acceleration"),
+    ("q", "ddot"): ("ddq", "acceleration"),
+    ("i", "q"): ("tau", "current"),
+    ("observation", "state"): ("q", "position"),
+}
+MEASURED = frozenset(("actual", "act", "measured", "meas", "feedback", "fb", "present", "real", "sensor", "observed"))
+COMMANDED = frozenset(
+    ("target", "desired", "des", "commanded", "command", "cmd", "reference", "ref", "setpoint", "goal", "action")
+)
+DESIRED = "d"
+"""As in Franka's `q_d` and `tau_J_d`: only behind the quantity, as `d` alone may be anything else."""
+NEUTRAL = frozenset(("joint", "joints", "jnt", "j", "axis", "motor", "filtered", "raw", "state", "value", "link"))
+FOREIGN = (
+    frozenset(("tcp", "ee", "eef", "cartesian", "pose", "orientation", "quaternion", "wrench", "twist", "imu"))
+    | {"gyro", "accelerometer", "gravity", "coriolis", "friction", "momentum", "ext", "external", "limit", "limits"}
+    | {"residual", "error", "err", "std", "variance", "hat", "temperature", "temp", "voltage"}
+)
+"""A column with such a word is no position, velocity, acceleration or whole torque of a joint."""
+_VOCABULARY = frozenset(QUANTITY_WORDS) | MEASURED | COMMANDED | NEUTRAL | FOREIGN
+_PIECES = re.compile(r"[^\W\d_]+|\d+")
+_CAMEL = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
+_JOINT = "joint"
+
+
+@lru_cache(maxsize=1024)
+def plain(unit: str) -> str:
+    """A unit without what spellings differ in: case, blanks, signs of multiplication and division, full words."""
+    text = unit.lower()[:_LONGEST]
+    for spelling, short in _SPELLINGS:
+        text = spelling.sub(short, text)
+    return text
+
+
+def factor(quantity: str, unit: str) -> float | None:
+    """SI units in one `unit` of t, q, dq, ddq or tau (A for currents); None where it is no unit of that."""
+    return FACTORS.get(quantity, {}).get(plain(unit))
+
+
+def is_current(unit: str | None) -> bool:
+    """Whether this is a unit of electric current."""
+    return unit is not None and plain(unit) in CURRENTS
+
+
+def in_header(name: str) -> Iterator[tuple[str, str]]:
+    """The ways in which a column's name may end in a unit: what is before it, and the unit. Likeliest first.
+
+    `q1 [deg]`, `q1 (deg)`, `q1_deg`, `dq1_deg_per_s`. What is in brackets may be no unit at all.
+    """
+    text = name.rstrip()
+    opening = text.rfind(_OPENING.get(text[-1:], "\n"))
+    if opening > 0:
+        before, unit = text[:opening], text[opening + 1 : -1].strip()
+        # without a blank it may be a joint's number or name, as in `position[3]`
+        if before[-1].isspace() or _is_unit(unit):
+            yield before.rstrip(), unit
+        return
+    for place in [each.start() for each in re.finditer(r"[_ ]", name)][-_SUFFIX_WORDS:]:
+        before, unit = name[:place], name[place + 1 :]
+        # one letter is a unit only where nothing else can be meant: of q1_m, but not of q_m
+        single = len(plain(unit)) == 1 and not _NUMBERED.search(before)
+        if before and not unit.rpartition("_")[2].isdecimal() and not single and _is_unit(unit):
+            yield before, unit
+
+
+def _is_unit(text: str) -> bool:
+    return any(plain(text) in units for units in FACTORS.values())
+
+
+@dataclass(frozen=True)
+class Word:
+    """A word or number of a name: small letters, and where it is."""
+
+    text: str
+    start: int
+    end: int
+
+
+@dataclass(frozen=True)
+class Mention:
+    """Where a name speaks of a quantity: words first to last, the latter not included."""
+
+    quantity: str
+    kind: str
+    first: int
+    last: int
+
+
+def words(name: str) -> list[Word]:
+    """Cut a name into words and numbers."""
+    cut_words = []
+    for piece in _PIECES.finditer(name):
+        text, start = piece.group(), piece.start()
+        small = text.lower()
+        if small in _VOCABULARY or small.isdecimal():
+            cut_words.append(Word(small, start, piece.end()))
+        elif small.startswith(_JOINT) and small[len(_JOINT) :] in QUANTITY_WORDS:
+            cut = start + len(_JOINT)
+            cut_words += [Word(_JOINT, start, cut), Word(small[len(_JOINT) :], cut, piece.end())]
+        else:
+            parts = [Word(m.group().lower(), start + m.start(), start + m.end()) for m in _CAMEL.finditer(text)]
+            known = text.isascii() and any(part.text in _VOCABULARY for part in parts)
+            cut_words += parts if known else [Word(small, start, piece.end())]
+    return cut_words
+
+
+def mention(parts: list[Word]) -> Mention | None:
+    """The quantity that words speak of: the last one, as `current_position` is a position."""
+    last = None
+    place = 0
+    while place < len(parts):
+        for length in (3, 2, 1):
+            texts = tuple(word.text for word in parts[place : place + length])
+            meaning = TWO_WORDS.get(texts) if length > 1 else QUANTITY_WORDS.get(texts[0])
+            if meaning is not None:
+                last = Mention(*meaning, place, place + length)
+                place += length - 1
+                break
+        place += 1
+    return last
