@@ -20,6 +20,11 @@ JOB, GPU = "JOB", "GPU"
 """Tags of workers that take jobs, and of those that have a GPU."""
 
 
+def needs_gpu(request: dict[str, Any]) -> bool:
+    """Whether a job, by its request, has to run on a worker with a GPU."""
+    return bool(request.get("options", {}).get("device") == "cuda")
+
+
 class Cluster:
     """A cluster as one service sees it. All but `close` return at once, whatever the scheduler does.
 

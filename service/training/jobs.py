@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
@@ -19,14 +19,12 @@ from service.models.loaded import LoadedModels
 from service.robots import store as robots
 from service.storage.database import Database, DatasetRow, JobRow, RobotRow, now
 from service.storage.files import new_id
-from service.training import history, holding_out
+from service.training import holding_out, lifecycle
+from service.training.queue import JobQueue
 from service.training.schema import Job, JobPage, JobRequest, Options
 from service.web.idempotency import Identity, done, mark
 from service.web.observability.context import request_id
 from service.web.pagination import Page, newest
-
-if TYPE_CHECKING:  # the service learns online too, and that queues jobs
-    from service.training.queue import JobQueue
 
 USUAL_WAIT_S, LONGEST_WAIT_S = 30, 3600
 """Seconds after which who finds the queue full may try again: where nothing is known of the jobs that run, and most."""
@@ -99,7 +97,7 @@ def add(
         request_id=request_id.get(),
     )
     mark(job, named)
-    history.enter(job, QUEUED, "queued" if retry_of is None else f"queued to repeat job {retry_of}")
+    lifecycle.enter(job, QUEUED, "queued" if retry_of is None else f"queued to repeat job {retry_of}")
     session.add(job)
     return job
 
@@ -149,9 +147,9 @@ def cancel(queue: JobQueue, job: str) -> Job:
         if row.state not in ACTIVE:
             raise ConflictError(f"job {job!r} has {row.state} already")
         if row.state == QUEUED:
-            history.enter(row, CANCELLED, "cancelled while it waited")
+            lifecycle.enter(row, CANCELLED, "cancelled while it waited")
         elif not row.cancel_requested:
-            history.enter(row, RUNNING, "asked to end")
+            lifecycle.enter(row, RUNNING, "asked to end")
         row.cancel_requested = True
     return shown(row)
 

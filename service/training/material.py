@@ -21,9 +21,7 @@ from service.models.lineage import named
 from service.robots import store as robots
 from service.storage.database import Database, DatasetRow, VersionRow
 from service.storage.files import Files
-from service.training import holding_out
-from service.training import refresh_material as material
-from service.training import refresh_scope as scope
+from service.training import holding_out, refresh_data
 from service.training.holding_out import Divided
 from service.training.rows import CANDIDATES, Part, Table, opened
 
@@ -91,11 +89,11 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
     with database.session() as session:
         version = session.get_one(VersionRow, (model, refresh["version"]))
         seen = log.newest(session, model)
-        within = scope.find(session, model, refresh["through"])
-        rows, left_out = scope.split(session, within, version.manifest["lineage"])
+        within = refresh_data.scope_of(session, model, refresh["through"])
+        rows, left_out = refresh_data.split_datasets(session, within, version.manifest["lineage"])
     rows = [row for row in rows if row.id in request["datasets"]]  # what may be deleted meanwhile was not promised
     base = files.load_version(version.folder, version.checksums)
-    logged = material.read(
+    logged = refresh_data.read_log(
         database, model, base.joint_names, within, settings.max_refresh_samples, settings.max_time_gap_s
     )
     parts = opened(files, rows)
@@ -108,7 +106,7 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
     if (found := logged.samples) is not None:
         span = {"first": float(found.t.min()), "last": float(found.t.max())}
         log_lineage |= {"rows": len(found), **span}
-        ages = material.weights(found.t, within)
+        ages = refresh_data.age_weights(found.t, within)
         counted = spacing.recorded(found.t, found.episode)
         weighted = found, counted if ages is None else counted * ages
     return Material(
@@ -157,9 +155,9 @@ def _candidates(table: Table, logged: Samples | None) -> tuple[Samples, Samples 
     return Samples.concatenate(parts), Samples.concatenate(stretches) if many else None
 
 
-def _aged(row: DatasetRow, within: scope.Scope) -> float:
+def _aged(row: DatasetRow, within: refresh_data.Scope) -> float:
     """What a data set's samples count where the model forgets: their age counts from their upload."""
-    found = material.weights(np.array([datetime.fromisoformat(row.created_at).timestamp()]), within)
+    found = refresh_data.age_weights(np.array([datetime.fromisoformat(row.created_at).timestamp()]), within)
     return 1.0 if found is None else float(found[0])
 
 

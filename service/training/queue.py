@@ -21,17 +21,15 @@ from fastapi import Depends, Request
 from sqlalchemy import select
 
 from service.compute.cluster import Cluster
-from service.compute.process import training_place
+from service.compute.process import Slot, training_place
 from service.foundation.settings import Settings
 from service.foundation.states import ACTIVE, CANCELLED, QUEUED, RUNNING
 from service.storage.database import JobRow
 from service.storage.replicas import Replicas
 from service.storage.storage import Storage
-from service.training import history, worker
+from service.training import lifecycle, worker
 from service.training.feed import Feed
-from service.training.settling import Settled, Settler, queue_again
-from service.training.slots import Slot
-from service.training.watch import Ended, Facts, Hand
+from service.training.lifecycle import Ended, Facts, Hand, Settled, Settler, queue_again
 
 logger = logging.getLogger(__name__)
 
@@ -117,10 +115,10 @@ class JobQueue:
                 if not self.replicas.mine(row.owner):
                     continue
                 if row.cancel_requested:
-                    history.enter(row, CANCELLED, "cancelled: the service was stopped while it ran")
+                    lifecycle.enter(row, CANCELLED, "cancelled: the service was stopped while it ran")
                     continue
                 row.attempts -= 1  # handed back in order: such a start is no failed attempt
-                history.enter(row, QUEUED, "the service was stopped while it ran: queued again")
+                lifecycle.enter(row, QUEUED, "the service was stopped while it ran: queued again")
 
     def _is_ready(self, row: JobRow) -> bool:
         if row.state == QUEUED and not row.cancel_requested:

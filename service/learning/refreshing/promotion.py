@@ -14,7 +14,7 @@ from service.learning.learner.messages import Contested
 from service.models import registry
 from service.models.loaded import LoadedModels
 from service.storage.database import Database, LearnerRow, ServingRow
-from service.training import refresh_scope as scope
+from service.training import refresh_data
 
 logger = logging.getLogger(__name__)
 
@@ -49,7 +49,7 @@ def _act(session: Session, contested: Contested, learner: LearnerRow) -> bool:
     if contested.verdict == "dismiss":
         _note(session, contested, f"version {new} does not predict better than version {old} and is dismissed", False)
         return False
-    if scope.taken_back(session, model, learner.start, learner.start):
+    if refresh_data.taken_back(session, model, learner.start, learner.start):
         message = f"version {new} is dismissed: part of what it was trained on has been taken back since"
         _note(session, contested, message, False)
         return False
