@@ -72,7 +72,7 @@ def train(
     """Upload recordings and train a model on them. Ctrl-C cancels the job."""
     # the client takes long to import; help needs none
     from service.cli.watching import watch  # noqa: PLC0415
-    from service.client.calls.keys import new_key  # noqa: PLC0415
+    from service.client.call import new_key  # noqa: PLC0415
 
     options: dict[str, Any] = {name: _value(text) for name, text in pairs("--option", option).items()}
     if prior is not None:
