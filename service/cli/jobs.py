@@ -9,9 +9,8 @@ import typer
 from rich.markup import escape
 from rich.table import Column, Table
 
-from service.cli.connecting import connected
-from service.cli.consoles import note, out, print_json, say
-from service.cli.errors import INTERRUPTED, CommandError
+from service.cli.connecting import connected, watch
+from service.cli.consoles import INTERRUPTED, CommandError, note, out, print_json, say
 from service.cli.options import JobId, Json, Limit, Url
 from service.foundation.settings import DEFAULT_URL
 
@@ -73,8 +72,6 @@ def retry(job: JobId, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
 @app.command()
 def follow(job: JobId, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
     """Show a job's progress until it ends; Ctrl-C stops watching, and the job goes on."""
-    from service.cli.watching import watch  # noqa: PLC0415 - the client takes long to import; help needs none
-
     with connected(url) as client:
         found, interrupted = watch(client, client.job(job), cancels=False)
     _print(found, as_json)

@@ -13,8 +13,7 @@ from rich.table import Table
 
 from service.cli import completion
 from service.cli.connecting import connected, dataset_of
-from service.cli.consoles import note, out, print_json, say
-from service.cli.errors import CommandError
+from service.cli.consoles import CommandError, note, out, print_json, say
 from service.cli.options import Alias, Data, Json, Limit, Model, Url, Version, Yes, confirm
 from service.foundation.settings import DEFAULT_URL
 

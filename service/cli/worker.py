@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from pydantic import ValidationError
 
-from service.cli.errors import CommandError
+from service.cli.consoles import CommandError
 from service.compute.process import THREAD_VARIABLES
 from service.foundation.settings import Settings
 from service.web.observability import logs

@@ -1,10 +1,12 @@
-"""`lipserve excite`: from options to a motion that a robot can be driven along."""
+"""The model that a motion is planned for: saved in a folder, or served under a name."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import numpy as np
@@ -12,21 +14,62 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+import lipcore
+from lipcore import TorqueModel, persistence
 from lipcore.estimators import ESTIMATORS
 from lipcore.excitation import Belief, Limits, Plan, PlanOptions, plan
 from lipcore.linalg import NotPositiveDefiniteError
+from lipcore.manifest import DEFAULT_LIMITS, MANIFEST, ROBOT, TENSORS, ModelFormatError
 from lipcore.profiles import names
 from lipcore.robots import Robot, SimulationUnavailableError
 from lipcore.samples import Array
 from lipcore.simulation import FAST, Stream, sinusoids
 from lipcore.vocabulary import JointType
+from service.cli import plotting
 from service.cli.consoles import err, print_json
-from service.cli.excite import plotting
-from service.cli.excite.model import model as find_model
-from service.cli.excite.robot import Arm, find
+from service.cli.excite_robot import Arm, find
 from service.cli.options import Json
-from service.client import ApiError
+from service.client import ApiError, Client
 from service.foundation.settings import DEFAULT_URL
+from service.models import archive
+
+MAX_TENSOR_BYTES = 1 << 30
+SMALL = 64 * 1024
+MEMBER_LIMITS: Mapping[str, int] = {
+    archive.EXPORT: SMALL,
+    archive.CHECKSUMS: SMALL,
+    MANIFEST: DEFAULT_LIMITS.manifest_bytes,
+    TENSORS: MAX_TENSOR_BYTES,
+    ROBOT: DEFAULT_LIMITS.robot_bytes,
+}
+
+
+def find_model(given: str, url: str, version: int | None = None, alias: str | None = None) -> TorqueModel:
+    """The model in a folder of that path, or of that name from the service at `url`.
+
+    Raise ModelFormatError for what is no model, ApiError or ServiceUnreachableError where the service has none.
+    """
+    folder = Path(given)
+    if (folder / MANIFEST).is_file():
+        return lipcore.load(folder)
+    if folder.is_dir():
+        raise ModelFormatError(f"{given} holds no {MANIFEST}, expected the folder of a saved model", MANIFEST)
+    return fetch(given, url, version, alias)
+
+
+def fetch(name: str, url: str, version: int | None = None, alias: str | None = None) -> TorqueModel:
+    """A served model as it is now, with all that it has learnt online."""
+    with TemporaryDirectory(prefix="lipserve-excite-") as folder, Client(url) as client:
+        path = client.export(name, Path(folder) / "model.tar", version, alias)
+        try:
+            found = archive.members(path, MEMBER_LIMITS)
+        except archive.ArchiveError as error:
+            raise ModelFormatError(str(error), error.member) from None
+        files = {each: archive.read(path, member) for each, member in found.items()}
+        for each in (archive.EXPORT, archive.CHECKSUMS):
+            files.pop(each, None)
+        return persistence.decode(files)
+
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 ERRORS = (ApiError, NotPositiveDefiniteError, SimulationUnavailableError, plotting.PlotUnavailableError)
@@ -100,7 +143,7 @@ def excite(
         )
     write(out, made)
     if plot is not None:
-        plotting.draw(plot, made)
+        plotting.draw_motion(plot, made)
     random = random_motion(made)
     if as_json:
         print_json(shown(made, random, out, plot))

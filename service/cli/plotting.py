@@ -1,4 +1,4 @@
-"""Drawing a planned motion. Needs matplotlib (extra `plot`)."""
+"""Drawing planned motions, and measured and predicted torque. Needs matplotlib (extra `plot`)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from lipcore.excitation import Plan
+from lipcore.samples import Samples
+from service.client import Prediction
 
 HEADINGS = ("position, rad (m)", "speed, per s", "acceleration, per s²")
 
@@ -28,7 +30,7 @@ def pyplot() -> Any:
     return plt
 
 
-def draw(path: Path, made: Plan) -> None:
+def draw_motion(path: Path, made: Plan) -> None:
     """Draw each joint's position, speed and acceleration with their limits, and what is expected to be left."""
     plt, limits = pyplot(), made.limits
     t, *parts = made.table()
@@ -53,6 +55,26 @@ def draw(path: Path, made: Plan) -> None:
         axis.set_xlabel("s", fontsize=8)
     mean = float(np.exp(np.log(made.left).mean()))
     figure.suptitle(f"planned motion: {mean:.2%} of the torque's variance expected to be left", fontsize=9)
+    figure.tight_layout()
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+
+
+def draw_torque(path: Path, samples: Samples, answer: Prediction, level: float = 0.95) -> None:
+    """Draw each joint's measured torque, its prediction and the band that shall hold `level` of measurements."""
+    plt = pyplot()
+    lower, upper = answer.interval(level)
+    figure, axes = plt.subplots(samples.n_joints, 1, sharex=True, figsize=(9, 1.5 * samples.n_joints))
+    for j, axis in enumerate(np.atleast_1d(axes)):
+        axis.fill_between(
+            samples.t, lower[:, j], upper[:, j], color="tab:blue", alpha=0.25, lw=0, label=f"{level:.0%} interval"
+        )
+        axis.plot(samples.t, answer.tau[:, j], color="tab:blue", lw=1, label="predicted")
+        axis.plot(samples.t, samples.tau[:, j], ".", color="black", ms=1.5, label="measured")
+        axis.set_ylabel(f"{samples.joint_names[j].removeprefix('panda_')}\nN·m", fontsize=8)
+        axis.tick_params(labelsize=7)
+    axes[0].legend(ncols=3, fontsize=7, loc="lower right", bbox_to_anchor=(1, 1), frameon=False)
+    axes[-1].set_xlabel("s", fontsize=8)
     figure.tight_layout()
     figure.savefig(path, dpi=100)
     plt.close(figure)
