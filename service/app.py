@@ -46,23 +46,15 @@ from service.training import metrics as jobs_metrics
 from service.training import routes as training
 from service.training.queue import JobQueue, queue_of
 from service.web import health, openapi, storage_errors
-from service.web.access import openapi as access
-from service.web.access.keyring import Keyring
-from service.web.access.local import LocalAccess
-from service.web.access.middleware import KeyAccess
+from service.web.access.keys import Keyring
+from service.web.access.middleware import KeyAccess, LocalAccess
 from service.web.limits import BodyLimit
-from service.web.limits.gate import Gate
-from service.web.limits.rate import RateLimit
-from service.web.limits.stopping import Stopping
-from service.web.limits.turns import Turns
-from service.web.observability import routes as metrics
-from service.web.observability import tracing
+from service.web.limits.requests import Gate, RateLimit, Turns
+from service.web.observability import metrics, requests
 from service.web.observability.meters import Meters
-from service.web.observability.readiness import Look, Readiness
-from service.web.observability.request_log import RequestLog
-from service.web.observability.requests import RequestContext
-from service.web.observability.system import System
-from service.web.observability.traffic import Traffic
+from service.web.observability.metrics import System, Traffic
+from service.web.observability.readiness import Look, Readiness, Stopping
+from service.web.observability.requests import RequestContext, RequestLog
 
 logger = logging.getLogger(__name__)
 
@@ -114,14 +106,13 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         redirect_slashes=False,  # to an address that the client's Host header would choose
         # tried first, and not through an included router: 50 µs less a request
         routes=hot,
-        telemetry=tracing.telemetry(settings),
+        telemetry=requests.telemetry(settings),
     )
     app.state.stopping, app.state.meters = stopping, meters
     errors.install(app)
-    openapi.install(app)
     storage_errors.install(app)
     _add_middleware(app, settings, keyring, meters, hot)
-    access.install(app, settings.keys_needed)
+    openapi.install(app, settings.keys_needed)
     app.include_router(health.router)
     app.include_router(metrics.router)
     app.include_router(datasets.router)

@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 from websockets.asyncio.client import ClientConnection, connect, unix_connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 
+from service.client.sending import headers_of
 from service.foundation.settings import DEFAULT_URL
 from service.stream.exchange import Exchange, closed, destination, refused, unanswered, unsettled
 from service.stream.messages import StreamAnswer, StreamError, StreamHello, StreamLearnt, StreamRefusal
-from service.web.access.credentials import headers_of
 
 
 class AsyncStreamClient:

@@ -8,6 +8,7 @@ starts again; one that never has is told to be missing at once.
 from __future__ import annotations
 
 import json
+import os
 import random
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -48,11 +49,24 @@ def refused(status: int, body: bytes, retry_after: float | None = None) -> ApiEr
         return ApiError(status, "http_error", body[:500].decode(errors="replace"), [], retry_after)
 
 
+VARIABLE = "LIPSERVE_KEY"
+"""Environment variable that clients take the key from."""
 UNIX = "unix://"
 NO_HOST = "http://localhost"
 """What HTTP says the host is where a socket leads to the service."""
 CHUNK = 1 << 18
 """Bytes of a file that are sent together."""
+
+
+def headers_of(key: str | None) -> dict[str, str]:
+    """Headers of a client's requests with its key, where None the one of the environment, or none at all.
+
+    Raise ValueError, which does not repeat it, where it cannot be a key.
+    """
+    given = (os.environ.get(VARIABLE, "") if key is None else key).strip()
+    if not given.isascii() or not given.isprintable() or " " in given:
+        raise ValueError(f"key (or {VARIABLE}) holds other characters than keys do, expected lip_…")
+    return {"Authorization": f"Bearer {given}"} if given else {}
 
 
 @dataclass(frozen=True)

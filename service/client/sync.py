@@ -24,6 +24,7 @@ from service.client.sending import (
     ServiceUnreachableError,
     answer_of,
     draft_of,
+    headers_of,
     pieces,
     request_of,
 )
@@ -32,7 +33,6 @@ from service.foundation.settings import DEFAULT_URL
 from service.foundation.states import ACTIVE
 from service.learning.control.learning_schema import Learning
 from service.training.schema import Job
-from service.web.access.credentials import headers_of
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -8,8 +8,7 @@ from fastapi import APIRouter, Request, Response
 from starlette.types import Scope
 
 from service.foundation.errors import TooLargeError, responses
-from service.web.hot import Reply, hot_route
-from service.web.route import OCTETS, media_type
+from service.web.route import OCTETS, Reply, hot_route, media_type
 
 _CONTENT: dict[str, Any] = {
     "application/json": {"schema": {}, "example": {"q": [0.0, -0.5], "dq": [0.1, 0.0], "ddq": [0.0, 0.5]}},

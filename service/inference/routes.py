@@ -25,9 +25,8 @@ from service.inference.wire import decode, encode
 from service.models.loaded import LoadedModels, LoadedModelsDep
 from service.models.served import Served
 from service.models.waiting import reached
-from service.web.hot import Reply, hot_route
-from service.web.limits.turns import PredictionsDep
-from service.web.route import Route, is_json
+from service.web.limits.requests import PredictionsDep
+from service.web.route import Reply, Route, hot_route, is_json
 
 _ERRORS = responses(InvalidRequestError, NotFoundError, TooLargeError)
 _LATE = responses(RevisionNotReachedError)

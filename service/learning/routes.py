@@ -17,8 +17,7 @@ from service.learning.errors import ExpiredError, LearningDisabledError
 from service.learning.ingest import wire
 from service.learning.schema import ObservationRequest, ObservationResponse
 from service.learning.updates import Updates, UpdatesDep
-from service.web.hot import Reply, hot_route
-from service.web.route import is_json
+from service.web.route import Reply, hot_route, is_json
 
 hot = APIRouter(
     prefix="/v1/models",

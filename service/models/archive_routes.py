@@ -22,7 +22,7 @@ from service.models.archive import MEDIA_TYPE
 from service.models.export import export
 from service.models.loaded import LoadedModelsDep
 from service.models.schema import AliasName, ModelName, Version, VersionNumber
-from service.web.limits.turns import ArchivesDep
+from service.web.limits.requests import ArchivesDep
 from service.web.limits.upload import Kinds, receive_to
 from service.web.route import Route
 

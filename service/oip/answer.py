@@ -11,7 +11,7 @@ from service.oip.outputs import Array
 from service.oip.query import Query, read
 from service.oip.schema import AnswerParameters, InferRequest, InferResponse, InferTensor, TensorParameters
 from service.oip.wire import Headers, Message
-from service.web.hot import Reply
+from service.web.route import Reply
 
 
 def infer(served: Served, body: bytes, headers: Headers, settings: Settings) -> Reply:

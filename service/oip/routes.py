@@ -14,9 +14,8 @@ from service.oip import answer, versions, wire
 from service.oip.openapi import MODEL, VERSION, failures, infer_answer, infer_body
 from service.oip.schema import BINARY, ModelMetadata, ModelReady, ServerLive, ServerMetadata, ServerReady
 from service.web import health
-from service.web.hot import Reply, hot_route
 from service.web.observability.readiness import ReadinessDep
-from service.web.route import Route
+from service.web.route import Reply, Route, hot_route
 
 SMALL = 16 * 1024
 """Bytes of a body that is decoded on the event loop: one query of the largest robot fits many times."""

@@ -12,8 +12,7 @@ import msgspec
 
 from service.foundation.errors import InvalidRequestError, UnsupportedMediaTypeError, invalid_request, problem, sentence
 from service.oip.schema import InferRequest, InferResponse
-from service.web.hot import Reply
-from service.web.route import OCTETS
+from service.web.route import OCTETS, Reply
 
 HEADER = "Inference-Header-Content-Length"
 _HEADER, _ENCODING = HEADER.lower().encode(), b"content-encoding"

@@ -23,7 +23,7 @@ from service.training import holding_out, lifecycle
 from service.training.queue import JobQueue
 from service.training.schema import Job, JobPage, JobRequest, Options
 from service.web.idempotency import Identity, done, mark
-from service.web.observability.context import request_id
+from service.web.observability.logs import request_id
 from service.web.pagination import Page, newest
 
 USUAL_WAIT_S, LONGEST_WAIT_S = 30, 3600

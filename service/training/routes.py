@@ -25,7 +25,7 @@ from service.training import jobs, refreshes
 from service.training.queue import JobQueue, JobQueueDep
 from service.training.schema import Job, JobPage, JobRequest
 from service.web.idempotency import KeyHeader, identity
-from service.web.limits.stopping import StoppingDep
+from service.web.observability.readiness import StoppingDep
 from service.web.pagination import PageQuery
 from service.web.route import Route
 

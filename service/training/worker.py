@@ -30,7 +30,7 @@ from service.training.pulse import Pulse, Remaining, SupersededError
 from service.training.rows import CANDIDATES
 from service.training.summing import all_rows
 from service.web import storage_errors
-from service.web.observability.context import job_id
+from service.web.observability.logs import job_id
 
 logger = logging.getLogger(__name__)
 

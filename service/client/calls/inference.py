@@ -16,7 +16,7 @@ from service.client.results.evaluation import Comparison, Evaluation, read_compa
 from service.client.results.prediction import Prediction, read_prediction
 from service.client.results.series import Trace, read_trace
 from service.oip.schema import ModelMetadata, ModelReady, ServerLive, ServerMetadata, ServerReady
-from service.web.health_schema import Live, Ready
+from service.web.health import Live, Ready
 
 
 @route("POST", "/v1/models/{model}/predict", repeatable=True)

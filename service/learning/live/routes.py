@@ -10,8 +10,8 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from service.foundation.errors import BusyError, InvalidRequestError, NotFoundError, responses
 from service.learning.live import events
 from service.learning.updates import UpdatesDep
-from service.web.limits.stopping import StoppingDep
 from service.web.observability.meters import MetersDep
+from service.web.observability.readiness import StoppingDep
 from service.web.route import Route
 
 router = APIRouter(

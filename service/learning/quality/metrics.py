@@ -17,7 +17,7 @@ from service.learning.quality.monitor import Monitor
 from service.learning.updates import Updates
 from service.models.loaded import Served
 from service.storage.database import StreamRow
-from service.web.observability.metric import MetricKind
+from service.web.observability.meters import MetricKind
 
 FIGURES = {
     "nmse": "Mean squared error / variance of the measured torque; every row is predicted before it is learnt",

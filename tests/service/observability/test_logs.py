@@ -13,8 +13,7 @@ import pytest
 
 from service.compute.process import Place, start_process
 from service.web.observability import logs
-from service.web.observability.context import job_id, request_id
-from service.web.observability.logs import LogOptions
+from service.web.observability.logs import LogOptions, job_id, request_id
 
 
 def record(message="said %s", *args, **more):

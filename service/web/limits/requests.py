@@ -1,16 +1,73 @@
-"""How often one client may ask."""
+"""How many requests are answered at a time, how many of a kind compute at once, and how often one client may ask."""
 
 from __future__ import annotations
 
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
 from ipaddress import IPv6Address, ip_address
 from math import ceil
 from time import monotonic
+from typing import Annotated
 
+from anyio import CapacityLimiter
+from fastapi import Depends, Request
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service.foundation.errors import RateLimitedError, refuse
-from service.web.access.middleware import KEY_ID
-from service.web.limits.gate import HEALTH
+from service.foundation.errors import BusyError, RateLimitedError, refuse
+from service.web.observability.logs import KEY_ID
+
+HEALTH = "/health/"
+"""Requests below it are always answered: a service that is busy is not one that is dead."""
+
+
+class Gate:
+    """Middleware that refuses requests while `most` others are answered. Streams have a limit of their own.
+
+    open: requests that are answered now.
+    """
+
+    def __init__(self, app: ASGIApp, most: int) -> None:
+        self.app, self.most, self.open = app, most, 0
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on, or answer it with 429."""
+        if scope["type"] != "http" or (self.open >= self.most and scope["path"].startswith(HEALTH)):
+            await self.app(scope, receive, send)
+            return
+        if self.open >= self.most:
+            message = (
+                f"{self.open} requests are being answered, the most there may be (LIPSERVE_MAX_REQUESTS): try again"
+            )
+            await refuse(BusyError(message, headers={"Retry-After": "1"}), scope, receive, send)
+            return
+        self.open += 1
+        try:
+            await self.app(scope, receive, send)
+        finally:
+            self.open -= 1
+
+
+@dataclass(frozen=True)
+class Turns:
+    """One limiter a kind; to be made where an event loop runs."""
+
+    predictions: CapacityLimiter
+    uploads: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(2))
+    archives: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))
+
+
+def _of(kind: str) -> Callable[[Request], Awaitable[CapacityLimiter]]:
+    async def limiter(request: Request) -> CapacityLimiter:
+        found: CapacityLimiter = getattr(request.app.state.turns, kind)
+        return found
+
+    return limiter
+
+
+PredictionsDep = Annotated[CapacityLimiter, Depends(_of("predictions"))]
+UploadsDep = Annotated[CapacityLimiter, Depends(_of("uploads"))]
+ArchivesDep = Annotated[CapacityLimiter, Depends(_of("archives"))]
+
 
 MAX_CLIENTS = 10_000
 """Clients that are told apart at a time; those beyond share one rate."""
@@ -68,8 +125,8 @@ class RateLimit:
             client = client_of(scope)
             wait = self.rate.wait(client, monotonic())
             if wait:
-                said = f"{client} asks more than {self.per_s:g} times per s (LIPSERVE_MAX_REQUESTS_PER_S)"
-                error = RateLimitedError(said, headers={"Retry-After": str(ceil(wait))})
+                message = f"{client} asks more than {self.per_s:g} times per s (LIPSERVE_MAX_REQUESTS_PER_S)"
+                error = RateLimitedError(message, headers={"Retry-After": str(ceil(wait))})
                 await refuse(error, scope, receive, send)
                 return
         await self.app(scope, receive, send)
