@@ -30,17 +30,15 @@ from service.learning.quality.metrics import Learning
 from service.learning.refreshing import routes as refreshing
 from service.learning.refreshing.wiring import attach
 from service.learning.updates import Updates
-from service.models import archive_routes as archives
 from service.models import registry
 from service.models import routes as models
 from service.models.loaded import LoadedModels
 from service.oip import routes as oip
 from service.replication.replication import Replication
 from service.robots import routes as robots
-from service.storage import looks as looking
-from service.storage.files import sweeping
+from service.storage.files.store import start_sweeping
 from service.storage.home import hold_home
-from service.storage.storage import Storage
+from service.storage.storage import Storage, look_database, look_files, look_home
 from service.stream import routes as stream
 from service.training import metrics as jobs_metrics
 from service.training import routes as training
@@ -118,7 +116,6 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.include_router(datasets.router)
     app.include_router(robots.router)
     app.include_router(training.router)
-    app.include_router(archives.router)
     app.include_router(models.router)
     app.include_router(inference.router)
     app.include_router(control.router)
@@ -163,7 +160,7 @@ def _open(settings: Settings) -> tuple[Storage, JobQueue, Updates]:
     sys.setswitchinterval(SWITCH_INTERVAL)
     storage = Storage.open(settings)
     database, files = storage.database, storage.files
-    sweeping.start(database, files)
+    start_sweeping(database, files)
     registry.install_shipped(database, files)
     loaded = LoadedModels(storage, LearntVersions(database, files))
     logger.info("loaded %d models", loaded.preload())
@@ -179,9 +176,9 @@ def _share(app: FastAPI, storage: Storage, jobs: JobQueue, updates: Updates) -> 
     """Put the parts where routes ask for them, each for those that it uses."""
     state, loaded, settings = app.state, updates.loaded, storage.settings
     looks: dict[str, Look] = {
-        "database": lambda _: looking.database(storage),
-        "home": lambda _: looking.home(storage),
-        **({"files": lambda _: looking.files(storage)} if storage.files.shared else {}),
+        "database": lambda _: look_database(storage),
+        "home": lambda _: look_home(storage),
+        **({"files": lambda _: look_files(storage)} if storage.files.shared else {}),
         "models": loaded.look,
         "learner": updates.look,
         "training": lambda lasting: jobs_metrics.look(jobs, lasting),

@@ -19,7 +19,7 @@ from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
     from service.client.results import Version as VersionRecord
-    from service.models.alias_schema import Alias as AliasRecord
+    from service.models.schema import Alias as AliasRecord
     from service.models.schema import Selection
 
 app = typer.Typer(

@@ -26,7 +26,7 @@ from service.foundation.errors import (
     invalid_request,
     responses,
 )
-from service.foundation.names import NameForPeople
+from service.foundation.fields import NameForPeople
 from service.storage.storage import StorageDep
 from service.web.idempotency import KeyHeader, identity
 from service.web.limits.requests import UploadsDep

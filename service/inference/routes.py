@@ -23,8 +23,7 @@ from service.inference.schema import EvaluateRequest, EvaluateResponse, PredictR
 from service.inference.trace_schema import TraceRequest, TraceResponse
 from service.inference.wire import decode, encode
 from service.models.loaded import LoadedModels, LoadedModelsDep
-from service.models.served import Served
-from service.models.waiting import reached
+from service.models.served import Served, reached
 from service.web.limits.requests import PredictionsDep
 from service.web.route import Reply, Route, hot_route, is_json
 

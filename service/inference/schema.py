@@ -20,7 +20,7 @@ from pydantic import (
 
 from lipcore.vocabulary import COMPONENTS, ComponentName, TorqueConvention
 from service.foundation.errors import invalid_request
-from service.foundation.matrices import to_array
+from service.foundation.fields import to_array
 from service.inference import checks
 from service.models.schema import AliasName, VersionNumber
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema
 
 from service.foundation.errors import invalid_request
-from service.foundation.matrices import to_array
+from service.foundation.fields import to_array
 
 MOST_SEQUENCE = 2**53 - 1
 """The largest whole number that every JSON reader takes for what it is."""

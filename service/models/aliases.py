@@ -7,9 +7,9 @@ from sqlalchemy.orm import Session
 
 from service.foundation.errors import ConflictError, invalid_request, not_found
 from service.models import moves, registry
-from service.models.alias_schema import Alias, AliasList, AliasMove, AliasRequest
 from service.models.loaded import LoadedModels
 from service.models.moves import SERVING
+from service.models.schema import Alias, AliasList, AliasMove, AliasRequest
 from service.storage.database import AliasMoveRow, AliasRow, ModelRow, VersionRow
 
 

@@ -19,9 +19,8 @@ from service.foundation.errors import InvalidDataError, invalid_data, problem
 from service.foundation.settings import Settings
 from service.models import archive, registry
 from service.models.archive import CHECKSUMS, EXPORT, ArchiveError
-from service.models.holdout_schema import HoldoutLineage
 from service.models.loaded import LoadedModels
-from service.models.schema import ModelName, Version
+from service.models.schema import HoldoutLineage, ModelName, Version
 from service.storage.database import LearnerRow, ServingRow, now
 from service.storage.files import new_id
 from service.web.storage_errors import undecided

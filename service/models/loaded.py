@@ -22,8 +22,7 @@ from service.foundation.states import PartState
 from service.models import moves, registry
 from service.models.lineage import learnt_from
 from service.models.registry import Serving
-from service.models.served import Alias, Key, LearntStates, Served, Snapshot
-from service.models.waiting import Waiting
+from service.models.served import Alias, Key, LearntStates, Served, Snapshot, Waiting
 from service.storage.database import VersionRow
 from service.storage.storage import Storage
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import closing
 
 from service.storage.database import Database
-from service.storage.database.notices import Notice
+from service.storage.database.engine import Notice
 
 logger = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from service.learning.updates import Updates
 from service.replication.listening import Listener
 from service.replication.looking import lagging, look
-from service.storage.database.notices import Notice
+from service.storage.database.engine import Notice
 
 logger = logging.getLogger(__name__)
 

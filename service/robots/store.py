@@ -16,7 +16,7 @@ from lipcore.profiles.reading import read_limits
 from lipcore.robots import ROBOTS, UnknownRobotError, profile_urdf
 from lipcore.urdf import MOVABLE, RigidBody, UrdfError, describe
 from service.foundation.errors import ConflictError, InvalidDataError, invalid_request, not_found, problem
-from service.foundation.names import LONGEST, for_people
+from service.foundation.fields import LONGEST, for_people
 from service.foundation.states import ACTIVE
 from service.robots.schema import Robot, RobotPage
 from service.storage.database import Database, JobRow, RobotRow, now

@@ -16,7 +16,7 @@ from service.foundation.errors import BusyError, NotFoundError, NotReadyError, i
 from service.inference import checks
 from service.learning.updates import Updates
 from service.models.schema import ALIAS
-from service.models.waiting import reached
+from service.models.served import reached
 from service.stream.conversation import Conversation, Echo
 from service.stream.session import Session
 from service.web.server.stream_protocol import CONNECTION, StreamProtocol

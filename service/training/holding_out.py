@@ -15,7 +15,7 @@ import numpy as np
 from lipcore.samples import Array
 from lipcore.splits import GUARD_S, Mask, Numbers, Parts, Split, SplitError, choose, split
 from service.foundation.errors import invalid_request
-from service.models.holdout_schema import HeldOutSet, Holdout, HoldoutLineage
+from service.models.schema import HeldOutSet, Holdout, HoldoutLineage
 from service.storage.database import DatasetRow
 
 UNTIMED_GUARD = 25.0

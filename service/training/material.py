@@ -16,8 +16,8 @@ from lipcore.urdf import RigidBody
 from lipcore.vocabulary import TorqueConvention
 from service.foundation.settings import Settings
 from service.journal import log
-from service.models.holdout_schema import Holdout, HoldoutLineage
 from service.models.lineage import named
+from service.models.schema import Holdout, HoldoutLineage
 from service.robots import store as robots
 from service.storage.database import Database, DatasetRow, VersionRow
 from service.storage.files import Files

@@ -13,7 +13,7 @@ from service.journal import log
 from service.models import moves, registry
 from service.replication.listening import Listener
 from service.storage.database import AlarmRow, Database, DeletedModelRow, EventRow, ModelRow, VersionRow, now
-from service.storage.database.notices import Notice, read
+from service.storage.database.engine import Notice, read_notice
 from tests.cluster.servers import Postgres, Shared
 from tests.service.data import eventually
 from tests.service.updates.batches import MODEL, OTHER, batch
@@ -98,9 +98,9 @@ def test_a_service_alone_tells_and_hears_nothing(tmp_path):
 
 @pytest.mark.parametrize("payload", ["", "log", "other 12 arm"])
 def test_notices_of_other_releases_are_passed_over(payload):
-    found = read(payload)
+    found = read_notice(payload)
     assert found is None or found.model == ""
-    assert read(Notice("log", "arm.b-2", "0a").payload()) == ("log", "arm.b-2", "0a")
+    assert read_notice(Notice("log", "arm.b-2", "0a").payload()) == ("log", "arm.b-2", "0a")
 
 
 def test_a_listener_that_loses_its_connection_says_what_it_may_have_missed(database, shared, postgres: Postgres):

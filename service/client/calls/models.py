@@ -8,8 +8,7 @@ from typing import Any
 
 from service.client.call import KEY_HEADER, Answer, Call, Page, Route, given, new_key, nothing, page, record, route
 from service.client.results.arm import Version
-from service.models.alias_schema import Alias, AliasList
-from service.models.schema import Model
+from service.models.schema import Alias, AliasList, Model
 from service.training.schema import Job
 
 

@@ -18,7 +18,7 @@ from psycopg.types.string import StrDumperUnknown
 from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url, text
 from sqlalchemy.exc import ArgumentError
 
-from service.storage.database.notices import CHANNEL
+from service.storage.database.engine import CHANNEL
 
 WRITERS, TURNS = 0x4C495053, 0x4C495054
 """Names of the two kinds of locks among those of the database."""

@@ -21,7 +21,7 @@ from anyio import CapacityLimiter, to_thread
 from sqlalchemy import select, update
 
 from service.foundation.errors import InvalidRequestError, UnauthorizedError
-from service.foundation.names import for_people
+from service.foundation.fields import for_people
 from service.storage.database import ApiKeyRow, Database, now
 from service.storage.files import new_id
 from service.web.access.scopes import ADMIN, SCOPES

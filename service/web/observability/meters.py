@@ -133,7 +133,7 @@ _FAMILIES: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class MetricKind:
-    """A metric that /metrics shows. name: as in queries, a counter's with `_total`; meaning: in words, with its unit."""
+    """A metric of /metrics. name: as in queries, a counter's with `_total`; meaning: in words, with its unit."""
 
     kind: Literal["counter", "gauge", "histogram"]
     name: str

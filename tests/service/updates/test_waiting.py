@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from service.learning.learner.process import LearnerProcess
-from service.models.waiting import Waiting
+from service.models.served import Waiting
 from tests.service.data import error, service_of
 from tests.service.updates.lessons import QUERIES, lesson
 

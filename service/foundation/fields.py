@@ -1,14 +1,34 @@
-"""Rows of numbers in JSON as arrays, with errors that name the place."""
+"""Fields of requests that several rooms check: names for people, rows of numbers."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, Field, ValidationInfo
 
 from service.foundation.errors import invalid_request
+
+LONGEST = 200
+
+
+def for_people(field: str, name: str) -> str:
+    """Return a name; raise InvalidRequestError where it would not be shown as it is, or not be seen at all.
+
+    Control, bidirectional and zero-width characters let one name pass for another, and break logs and terminals.
+    """
+    if not name.strip() or len(name) > LONGEST or not name.isprintable():
+        raise invalid_request(field, name, f"1 to {LONGEST} printable characters")
+    return name
+
+
+def _checked(name: str, info: ValidationInfo) -> str:
+    return for_people(info.field_name or "name", name)
+
+
+NameForPeople = Annotated[str, Field(min_length=1, max_length=LONGEST), AfterValidator(_checked)]
 
 
 def to_array(name: str, value: Any, read: Callable[[str, list[Any]], list[float]]) -> NDArray[np.float64]:
