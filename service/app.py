@@ -20,7 +20,7 @@ from service.datasets import routes as datasets
 from service.foundation import errors
 from service.foundation.settings import Settings
 from service.guide import routes as guide
-from service.inference import echo
+from service.inference import routes
 from service.inference import routes as inference
 from service.learning import routes as observations
 from service.learning.control import routes as control
@@ -92,7 +92,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
                     rest.push_async_callback(to_thread.run_sync, replication.close)
                 await to_thread.run_sync(jobs.close)  # first: what learns needs the CPU to store its state
 
-    hot = [*inference.hot.routes, *echo.hot.routes, *oip.hot.routes, *observations.hot.routes]
+    hot = [*inference.hot.routes, *routes.echo_hot.routes, *oip.hot.routes, *observations.hot.routes]
     # the documentation page loads nothing from other hosts: robots' networks often have no way out
     app = FastAPIOffline(
         title="LIPServe",

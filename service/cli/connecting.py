@@ -27,7 +27,7 @@ def connected(url: str) -> Iterator[Client]:
     """A client of the service at `url`; raise CommandError with a hint where it refuses or is not there."""
     # takes long to import, and help needs none of it
     from service.client import ApiError, Client, ServiceUnreachableError  # noqa: PLC0415
-    from service.stream.messages import StreamError  # noqa: PLC0415
+    from service.stream.exchange import StreamError  # noqa: PLC0415
 
     try:
         with Client(url) as client:

@@ -96,7 +96,7 @@ def explain(error: Exception, expected: tuple[type[Exception], ...] = ()) -> Exp
 
 def _refusals() -> tuple[type[Exception], ...]:
     """Errors that tell what a service has said, of modules that are imported: others cannot have been raised."""
-    kinds = {"service.client.sending": "ApiError", "service.stream.messages": "StreamError"}
+    kinds = {"service.client.sending": "ApiError", "service.stream.exchange": "StreamError"}
     return tuple(getattr(sys.modules[module], name) for module, name in kinds.items() if module in sys.modules)
 
 

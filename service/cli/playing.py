@@ -31,7 +31,7 @@ from service.datasets.staging import Staged
 from service.foundation.errors import ServiceError
 from service.foundation.settings import Settings
 from service.storage.disk import Disk
-from service.stream.messages import StreamAnswer, StreamLearnt
+from service.stream.exchange import StreamAnswer, StreamLearnt
 
 BAND = 1.959963984540054
 """Standard deviations on both sides that hold 95 %."""

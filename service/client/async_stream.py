@@ -13,8 +13,19 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidSta
 
 from service.client.sending import headers_of
 from service.foundation.settings import DEFAULT_URL
-from service.stream.exchange import Exchange, closed, destination, refused, unanswered, unsettled
-from service.stream.messages import StreamAnswer, StreamError, StreamHello, StreamLearnt, StreamRefusal
+from service.stream.exchange import (
+    Exchange,
+    StreamAnswer,
+    StreamError,
+    StreamHello,
+    StreamLearnt,
+    StreamRefusal,
+    closed,
+    destination,
+    refused,
+    unanswered,
+    unsettled,
+)
 
 
 class AsyncStreamClient:

@@ -10,7 +10,6 @@ from lipcore.metrics import evaluate
 from lipcore.paired import Answer, Comparison, Difference
 from lipcore.samples import Array, Samples
 from service.foundation.errors import invalid_request
-from service.inference.answer import measured
 from service.inference.comparison_schema import (
     CompareRequest,
     CompareResponse,
@@ -20,6 +19,7 @@ from service.inference.comparison_schema import (
     TotalDifference,
     VersionFigures,
 )
+from service.inference.evaluating import measured
 from service.models.loaded import LoadedModels, Served
 
 

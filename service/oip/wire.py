@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 import msgspec
 
 from service.foundation.errors import InvalidRequestError, UnsupportedMediaTypeError, invalid_request, problem, sentence
-from service.oip.schema import InferRequest, InferResponse
+from service.oip.schema import HEADER, InferRequest, InferResponse
 from service.web.route import OCTETS, Reply
 
-HEADER = "Inference-Header-Content-Length"
 _HEADER, _ENCODING = HEADER.lower().encode(), b"content-encoding"
 _decode = msgspec.json.Decoder(InferRequest).decode
 _encode = msgspec.json.Encoder().encode

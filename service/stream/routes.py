@@ -13,7 +13,7 @@ from starlette.types import Receive, Scope, Send
 from uvicorn.protocols.utils import ClientDisconnected
 
 from service.foundation.errors import BusyError, NotFoundError, NotReadyError, invalid_request
-from service.inference import checks
+from service.inference.schema import one_choice
 from service.learning.updates import Updates
 from service.models.schema import ALIAS
 from service.models.served import reached
@@ -137,7 +137,7 @@ def _parameters(query: bytes) -> Asked:
             min_revision = int(value)
         else:
             raise invalid_request(name, value, "no parameter but version, alias, std, stream_id and min_revision")
-    checks.one_choice(version, alias)
+    one_choice(version, alias)
     return Asked(version, alias, std, stream_id, min_revision)
 
 

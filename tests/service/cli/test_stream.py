@@ -11,7 +11,7 @@ import pytest
 from service.cli.playing import Tally, recorded
 from service.cli.simulate import write_recording
 from service.client.stream import StreamClient
-from service.stream.messages import StreamAnswer
+from service.stream.exchange import StreamAnswer
 from tests.service.data import stream, train, upload
 
 

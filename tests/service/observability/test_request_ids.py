@@ -10,7 +10,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.compute.process import Place
-from service.inference import answer as inference
+from service.inference import predicting as inference
 from service.learning.ingest.threads import IngestThreads
 from service.web.observability.logs import given_request_id, new_request_id, request_id
 from service.web.observability.meters import Meters

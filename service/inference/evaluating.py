@@ -1,95 +1,51 @@
-"""Answering queries: no transport here."""
+"""Comparing a version with a data set, or with what its training held out of it: no transport here."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite
-from typing import Any
+from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lipcore.metrics import LEVELS, RELIABILITY_LEVELS
 from lipcore.metrics import evaluate as compare
-from lipcore.samples import Samples
+from lipcore.samples import Array, Samples
 from service.datasets import store
 from service.foundation.errors import InvalidRequestError, invalid_request
-from service.inference import checks, components
-from service.inference.schema import EvaluateRequest, EvaluateResponse, Interval, PredictRequest, Reliability
-from service.inference.stretches import stretches
-from service.inference.wire import Prediction
+from service.inference.schema import EvaluateRequest, EvaluateResponse, Interval, Reliability, Stretches
 from service.models import registry
 from service.models.loaded import LoadedModels, Served
 from service.storage.database import DatasetRow
 from service.training import holding_out
 from service.training.holding_out import CannotHoldOutError, SetSplit
 
-Array = NDArray[np.float64]
+FEWEST_EPISODES, MOST_EPISODES = 5, 200
+"""Episodes stand for stretches where there are so many; fewer make no box plot, more are mostly a few samples long."""
+EQUAL = 10
 
 
-def at_once(served: Served, motion: Array, max_position: float) -> Prediction | None:
-    """Torque at one motion (3, n), for the event loop; None where the motion or the answer is not as it should be."""
-    if motion.shape[1] != served.model.n_joints or abs(motion[0]).max() > max_position:
-        return None
-    mean, deviation = served.model.answer(motion)
-    assert deviation is not None  # it is, unless declined
-    tau, tau_std = mean.tolist(), deviation.tolist()
-    if not isfinite(sum(tau) + sum(tau_std)):
-        return None
-    return _prediction(served, tau, tau_std)
+def stretches(samples: Samples, mean: Array) -> Stretches:
+    """Mean squared error of each stretch / variance of the measured torque over all samples; mean: (N, n) N·m.
 
-
-def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: Served | None = None) -> Prediction:
-    """Torque with uncertainty at the queries; raise InvalidRequestError or NotFoundError. Not for the event loop.
-
-    served: what answers, where that is found already.
+    The variance is that of all samples: a joint that rests for a while has a variance near zero then, and any error
+    would look enormous.
     """
-    settings = loaded.storage.settings
-    served = served or loaded.get(model, request.version, request.alias)
-    known = served.model
-    single = request.q.ndim == 1
-    components.check(known, request, settings.max_component_batch)
-    for name in ("q", "dq", "ddq", "tau"):
-        values = getattr(request, name)
-        if values is None:
-            continue
-        if values.shape[-1] != known.n_joints:
-            expected = f"{known.n_joints} numbers: {', '.join(known.joint_names)}"
-            raise invalid_request(name, f"{values.shape[-1]} numbers long", expected)
-        if values.shape != request.q.shape:
-            raise invalid_request(name, f"of shape {values.shape}", f"the shape of q, {request.q.shape}")
-    queries = np.atleast_2d(request.q)
-    if len(queries) > settings.max_batch:
-        raise invalid_request("q", f"{len(queries)} queries", f"at most {settings.max_batch} in one request")
-    checks.positions(request.q, settings.max_position)
-
-    answer = known.predict(queries, np.atleast_2d(request.dq), np.atleast_2d(request.ddq), request.covariance)
-    parts = {"tau": answer.tau, "tau_std": answer.tau_std}
-    if answer.covariance is not None:
-        parts["covariance"] = answer.covariance
-    found: dict[str, list[Any]] = {}
-    for name, values in parts.items():
-        shaped = values[0] if single else values
-        checks.answer(name, shaped)
-        found[name] = shaped.tolist()
-    prediction = _prediction(served, **found)
-    if request.components:
-        prediction.components = components.answer(known, request)
-    return prediction
-
-
-def _prediction(served: Served, tau: list[Any], tau_std: list[Any], covariance: list[Any] | None = None) -> Prediction:
-    model = served.model
-    return Prediction(
-        model=served.name,
-        version=served.version,
-        revision=served.revision,
-        joint_names=model.joint_names,
-        torque_convention=model.torque_convention,
-        tau=tau,
-        tau_std=tau_std,
-        noise_std=served.noise_std,
-        covariance=covariance,
+    episodes = samples.episodes()
+    by_episode = FEWEST_EPISODES <= len(episodes) <= MOST_EPISODES
+    if not by_episode:
+        edges = np.linspace(0, len(samples), min(EQUAL, len(samples)) + 1).astype(np.int64).tolist()
+        episodes = [slice(first, last) for first, last in pairwise(edges)]
+    squared = (samples.tau - mean) ** 2
+    varies = np.ptp(samples.tau, axis=0) > 0  # rounding gives a constant column a variance above zero
+    variance = samples.tau.var(axis=0)
+    means = np.array([squared[each].mean(axis=0) for each in episodes])
+    return Stretches(
+        kind="episodes" if by_episode else "equal",
+        samples=[each.stop - each.start for each in episodes],
+        nmse=[
+            (column / variance[joint]).tolist() if varies[joint] else [None] * len(episodes)
+            for joint, column in enumerate(means.T)
+        ],
     )
 
 
