@@ -88,13 +88,13 @@ def aliases(context: typer.Context) -> Names:
 
 def _model(context: typer.Context) -> dict[str, Any]:
     name = context.params.get("model")
-    found = _asked(context, f"/v1/models/{quote(name, safe='')}") if name else None
-    return found if isinstance(found, dict) else {"aliases": {}}
+    record = _asked(context, f"/v1/models/{quote(name, safe='')}") if name else None
+    return record if isinstance(record, dict) else {"aliases": {}}
 
 
 def _listed(context: typer.Context, path: str, name: Callable[[dict[str, Any]], tuple[str, str]]) -> Names:
-    found = _asked(context, path)
-    return [name(each) for each in found["items"]] if isinstance(found, dict) else []
+    listed = _asked(context, path)
+    return [name(each) for each in listed["items"]] if isinstance(listed, dict) else []
 
 
 def _asked(context: typer.Context, path: str) -> Any:

@@ -62,10 +62,10 @@ def fetch(name: str, url: str, version: int | None = None, alias: str | None = N
     with TemporaryDirectory(prefix="lipserve-excite-") as folder, Client(url) as client:
         path = client.export(name, Path(folder) / "model.tar", version, alias)
         try:
-            found = archive.members(path, MEMBER_LIMITS)
+            places = archive.members(path, MEMBER_LIMITS)
         except archive.ArchiveError as error:
             raise ModelFormatError(str(error), error.member) from None
-        files = {each: archive.read(path, member) for each, member in found.items()}
+        files = {each: archive.read(path, member) for each, member in places.items()}
         for each in (archive.EXPORT, archive.CHECKSUMS):
             files.pop(each, None)
         return persistence.decode(files)
@@ -127,10 +127,10 @@ def excite(
     if plot is not None:
         plotting.pyplot()  # before a minute of planning
     known = None if model is None else find_model(model, url)
-    found = find(robot, known)
-    limits = found.limits.within(position, scale, reach)
+    arm = find(robot, known)
+    limits = arm.limits.within(position, scale, reach)
     options = PlanOptions(seconds, rate, harmonics, iterations, budget_s=budget, seed=seed)
-    belief = Belief.of_model(known) if known is not None else _prior(found, limits, noise, estimator, seed)
+    belief = Belief.of_model(known) if known is not None else _prior(arm, limits, noise, estimator, seed)
 
     console = Console(width=None if sys.stdout.isatty() else 120)
     with (err if as_json else console).status("planning") as status:
@@ -138,7 +138,7 @@ def excite(
             belief,
             limits,
             options,
-            found.robot,
+            arm.robot,
             lambda step, left: status.update(f"planning, step {step}: {left:.2%} of the variance would be left"),
         )
     write(out, made)
@@ -149,7 +149,7 @@ def excite(
         print_json(shown(made, random, out, plot))
         return
     console.print(table(made, random), highlight=False)
-    console.print(said(made, "the model" if known is not None else f"a {estimator} prior"), highlight=False)
+    console.print(summary(made, "the model" if known is not None else f"a {estimator} prior"), highlight=False)
     for path in filter(None, (out, plot)):
         console.print(f"written to {path}", highlight=False)
     console.print(WARNING, style="yellow", highlight=False)
@@ -216,7 +216,7 @@ def table(made: Plan, random: Random) -> Table:
     return grid
 
 
-def said(made: Plan, known: str) -> str:
+def summary(made: Plan, known: str) -> str:
     """In words: what was planned, for what, and from where the robot starts."""
     start = ", ".join(f"{value:.3f}" for value in made.series.at(np.zeros(1))[0][0])
     options = made.options
@@ -230,11 +230,11 @@ def said(made: Plan, known: str) -> str:
     )
 
 
-def _prior(found: Arm, limits: Limits, noise: float | None, estimator: str, seed: int) -> Belief:
-    if found.robot is None:
+def _prior(arm: Arm, limits: Limits, noise: float | None, estimator: str, seed: int) -> Belief:
+    if arm.robot is None:
         raise ValueError(
-            f"no URDF of robot {found.name!r} is installed, so nothing tells how large its torques are: give --model, "
+            f"no URDF of robot {arm.name!r} is installed, so nothing tells how large its torques are: give --model, "
             "or a .urdf file as --robot"
         )
-    bodies = found.bodies if estimator.startswith("rigid-body") else None
-    return Belief.prior(found.robot, limits, noise, estimator, bodies, seed)
+    bodies = arm.bodies if estimator.startswith("rigid-body") else None
+    return Belief.prior(arm.robot, limits, noise, estimator, bodies, seed)

@@ -51,14 +51,14 @@ def _of_model(model: TorqueModel) -> Arm:
     if model.robot is not None:
         profile = profiles.from_urdf(model.robot.urdf, model.robot.name)
         return _of_urdf(profile, model.robot.urdf_joints, model.joint_names)
-    found = profiles.recognise(model.joint_names)
-    if len(found) != 1:
-        fit = f"several robots have: {', '.join(found)}" if found else "no robot that is known has"
+    names = profiles.recognise(model.joint_names)
+    if len(names) != 1:
+        fit = f"several robots have: {', '.join(names)}" if names else "no robot that is known has"
         raise ValueError(
             f"the model has the joints {', '.join(model.joint_names)}, which {fit}. Name the robot by --robot: "
             f"a .urdf file or one of {', '.join(profiles.names())}"
         )
-    return _named(found[0], model)
+    return _named(names[0], model)
 
 
 def _named(name: str, model: TorqueModel | None) -> Arm:
@@ -94,11 +94,11 @@ def _of_urdf(profile: Profile, joints: Sequence[str], names: tuple[str, ...] | N
     return Arm(profile.name, limits, robot, replace(bodies, joint_names=called))
 
 
-def _check(profile: Profile, own: Sequence[str], wanted: Sequence[str]) -> None:
+def _check(profile: Profile, own: Sequence[str], called: Sequence[str]) -> None:
     """The model's joints are the robot's, in the same order, whatever they are called."""
-    known = profile.called(wanted)
-    if len(own) != len(wanted) or (known is not None and known != tuple(own)):
+    known = profile.called(called)
+    if len(own) != len(called) or (known is not None and known != tuple(own)):
         raise ValueError(
-            f"robot {profile.name!r} has the joints {', '.join(own)}; the model has {', '.join(wanted)}, expected as "
+            f"robot {profile.name!r} has the joints {', '.join(own)}; the model has {', '.join(called)}, expected as "
             "many in the same order"
         )

@@ -53,13 +53,13 @@ def names(text: str | None) -> list[str] | None:
 
 def pairs(option: str, given: Sequence[str] | None) -> dict[str, str]:
     """Values by name of an option that is given as name=value, repeatedly; raise ValueError."""
-    found = {}
+    values = {}
     for text in given or ():
         name, equals, value = text.partition("=")
         if not equals or not value:
             raise ValueError(f"{option} is {text!r}, expected a quantity, = and what it is, as q=deg")
-        found[name.strip()] = value.strip()
-    return found
+        values[name.strip()] = value.strip()
+    return values
 
 
 def confirm(question: str, yes: bool) -> None:

@@ -204,8 +204,8 @@ def _staged(path: Path, folder: Path) -> tuple[Staged, TorqueConvention]:
     settings, options = Settings(home=folder, min_samples=FEWEST, max_home_bytes=None), UploadOptions()
     disk = Disk(settings)
     with open_table(path, None, options.read, settings) as table:
-        found = read(table, folder, options, None, settings, disk)
-    return prepare(found.staged, folder, options.recipe, FEWEST, disk).staged, found.torque_convention
+        recording = read(table, folder, options, None, settings, disk)
+    return prepare(recording.staged, folder, options.recipe, FEWEST, disk).staged, recording.torque_convention
 
 
 NAP = 0.05
@@ -219,7 +219,7 @@ class Stop:
         self.asked = False
 
     @contextmanager
-    def heard(self) -> Iterator[Stop]:
+    def listening(self) -> Iterator[Stop]:
         """Listen for Ctrl-C, in the main thread, which alone hears it."""
         if threading.current_thread() is not threading.main_thread():
             yield self
@@ -249,7 +249,7 @@ def play(
     A row that is refused is counted and the next one is sent; rows that are due already follow without a pause. Raise
     StreamError where the stream is lost. each_second: is told which second of the playing has ended, and its figures.
     """
-    whole, part = Tally(stream.hello.noise_std), Tally(stream.hello.noise_std)
+    total, part = Tally(stream.hello.noise_std), Tally(stream.hello.noise_std)
     due = motion.t - motion.t[0]
     begin, second = time.perf_counter(), 1
     for row in range(len(motion)):
@@ -260,7 +260,7 @@ def play(
         sent = time.perf_counter()
         if sent - begin >= second:
             each_second(second, part)
-            whole.merge(part)
+            total.merge(part)
             part, second = Tally(stream.hello.noise_std), int(sent - begin) + 1
             sent = time.perf_counter()
         tau = motion.tau[row] if learn else None
@@ -274,5 +274,5 @@ def play(
         part.add(answer, motion.tau[row], time.perf_counter() - sent, max(0.0, -wait))
     if part.rows or part.refused:
         each_second(second, part)
-        whole.merge(part)
-    return whole
+        total.merge(part)
+    return total

@@ -79,19 +79,24 @@ def stream(
         motion = simulated(simulate or "", seconds or SECONDS, rate, seed, fast, payload, payload_at)
     source = (stream_id or f"lipserve-{secrets.token_hex(4)}") if learn else None
     with (
-        Stop().heard() as stop,
+        Stop().listening() as stop,
         connected(url) as client,
-        client.stream(model, version=version, alias=alias, stream_id=source) as found,
+        client.stream(model, version=version, alias=alias, stream_id=source) as opened,
     ):
-        motion = _fitting(motion, found)
+        motion = _fitting(motion, opened)
         step = motion.step if deadline is None else deadline / 1e3
-        _announce(motion, found, source)
-        whole = play(
-            found, motion, learn, step, stop, lambda second, part: _tell_second(second, part, found, learn, as_json)
+        _announce(motion, opened, source)
+        total = play(
+            opened,
+            motion,
+            learn,
+            step,
+            stop,
+            lambda second, part: _tell_second(second, part, opened, learn, as_json),
         )
         if learn:
-            found.flush()
-        _tell_all(whole, found, learn, as_json)
+            opened.flush()
+        _tell_all(total, opened, learn, as_json)
     if stop.asked:
         raise typer.Exit(INTERRUPTED)
 
@@ -131,10 +136,10 @@ def _tell_second(second: int, part: Tally, stream: StreamClient, learn: bool, as
         say(f"{second:4d} s  {_line(shown)}")
 
 
-def _tell_all(whole: Tally, stream: StreamClient, learn: bool, as_json: bool) -> None:
+def _tell_all(total: Tally, stream: StreamClient, learn: bool, as_json: bool) -> None:
     from service.cli.playing import learnt_shown  # noqa: PLC0415 - as above
 
-    shown = {**whole.shown(), "joints": whole.joints(stream.hello.joint_names)}
+    shown = {**total.shown(), "joints": total.joints(stream.hello.joint_names)}
     if learn:
         shown["learnt"] = learnt_shown(stream.learnt)
         shown["not_logged"] = [

@@ -105,8 +105,8 @@ def train(
         note(f"job {job.id} is cancelled")
         raise typer.Exit(INTERRUPTED)
     if wait and job.version is None:
-        said = f"job {job.id} has {job.state}" + (f": {job.error.message}" if job.error else "")
-        raise CommandError(said, f"`lipserve jobs show {job.id}` tells its history")
+        message = f"job {job.id} has {job.state}" + (f": {job.error.message}" if job.error else "")
+        raise CommandError(message, f"`lipserve jobs show {job.id}` tells its history")
     if as_json:
         return
     if not wait:

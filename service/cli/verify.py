@@ -76,18 +76,18 @@ def verify_home(settings: Settings) -> Verified:
 
 
 def _verify(database: Database, files: Files) -> Verified:
-    found = Verified()
-    found.damages += [Damage("database", FILE, each) for each in database.adapter.inconsistencies(FAULTS)]
+    findings = Verified()
+    findings.damages += [Damage("database", FILE, each) for each in database.adapter.inconsistencies(FAULTS)]
     for kind, check in _CHECKS.items():
-        found.read[kind] = 0
+        findings.read[kind] = 0
         for name, gone, reason in check(database, files):
-            found.read[kind] += 1
+            findings.read[kind] += 1
             if reason is None:
                 continue
             with database.session() as session:
                 if not gone(session):
-                    found.damages.append(Damage(kind.removesuffix("s"), name, reason))
-    return found
+                    findings.damages.append(Damage(kind.removesuffix("s"), name, reason))
+    return findings
 
 
 _Finding = tuple[str, Callable[[Session], bool], str | None]
@@ -208,13 +208,13 @@ def verify(as_json: Json = False) -> None:
     """Read everything that the home LIPSERVE_HOME stores and report what is damaged; also while the service runs."""
     settings = Settings()
     with usable(settings):
-        found = verify_home(settings)
+        findings = verify_home(settings)
     if as_json:
-        print_json(found.shown())
+        print_json(findings.shown())
     else:
-        for damage in found.damages:
+        for damage in findings.damages:
             err.print(f"[red]damaged:[/red] {escape(str(damage))}", highlight=False, soft_wrap=True)
-        counts = ", ".join(f"{count} {kind}" for kind, count in found.read.items())
-        say(f"read {counts}: {len(found.damages) or 'nothing'} damaged")
-    if found.damages:
+        counts = ", ".join(f"{count} {kind}" for kind, count in findings.read.items())
+        say(f"read {counts}: {len(findings.damages) or 'nothing'} damaged")
+    if findings.damages:
         raise typer.Exit(1)

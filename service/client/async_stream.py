@@ -162,13 +162,13 @@ class AsyncStreamClient:
         """Read one message."""
         try:
             async with asyncio.timeout(timeout):
-                said = await self._open().recv()
+                message = await self._open().recv()
         except TimeoutError as error:
             assert timeout is not None
             raise unanswered(timeout) from error
         except ConnectionClosed as error:
             raise closed(error) from error
-        self._exchange.take(said)
+        self._exchange.take(message)
 
     def _open(self) -> ClientConnection:
         if self._connection is None:

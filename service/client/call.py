@@ -130,8 +130,8 @@ def page(kind: type[Record]) -> Callable[[Answer], Page[Record]]:
     """Read one page of a list of records."""
 
     def read(answer: Answer) -> Page[Record]:
-        found = json.loads(answer.body)
-        return Page([kind.model_validate(item) for item in found["items"]], found.get("next_cursor"))
+        document = json.loads(answer.body)
+        return Page([kind.model_validate(item) for item in document["items"]], document.get("next_cursor"))
 
     return read
 

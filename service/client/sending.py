@@ -128,9 +128,9 @@ class Events:
         elif line.startswith("data:"):
             self._data.append(line.removeprefix("data:").removeprefix(" "))
         elif not line:
-            found = Answer(200, "\n".join(self._data).encode(), event=self._event) if self._data else None
+            event = Answer(200, "\n".join(self._data).encode(), event=self._event) if self._data else None
             self._event, self._data = "", []
-            return found
+            return event
         return None  # comments keep the connection alive
 
 
@@ -203,5 +203,5 @@ class Attempts:
 
 
 def _retry_after(headers: Mapping[str, str]) -> float | None:
-    said = headers.get("retry-after", "")
-    return float(said) if said.isascii() and said.isdigit() else None
+    seconds = headers.get("retry-after", "")
+    return float(seconds) if seconds.isascii() and seconds.isdigit() else None

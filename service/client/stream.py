@@ -176,13 +176,13 @@ class StreamClient:
     def _take(self, timeout: float) -> None:
         """Read one message."""
         try:
-            said = self._socket.recv(timeout)
+            message = self._socket.recv(timeout)
         except TimeoutError as error:
             raise unanswered(timeout) from error
         except ConnectionClosed as error:
             raise closed(error) from error
         try:
-            self._exchange.take(said)
+            self._exchange.take(message)
         except StreamError:  # of a layout that this client cannot read
             self.close()
             raise

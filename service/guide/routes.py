@@ -72,12 +72,12 @@ def folder() -> Path:
 @lru_cache(1)
 def pages() -> dict[str, Page]:
     """Every page by its slug, in the guide's order, the index first."""
-    found = {}
+    pages = {}
     for file in (INDEX, *ORDER):
         if (path := folder() / file).is_file():
             slug = "" if file == INDEX else SLUGS.get(file, path.stem)
-            found[slug] = Page(slug, file, _title(path))
-    return found
+            pages[slug] = Page(slug, file, _title(path))
+    return pages
 
 
 @lru_cache(1)
@@ -104,11 +104,11 @@ def target(href: str, file: str) -> str | None:
     if _ELSEWHERE.match(href):
         return href
     path, _, fragment = href.partition("#")
-    wanted = posixpath.normpath(posixpath.join(posixpath.dirname(file), path))
+    leads_to = posixpath.normpath(posixpath.join(posixpath.dirname(file), path))
     for page in pages().values():
-        if page.file == wanted:
+        if page.file == leads_to:
             return page.address + (f"#{fragment}" if fragment else "")
-    name = _flat(wanted)
+    name = _flat(leads_to)
     return f"/guide/files/{name}" if name in images() else None
 
 

@@ -121,8 +121,8 @@ def evaluate(
     """
     served = served or loaded.get(model, request.version, request.alias)
     known = served.model
-    whole = request.part == "all"
-    recorded = (measured if whole else held_out)(loaded, request.dataset, served)
+    all_of_it = request.part == "all"
+    recorded = (measured if all_of_it else held_out)(loaded, request.dataset, served)
     used = recorded.used
     answer = known.predict(used.q, used.dq, used.ddq)
     metrics = compare(used.tau, answer.tau, answer.tau_std, answer.noise_std)
@@ -147,5 +147,5 @@ def evaluate(
         ],
         reliability=Reliability(nominal=list(RELIABILITY_LEVELS), observed=metrics.reliability.T.tolist()),
         stretches=stretches(used, answer.tau),
-        in_training=whole and recorded.in_training_of(served),
+        in_training=all_of_it and recorded.in_training_of(served),
     )

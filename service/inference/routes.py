@@ -101,7 +101,7 @@ def _encoded(loaded: LoadedModels, model: str, request: PredictRequest, served: 
     return encode(predicting.predict(loaded, model, request, served))
 
 
-async def _wanted(loaded: LoadedModels, model: str, request: PredictRequest | EvaluateRequest) -> Served | None:
+async def _revised(loaded: LoadedModels, model: str, request: PredictRequest | EvaluateRequest) -> Served | None:
     """The version that answers, where the request waits for a revision of it; None where it does not."""
     if request.min_revision is None:
         return None
@@ -111,7 +111,7 @@ async def _wanted(loaded: LoadedModels, model: str, request: PredictRequest | Ev
 async def predict(loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: PredictRequest) -> Response:
     """Answer one query or a batch. Nothing is clipped; `tau_std` grows where the model knows little."""
     # a right query has been answered before: this reads the others, to say what is wrong, or in JSON of other dialects
-    served = await _wanted(loaded, model, request)
+    served = await _revised(loaded, model, request)
     return Reply(await _in_thread(loaded, turns, model, request, served)).response()
 
 
@@ -131,7 +131,7 @@ async def evaluate(
     loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: EvaluateRequest
 ) -> EvaluateResponse:
     """Error, coverage and density of the model's torques against measured ones, joint by joint."""
-    served = await _wanted(loaded, model, request)
+    served = await _revised(loaded, model, request)
     return await to_thread.run_sync(evaluating.evaluate, loaded, model, request, served, limiter=turns)
 
 

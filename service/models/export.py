@@ -103,9 +103,9 @@ def _checked(folder: Path, row: VersionRow) -> dict[str, bytes]:
 
 def _learnt(row: VersionRow, revision: int) -> dict[str, Any]:
     """What the lineage says of online updates: of an earlier life too, where the version was imported with some."""
-    found: dict[str, Any] = {"model": row.model, "version": row.version, "revision": revision}
+    about: dict[str, Any] = {"model": row.model, "version": row.version, "revision": revision}
     earlier = row.manifest["lineage"].get("learnt")
-    return found if earlier is None else {**found, "before": earlier}
+    return about if earlier is None else {**about, "before": earlier}
 
 
 def _on_disk(loaded: LoadedModels, part: Part) -> Part:

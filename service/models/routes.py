@@ -108,9 +108,9 @@ async def export_version(
     learnt: Annotated[bool, Query(description="With what it has learnt online; false: as it was trained")] = True,
 ) -> StreamingResponse:
     """One archive with all that another service needs to answer alike; `export.json` in it says what it holds."""
-    found = await to_thread.run_sync(export, loaded, model, version, alias, learnt, limiter=turns)
-    headers = {"Content-Length": str(found.size), "Content-Disposition": f'attachment; filename="{found.name}"'}
-    return StreamingResponse(found.pieces, media_type=MEDIA_TYPE, headers=headers)
+    archived = await to_thread.run_sync(export, loaded, model, version, alias, learnt, limiter=turns)
+    headers = {"Content-Length": str(archived.size), "Content-Disposition": f'attachment; filename="{archived.name}"'}
+    return StreamingResponse(archived.pieces, media_type=MEDIA_TYPE, headers=headers)
 
 
 @router.get(
@@ -141,17 +141,17 @@ def version_urdf(
 @router.get("", summary="List models, newest first")
 def list_models(loaded: LoadedModelsDep, page: PageQuery) -> ModelPage:
     """One page of models with their versions."""
-    found = registry.page(loaded.database, page)
-    loaded.announce([item.name for item in found.items])
-    return found
+    listed = registry.page(loaded.database, page)
+    loaded.announce([item.name for item in listed.items])
+    return listed
 
 
 @router.get("/{model}", summary="One model and its versions", responses=responses(NotFoundError))
 def show(loaded: LoadedModelsDep, model: str) -> Model:
     """Which versions there are and which one answers."""
-    found = registry.show(loaded.database, model)
-    loaded.announce([found.name])
-    return found
+    record = registry.show(loaded.database, model)
+    loaded.announce([record.name])
+    return record
 
 
 @router.get("/{model}/versions/{version}", summary="One version", responses=responses(NotFoundError))

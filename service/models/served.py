@@ -49,8 +49,8 @@ class Served:
     @cached_property
     def noise_std(self) -> list[float]:
         """Standard deviation of the measured torque around the function, (n,) N·m, as answers carry it."""
-        found: list[float] = self.model.noise_std.tolist()
-        return found
+        numbers: list[float] = self.model.noise_std.tolist()
+        return numbers
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class Waiting:
         self._lock = threading.Lock()
         self._waiters: dict[str, set[Waiter]] = {}
 
-    def tell(self, model: str) -> None:
+    def wake(self, model: str) -> None:
         """Wake those that wait for a model; never waits itself."""
         with self._lock:
             waiters = tuple(self._waiters.get(model, ()))
@@ -172,6 +172,6 @@ async def reached(loaded: LoadedModels, model: str, version: int | None, alias: 
 
 def _not_reached(served: Served, revision: int) -> RevisionNotReachedError:
     name = f"version {served.version} of model {served.name!r}"
-    said = f"{name} answers with revision {served.revision} and has not learnt up to revision {revision} yet: ask again"
+    text = f"{name} answers with revision {served.revision} and has not learnt up to revision {revision} yet: ask again"
     expected = f"{served.revision} or less now, of version {served.version}"
-    return RevisionNotReachedError(said, [problem("min_revision", revision, expected)], AGAIN)
+    return RevisionNotReachedError(text, [problem("min_revision", revision, expected)], AGAIN)

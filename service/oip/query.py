@@ -47,11 +47,11 @@ NEED_TORQUE = frozenset(name for name, part in PARTS.items() if part.component =
 def shapes(model: TorqueModel) -> dict[str, Shape]:
     """Every tensor that a model can answer, and its shape at N queries; -1 stands for N."""
     n, offered = model.n_joints, available(model.estimator)
-    found: dict[str, Shape] = {"tau": (-1, n), "tau_std": (-1, n), "noise_std": (n,), "covariance": (-1, n, n)}
+    tensors: dict[str, Shape] = {"tau": (-1, n), "tau_std": (-1, n), "noise_std": (n,), "covariance": (-1, n, n)}
     for name, part in PARTS.items():
         if part.component in offered:
-            found[name] = _shape(part.component, n)
-    return found
+            tensors[name] = _shape(part.component, n)
+    return tensors
 
 
 def _shape(component: ComponentName, n: int) -> Shape:
@@ -104,17 +104,17 @@ def _outputs(request: InferRequest, model: TorqueModel) -> dict[str, bool]:
     usual = bool(request.parameters and request.parameters.binary_data_output)
     if not request.outputs:
         return dict.fromkeys(DEFAULT, usual)
-    found: dict[str, bool] = {}
+    outputs: dict[str, bool] = {}
     for index, output in enumerate(request.outputs):
         name, field = output.name, f"outputs[{index}]"
-        if name in found:
+        if name in outputs:
             raise invalid_request(f"{field}.name", name, "each output once")
         part = PARTS.get(name)
         if (part is None or part.component not in available(model.estimator)) and name not in (*QUICK, "covariance"):
             expected = f"what a model with the estimator {model.estimator.name} offers: {', '.join(shapes(model))}"
             raise invalid_request(f"{field}.name", name, expected)
-        found[name] = _binary(output, field, usual)
-    return found
+        outputs[name] = _binary(output, field, usual)
+    return outputs
 
 
 def _binary(output: InferOutput, field: str, usual: bool) -> bool:
@@ -177,8 +177,8 @@ def _values(tensor: InferInput, body: bytes, offset: int) -> tuple[Array, int]:
         raise invalid_request(f"{name}.parameters.shared_memory_region", given.shared_memory_region, _NO_TENSORS)
     size = None if given is None else given.binary_data_size
     if (size is None) == (tensor.data is None):
-        found = "missing" if size is None else "given, and binary_data_size too"
-        raise invalid_request(f"{name}.data", found, "numbers in data, or binary_data_size and binary data")
+        given_data = "missing" if size is None else "given, and binary_data_size too"
+        raise invalid_request(f"{name}.data", given_data, "numbers in data, or binary_data_size and binary data")
     if size is None:
         return _as_read(_listed(tensor, count), dtype), offset
     if size != count * dtype.itemsize:
@@ -202,6 +202,6 @@ def _listed(tensor: InferInput, count: int) -> Array:
     except ValueError:
         raise invalid_request(field, "numbers and lists, or lists of different lengths", expected) from None
     if values.size != count or (values.ndim == 2 and list(values.shape) != tensor.shape):
-        found = f"{values.size} numbers" if values.ndim == 1 else f"rows of shape {list(values.shape)}"
-        raise invalid_request(field, found, expected)
+        given = f"{values.size} numbers" if values.ndim == 1 else f"rows of shape {list(values.shape)}"
+        raise invalid_request(field, given, expected)
     return values

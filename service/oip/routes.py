@@ -46,9 +46,9 @@ async def find(loaded: LoadedModels, turns: CapacityLimiter, name: str, version:
     turns: of what loads. Raise NotFoundError naming those there are.
     """
     number, alias = (None, None) if version is None else _meant(version)
-    found = loaded.hot(name, number, alias)
-    if found is not None:
-        return found
+    served = loaded.hot(name, number, alias)
+    if served is not None:
+        return served
     return await to_thread.run_sync(_load, loaded, name, version, number, alias, limiter=turns)
 
 

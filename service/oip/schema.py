@@ -235,8 +235,8 @@ def infer_answer() -> dict[str, Any]:
 
 def _schema(message: type[msgspec.Struct]) -> dict[str, Any]:
     """JSON schema of a message with all that it refers to in place."""
-    whole = msgspec.json.schema(message)
-    inlined: dict[str, Any] = _inline(whole["$defs"][message.__name__], whole["$defs"])
+    document = msgspec.json.schema(message)
+    inlined: dict[str, Any] = _inline(document["$defs"][message.__name__], document["$defs"])
     return inlined
 
 

@@ -47,7 +47,7 @@ class Listener:
 
     def _listen(self) -> None:
         self._hearing = False
-        with closing(self._database.heard(PAUSE_S)) as told:
+        with closing(self._database.changes_of_others(PAUSE_S)) as told:
             for notice in told:
                 if self._ending.is_set():
                     return

@@ -31,8 +31,8 @@ class Storage:
 
 
 async def _storage(request: Request) -> Storage:
-    found: Storage = request.app.state.storage
-    return found
+    storage: Storage = request.app.state.storage
+    return storage
 
 
 StorageDep = Annotated[Storage, Depends(_storage)]

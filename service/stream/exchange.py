@@ -77,17 +77,17 @@ class StreamLearnt:
     rejected: dict[str, int] = field(default_factory=dict)
     revision: int = 0
 
-    def and_more(self, said: dict[str, Any]) -> StreamLearnt:
+    def and_more(self, message: dict[str, Any]) -> StreamLearnt:
         """Return the totals after one more message of the service."""
         rejected = dict(self.rejected)
-        for code, count in said["rejected"].items():
+        for code, count in message["rejected"].items():
             rejected[code] = rejected.get(code, 0) + count
         return StreamLearnt(
-            through=said["through"],
-            accepted=self.accepted + said["accepted"],
-            duplicates=self.duplicates + said["duplicates"],
+            through=message["through"],
+            accepted=self.accepted + message["accepted"],
+            duplicates=self.duplicates + message["duplicates"],
             rejected=rejected,
-            revision=max(self.revision, said["revision"]),
+            revision=max(self.revision, message["revision"]),
         )
 
 
@@ -102,25 +102,25 @@ class StreamRefusal:
     detail: list[dict[str, Any]]
 
 
-def read_hello(said: dict[str, Any]) -> StreamHello:
+def read_hello(message: dict[str, Any]) -> StreamHello:
     """Read what holds for all answers; raise StreamError where frames have another layout than this client's."""
-    if said["layout"] != LAYOUT:
-        raise StreamError(f"the service's frames have layout {said['layout']}, this client knows {LAYOUT}", "layout")
+    if message["layout"] != LAYOUT:
+        raise StreamError(f"the service's frames have layout {message['layout']}, this client knows {LAYOUT}", "layout")
     return StreamHello(
-        model=said["model"],
-        version=said["version"],
-        revision=said["revision"],
-        joint_names=tuple(said["joint_names"]),
-        torque_convention=said["torque_convention"],
-        noise_std=np.array(said["noise_std"]),
-        max_position=said["max_position"],
+        model=message["model"],
+        version=message["version"],
+        revision=message["revision"],
+        joint_names=tuple(message["joint_names"]),
+        torque_convention=message["torque_convention"],
+        noise_std=np.array(message["noise_std"]),
+        max_position=message["max_position"],
     )
 
 
-def read_refusal(said: dict[str, Any]) -> StreamRefusal:
+def read_refusal(message: dict[str, Any]) -> StreamRefusal:
     """Read why torques were not logged."""
-    error = said["error"]
-    return StreamRefusal(said["first"], said["through"], error["code"], error["message"], error["detail"])
+    error = message["error"]
+    return StreamRefusal(message["first"], message["through"], error["code"], error["message"], error["detail"])
 
 
 def read_answer(data: bytes) -> StreamAnswer | StreamError:
@@ -204,15 +204,15 @@ class Exchange:
                 with suppress(ValueError):  # a frame without torque
                     self.unsettled.remove(answer.sequence)
             return
-        said = json.loads(data)
-        if "learnt" in said:
-            self.learnt = self.learnt.and_more(said["learnt"])
-            self._settle(said["learnt"]["through"])
-        elif "refused" in said:
-            self.refusals.append(read_refusal(said["refused"]))
-            self._settle(said["refused"]["through"])
+        message = json.loads(data)
+        if "learnt" in message:
+            self.learnt = self.learnt.and_more(message["learnt"])
+            self._settle(message["learnt"]["through"])
+        elif "refused" in message:
+            self.refusals.append(read_refusal(message["refused"]))
+            self._settle(message["refused"]["through"])
         else:
-            self.hello = read_hello(said)
+            self.hello = read_hello(message)
 
     def answer(self) -> StreamAnswer:
         """Take the oldest answer; raise what is in its place where the query was refused."""

@@ -28,12 +28,12 @@ PATH, ECHO_PATH = "/v1/models/{model}/stream", "/v1/echo/stream"
 def router() -> APIRouter:
     """Return the routes, which count their connections together."""
     streams = Streams()
-    found = APIRouter()
+    router = APIRouter()
     # objects, not functions: those Starlette would wrap in its own WebSocket
-    found.add_websocket_route(PATH, StreamRoute(streams), name="stream")  # type: ignore[arg-type]
-    found.add_websocket_route(ECHO_PATH, EchoRoute(streams), name="echo")  # type: ignore[arg-type]
-    found.add_websocket_route("/{path:path}", NoRoute(), name="no stream")  # type: ignore[arg-type]
-    return found
+    router.add_websocket_route(PATH, StreamRoute(streams), name="stream")  # type: ignore[arg-type]
+    router.add_websocket_route(ECHO_PATH, EchoRoute(streams), name="echo")  # type: ignore[arg-type]
+    router.add_websocket_route("/{path:path}", NoRoute(), name="no stream")  # type: ignore[arg-type]
+    return router
 
 
 class Streams:
@@ -142,7 +142,7 @@ def _parameters(query: bytes) -> Asked:
 
 
 def _connection(scope: Scope) -> StreamProtocol:
-    found = scope.get("state", {}).get(CONNECTION)
-    if not isinstance(found, StreamProtocol):
+    connection = scope.get("state", {}).get(CONNECTION)
+    if not isinstance(connection, StreamProtocol):
         raise NotReadyError("streams need the server that `lipserve serve` starts")
-    return found
+    return connection

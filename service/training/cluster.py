@@ -60,7 +60,7 @@ class ClusterQueue(JobQueue):
     def _look_around(self) -> None:
         self._reconciled = -float("inf")
 
-    def _found(self, row: JobRow, ours: bool) -> None:
+    def _see_to(self, row: JobRow, ours: bool) -> None:
         """Watch a job that runs on some worker."""
         self._hands.append(Hand(row.id, None, None, time.monotonic(), away=True))
 
@@ -88,9 +88,9 @@ class ClusterQueue(JobQueue):
             if row is None or row.state != QUEUED or row.owner not in (None, self.replicas.id):
                 return None
             gpu = needs_gpu(row.request)
-            said = f"waits for a worker of the cluster{' with a GPU' if gpu else ''}"
-            if not row.history or row.history[-1]["message"] != said:
-                lifecycle.enter(row, QUEUED, said)
+            message = f"waits for a worker of the cluster{' with a GPU' if gpu else ''}"
+            if not row.history or row.history[-1]["message"] != message:
+                lifecycle.enter(row, QUEUED, message)
             row.owner = self.replicas.id
         return gpu
 

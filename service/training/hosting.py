@@ -176,8 +176,8 @@ class Host:
 
     def _row(self, job: str) -> JobRow | None:
         with self.database.session() as session:
-            found: JobRow | None = session.scalar(select(JobRow).where(JobRow.id == job))
-        return found
+            row: JobRow | None = session.scalar(select(JobRow).where(JobRow.id == job))
+        return row
 
     def _hand_back(self, job: str, attempt: int) -> None:
         with self.database.transaction() as session:

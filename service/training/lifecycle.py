@@ -71,7 +71,7 @@ class Hand:
 
     slot: the place of the process, and future: its end, as the kind of queue has them; away: it is the process of a
     worker elsewhere, for which the job may have to wait; since: when it was handed over; ran, stopped, done: when it
-    was first seen to run, to be cancelled and to have ended; heartbeat: the last one seen, and heard: when.
+    was first seen to run, to be cancelled and to have ended; heartbeat: the last one seen, and beat_at: when.
     """
 
     job: str
@@ -83,14 +83,14 @@ class Hand:
     stopped: float | None = None
     done: float | None = None
     heartbeat: str | None = None
-    heard: float = 0.0
+    beat_at: float = 0.0
 
     def see(self, facts: Facts, clock: float) -> None:
         """Take note of what the row says."""
         if facts.state == RUNNING and self.ran is None:
-            self.ran = self.heard = clock
+            self.ran = self.beat_at = clock
         if facts.heartbeat_at != self.heartbeat:
-            self.heartbeat, self.heard = facts.heartbeat_at, clock
+            self.heartbeat, self.beat_at = facts.heartbeat_at, clock
         if facts.cancel_requested:
             self.stop(clock)
         if (facts.state not in ACTIVE or not facts.ours) and self.done is None:
@@ -119,7 +119,7 @@ class Hand:
             if self.away or clock - self.since < settings.job_start_s:
                 return None
             return Ended(self.job, "not_started", f"no training process was ready within {settings.job_start_s:g} s")
-        if clock - self.heard >= settings.job_heartbeat_s:
+        if clock - self.beat_at >= settings.job_heartbeat_s:
             message = f"the training process gave no sign of life for {settings.job_heartbeat_s:g} s and was ended"
             return Ended(self.job, "silent", message)
         if clock - self.ran >= settings.max_job_s:

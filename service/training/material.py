@@ -99,16 +99,16 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
     parts = opened(files, rows)
     divided = holding_out.hold_out_again(rows, [part.clock() for part in parts], version.manifest["lineage"])
     table = _learnt([replace(part, factor=_aged(part.row, within)) for part in parts], divided)
-    if not table.parts and logged.found < settings.min_samples:
-        raise NothingToLearnError(f"the log has {logged.found} rows to train on, expected {settings.min_samples}")
-    log_lineage: dict[str, Any] = {"through": within.through, "rows": 0, "found": logged.found}
+    if not table.parts and logged.rows < settings.min_samples:
+        raise NothingToLearnError(f"the log has {logged.rows} rows to train on, expected {settings.min_samples}")
+    log_lineage: dict[str, Any] = {"through": within.through, "rows": 0, "found": logged.rows}
     weighted = None
-    if (found := logged.samples) is not None:
-        span = {"first": float(found.t.min()), "last": float(found.t.max())}
-        log_lineage |= {"rows": len(found), **span}
-        ages = refresh_data.age_weights(found.t, within)
-        counted = spacing.recorded(found.t, found.episode)
-        weighted = found, counted if ages is None else counted * ages
+    if (samples := logged.samples) is not None:
+        span = {"first": float(samples.t.min()), "last": float(samples.t.max())}
+        log_lineage |= {"rows": len(samples), **span}
+        ages = refresh_data.age_weights(samples.t, within)
+        counted = spacing.recorded(samples.t, samples.episode)
+        weighted = samples, counted if ages is None else counted * ages
     return Material(
         *_candidates(table, logged.samples),
         table,
@@ -157,14 +157,14 @@ def _candidates(table: Table, logged: Samples | None) -> tuple[Samples, Samples 
 
 def _aged(row: DatasetRow, within: refresh_data.Scope) -> float:
     """What a data set's samples count where the model forgets: their age counts from their upload."""
-    found = refresh_data.age_weights(np.array([datetime.fromisoformat(row.created_at).timestamp()]), within)
-    return 1.0 if found is None else float(found[0])
+    weights = refresh_data.age_weights(np.array([datetime.fromisoformat(row.created_at).timestamp()]), within)
+    return 1.0 if weights is None else float(weights[0])
 
 
 def _datasets(database: Database, names: list[str]) -> list[DatasetRow]:
     with database.session() as session:
-        found = {row.id: row for row in session.scalars(select(DatasetRow).where(DatasetRow.id.in_(names)))}
-    return [found[name] for name in names]
+        rows = {row.id: row for row in session.scalars(select(DatasetRow).where(DatasetRow.id.in_(names)))}
+    return [rows[name] for name in names]
 
 
 def _holdout(lineage: HoldoutLineage | None) -> dict[str, Any]:

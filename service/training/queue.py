@@ -195,13 +195,13 @@ class JobQueue:
         jobs = [hand.job for hand in self._hands]
         with self.database.session() as session:
             rows = session.execute(select(JobRow.id, JobRow.owner, *columns).where(JobRow.id.in_(jobs)))
-            found = {
-                job: Facts(state, heard, cancel, attempts, self.replicas.mine(owner))
-                for job, owner, state, heard, cancel, attempts in rows
+            facts = {
+                job: Facts(state, beat, cancel, attempts, self.replicas.mine(owner))
+                for job, owner, state, beat, cancel, attempts in rows
             }
         for hand in self._hands:
-            if hand.job in found:
-                hand.see(found[hand.job], clock)
+            if hand.job in facts:
+                hand.see(facts[hand.job], clock)
             if hand.ran is not None:
                 self.problem = None
 
@@ -239,7 +239,7 @@ class JobQueue:
             if row.state == QUEUED:
                 self.submit(row.id)
             else:
-                self._found(row, ours)
+                self._see_to(row, ours)
 
     def _may_have(self, row: JobRow) -> bool:
         """Whether a job that nobody has, or one who is gone, can be this service's."""
@@ -247,7 +247,7 @@ class JobQueue:
             return True  # it is taken when it is handed out
         return self.replicas.take(row.id, row.owner)
 
-    def _found(self, row: JobRow, ours: bool) -> None:
+    def _see_to(self, row: JobRow, ours: bool) -> None:
         """See to a job that runs, but not in a process of this service. ours: not taken over just now."""
         if not ours:
             self._pass_on(Ended(row.id, "ended", "the service that had it run is gone"))
@@ -300,8 +300,8 @@ def queue_of(settings: Settings) -> type[JobQueue]:
 
 
 async def _queue(request: Request) -> JobQueue:
-    found: JobQueue = request.app.state.jobs
-    return found
+    queue: JobQueue = request.app.state.jobs
+    return queue
 
 
 JobQueueDep = Annotated[JobQueue, Depends(_queue)]

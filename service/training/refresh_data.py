@@ -70,12 +70,12 @@ def split_datasets(
 ) -> tuple[list[DatasetRow], list[dict[str, str]]]:
     """Data sets of a version's lineage that a refresh learns from, in order, and why it leaves out the others."""
     named = [item["id"] for item in lineage.get("datasets", [])]
-    found = {row.id: row for row in _datasets(session, named)}
+    known = {row.id: row for row in _datasets(session, named)}
     kept, left_out = [], []
     for name in named:
-        why = scope.left_out(found[name]) if name in found else "it has been deleted"
+        why = scope.left_out(known[name]) if name in known else "it has been deleted"
         if why is None:
-            kept.append(found[name])
+            kept.append(known[name])
         else:
             left_out.append({"id": name, "reason": why})
     return kept, left_out
@@ -101,10 +101,10 @@ PAGE = 50
 
 @dataclass(frozen=True)
 class Logged:
-    """Samples of the log, None where there are none; found: rows before they were thinned; t of samples: event time."""
+    """Samples of the log, t their event time, None where there are none; rows: how many before they were thinned."""
 
     samples: Samples | None
-    found: int
+    rows: int
 
 
 def read_log(
@@ -114,15 +114,15 @@ def read_log(
 
     Sorted by stream and time; where time steps by more than `longest_step` seconds a new episode begins.
     """
-    kept, found = _thinned(database, model, scope, most)
-    if found == 0:
+    kept, count = _thinned(database, model, scope, most)
+    if count == 0:
         return Logged(None, 0)
     rows, source = Rows.concatenate([part for part, _ in kept]), np.concatenate([stream for _, stream in kept])
     order = np.lexsort((rows.time, source))
     rows, source = rows.take(order), source[order]
     breaks = (np.diff(source) != 0) | (np.diff(rows.time) > longest_step)
     episode = np.concatenate([[0], np.cumsum(breaks)]).astype(np.int64)
-    return Logged(Samples(joint_names, rows.time, episode, rows.q, rows.dq, rows.ddq, rows.tau), found)
+    return Logged(Samples(joint_names, rows.time, episode, rows.q, rows.dq, rows.ddq, rows.tau), count)
 
 
 def age_weights(times: Array, scope: Scope) -> Array | None:
@@ -139,7 +139,7 @@ def _thinned(database: Database, model: str, scope: Scope, most: int) -> tuple[l
     """
     kept: list[tuple[Rows, Array]] = []
     streams: dict[str | None, int] = {}
-    step, found, held, after = 1, 0, 0, 0
+    step, count, held, after = 1, 0, 0, 0
     while True:
         with database.session() as session:
             events = log.events(session, model, after, PAGE)
@@ -148,8 +148,8 @@ def _thinned(database: Database, model: str, scope: Scope, most: int) -> tuple[l
                 continue
             rows = decode(event.payload).learnt
             rows = rows.take(rows.time >= scope.since)
-            chosen = rows.take((np.arange(found, found + len(rows)) % step) == 0)
-            found, held = found + len(rows), held + len(chosen)
+            chosen = rows.take((np.arange(count, count + len(rows)) % step) == 0)
+            count, held = count + len(rows), held + len(chosen)
             kept.append((chosen, np.full(len(chosen), streams.setdefault(event.stream_id, len(streams)))))
             if held > 2 * most:
                 kept, step = _every(kept, 2), 2 * step
@@ -162,7 +162,7 @@ def _thinned(database: Database, model: str, scope: Scope, most: int) -> tuple[l
         chosen_rows = np.zeros(held, dtype=bool)
         chosen_rows[np.linspace(0, held - 1, most).round().astype(np.int64)] = True
         kept = _where(kept, chosen_rows)
-    return kept, found
+    return kept, count
 
 
 def _every(parts: list[tuple[Rows, Array]], step: int) -> list[tuple[Rows, Array]]:

@@ -59,9 +59,9 @@ def add(
     for job in session.scalars(of(model).where(JobRow.state.in_(ACTIVE))):
         raise ConflictError(f"job {job.id!r} refreshes model {model!r} already: wait for its end or cancel it")
     through = log.newest(session, model)
-    found = refresh_data.scope_of(session, model, through)
-    kept, left_out = refresh_data.split_datasets(session, found, manifest["lineage"])
-    rows = refresh_data.rows_within(session, model, found)
+    scope = refresh_data.scope_of(session, model, through)
+    kept, left_out = refresh_data.split_datasets(session, scope, manifest["lineage"])
+    rows = refresh_data.rows_within(session, model, scope)
     if not kept and rows < settings.min_samples:
         raise ConflictError(_nothing(version, rows, left_out, settings.min_samples))
     made_by = None if version.job is None else session.scalar(select(JobRow).where(JobRow.id == version.job))

@@ -97,8 +97,8 @@ def _train(settings: Settings, database: Database, files: Files, claim: Claim) -
             if material.held_out is not None:
                 pulse.stage("evaluating")
                 held_out, of = material.held_out
-                found = figures(trained, held_out, settings.max_evaluation_samples, of)
-                lineage["holdout"] = {**lineage["holdout"], **found}
+                held_out_figures = figures(trained, held_out, settings.max_evaluation_samples, of)
+                lineage["holdout"] = {**lineage["holdout"], **held_out_figures}
             pulse.stage("saving")
             folder = lifecycle.new_folder(claim.job)
             Disk(settings).require()
@@ -134,7 +134,7 @@ def _fit(settings: Settings, claim: Claim, material: Material, pulse: Pulse) -> 
     options = lipcore.FitOptions(**request["options"])
     table = material.table.weighed(options.posterior_samples)
     # the version that serves has learnt all rows of a refresh, not only the few that a fit chooses
-    every = request.get("refresh") is not None or wanted(options, material.rows, table.worth())
+    every = request.get("refresh") is not None or wanted(options, material.rows, table.independent_rows())
     if every:
         pulse.plan(material.rows)
     if not every or material.rows <= CANDIDATES:  # else it is the pass that takes long

@@ -75,14 +75,14 @@ def read_json(body: bytes) -> Any:
     try:
         return json.loads(body.decode("utf-8-sig"), object_pairs_hook=_object)
     except UnicodeDecodeError as error:
-        found = f"not UTF-8 at byte {error.start}"
+        reason = f"not UTF-8 at byte {error.start}"
     except json.JSONDecodeError as error:
-        found = f"not JSON at character {error.pos}: {error.msg}"
+        reason = f"not JSON at character {error.pos}: {error.msg}"
     except RecursionError:
-        found = "nested too deep"
+        reason = "nested too deep"
     except ValueError:  # Python reads no whole number of more digits
-        found = "not JSON that can be read: a whole number has more than 4300 digits"
-    raise invalid_request("body", found, "JSON")
+        reason = "not JSON that can be read: a whole number has more than 4300 digits"
+    raise invalid_request("body", reason, "JSON")
 
 
 def each_once(body: bytes, *names: bytes) -> bool:
@@ -115,13 +115,13 @@ class _JsonRequest(Request):
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    value = dict(pairs)
+    if len(value) < len(pairs):
         names = [name for name, _ in pairs]
         twice = next(name for index, name in enumerate(names) if name in names[:index])
         item = problem(twice, "given twice", "each field once")
         raise InvalidRequestError(sentence(item), [item])
-    return found
+    return value
 
 
 def _check_encoding(scope: Scope) -> None:
@@ -193,8 +193,8 @@ def hot_route(answer: Answerer) -> type[Route]:
 async def _read(receive: Receive) -> bytes | None:
     message = await receive()
     if not message.get("more_body") and message["type"] == "http.request":
-        whole: bytes = message.get("body", b"")
-        return whole
+        body: bytes = message.get("body", b"")
+        return body
     parts: list[bytes] = []
     while message["type"] == "http.request":
         parts.append(message.get("body", b""))

@@ -35,7 +35,7 @@ def database(shared: Shared) -> Iterator[Database]:
 def told(database: Database, *work: Callable[[], object]) -> list[tuple[str, str]]:
     """Kind and model of what a service hears while another one does things, in the order of commits."""
     heard = []
-    with closing(database.heard(0.5)) as notices:
+    with closing(database.changes_of_others(0.5)) as notices:
         assert next(notices) is None
         for do in work:
             do()
@@ -93,7 +93,7 @@ def test_what_is_rolled_back_is_not_told(database):
 
 def test_a_service_alone_tells_and_hears_nothing(tmp_path):
     with closing(Database(tmp_path)) as alone:
-        assert list(alone.heard(60.0)) == []
+        assert list(alone.changes_of_others(60.0)) == []
 
 
 @pytest.mark.parametrize("payload", ["", "log", "other 12 arm"])

@@ -166,5 +166,5 @@ def infer(
 
 
 def _tensors(answer: Answer) -> dict[str, Array]:
-    said = msgspec.json.decode(answer.body)
-    return {each["name"]: array(each["data"]).reshape(each["shape"]) for each in said["outputs"]}
+    document = msgspec.json.decode(answer.body)
+    return {each["name"]: array(each["data"]).reshape(each["shape"]) for each in document["outputs"]}

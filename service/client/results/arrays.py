@@ -62,8 +62,8 @@ class Plain:
 
     def as_dict(self) -> dict[str, Any]:
         """The result as the API tells it: lists for arrays, None for NaN; fields that are None are left out."""
-        found: dict[str, Any] = plain(self)
-        return found
+        document: dict[str, Any] = plain(self)
+        return document
 
 
 def figure(value: float, form: str) -> str:

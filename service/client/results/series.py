@@ -124,8 +124,8 @@ class LivePart(Plain):
     @property
     def innovation(self) -> Array:
         """(K, n) of tau - mean in standard deviations of a measurement."""
-        found: Array = (self.tau - self.mean) / np.hypot(self.std, self.noise_std)
-        return found
+        innovation: Array = (self.tau - self.mean) / np.hypot(self.std, self.noise_std)
+        return innovation
 
 
 @dataclass(frozen=True, eq=False)

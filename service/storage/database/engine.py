@@ -69,12 +69,12 @@ def collect_notices(session: Session, _: Any) -> None:
 
     Rows that are changed by a statement alone pass unseen: each such change comes with a row that does not.
     """
-    found = session.info.setdefault(_KEY, set())
+    changes = session.info.setdefault(_KEY, set())
     row: Any
     for row in chain(session.new, session.dirty, session.deleted):
         if type(row) in KINDS:
             model = row.name if isinstance(row, DeletedModelRow) else row.model
-            found.add((KINDS[type(row)], model))
+            changes.add((KINDS[type(row)], model))
 
 
 def send_notices(session: Session, origin: str) -> None:
@@ -106,8 +106,8 @@ class Adapter(Protocol):
     def turn(self, model: str) -> AbstractContextManager[None]:
         """Be the only one, of all services, that takes something for a model while the block runs."""
 
-    def heard(self, pause_s: float) -> Iterator[str | None]:
-        """What other services tell, see `Database.heard`."""
+    def changes_of_others(self, pause_s: float) -> Iterator[str | None]:
+        """What other services tell, see `Database.changes_of_others`."""
 
     def close(self) -> None:
         """Close all connections."""
@@ -177,12 +177,12 @@ class Database:
         """
         return self.adapter.turn(model)
 
-    def heard(self, pause_s: float) -> Generator[Notice | None, None, None]:
+    def changes_of_others(self, pause_s: float) -> Generator[Notice | None, None, None]:
         """What is changed from the first None on that this yields, as it is committed; and None after each pause, s.
 
         Ends with an error where the connection does. Where there is one service, nothing is told and this ends at once.
         """
-        for payload in self.adapter.heard(pause_s):
+        for payload in self.adapter.changes_of_others(pause_s):
             notice = None if payload is None else read_notice(payload)
             if payload is None or notice is not None:
                 yield notice

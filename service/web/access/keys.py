@@ -65,10 +65,10 @@ def create(database: Database, name: str, scopes: Iterable[str], expires_at: dat
         for_people("name", name)
     except InvalidRequestError as error:
         raise ValueError(error.message) from error
-    wanted = list(dict.fromkeys(scopes))
-    if not wanted:
+    allowed = list(dict.fromkeys(scopes))
+    if not allowed:
         raise ValueError(f"scopes are missing, expected some of {', '.join(SCOPES)}")
-    for scope in wanted:
+    for scope in allowed:
         if scope not in SCOPES:
             raise ValueError(f"scope is {scope!r}, expected one of {', '.join(SCOPES)}")
     secret = PREFIX + secrets.token_urlsafe(SECRET_BYTES)
@@ -76,7 +76,7 @@ def create(database: Database, name: str, scopes: Iterable[str], expires_at: dat
         id=new_id("key"),
         name=name,
         hash=digest_of(secret.encode()).hex(),
-        scopes=wanted,
+        scopes=allowed,
         created_at=now(),
         expires_at=None if expires_at is None else expires_at.astimezone(UTC).isoformat(timespec="milliseconds"),
     )

@@ -85,8 +85,8 @@ class LocalAccess:
 
     def _is_local(self, host: bytes) -> bool:
         name = host.decode("latin-1")
-        found = _HOST.fullmatch(name)
-        if found is None or not is_loopback((found[1] or found[2]).lower().removesuffix(".")):
+        match = _HOST.fullmatch(name)
+        if match is None or not is_loopback((match[1] or match[2]).lower().removesuffix(".")):
             return False
         if len(self._known) < MOST_KNOWN:
             self._known.add(host)

@@ -58,8 +58,8 @@ class Turns:
 
 def _of(kind: str) -> Callable[[Request], Awaitable[CapacityLimiter]]:
     async def limiter(request: Request) -> CapacityLimiter:
-        found: CapacityLimiter = getattr(request.app.state.turns, kind)
-        return found
+        kind_limiter: CapacityLimiter = getattr(request.app.state.turns, kind)
+        return kind_limiter
 
     return limiter
 

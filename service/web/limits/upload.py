@@ -62,9 +62,9 @@ class FormFile:
             self._parser.write(data)
         except FormParserError as error:
             raise _broken(error) from None
-        found = b"".join(self._pieces)
+        content = b"".join(self._pieces)
         self._pieces.clear()
-        return found
+        return content
 
     def end(self) -> str:
         """Finish and return the file's name; raise InvalidRequestError where the form ends early or had no file."""

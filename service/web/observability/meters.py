@@ -117,8 +117,8 @@ class Meters:
 
 
 async def _meters(request: Request) -> Meters:
-    found: Meters = request.app.state.meters
-    return found
+    meters: Meters = request.app.state.meters
+    return meters
 
 
 MetersDep = Annotated[Meters, Depends(_meters)]
@@ -162,11 +162,11 @@ class MetricKind:
 
 def merged(parts: Iterable[Durations]) -> Durations:
     """All durations of several meters together."""
-    found = Durations()
+    total = Durations()
     for part in parts:
-        found.counts = [ours + theirs for ours, theirs in zip(found.counts, part.counts, strict=True)]
-        found.total += part.total
-    return found
+        total.counts = [ours + theirs for ours, theirs in zip(total.counts, part.counts, strict=True)]
+        total.total += part.total
+    return total
 
 
 def _buckets(durations: Durations) -> Iterator[tuple[str, float]]:

@@ -66,14 +66,14 @@ class System(Collector):
 
 def _processes() -> Iterator[Metric]:
     """What the processes take that the service has started, where the platform says."""
-    found: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
+    figures: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
     for process in multiprocessing.active_children():
         name, pid = "learner" if process.name == LEARNER else "training", process.pid
         for family in ProcessCollector(pid=lambda pid=pid: pid, registry=None).collect():  # type: ignore[misc]
             if family.name in _SHOWN:
-                found[family.name][name] += family.samples[0].value
+                figures[family.name][name] += family.samples[0].value
     for shown, kind in _SHOWN.items():
-        yield kind.of(([name], value) for name, value in found[shown].items())
+        yield kind.of(([name], value) for name, value in figures[shown].items())
 
 
 DURATION = MetricKind(
@@ -127,10 +127,10 @@ class Traffic(Collector):
         seen = {Kind(*key): durations for key, durations in list(requests.known.items())}
         yield DURATION.spread(_grouped(seen, lambda kind: (kind.method, kind.route, kind.model)))
         answers = _grouped(seen, lambda kind: (kind.method, kind.route, str(kind.status)))
-        yield REQUESTS.of((labels, sum(found.counts)) for labels, found in answers)
+        yield REQUESTS.of((labels, sum(each.counts)) for labels, each in answers)
         refused = {kind: durations for kind, durations in seen.items() if kind.code}
         errors = _grouped(refused, lambda kind: (kind.route, kind.code))
-        yield ERRORS.of((labels, sum(found.counts)) for labels, found in errors)
+        yield ERRORS.of((labels, sum(each.counts)) for labels, each in errors)
         yield IN_FLIGHT.of([((), requests.in_flight)])
         yield STREAMS.of([((), requests.streams)])
         yield FRAMES.spread(([model], meter.durations) for model, meter in streams.items())
@@ -146,7 +146,7 @@ def _grouped(
     groups: dict[tuple[str, ...], list[Durations]] = defaultdict(list)
     for kind, durations in seen.items():
         groups[labels(kind)].append(durations)
-    return [(found, merged(groups[found])) for found in sorted(groups)]
+    return [(group, merged(groups[group])) for group in sorted(groups)]
 
 
 EXAMPLE = """# HELP lipserve_requests_total Requests that were answered; 101: a stream, 499: the client went away before

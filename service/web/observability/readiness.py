@@ -27,8 +27,8 @@ class Stopping:
 
 
 async def _stopping(request: Request) -> Stopping:
-    found: Stopping = request.app.state.stopping
-    return found
+    stopping: Stopping = request.app.state.stopping
+    return stopping
 
 
 StoppingDep = Annotated[Stopping, Depends(_stopping)]
@@ -108,8 +108,8 @@ class Readiness:
 
 
 async def _readiness(request: Request) -> Readiness:
-    found: Readiness = request.app.state.readiness
-    return found
+    readiness: Readiness = request.app.state.readiness
+    return readiness
 
 
 ReadinessDep = Annotated[Readiness, Depends(_readiness)]

@@ -76,7 +76,7 @@ class RequestLog:
         self.quiet, self.slow_s, self.most_refusals = frozenset(quiet) | MONITORING, slow_s, most_refusals
         self._refusals: dict[tuple[str, int, str], _Second] = {}
 
-    def worth(self, route: str, seconds: float) -> bool:
+    def may_log(self, route: str, seconds: float) -> bool:
         """Whether a request that was not refused may be worth a line: a quick look, before more is made of it."""
         return route not in self.quiet or seconds >= self.slow_s or request_lines.isEnabledFor(logging.DEBUG)
 
@@ -120,14 +120,14 @@ class RequestLog:
 
 def _of(scope: Scope, route: str) -> dict[str, Any]:
     """What a line says of a request: its address without the query, cut, as clients choose both."""
-    found = {"route": route, "path": scope["path"][:SHOWN]}
+    fields = {"route": route, "path": scope["path"][:SHOWN]}
     if "method" in scope:
-        found["method"] = scope["method"][:16]
+        fields["method"] = scope["method"][:16]
     if scope.get("client"):
-        found["client"] = scope["client"][0]
+        fields["client"] = scope["client"][0]
     if KEY_ID in scope:
-        found["key"] = scope[KEY_ID]
-    return found
+        fields["key"] = scope[KEY_ID]
+    return fields
 
 
 class _Second:
@@ -170,21 +170,21 @@ class RequestContext:
         answered = began
 
         # no coroutine of its own, which would cost every frame of a stream
-        def tell(message: Message) -> Awaitable[None]:
+        def note_status(message: Message) -> Awaitable[None]:
             nonlocal status, answered
-            if not status and (found := _status_of(message)):
-                status, answered = found, perf_counter()
+            if not status and (begun := _status_of(message)):
+                status, answered = begun, perf_counter()
                 message["headers"] = [*message.get("headers", ()), (REQUEST_ID, name.encode())]
-                if found == 101:
+                if begun == 101:
                     self.requests.streams += 1
                     self.log.opened(scope, _template(scope))
             return send(message)
 
         self.requests.in_flight += method is not WEBSOCKET
         try:
-            await self.app(scope, receive, tell)
+            await self.app(scope, receive, note_status)
         except Exception as error:
-            await self._answer(scope, receive, tell, error, begun=bool(status))
+            await self._answer(scope, receive, note_status, error, begun=bool(status))
             raise
         finally:
             self.requests.in_flight -= method is not WEBSOCKET
@@ -199,7 +199,7 @@ class RequestContext:
             if durations is None:
                 durations = self.requests.find(Kind(*kind), status < 400 or _exists(scope, model))
             durations.add(answered - began)
-            if status >= 400 or self.log.worth(path, seconds):
+            if status >= 400 or self.log.may_log(path, seconds):
                 self.log.answered(scope, Kind(*kind), seconds)
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send, error: Exception, begun: bool) -> None:
@@ -224,8 +224,8 @@ def _status_of(message: Message) -> int:
 def _template(scope: Scope) -> str:
     """Path of the route that a request has reached, with the names of its parameters; empty where it reached none."""
     route = scope.get("route") or scope.get("endpoint")  # Starlette names no route of a WebSocket
-    found: str = getattr(route, "path", "")
-    return found
+    path: str = getattr(route, "path", "")
+    return path
 
 
 def _exists(scope: Scope, model: str) -> bool:

@@ -152,11 +152,11 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def _waiting(self) -> int:
         """Bytes that the client has not taken: here, and in the kernel, whose buffers hide a slow reader for long."""
-        found = self.transport.get_write_buffer_size()
+        waiting = self.transport.get_write_buffer_size()
         with suppress(OSError, ValueError):  # a kernel that does not tell, a socket that is closed
             number = self.transport.get_extra_info("socket").fileno()
-            found += int.from_bytes(fcntl.ioctl(number, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
-        return found
+            waiting += int.from_bytes(fcntl.ioctl(number, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
+        return waiting
 
     def _say(self, status: HTTPStatus, code: str, message: str) -> None:
         """Answer what did not become a request, and close."""

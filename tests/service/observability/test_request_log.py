@@ -69,8 +69,8 @@ def test_a_control_loop_has_one_where_it_is_wrong(api, lines):
 
 def test_a_control_loop_has_one_where_it_is_slow(lines):
     log = RequestLog([HOT], slow_s=0.25, most_refusals=10)
-    assert not log.worth(HOT, 0.249)
-    assert log.worth(HOT, 0.25)
+    assert not log.may_log(HOT, 0.249)
+    assert log.may_log(HOT, 0.25)
     answered(log, seconds=0.249)
     answered(log, seconds=0.25)
     assert [(line["duration_ms"], line["slow"]) for line in lines()] == [(250.0, True)]
@@ -79,7 +79,7 @@ def test_a_control_loop_has_one_where_it_is_slow(lines):
 def test_a_control_loop_has_one_at_debug(caplog, lines):
     caplog.set_level(logging.DEBUG, "service.requests")
     log = RequestLog([HOT], slow_s=0.25, most_refusals=10)
-    assert log.worth(HOT, 0.001)
+    assert log.may_log(HOT, 0.001)
     answered(log)
     assert [line["level"] for line in lines()] == ["DEBUG"]
 

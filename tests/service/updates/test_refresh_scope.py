@@ -39,7 +39,7 @@ def test_all_rows_that_teach_are_in_scope(database):
     found = read(database, within)
     expected = np.concatenate([rows(seed=0).tau, rows(seed=2).tau, rows(seed=3).tau, rows(6, seed=9).tau[2:]])
     np.testing.assert_array_equal(found.samples.tau, expected)
-    assert found.found == 16
+    assert found.rows == 16
     assert len(found.samples.episodes()) == 4
     with database.session() as session:
         assert refresh_data.rows_within(session, MODEL, within) == 16
@@ -63,7 +63,7 @@ def test_streams_are_told_apart(database):
 def test_many_rows_are_thinned_evenly(database, most):
     write(database, *(batches.batch(number, rows=rows(40, seed=number)) for number in range(10)))
     found = read(database, found_scope(database), most)
-    assert found.found == 400
+    assert found.rows == 400
     assert 0.9 * most <= len(found.samples) <= most
     everything_there = np.concatenate([rows(40, seed=number).time for number in range(10)])
     places = np.searchsorted(everything_there, found.samples.t)
