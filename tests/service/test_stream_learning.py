@@ -80,15 +80,11 @@ class Talk:
             passing.set()
         self.current = served()
         loaded = SimpleNamespace(hot=lambda name, version, alias: self.current)
-        service = SimpleNamespace(
-            settings=Settings(**{**QUICK, **settings}),
-            loaded=loaded,
-            updates=updates,
-            meters=Meters(),
-        )
+        updates.settings, updates.loaded = Settings(**{**QUICK, **settings}), loaded
         self.connection = SimpleNamespace(arrived=perf_counter(), abort=self.aborted.set, scope={"subprotocols": []})
+        meter = Meters().stream("m")
         self.session = Session(
-            self.connection, self.messages.get, self.send, service, self.current, pinned, std, stream_id
+            self.connection, self.messages.get, self.send, updates, self.current, meter, pinned, std, stream_id
         )
 
     async def __aenter__(self):

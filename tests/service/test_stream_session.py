@@ -66,8 +66,8 @@ def session(loaded, version, pinned=False):
     async def send(message):
         said.append(message["text"])
 
-    service = SimpleNamespace(settings=Settings(), loaded=loaded, meters=Meters())
-    return Session(None, None, send, service, loaded.stored[version], pinned, std=False), said
+    updates = SimpleNamespace(settings=Settings(), loaded=loaded)
+    return Session(None, None, send, updates, loaded.stored[version], Meters().stream("m"), pinned, std=False), said
 
 
 def reply(talk, request=None, arrived=None):
