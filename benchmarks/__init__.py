@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from service.cli.errors import explain, tell
+from service.cli.consoles import explain, print_error
 
 
 def run(app: typer.Typer, expected: tuple[type[Exception], ...], name: str) -> None:
@@ -17,5 +17,5 @@ def run(app: typer.Typer, expected: tuple[type[Exception], ...], name: str) -> N
         words = explain(error, expected)
         if words is None:
             raise
-        tell(words)
+        print_error(words)
         sys.exit(1)

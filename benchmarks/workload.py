@@ -18,8 +18,8 @@ from lipcore.model import TorqueModel
 from lipcore.robots import ROBOTS, Robot, load_robot
 from lipcore.samples import Array, Samples
 from lipcore.simulation import Stream, simulate
-from service.cli import recordings
-from service.cli.demonstration import ServiceProcess
+from service.cli.demo import ServiceProcess
+from service.cli.simulate import write_recording
 from service.client import Client
 from service.client.progress import follow
 from service.foundation.settings import Settings
@@ -143,7 +143,7 @@ def _install(home: Path, folder: Path) -> None:
 
 
 def _upload(client: Client, samples: Samples, path: Path) -> str:
-    recordings.write(path, samples)
+    write_recording(path, samples)
     return client.upload(path).id
 
 

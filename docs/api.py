@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from service.app import create_app
-from service.guide.pages import anchor
+from service.guide.routes import anchor
 from service.web.access.scopes import TABLE
 from service.web.openapi import METHODS
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from service.cli.tree import Command, commands
+from service.cli.main import Command, commands
 
 OUT = Path(__file__).resolve().parent / "reference" / "cli.md"
 HEAD = """# Command line

@@ -7,10 +7,15 @@ from collections.abc import Iterator
 
 from service.learning import metrics as learning
 from service.training import metrics as training
-from service.web.observability import system, traffic
-from service.web.observability.metric import MetricKind
+from service.web.observability import metrics
+from service.web.observability.meters import MetricKind
 
-KINDS: tuple[MetricKind, ...] = (*traffic.KINDS, *training.KINDS, *learning.KINDS, *system.KINDS)
+KINDS: tuple[MetricKind, ...] = (
+    *metrics.TRAFFIC_KINDS,
+    *training.KINDS,
+    *learning.KINDS,
+    *metrics.SYSTEM_KINDS,
+)
 """All metrics that /metrics shows besides Prometheus's usual ones of a process."""
 
 
@@ -20,7 +25,7 @@ def lines() -> Iterator[str]:
     yield "| --- | --- | --- | --- |"
     for kind in KINDS:
         labels = ", ".join(f"`{label}`" for label in kind.labels)
-        yield f"| `{kind.name}` | {kind.kind} | {labels} | {kind.said} |"
+        yield f"| `{kind.name}` | {kind.kind} | {labels} | {kind.meaning} |"
 
 
 if __name__ == "__main__":

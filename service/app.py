@@ -20,7 +20,7 @@ from service.datasets import routes as datasets
 from service.foundation import errors
 from service.foundation.settings import Settings
 from service.guide import routes as guide
-from service.inference import echo
+from service.inference import routes
 from service.inference import routes as inference
 from service.learning import metrics as learning_metrics
 from service.learning.control import routes as control
@@ -29,39 +29,29 @@ from service.learning.learner.learnt import LearntVersions
 from service.learning.learners import Learners
 from service.learning.live import routes as live
 from service.learning.refresh import attach
-from service.models import archive_routes as archives
 from service.models import registry
 from service.models import routes as models
 from service.models.loaded import LoadedModels
 from service.oip import routes as oip
 from service.replication.replication import Replication
 from service.robots import routes as robots
-from service.storage import looks as looking
-from service.storage.files import sweeping
+from service.storage.files.store import start_sweeping
 from service.storage.home import hold_home
-from service.storage.storage import Storage
+from service.storage.storage import Storage, look_database, look_files, look_home
 from service.stream import routes as stream
 from service.training import metrics as jobs_metrics
 from service.training import routes as training
 from service.training.queue import JobQueue, queue_of
 from service.web import health, openapi, storage_errors
-from service.web.access import openapi as access
-from service.web.access.keyring import Keyring
-from service.web.access.local import LocalAccess
-from service.web.access.middleware import KeyAccess
+from service.web.access.keys import Keyring
+from service.web.access.middleware import KeyAccess, LocalAccess
 from service.web.limits import BodyLimit
-from service.web.limits.gate import Gate
-from service.web.limits.rate import RateLimit
-from service.web.limits.stopping import Stopping
-from service.web.limits.turns import Turns
-from service.web.observability import routes as metrics
-from service.web.observability import tracing
+from service.web.limits.requests import Gate, RateLimit, Turns
+from service.web.observability import metrics, requests
 from service.web.observability.meters import Meters
-from service.web.observability.readiness import Look, Readiness
-from service.web.observability.request_log import RequestLog
-from service.web.observability.requests import RequestContext
-from service.web.observability.system import System
-from service.web.observability.traffic import Traffic
+from service.web.observability.metrics import System, Traffic
+from service.web.observability.readiness import Look, Readiness, Stopping
+from service.web.observability.requests import RequestContext, RequestLog
 
 logger = logging.getLogger(__name__)
 
@@ -101,7 +91,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
                     rest.push_async_callback(to_thread.run_sync, replication.close)
                 await to_thread.run_sync(jobs.close)  # first: what learns needs the CPU to store its state
 
-    hot = [*inference.hot.routes, *echo.hot.routes, *oip.hot.routes, *observations.hot.routes]
+    hot = [*inference.hot.routes, *routes.echo_hot.routes, *oip.hot.routes, *observations.hot.routes]
     # the documentation page loads nothing from other hosts: robots' networks often have no way out
     app = FastAPIOffline(
         title="LIPServe",
@@ -113,20 +103,18 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         redirect_slashes=False,  # to an address that the client's Host header would choose
         # tried first, and not through an included router: 50 µs less a request
         routes=hot,
-        telemetry=tracing.telemetry(settings),
+        telemetry=requests.telemetry(settings),
     )
     app.state.stopping, app.state.meters = stopping, meters
     errors.install(app)
-    openapi.install(app)
     storage_errors.install(app)
     _add_middleware(app, settings, keyring, meters, hot)
-    access.install(app, settings.keys_needed)
+    openapi.install(app, settings.keys_needed)
     app.include_router(health.router)
     app.include_router(metrics.router)
     app.include_router(datasets.router)
     app.include_router(robots.router)
     app.include_router(training.router)
-    app.include_router(archives.router)
     app.include_router(models.router)
     app.include_router(inference.router)
     app.include_router(control.router)
@@ -170,7 +158,7 @@ def _open(settings: Settings) -> tuple[Storage, JobQueue, Learners]:
     sys.setswitchinterval(SWITCH_INTERVAL)
     storage = Storage.open(settings)
     database, files = storage.database, storage.files
-    sweeping.start(database, files)
+    start_sweeping(database, files)
     registry.install_shipped(database, files)
     loaded = LoadedModels(storage, LearntVersions(database, files))
     logger.info("loaded %d models", loaded.preload())
@@ -186,9 +174,9 @@ def _share(app: FastAPI, storage: Storage, jobs: JobQueue, learners: Learners) -
     """Put the parts where routes ask for them, each for those that it uses."""
     state, loaded, settings = app.state, learners.loaded, storage.settings
     looks: dict[str, Look] = {
-        "database": lambda _: looking.database(storage),
-        "home": lambda _: looking.home(storage),
-        **({"files": lambda _: looking.files(storage)} if storage.files.shared else {}),
+        "database": lambda _: look_database(storage),
+        "home": lambda _: look_home(storage),
+        **({"files": lambda _: look_files(storage)} if storage.files.shared else {}),
         "models": loaded.look,
         "learner": learners.look,
         "training": lambda lasting: jobs_metrics.look(jobs, lasting),

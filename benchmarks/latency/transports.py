@@ -15,7 +15,7 @@ from benchmarks.latency.websocket import WebSocket, frame, read_answer, request_
 from benchmarks.workload import MODEL, Bed
 from lipcore.samples import Array
 from service.client.stream import StreamClient
-from service.oip.wire import HEADER
+from service.oip.schema import HEADER
 from service.stream.frames import request_bytes
 
 CLIENT = "ws-client"

@@ -17,7 +17,7 @@ from benchmarks.clients import HttpClient, post
 from benchmarks.workload import BenchError
 from lipcore.model import TorqueModel
 from lipcore.samples import Array, Samples
-from service.cli.demonstration import ServiceProcess
+from service.cli.demo import ServiceProcess
 from service.client import Client
 from service.learning.owner import set_options
 from service.learning.schema import LearningOptions

@@ -24,7 +24,7 @@ from benchmarks.workload import BenchError
 from lipcore.model import TorqueModel
 from lipcore.online.learner import OnlineModel
 from lipcore.samples import Array, Samples
-from service.cli.demonstration import ServiceProcess
+from service.cli.demo import ServiceProcess
 from service.client import Client
 
 Victim = Literal["service", "learner"]

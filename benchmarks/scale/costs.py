@@ -23,7 +23,7 @@ from benchmarks.scale.engines import Engines, eventually, ready, stored
 from benchmarks.scale.part import Part
 from benchmarks.scale.replicas import LEARNING, MODEL
 from lipcore.samples import Samples
-from service.cli.demonstration import ServiceProcess
+from service.cli.demo import ServiceProcess
 from service.client import Client
 from service.client.stream import StreamClient
 from service.foundation.settings import shipped_models

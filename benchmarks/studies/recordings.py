@@ -16,7 +16,7 @@ from typing import Any
 
 from rich.console import Console
 
-from service.cli.demonstration import ServiceProcess
+from service.cli.demo import ServiceProcess
 from service.client import Client
 from service.datasets.asking import Reading
 from service.datasets.report import tables

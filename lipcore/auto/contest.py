@@ -131,7 +131,7 @@ class Contest:
             if self._ties(name, best):
                 return (
                     name,
-                    f"{best} is ahead by less than one standard error, or errs no less: what knows more of the arm is taken",
+                    f"{best} is within one standard error or errs no less: what knows more of the arm is taken",
                 )
         if len(trained) == 1:
             return best, "no other could be trained"

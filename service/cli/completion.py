@@ -1,17 +1,61 @@
-"""Names that a shell completes: those of a running service, if it answers within a second; else none."""
+"""Names that a shell completes: those of a running service, if it answers within a second; else none.
+
+It asks with the least of a client, as nothing may be imported that takes time.
+"""
 
 from __future__ import annotations
 
+import http.client
+import json
 import os
+import socket
 from collections.abc import Callable
 from http.client import HTTPException
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 import typer
 
-from service.cli.asking import ask
 from service.foundation.settings import DEFAULT_URL
+
+UNIX = "unix://"
+
+
+class _UnixConnection(http.client.HTTPConnection):
+    """HTTP over a Unix-domain socket."""
+
+    def __init__(self, path: str, timeout: float) -> None:
+        super().__init__("localhost", timeout=timeout)
+        self._path = path
+
+    def connect(self) -> None:
+        self.sock = socket.socket(socket.AF_UNIX)
+        self.sock.settimeout(self.timeout)
+        self.sock.connect(self._path)
+
+
+def ask(url: str, path: str, timeout: float = 1.0) -> Any:
+    """Return the JSON at a path of a service, with the key in LIPSERVE_KEY.
+
+    Raise OSError, HTTPException or ValueError where none answers in time, it refuses, or it is no such service.
+    """
+    parts = urlsplit(url)
+    connection: http.client.HTTPConnection
+    if url.startswith(UNIX):
+        connection = _UnixConnection(url.removeprefix(UNIX), timeout)
+    else:
+        kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
+        connection = kind(parts.netloc, timeout=timeout)
+    key = os.environ.get("LIPSERVE_KEY", "").strip()
+    try:
+        connection.request("GET", path, headers={"Authorization": f"Bearer {key}"} if key else {})
+        answer = connection.getresponse()
+        if answer.status != http.client.OK:
+            raise ValueError(f"status {answer.status}")
+        return json.loads(answer.read())
+    finally:
+        connection.close()
+
 
 Names = list[str | tuple[str, str]]
 """What may stand there, with what it is."""
@@ -44,13 +88,13 @@ def aliases(context: typer.Context) -> Names:
 
 def _model(context: typer.Context) -> dict[str, Any]:
     name = context.params.get("model")
-    found = _asked(context, f"/v1/models/{quote(name, safe='')}") if name else None
-    return found if isinstance(found, dict) else {"aliases": {}}
+    record = _asked(context, f"/v1/models/{quote(name, safe='')}") if name else None
+    return record if isinstance(record, dict) else {"aliases": {}}
 
 
 def _listed(context: typer.Context, path: str, name: Callable[[dict[str, Any]], tuple[str, str]]) -> Names:
-    found = _asked(context, path)
-    return [name(each) for each in found["items"]] if isinstance(found, dict) else []
+    listed = _asked(context, path)
+    return [name(each) for each in listed["items"]] if isinstance(listed, dict) else []
 
 
 def _asked(context: typer.Context, path: str) -> Any:

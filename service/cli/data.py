@@ -106,13 +106,13 @@ def list_(
 ) -> None:
     """List data sets, newest first."""
     with connected(url) as client:
-        found = list(islice(client.datasets(), limit))
+        datasets = list(islice(client.datasets(), limit))
     if as_json:
-        print_json(found)
+        print_json(datasets)
         return
-    if not found:
+    if not datasets:
         say("no data set yet: `lipserve data add FILE` uploads a recording")
-    for each in found:
+    for each in datasets:
         rate = "" if each.report.rate_hz is None else f" at {each.report.rate_hz:.4g} Hz"
         joints = f"{len(each.joint_names)} joints"
         say(f"{each.id}  {each.created_at[:19]}  {each.name}: {each.report.rows:,} samples{rate}, {joints}")
@@ -122,11 +122,11 @@ def list_(
 def show(dataset: DatasetId, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
     """Print the report of a data set."""
     with connected(url) as client:
-        found = client.dataset(dataset)
+        record = client.dataset(dataset)
     if as_json:
-        print_json(found)
+        print_json(record)
     else:
-        _print(found)
+        _print(record)
 
 
 @app.command()
@@ -158,12 +158,12 @@ def _print(dataset: Dataset) -> None:
         out.print(table)
     if report.excitation is not None:
         say(f"  {report.excitation.text}")
-    for said in report.warnings:
-        out.print(f"[yellow]warning:[/yellow] {escape(said)}", highlight=False)
-    for said in report.advice:
-        out.print(f"[cyan]next:[/cyan] {escape(said)}", highlight=False)
+    for line in report.warnings:
+        out.print(f"[yellow]warning:[/yellow] {escape(line)}", highlight=False)
+    for line in report.advice:
+        out.print(f"[cyan]next:[/cyan] {escape(line)}", highlight=False)
 
 
 def _one_or_more(text: str) -> str | list[str]:
-    found = [part.strip() for part in text.split(",")]
-    return found[0] if len(found) == 1 else found
+    parts = [part.strip() for part in text.split(",")]
+    return parts[0] if len(parts) == 1 else parts

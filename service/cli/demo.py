@@ -1,16 +1,189 @@
-"""`lipserve demo`."""
+"""The main job, end to end, against a real service process: what `make demo` runs."""
 
 from __future__ import annotations
 
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import time
 from pathlib import Path
-from typing import Annotated
+from types import TracebackType
+from typing import Annotated, Self
 
+import numpy as np
 import typer
+from rich.console import Console
+from rich.table import Table
 
-from lipcore.robots import SimulationUnavailableError
+from lipcore.robots import Robot, SimulationUnavailableError, load_robot
+from lipcore.samples import Samples
+from lipcore.simulation import FAST, Stream, simulate
 from service.cli.consoles import out
-from service.cli.demonstration import DemoError, run
-from service.client import ApiError
+from service.cli.plotting import draw_torque
+from service.cli.simulate import write_recording
+from service.client import ApiError, Client, Evaluation, Prediction
+from service.client.progress import follow
+from service.datasets.asking import Reading
+from service.foundation.states import SUCCEEDED
+
+MODEL = "panda-demo"
+START_SECONDS = 60.0
+PLOTTED = 150
+"""Samples in the plot: fifteen seconds."""
+REGIMES = {"slow": 1.0, "fast": FAST}
+"""The paper's slow sinusoids, where gravity rules, and the faster variant, where inertia shows."""
+
+
+class DemoError(RuntimeError):
+    """A step of the demo failed."""
+
+
+class ServiceProcess:
+    """A service of its own, running `lipserve serve`."""
+
+    def __init__(self, port: int, env: dict[str, str] | None = None) -> None:
+        self.port = port if port and _free(port) else free_port()
+        self.url = f"http://127.0.0.1:{self.port}"
+        command = [sys.executable, "-m", "service", "serve", "--host", "127.0.0.1", "--port", str(self.port)]
+        quiet = {"LIPSERVE_LOG_LEVEL": "warning"}  # unless the user wants more: its lines would stand among the demo's
+        self.process = subprocess.Popen(command, env={**quiet, **os.environ, **(env or {})})  # noqa: S603 - our own
+
+    def wait_ready(self, client: Client) -> float:
+        """Wait until the service is ready; return the seconds it took. Raise DemoError where it ends or hangs."""
+        began = time.monotonic()
+        while not client.ready():
+            if self.process.poll() is not None:
+                raise DemoError(f"the service ended with exit code {self.process.returncode} before it was ready")
+            if time.monotonic() - began > START_SECONDS:
+                raise DemoError(f"the service was not ready after {START_SECONDS:g} s")
+            time.sleep(0.1)
+        return time.monotonic() - began
+
+    def stop(self) -> None:
+        """End the service and wait for its end."""
+        self.process.terminate()
+        self.process.wait(30)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is not None and self.process.poll() is None:
+            self.stop()
+
+
+def run(port: int, once: bool, plot: Path | None, console: Console) -> None:
+    """Serve, simulate, upload, train, evaluate and ask; leave the service up unless `once`."""
+    began = time.monotonic()
+    console.print("[bold]1. starting the service[/bold]")
+    with ServiceProcess(port) as service, Client(service.url) as client, tempfile.TemporaryDirectory() as folder:
+        seconds = service.wait_ready(client)
+        console.print(f"  ready at {service.url} after {seconds:.1f} s: watch it there")
+
+        console.print("[bold]2. simulating a Panda (7 joints, 10 Hz, 50 s a stream) and uploading the streams[/bold]")
+        robot = load_robot("panda")
+        train, test = {}, {}
+        for name, speed in REGIMES.items():
+            train[name] = _upload(client, robot, Stream(speed=speed), 1, Path(folder) / f"train-{name}.csv")
+            test[name] = _upload(
+                client, robot, Stream(speed=speed, n_sinusoids=100), 2, Path(folder) / f"test-{name}.npz"
+            )
+            console.print(f"  {name}: training stream {train[name][0]}, unseen test trajectory {test[name][0]}")
+
+        console.print(f"[bold]3. training {MODEL}[/bold]")
+        queued = client.train(MODEL, [dataset for dataset, _ in train.values()])
+        job = follow(client, queued, console)
+        if job.state != SUCCEEDED or job.version is None:
+            raise DemoError(f"the training job has {job.state}: {job.error.message if job.error else ''}")
+        version = client.version(MODEL, job.version)
+        fit, process = version.fit, version.lineage["training_process"]
+        console.print(
+            f"  version {job.version} after {job.progress.elapsed_s:.0f} s: {fit['samples_posterior']} of "
+            f"{fit['samples_given']} samples kept, {fit['iterations']} iterations, "
+            f"peak memory of the training process {process['peak_memory_mb']} MB"
+        )
+
+        console.print("[bold]4. evaluating on the unseen trajectories[/bold]")
+        for name, (dataset, samples) in test.items():
+            console.print(_table(name, client.evaluate(MODEL, dataset), samples))
+
+        console.print("[bold]5. one query and its answer[/bold]")
+        samples, row = test["fast"][1], 250
+        query = {key: getattr(samples, key)[row] for key in ("q", "dq", "ddq")}
+        answer = client.predict(MODEL, **query)
+        _show_query(query, answer, samples.tau[row], service.url, console)
+        if plot is not None:
+            part = samples.rows(slice(0, PLOTTED))
+            draw_torque(plot, part, client.predict(MODEL, part.q, part.dq, part.ddq))
+            console.print(f"  drawn to {plot}")
+        console.print(f"[bold]done in {time.monotonic() - began:.0f} s[/bold]")
+        if once:
+            service.stop()
+            return
+    console.print(f"Look at the model, joint by joint: {service.url}/#/models/{MODEL}")
+    console.print(f"The service stays up (guide: {service.url}/guide, API: {service.url}/docs). Ctrl-C ends it.")
+    try:
+        service.process.wait()
+    except KeyboardInterrupt:
+        service.stop()
+
+
+def _upload(client: Client, robot: Robot, stream: Stream, seed: int, path: Path) -> tuple[str, Samples]:
+    samples = simulate(robot, stream, seed)
+    write_recording(path, samples)
+    reading = Reading(joint_names=samples.joint_names) if path.suffix == ".csv" else Reading()
+    return client.upload(path, **reading).id, samples
+
+
+def _table(name: str, result: Evaluation, samples: Samples) -> Table:
+    table = Table(title=f"{name} trajectory, {result.samples_used} unseen samples, model version {result.version}")
+    table.add_column("joint")
+    for heading in ("torque std N·m", "nMSE", "RMSE N·m", f"coverage of {result.level:.0%}", "interval N·m"):
+        table.add_column(heading, justify="right")
+    spread = samples.tau.std(axis=0)
+    for j, joint in enumerate(result.joint_names):
+        nmse = result.nmse[j]
+        table.add_row(
+            joint,
+            f"{spread[j]:.3f}",
+            "-" if np.isnan(nmse) else f"{nmse:.1e}",
+            f"{result.rmse[j]:.4f}",
+            f"{result.coverage[j]:.1%}",
+            f"{result.interval_width[j]:.3f}",
+        )
+    return table
+
+
+def _show_query(
+    query: dict[str, np.ndarray], answer: Prediction, measured: np.ndarray, url: str, console: Console
+) -> None:
+    rounded = {name: [round(float(v), 3) for v in values] for name, values in query.items()}
+    console.print(f"  POST {url}/v1/models/{MODEL}/predict", rounded, highlight=False)
+    table = Table(title=f"answer of {answer.model} version {answer.version} revision {answer.revision}, N·m")
+    table.add_column("joint")
+    for heading in ("tau", "tau_std", "noise_std", "measured"):
+        table.add_column(heading, justify="right")
+    rows = zip(answer.joint_names, answer.tau, answer.tau_std, answer.noise_std, measured, strict=True)
+    for joint, *figures in rows:
+        table.add_row(joint, *(f"{figure:.4f}" for figure in figures))
+    console.print(table)
+
+
+def _free(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) != 0
+
+
+def free_port() -> int:
+    """A port that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 ERRORS = (ApiError, DemoError, SimulationUnavailableError)

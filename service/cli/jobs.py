@@ -9,9 +9,8 @@ import typer
 from rich.markup import escape
 from rich.table import Column, Table
 
-from service.cli.connecting import connected
-from service.cli.consoles import note, out, print_json, say
-from service.cli.errors import INTERRUPTED, CommandError
+from service.cli.connecting import connected, watch
+from service.cli.consoles import INTERRUPTED, CommandError, note, out, print_json, say
 from service.cli.options import JobId, Json, Limit, Url
 from service.foundation.settings import DEFAULT_URL
 
@@ -34,15 +33,15 @@ def list_(
 ) -> None:
     """List jobs, newest first."""
     with connected(url) as client:
-        found = list(islice(client.jobs(), limit))
+        jobs = list(islice(client.jobs(), limit))
     if as_json:
-        print_json(found)
+        print_json(jobs)
         return
-    if not found:
+    if not jobs:
         say("no job yet: `lipserve train FILE --model NAME` queues one")
         return
     table = Table(Column("id", no_wrap=True), "model", "estimator", "state", "done", "version", "queued")
-    for job in found:
+    for job in jobs:
         version = "-" if job.version is None else str(job.version)
         at = job.created_at[:16].replace("T", " ")
         table.add_row(job.id, escape(job.model), job.estimator, job.state, f"{job.progress.fraction:.0%}", version, at)
@@ -73,16 +72,14 @@ def retry(job: JobId, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
 @app.command()
 def follow(job: JobId, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
     """Show a job's progress until it ends; Ctrl-C stops watching, and the job goes on."""
-    from service.cli.watching import watch  # noqa: PLC0415 - the client takes long to import; help needs none
-
     with connected(url) as client:
-        found, interrupted = watch(client, client.job(job), cancels=False)
-    _print(found, as_json)
+        ended, interrupted = watch(client, client.job(job), cancels=False)
+    _print(ended, as_json)
     if interrupted:
-        note(f"job {found.id} goes on: `lipserve jobs cancel {found.id}` ends it")
+        note(f"job {ended.id} goes on: `lipserve jobs cancel {ended.id}` ends it")
         raise typer.Exit(INTERRUPTED)
-    if found.state != "succeeded":
-        raise CommandError(f"job {found.id} has {found.state}" + (f": {found.error.message}" if found.error else ""))
+    if ended.state != "succeeded":
+        raise CommandError(f"job {ended.id} has {ended.state}" + (f": {ended.error.message}" if ended.error else ""))
 
 
 def _print(job: Job, as_json: bool) -> None:

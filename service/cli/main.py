@@ -1,4 +1,4 @@
-"""The command line: `lipserve`.
+"""The command line: `lipserve`. Modules of commands are imported when one of them is run, and not to list them.
 
 Exit codes: 0 done; 1 refused or failed, standard error says why; 2 the command line cannot be read; 130 ended by
 Ctrl-C.
@@ -6,13 +6,69 @@ Ctrl-C.
 
 from __future__ import annotations
 
-from typing import Annotated
+import sys
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
 from service import __version__
-from service.cli.consoles import say
-from service.cli.lazy import Entry, LazyGroup
+from service.cli.consoles import explain, print_error, say
+from service.foundation.importing import imported
+
+
+class Entry(NamedTuple):
+    """Where a command is: a Typer application of a module, and what lists say of it."""
+
+    module: str
+    help: str
+    panel: str
+    app: str = "app"
+
+
+class LazyGroup(TyperGroup):
+    """Commands by name in `entries`; lists and help show them as they are described there.
+
+    What a command's module names in `ERRORS` is told to the user without a traceback, beside ValueError and OSError.
+    """
+
+    entries: ClassVar[Mapping[str, Entry]] = {}
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        self.commands = {
+            name: TyperCommand(name, help=entry.help, rich_help_panel=entry.panel)
+            for name, entry in self.entries.items()
+        }
+
+    def load(self, name: str) -> Any:
+        """Import a command and return it; raise KeyError for an unknown one."""
+        entry = self.entries[name]
+        if entry.module not in sys.modules:
+            imported(entry.module)
+        command = typer.main.get_command(getattr(sys.modules[entry.module], entry.app))
+        command.name = name
+        return command
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
+        """Find the command that is to be run, or whose options are to be completed; unknown ones are refused."""
+        name, described, rest = super().resolve_command(ctx, args)
+        return name, described if name is None else self.load(name), rest
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command; what a user can act on is told in words, and ends it with 1."""
+        try:
+            return super().invoke(ctx)
+        except Exception as error:
+            entry = self.entries.get(ctx.invoked_subcommand)
+            module = None if entry is None else sys.modules.get(entry.module)
+            explained = explain(error, getattr(module, "ERRORS", ()))
+            if explained is None:
+                raise
+            print_error(explained)
+            raise typer.Exit(1) from error
+
 
 RUN, DATA, MODELS, ANSWERS, ROBOT, CHECK = (
     "The service",
@@ -44,11 +100,13 @@ class Commands(LazyGroup):
             "Models: list, show, promote, rollback, alias, compare, export, import, delete.",
             MODELS,
         ),
-        "predict": Entry("service.cli.predict", "Ask a model for the torque at one motion.", ANSWERS),
-        "evaluate": Entry("service.cli.evaluate", "Compare a model with a recording, joint by joint.", ANSWERS),
+        "predict": Entry("service.cli.answers", "Ask a model for the torque at one motion.", ANSWERS, "predict_app"),
+        "evaluate": Entry(
+            "service.cli.answers", "Compare a model with a recording, joint by joint.", ANSWERS, "evaluate_app"
+        ),
         "stream": Entry("service.cli.stream", "Play a motion to a model in real time, and teach it.", ANSWERS),
         "simulate": Entry("service.cli.simulate", "Simulate a robot's stream and write it as a recording.", ROBOT),
-        "excite": Entry("service.cli.excite.command", "Plan the motion that tells most of what is not known.", ROBOT),
+        "excite": Entry("service.cli.excite", "Plan the motion that tells most of what is not known.", ROBOT),
         "bench": Entry("service.cli.bench", "Time the answers of a service on this machine.", CHECK),
     }
 
@@ -73,3 +131,31 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
     if version:
         say(__version__)
         raise typer.Exit
+
+
+PROGRAM = "lipserve"
+
+
+class Command(NamedTuple):
+    """A command or a group of them. path: words that call it; command: as Typer knows it; context: to ask it."""
+
+    path: tuple[str, ...]
+    command: Any
+    context: Any
+
+
+def commands() -> Iterator[Command]:
+    """All commands, groups before what is in them, in the order of their lists."""
+    root = typer.main.get_command(app)
+    yield from _below(Command((PROGRAM,), root, root.make_context(PROGRAM, [], resilient_parsing=True)))
+
+
+def _below(at: Command) -> Iterator[Command]:
+    yield at
+    if not hasattr(at.command, "list_commands"):
+        return
+    load = getattr(at.command, "load", None)
+    for name in at.command.list_commands(at.context):
+        command = at.command.get_command(at.context, name) if load is None else load(name)
+        context = command.make_context(name, [], parent=at.context, resilient_parsing=True)
+        yield from _below(Command((*at.path, name), command, context))

@@ -13,14 +13,13 @@ from rich.table import Table
 
 from service.cli import completion
 from service.cli.connecting import connected, dataset_of
-from service.cli.consoles import note, out, print_json, say
-from service.cli.errors import CommandError
+from service.cli.consoles import CommandError, note, out, print_json, say
 from service.cli.options import Alias, Data, Json, Limit, Model, Url, Version, Yes, confirm
 from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
     from service.client.results import Version as VersionRecord
-    from service.models.alias_schema import Alias as AliasRecord
+    from service.models.schema import Alias as AliasRecord
     from service.models.schema import Selection
 
 app = typer.Typer(
@@ -42,15 +41,15 @@ def list_(
 ) -> None:
     """List models, newest first."""
     with connected(url) as client:
-        found = list(islice(client.models(), limit))
+        models = list(islice(client.models(), limit))
     if as_json:
-        print_json(found)
+        print_json(models)
         return
-    if not found:
+    if not models:
         say("no model yet: `lipserve train FILE --model NAME` makes one")
         return
     table = Table("model", "serving", "versions", "estimator", "aliases", "made")
-    for model in found:
+    for model in models:
         serving = next((each for each in model.versions if each.version == model.serving_version), None)
         aliases = ", ".join(f"{name} → {at}" for name, at in model.aliases.items()) or "-"
         table.add_row(
@@ -68,16 +67,16 @@ def list_(
 def show(model: Model, version: Version = None, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
     """Print a model with its versions, and what one of them stands on: the one that serves, or one that is named."""
     with connected(url) as client:
-        found = client.model(model)
-        shown = client.version(model, version or found.serving_version)
+        record = client.model(model)
+        shown = client.version(model, version or record.serving_version)
     if as_json:
-        print_json({"model": found.model_dump(mode="json"), "version": shown.model_dump(mode="json")})
+        print_json({"model": record.model_dump(mode="json"), "version": shown.model_dump(mode="json")})
         return
-    say(f"{found.name}: version {found.serving_version} serves, {found.latest_version} is the newest")
+    say(f"{record.name}: version {record.serving_version} serves, {record.latest_version} is the newest")
     table = Table("version", "estimator", "made", "named")
-    for each in found.versions:
-        named = [name for name, at in found.aliases.items() if at == each.version]
-        named = [SERVING, *named] if each.version == found.serving_version else named
+    for each in record.versions:
+        named = [name for name, at in record.aliases.items() if at == each.version]
+        named = [SERVING, *named] if each.version == record.serving_version else named
         at = each.created_at[:16].replace("T", " ")
         table.add_row(str(each.version), each.estimator, at, escape(", ".join(named)) or "-")
     out.print(table)
@@ -146,14 +145,14 @@ def alias(
         if version is not None:
             _moved(model, client.set_alias(model, name, _which(version)), as_json)
             return
-        found = [each for each in client.aliases(model) if each.alias == name]
-    if not found:
+        aliases = [each for each in client.aliases(model) if each.alias == name]
+    if not aliases:
         raise CommandError(f"no alias {name!r} of {model}", f"`lipserve models alias {model} {name} VERSION` makes it")
     if as_json:
-        print_json(found[0])
+        print_json(aliases[0])
         return
-    say(f"{name} of {model} names version {found[0].version}")
-    for move in found[0].history:
+    say(f"{name} of {model} names version {aliases[0].version}")
+    for move in aliases[0].history:
         back = " (rolled back)" if move.rollback else ""
         say(f"  {move.at[:19].replace('T', ' ')}  {_or_none(move.before)} → {_or_none(move.version)}{back}")
 
@@ -169,15 +168,15 @@ def compare(
 ) -> None:
     """Compare two versions on a recording: which is better, as far as the data can tell."""
     with connected(url) as client:
-        found = client.compare(model, dataset_of(client, data), _which(first), _which(second))
+        comparison = client.compare(model, dataset_of(client, data), _which(first), _which(second))
     if as_json:
-        print_json(found)
+        print_json(comparison)
         return
     from service.cli.tables import comparison_table  # noqa: PLC0415 - takes long to import; help needs none
 
-    out.print(comparison_table(found))
-    say(found.verdict)
-    for warning in found.warnings:
+    out.print(comparison_table(comparison))
+    say(comparison.verdict)
+    for warning in comparison.warnings:
         out.print(f"[yellow]careful:[/yellow] {escape(warning)}", highlight=False)
 
 
@@ -265,13 +264,13 @@ def _moved(model: str, moved: AliasRecord, as_json: bool) -> None:
         note(f"`lipserve models rollback {model} --alias {moved.alias}` goes back to version {moved.previous}")
 
 
-def print_selection(found: Selection) -> None:
+def print_selection(selection: Selection) -> None:
     """Print how an estimator was chosen."""
     from service.cli.tables import selection_table  # noqa: PLC0415 - takes long to import; help needs none
 
-    out.print(selection_table(found))
-    say(f"  {found.chosen} is chosen: {found.reason}")
-    if found.held_out.repeats:
+    out.print(selection_table(selection))
+    say(f"  {selection.chosen} is chosen: {selection.reason}")
+    if selection.held_out.repeats:
         say("  all of the motion repeats itself, also what was held out: these figures flatter")
 
 

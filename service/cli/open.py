@@ -10,9 +10,8 @@ from urllib.parse import quote
 import typer
 
 from service.cli import completion
-from service.cli.asking import UNIX, ask
-from service.cli.consoles import print_json, say
-from service.cli.errors import START, CommandError
+from service.cli.completion import UNIX, ask
+from service.cli.consoles import START, CommandError, print_json, say
 from service.cli.options import Json, Url
 from service.foundation.settings import DEFAULT_URL
 

@@ -1,4 +1,4 @@
-"""Options and arguments that several commands have."""
+"""Options and arguments that several commands have, and names that help and completion list."""
 
 from __future__ import annotations
 
@@ -8,7 +8,15 @@ from typing import Annotated
 import typer
 
 from service.cli import completion
-from service.cli.errors import CommandError
+from service.cli.consoles import CommandError
+
+ROBOTS = [
+    *("panda", "ur3", "ur5", "ur10", "xarm7", "kinova", "z1", "so100", "so101", "baxter-left", "baxter-right"),
+    *("pr2-left", "pr2-right", "talos-left", "tiago", "tiago-pro-left", "tiago-pro-right", "double-pendulum"),
+    *("asr-twodof", "finger-edu"),
+]
+HELD_OUT_BY = ["last", "episodes", "blocks"]
+
 
 Url = Annotated[
     str, typer.Option("--url", envvar="LIPSERVE_URL", help="Address of the service: http://… or unix:///path.")
@@ -45,13 +53,13 @@ def names(text: str | None) -> list[str] | None:
 
 def pairs(option: str, given: Sequence[str] | None) -> dict[str, str]:
     """Values by name of an option that is given as name=value, repeatedly; raise ValueError."""
-    found = {}
+    values = {}
     for text in given or ():
         name, equals, value = text.partition("=")
         if not equals or not value:
             raise ValueError(f"{option} is {text!r}, expected a quantity, = and what it is, as q=deg")
-        found[name.strip()] = value.strip()
-    return found
+        values[name.strip()] = value.strip()
+    return values
 
 
 def confirm(question: str, yes: bool) -> None:

@@ -10,7 +10,7 @@ import uvicorn
 from pydantic import ValidationError
 
 from service.app import create_app
-from service.cli.errors import CommandError
+from service.cli.consoles import CommandError
 from service.foundation.settings import Settings
 from service.storage.home import HomeError, check_home
 from service.web.observability import logs

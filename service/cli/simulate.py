@@ -1,17 +1,36 @@
-"""`lipserve simulate`."""
+"""Writing samples as the files that the service reads."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from lipcore.robots import ROBOTS, SimulationUnavailableError, load_robot
+from lipcore.samples import Samples
 from lipcore.simulation import FAST, Payload, Stream, simulate
-from service.cli import recordings
 from service.cli.consoles import print_json, say
 from service.cli.options import Json
+
+
+def write_recording(path: Path, samples: Samples) -> None:
+    """Write samples as CSV or NPZ by the path's ending; raise ValueError for another ending."""
+    if path.suffix == ".npz":
+        names = ("t", "episode", "q", "dq", "ddq", "tau")
+        arrays = {name: getattr(samples, name) for name in names}
+        np.savez(path, joint_names=np.array(samples.joint_names), **arrays)
+    elif path.suffix == ".csv":
+        joints = range(1, samples.n_joints + 1)
+        quantities = ("q", "dq", "ddq", "tau")
+        header = ["t", "episode", *(f"{name}{joint}" for name in quantities for joint in joints)]
+        table = np.column_stack([samples.t, samples.episode, *(getattr(samples, name) for name in quantities)])
+        formats = ["%.17g", "%d", *["%.17g"] * (4 * samples.n_joints)]
+        np.savetxt(path, table, fmt=formats, delimiter=",", header=",".join(header), comments="")
+    else:
+        raise ValueError(f"file is {path.name!r}, expected the ending .csv or .npz")
+
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 ERRORS = (SimulationUnavailableError,)
@@ -47,7 +66,7 @@ def simulate_(
         payload=Payload(payload, payload_at) if payload else None,
     )
     data = simulate(load_robot(robot), stream, seed)
-    recordings.write(output, data)
+    write_recording(output, data)
     if as_json:
         print_json({"file": output, "samples": len(data), "rate_hz": rate, "joint_names": data.joint_names})
     else:

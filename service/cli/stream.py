@@ -10,15 +10,12 @@ import typer
 from rich.table import Table
 
 from service.cli.connecting import connected
-from service.cli.consoles import note, out, print_json, say
-from service.cli.errors import INTERRUPTED, CommandError
-from service.cli.options import Alias, Json, Model, Url, Version
-from service.cli.words import ROBOTS
+from service.cli.consoles import INTERRUPTED, CommandError, note, out, print_json, say
+from service.cli.options import ROBOTS, Alias, Json, Model, Url, Version
 from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
-    from service.cli.playing.source import Motion
-    from service.cli.playing.tally import Tally
+    from service.cli.playing import Motion, Tally
     from service.client.stream import StreamClient
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
@@ -68,8 +65,7 @@ def stream(
     One line a second, then figures of the whole. Each answer is given before its row is learnt. Ctrl-C ends it.
     """
     # takes long to import; help needs none of it
-    from service.cli.playing.player import Stop, play  # noqa: PLC0415
-    from service.cli.playing.source import recorded, simulated  # noqa: PLC0415
+    from service.cli.playing import Stop, play, recorded, simulated  # noqa: PLC0415
 
     if (file is None) == (simulate is None):
         raise CommandError(
@@ -83,19 +79,24 @@ def stream(
         motion = simulated(simulate or "", seconds or SECONDS, rate, seed, fast, payload, payload_at)
     source = (stream_id or f"lipserve-{secrets.token_hex(4)}") if learn else None
     with (
-        Stop().heard() as stop,
+        Stop().listening() as stop,
         connected(url) as client,
-        client.stream(model, version=version, alias=alias, stream_id=source) as found,
+        client.stream(model, version=version, alias=alias, stream_id=source) as opened,
     ):
-        motion = _fitting(motion, found)
+        motion = _fitting(motion, opened)
         step = motion.step if deadline is None else deadline / 1e3
-        _announce(motion, found, source)
-        whole = play(
-            found, motion, learn, step, stop, lambda second, part: _tell_second(second, part, found, learn, as_json)
+        _announce(motion, opened, source)
+        total = play(
+            opened,
+            motion,
+            learn,
+            step,
+            stop,
+            lambda second, part: _tell_second(second, part, opened, learn, as_json),
         )
         if learn:
-            found.flush()
-        _tell_all(whole, found, learn, as_json)
+            opened.flush()
+        _tell_all(total, opened, learn, as_json)
     if stop.asked:
         raise typer.Exit(INTERRUPTED)
 
@@ -124,7 +125,7 @@ def _announce(motion: Motion, stream: StreamClient, source: str | None) -> None:
 
 
 def _tell_second(second: int, part: Tally, stream: StreamClient, learn: bool, as_json: bool) -> None:
-    from service.cli.playing.tally import learnt_shown  # noqa: PLC0415 - as above
+    from service.cli.playing import learnt_shown  # noqa: PLC0415 - as above
 
     shown = {"second": second, **part.shown(), "version": stream.hello.version}
     if learn:
@@ -135,10 +136,10 @@ def _tell_second(second: int, part: Tally, stream: StreamClient, learn: bool, as
         say(f"{second:4d} s  {_line(shown)}")
 
 
-def _tell_all(whole: Tally, stream: StreamClient, learn: bool, as_json: bool) -> None:
-    from service.cli.playing.tally import learnt_shown  # noqa: PLC0415 - as above
+def _tell_all(total: Tally, stream: StreamClient, learn: bool, as_json: bool) -> None:
+    from service.cli.playing import learnt_shown  # noqa: PLC0415 - as above
 
-    shown = {**whole.shown(), "joints": whole.joints(stream.hello.joint_names)}
+    shown = {**total.shown(), "joints": total.joints(stream.hello.joint_names)}
     if learn:
         shown["learnt"] = learnt_shown(stream.learnt)
         shown["not_logged"] = [

@@ -48,15 +48,15 @@ def figures_table(title: str, joint_names: Sequence[str], figures: Mapping[str, 
     return table
 
 
-def selection_table(found: Selection) -> Table:
+def selection_table(selection: Selection) -> Table:
     """How the estimators did that `auto` has chosen from."""
-    held = found.held_out
+    held = selection.held_out
     title = "not judged"
     if held.blocks:
         title = f"judged on {held.blocks} stretches that the training did not see"
     table = Table("estimator", "log density nats", "less than the best", "mean nMSE", "coverage of 95%", title=title)
-    for each in found.table:
-        name = f"{each.estimator} (chosen)" if each.estimator == found.chosen else each.estimator
+    for each in selection.table:
+        name = f"{each.estimator} (chosen)" if each.estimator == selection.chosen else each.estimator
         if each.error is not None:
             table.add_row(name, f"failed: {escape(each.error)}", "", "", "")
             continue
@@ -92,17 +92,17 @@ def _pairs(means: ArrayLike, stds: ArrayLike) -> list[str]:
     return [f"{mean} ± {std}" for mean, std in zip(_texts(means), _texts(stds), strict=True)]
 
 
-def comparison_table(found: Comparison) -> Table:
+def comparison_table(comparison: Comparison) -> Table:
     """Figures of two versions, joint by joint."""
-    title = f"{found.model} on {found.samples_used} samples of {found.dataset}"
-    numbers = [f"version {each.version}" for each in found.versions]
+    title = f"{comparison.model} on {comparison.samples_used} samples of {comparison.dataset}"
+    numbers = [f"version {each.version}" for each in comparison.versions]
     heads = [f"{figure}, {number}" for figure in ("nMSE", "RMSE N·m", "coverage of 95%") for number in numbers]
     table = Table("joint", *heads, title=title)
-    for at, joint in enumerate(found.joint_names):
+    for at, joint in enumerate(comparison.joint_names):
         cells = [
             _figure(getattr(each, name)[at], form)
             for name, form in (("nmse", ".2e"), ("rmse", ".4f"), ("coverage", ".1%"))
-            for each in found.versions
+            for each in comparison.versions
         ]
         table.add_row(joint, *cells)
     return table

@@ -10,12 +10,10 @@ import typer
 
 from lipcore.vocabulary import CHOICES, DEFAULT_ESTIMATOR
 from service.cli import completion
-from service.cli.connecting import connected, dataset_of
-from service.cli.consoles import note, out, print_json, say
-from service.cli.errors import INTERRUPTED, CommandError
+from service.cli.connecting import connected, dataset_of, watch
+from service.cli.consoles import INTERRUPTED, CommandError, note, out, print_json, say
 from service.cli.models import print_selection
-from service.cli.options import Json, Url, names, pairs
-from service.cli.words import HELD_OUT_BY
+from service.cli.options import HELD_OUT_BY, Json, Url, names, pairs
 from service.foundation.settings import DEFAULT_URL
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
@@ -71,8 +69,7 @@ def train(
 ) -> None:
     """Upload recordings and train a model on them. Ctrl-C cancels the job."""
     # the client takes long to import; help needs none
-    from service.cli.watching import watch  # noqa: PLC0415
-    from service.client.calls.keys import new_key  # noqa: PLC0415
+    from service.client.call import new_key  # noqa: PLC0415
 
     options: dict[str, Any] = {name: _value(text) for name, text in pairs("--option", option).items()}
     if prior is not None:
@@ -108,8 +105,8 @@ def train(
         note(f"job {job.id} is cancelled")
         raise typer.Exit(INTERRUPTED)
     if wait and job.version is None:
-        said = f"job {job.id} has {job.state}" + (f": {job.error.message}" if job.error else "")
-        raise CommandError(said, f"`lipserve jobs show {job.id}` tells its history")
+        message = f"job {job.id} has {job.state}" + (f": {job.error.message}" if job.error else "")
+        raise CommandError(message, f"`lipserve jobs show {job.id}` tells its history")
     if as_json:
         return
     if not wait:

@@ -1,15 +1,203 @@
-"""`lipserve verify`."""
+"""Reading everything that a home stores, to find what is damaged before it is needed."""
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import torch
 import typer
 from rich.markup import escape
+from sqlalchemy import select
+from sqlalchemy.orm import Session, undefer
 
-from service.cli import verification
+import lipcore
+from lipcore import persistence
+from lipcore.online import state
+from lipcore.probing import probe
 from service.cli.consoles import err, print_json, say
 from service.cli.options import Json
+from service.foundation.errors import DamagedDataError
 from service.foundation.settings import Settings
+from service.journal.log import decode
+from service.storage.database import Database, DatasetRow, EventRow, RobotRow, SnapshotRow, VersionRow
+from service.storage.database.sqlite import FILE
+from service.storage.files import Files, FilesUnreachableError
 from service.storage.home import HomeError, usable
+
+FAULTS = 20
+"""Faults of the database that are told, at most."""
+EVENTS = 200
+"""Batches that are read together."""
+
+
+class Damage(NamedTuple):
+    """Something stored that cannot be used. kind, name: of what; reason: why."""
+
+    kind: str
+    name: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.kind} {self.name}: {self.reason}"
+
+
+@dataclass
+class Verified:
+    """What was read, how many of each kind, and what of it is damaged."""
+
+    read: dict[str, int] = field(default_factory=dict)
+    damages: list[Damage] = field(default_factory=list)
+
+    def shown(self) -> dict[str, Any]:
+        """The findings for JSON."""
+        return {"read": self.read, "damaged": [each._asdict() for each in self.damages]}
+
+
+def verify_home(settings: Settings) -> Verified:
+    """Read a home whole: the database, data sets, robots, versions, what they have learnt and the log of observations.
+
+    It may run beside the service: what that deletes meanwhile is not damaged. Nothing is changed but a database of an
+    earlier release, which is brought up to date. Where services share a database and files, all of these are read, and
+    no copies of them. Raise FileNotFoundError where the home has no database, FilesUnreachableError where the shared
+    files cannot be read now.
+    """
+    if settings.database_url is None and not (settings.home / FILE).is_file():
+        raise FileNotFoundError(f"home is {str(settings.home)!r}, expected a folder with the database of a service")
+    torch.set_num_threads(settings.serving_threads)
+    database = Database.of(settings, settings.database_timeout_s)
+    try:
+        with Files.fresh(settings) as files:
+            return _verify(database, files)
+    finally:
+        database.close()
+
+
+def _verify(database: Database, files: Files) -> Verified:
+    findings = Verified()
+    findings.damages += [Damage("database", FILE, each) for each in database.adapter.inconsistencies(FAULTS)]
+    for kind, check in _CHECKS.items():
+        findings.read[kind] = 0
+        for name, gone, reason in check(database, files):
+            findings.read[kind] += 1
+            if reason is None:
+                continue
+            with database.session() as session:
+                if not gone(session):
+                    findings.damages.append(Damage(kind.removesuffix("s"), name, reason))
+    return findings
+
+
+_Finding = tuple[str, Callable[[Session], bool], str | None]
+"""Name of what was read, how to tell whether it has been deleted since, and why it is damaged, None where it is not."""
+
+
+def _datasets(database: Database, files: Files) -> Iterator[_Finding]:
+    with database.session() as session:
+        rows = list(session.scalars(select(DatasetRow)))
+    for row in rows:
+        yield row.id, _gone(DatasetRow, row.seq), _reason(_read_dataset, files, row)
+
+
+def _read_dataset(files: Files, row: DatasetRow) -> None:
+    samples = files.read_samples(row.id, row.joint_names, row.sha256)
+    if len(samples) != row.rows:
+        raise ValueError(f"it has {len(samples)} rows, expected {row.rows}")
+
+
+def _robots(database: Database, files: Files) -> Iterator[_Finding]:
+    with database.session() as session:
+        rows = list(session.scalars(select(RobotRow).options(undefer(RobotRow.urdf))))
+    for row in rows:
+        same = hashlib.sha256(row.urdf.encode()).hexdigest() == row.sha256
+        yield row.id, _gone(RobotRow, row.seq), None if same else "its URDF has another sha256 than was kept"
+
+
+def _versions(database: Database, files: Files) -> Iterator[_Finding]:
+    with database.session() as session:
+        rows = list(session.scalars(select(VersionRow)))
+    for row in rows:
+        reason = _reason(_read_version, files, row)
+        yield f"{row.version} of model {row.model!r}", _gone(VersionRow, (row.model, row.version)), reason
+
+
+def _read_version(files: Files, row: VersionRow) -> None:
+    probe(files.load_version(row.folder, row.checksums))
+    if files.read_version(row.folder, persistence.read_manifest) != row.manifest:
+        raise ValueError("manifest.json is not the manifest that the database has")
+
+
+def _snapshots(database: Database, files: Files) -> Iterator[_Finding]:
+    with database.session() as session:
+        rows = list(session.scalars(select(SnapshotRow).order_by(SnapshotRow.model, SnapshotRow.version)))
+        versions = {(row.model, row.version): row for row in session.scalars(select(VersionRow))}
+    base: tuple[tuple[str, int], lipcore.TorqueModel | None] | None = None
+    for row in rows:
+        key = (row.model, row.version)
+        if base is None or base[0] != key:  # one model in memory at a time
+            base = key, _base(files, versions.get(key))
+        reason = _reason(_read_snapshot, files, row, base[1])
+        yield f"{row.id} of version {row.version} of model {row.model!r}", _gone(SnapshotRow, row.seq), reason
+
+
+def _base(files: Files, row: VersionRow | None) -> lipcore.TorqueModel | None:
+    """The version as trained, None where it cannot be read, which is said of the version."""
+    try:
+        return None if row is None else files.load_version(row.folder, row.checksums)
+    except lipcore.ModelFormatError:
+        return None
+
+
+def _read_snapshot(files: Files, row: SnapshotRow, base: lipcore.TorqueModel | None) -> None:
+    payload = files.read_snapshot(row.id, row.sha256)
+    if base is not None:
+        state.load(base, payload)
+
+
+def _observations(database: Database, files: Files) -> Iterator[_Finding]:
+    last = 0
+    while True:
+        query = select(EventRow).where(EventRow.seq > last, EventRow.payload.is_not(None)).order_by(EventRow.seq)
+        with database.session() as session:
+            rows = list(session.scalars(query.limit(EVENTS).options(undefer(EventRow.payload))))
+        if not rows:
+            return
+        for row in rows:
+            yield f"{row.number} of model {row.model!r}", _gone(EventRow, row.seq), _reason(_read_event, row)
+        last = rows[-1].seq
+
+
+def _read_event(row: EventRow) -> None:
+    rows = decode(row.payload or b"")
+    if len(rows) != row.rows:
+        raise ValueError(f"it has {len(rows)} rows, expected {row.rows}")
+
+
+def _reason(read: Callable[..., None], *arguments: Any) -> str | None:
+    """Why something cannot be read, None where it can."""
+    try:
+        read(*arguments)
+    except FilesUnreachableError:  # which says nothing of the file
+        raise
+    except (ValueError, OSError, DamagedDataError) as error:
+        return str(error)
+    return None
+
+
+def _gone(table: type[Any], key: object) -> Callable[[Session], bool]:
+    return lambda session: session.get(table, key) is None
+
+
+_CHECKS: dict[str, Callable[[Database, Files], Iterator[_Finding]]] = {
+    "datasets": _datasets,
+    "robots": _robots,
+    "versions": _versions,
+    "snapshots": _snapshots,
+    "observations": _observations,
+}
+
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 ERRORS = (HomeError,)
@@ -20,13 +208,13 @@ def verify(as_json: Json = False) -> None:
     """Read everything that the home LIPSERVE_HOME stores and report what is damaged; also while the service runs."""
     settings = Settings()
     with usable(settings):
-        found = verification.verify(settings)
+        findings = verify_home(settings)
     if as_json:
-        print_json(found.shown())
+        print_json(findings.shown())
     else:
-        for damage in found.damages:
+        for damage in findings.damages:
             err.print(f"[red]damaged:[/red] {escape(str(damage))}", highlight=False, soft_wrap=True)
-        counts = ", ".join(f"{count} {kind}" for kind, count in found.read.items())
-        say(f"read {counts}: {len(found.damages) or 'nothing'} damaged")
-    if found.damages:
+        counts = ", ".join(f"{count} {kind}" for kind, count in findings.read.items())
+        say(f"read {counts}: {len(findings.damages) or 'nothing'} damaged")
+    if findings.damages:
         raise typer.Exit(1)

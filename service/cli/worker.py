@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from pydantic import ValidationError
 
-from service.cli.errors import CommandError
+from service.cli.consoles import CommandError
 from service.compute.process import THREAD_VARIABLES
 from service.foundation.settings import Settings
 from service.web.observability import logs
@@ -35,10 +35,10 @@ def worker(
     logs.configure(logs.LogOptions(settings.log_level, settings.log_format))
     # before numerics are imported: they start their threads then
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(settings.training_threads)))
-    from service.training import membership  # noqa: PLC0415
+    from service.training import hosting  # noqa: PLC0415
 
     try:
-        membership.check(settings)
-    except membership.CannotJoinError as error:
+        hosting.check_storage(settings)
+    except hosting.CannotJoinError as error:
         raise CommandError(str(error)) from None
-    membership.join(settings, gpus, name)
+    hosting.join(settings, gpus, name)

@@ -1,8 +1,8 @@
 """Python client of the service."""
 
 from service.client.asynchronous import AsyncClient
-from service.client.errors import ApiError, ServiceUnreachableError
 from service.client.results import Comparison, Component, Evaluation, LiveRows, Prediction, Preview, Trace
+from service.client.sending import ApiError, ServiceUnreachableError
 from service.client.sync import Client
 
 __all__ = [

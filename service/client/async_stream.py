@@ -11,10 +11,21 @@ from numpy.typing import ArrayLike
 from websockets.asyncio.client import ClientConnection, connect, unix_connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 
+from service.client.sending import headers_of
 from service.foundation.settings import DEFAULT_URL
-from service.stream.exchange import Exchange, closed, destination, refused, unanswered, unsettled
-from service.stream.messages import StreamAnswer, StreamError, StreamHello, StreamLearnt, StreamRefusal
-from service.web.access.credentials import headers_of
+from service.stream.exchange import (
+    Exchange,
+    StreamAnswer,
+    StreamError,
+    StreamHello,
+    StreamLearnt,
+    StreamRefusal,
+    closed,
+    destination,
+    refused,
+    unanswered,
+    unsettled,
+)
 
 
 class AsyncStreamClient:
@@ -151,13 +162,13 @@ class AsyncStreamClient:
         """Read one message."""
         try:
             async with asyncio.timeout(timeout):
-                said = await self._open().recv()
+                message = await self._open().recv()
         except TimeoutError as error:
             assert timeout is not None
             raise unanswered(timeout) from error
         except ConnectionClosed as error:
             raise closed(error) from error
-        self._exchange.take(said)
+        self._exchange.take(message)
 
     def _open(self) -> ClientConnection:
         if self._connection is None:

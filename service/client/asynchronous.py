@@ -14,17 +14,26 @@ import httpx
 
 from service.client import calls
 from service.client.async_stream import AsyncStreamClient
-from service.client.attempts import RETRIES, Attempts, Reach
-from service.client.call import Answer, Call, Page
-from service.client.errors import ApiError, ServiceUnreachableError
-from service.client.sending import Address, Events, answer_of, draft_of, pieces, request_of
-from service.client.signatures import bound
+from service.client.call import Answer, Call, Page, bound
+from service.client.sending import (
+    RETRIES,
+    Address,
+    ApiError,
+    Attempts,
+    Events,
+    Reach,
+    ServiceUnreachableError,
+    answer_of,
+    draft_of,
+    headers_of,
+    pieces,
+    request_of,
+)
 from service.client.sync import POLL_SECONDS
 from service.foundation.settings import DEFAULT_URL
 from service.foundation.states import ACTIVE
 from service.learning.control.schema import Learning
 from service.training.schema import Job
-from service.web.access.credentials import headers_of
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -109,12 +118,12 @@ class AsyncClient:
     profiles = _async(calls.datasets.profiles)
     profile = _async(calls.datasets.profile)
 
-    train = _async(calls.jobs.train)
-    jobs = _listed(calls.jobs.jobs)
-    job = _async(calls.jobs.job)
-    job_events = _followed(calls.jobs.job_events)
-    cancel = _async(calls.jobs.cancel)
-    retry = _async(calls.jobs.retry)
+    train = _async(calls.models.train)
+    jobs = _listed(calls.models.jobs)
+    job = _async(calls.models.job)
+    job_events = _followed(calls.models.job_events)
+    cancel = _async(calls.models.cancel)
+    retry = _async(calls.models.retry)
 
     models = _listed(calls.models.models)
     model = _async(calls.models.model)
@@ -148,16 +157,16 @@ class AsyncClient:
     alarms = _listed(calls.learning.alarms)
     live = _followed(calls.learning.live)
 
-    health = _async(calls.server.health)
-    live_health = _async(calls.server.live_health)
-    metrics = _async(calls.server.metrics)
-    echo = _async(calls.server.echo)
-    server_metadata = _async(calls.server.server_metadata)
-    server_live = _async(calls.server.server_live)
-    server_ready = _async(calls.server.server_ready)
-    model_metadata = _async(calls.server.model_metadata)
-    model_ready = _async(calls.server.model_ready)
-    infer = _async(calls.server.infer)
+    health = _async(calls.inference.health)
+    live_health = _async(calls.inference.live_health)
+    metrics = _async(calls.inference.metrics)
+    echo = _async(calls.inference.echo)
+    server_metadata = _async(calls.inference.server_metadata)
+    server_live = _async(calls.inference.server_live)
+    server_ready = _async(calls.inference.server_ready)
+    model_metadata = _async(calls.inference.model_metadata)
+    model_ready = _async(calls.inference.model_ready)
+    infer = _async(calls.inference.infer)
 
     async def ready(self) -> bool:
         """Whether the service can answer queries now."""

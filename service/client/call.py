@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import wraps
 from pathlib import Path
+from secrets import token_hex
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 from urllib.parse import quote
 
@@ -129,8 +130,8 @@ def page(kind: type[Record]) -> Callable[[Answer], Page[Record]]:
     """Read one page of a list of records."""
 
     def read(answer: Answer) -> Page[Record]:
-        found = json.loads(answer.body)
-        return Page([kind.model_validate(item) for item in found["items"]], found.get("next_cursor"))
+        document = json.loads(answer.body)
+        return Page([kind.model_validate(item) for item in document["items"]], document.get("next_cursor"))
 
     return read
 
@@ -147,3 +148,30 @@ def nothing(answer: Answer) -> None:
 def given(**values: Any) -> dict[str, Any]:
     """Those of the values that are not None."""
     return {name: value for name, value in values.items() if value is not None}
+
+
+_RESULT = re.compile(r"Call\[(?:Page\[(?P<item>.+)\]|(?P<one>.+))\]")
+
+
+def bound(method: Callable[P, T], result: str = "{}") -> Callable[P, T]:
+    """Give a function that wraps a call's the signature of a method, and return it.
+
+    result: what it returns, with {} for what the call makes or its page lists.
+    """
+    own = inspect.signature(method)
+    itself = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
+    made = _RESULT.fullmatch(str(own.return_annotation))
+    returned = result.format(made["item"] or made["one"]) if made else own.return_annotation
+    parameters = [itself, *own.parameters.values()]
+    method.__signature__ = own.replace(  # type: ignore[attr-defined]
+        parameters=parameters, return_annotation=returned
+    )
+    return method
+
+
+KEY_HEADER = "Idempotency-Key"
+
+
+def new_key() -> str:
+    """A key that no other request has."""
+    return token_hex(16)

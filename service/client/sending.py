@@ -1,8 +1,16 @@
-"""What both clients share of sending: addresses, requests, files, server-sent events."""
+"""What both clients share of sending a call: errors, addresses, requests, files, server-sent events, attempts.
+
+A lost connection, and answers 429 and 503 that say when to come back, are no reason to give up at once; but only for
+calls that do the same however often they arrive. A service that has answered this client before is waited for while it
+starts again; one that never has is told to be missing at once.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import json
+import os
+import random
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -11,11 +19,54 @@ import httpx
 
 from service.client.call import Answer, Call
 
+
+class ServiceUnreachableError(ConnectionError):
+    """No service answers at the address, or the connection to it was lost."""
+
+
+class ApiError(RuntimeError):
+    """The service refused a request.
+
+    status: of HTTP; code, message, detail: as the service says; retry_after: seconds after which it may be tried again,
+    where the service says so.
+    """
+
+    def __init__(
+        self, status: int, code: str, message: str, detail: list[dict[str, Any]], retry_after: float | None = None
+    ) -> None:
+        super().__init__(message)
+        self.status, self.code, self.message, self.detail, self.retry_after = status, code, message, detail, retry_after
+
+
+def refused(status: int, body: bytes, retry_after: float | None = None) -> ApiError:
+    """The error that an answer tells."""
+    try:
+        error = json.loads(body)["error"]
+        if isinstance(error, str):  # below /v2
+            return ApiError(status, "http_error", error, [], retry_after)
+        return ApiError(status, error["code"], error["message"], error["detail"], retry_after)
+    except (ValueError, KeyError, TypeError):
+        return ApiError(status, "http_error", body[:500].decode(errors="replace"), [], retry_after)
+
+
+VARIABLE = "LIPSERVE_KEY"
+"""Environment variable that clients take the key from."""
 UNIX = "unix://"
 NO_HOST = "http://localhost"
 """What HTTP says the host is where a socket leads to the service."""
 CHUNK = 1 << 18
 """Bytes of a file that are sent together."""
+
+
+def headers_of(key: str | None) -> dict[str, str]:
+    """Headers of a client's requests with its key, where None the one of the environment, or none at all.
+
+    Raise ValueError, which does not repeat it, where it cannot be a key.
+    """
+    given = (os.environ.get(VARIABLE, "") if key is None else key).strip()
+    if not given.isascii() or not given.isprintable() or " " in given:
+        raise ValueError(f"key (or {VARIABLE}) holds other characters than keys do, expected lip_…")
+    return {"Authorization": f"Bearer {given}"} if given else {}
 
 
 @dataclass(frozen=True)
@@ -77,7 +128,80 @@ class Events:
         elif line.startswith("data:"):
             self._data.append(line.removeprefix("data:").removeprefix(" "))
         elif not line:
-            found = Answer(200, "\n".join(self._data).encode(), event=self._event) if self._data else None
+            event = Answer(200, "\n".join(self._data).encode(), event=self._event) if self._data else None
             self._event, self._data = "", []
-            return found
+            return event
         return None  # comments keep the connection alive
+
+
+RETRIES = 6
+"""Most times that a call is repeated: with these pauses a service may take three to six seconds to start again."""
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 10.0
+"""Pauses double from the first on; a service that asks for more than the longest is not waited for."""
+LATER = (429, 503)
+NOT_FOUND = 404
+
+
+@dataclass
+class Reach:
+    """What is known of a service. url: as people name it; retries: most repetitions of a call; reached: whether it has
+    answered since the client was made."""
+
+    url: str
+    retries: int = RETRIES
+    reached: bool = False
+
+
+class Attempts:
+    """The attempts at one call."""
+
+    def __init__(self, call: Call[Any], reach: Reach) -> None:
+        self._call, self._reach = call, reach
+        self._made = 0
+        self._lost = False
+
+    def lost(self, error: httpx.TransportError) -> float:
+        """Return after how many seconds to try again; raise ServiceUnreachableError where that is no use.
+
+        What takes too long is not asked again: that would only add to the load.
+        """
+        timed_out = isinstance(error, httpx.TimeoutException)
+        unknown = isinstance(error, httpx.ConnectError) and not self._reach.reached
+        if not self._call.repeatable or timed_out or unknown or self._made >= self._reach.retries:
+            what = "takes longer than it may" if timed_out else f"({error})"
+            raise ServiceUnreachableError(
+                f"no service answers at {self._reach.url} {what}: start one with `lipserve serve`"
+                if not self._reach.reached
+                else f"the service at {self._reach.url} does not answer any more {what}"
+            ) from error
+        self._lost = True
+        return self._pause()
+
+    def answered(self, answer: Answer) -> float | None:
+        """Return after how many seconds to try again, None where this is the answer; raise ApiError."""
+        self._reach.reached = True
+        if answer.status < 400:
+            return None
+        if self._call.removes and self._lost and answer.status == NOT_FOUND:
+            return None  # removed by the attempt whose answer was lost
+        after = _retry_after(answer.headers)
+        patient = self._call.repeatable and self._made < self._reach.retries
+        if answer.status in LATER and patient and after is not None and after <= LONGEST_PAUSE_S:
+            return max(after, self._pause())
+        raise self.refusal(answer)
+
+    @staticmethod
+    def refusal(answer: Answer) -> ApiError:
+        """The error that an answer tells."""
+        return refused(answer.status, answer.body, _retry_after(answer.headers))
+
+    def _pause(self) -> float:
+        """Twice as long each time, and never the same: many clients lose a service at once."""
+        self._made += 1
+        longest = min(FIRST_PAUSE_S * 2.0 ** (self._made - 1), LONGEST_PAUSE_S)
+        return longest * random.uniform(0.5, 1.0)  # noqa: S311 - no secret
+
+
+def _retry_after(headers: Mapping[str, str]) -> float | None:
+    seconds = headers.get("retry-after", "")
+    return float(seconds) if seconds.isascii() and seconds.isdigit() else None

@@ -13,10 +13,21 @@ from numpy.typing import ArrayLike
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 from websockets.sync.client import connect
 
+from service.client.sending import headers_of
 from service.foundation.settings import DEFAULT_URL
-from service.stream.exchange import Exchange, closed, destination, refused, unanswered, unsettled
-from service.stream.messages import StreamAnswer, StreamError, StreamHello, StreamLearnt, StreamRefusal
-from service.web.access.credentials import headers_of
+from service.stream.exchange import (
+    Exchange,
+    StreamAnswer,
+    StreamError,
+    StreamHello,
+    StreamLearnt,
+    StreamRefusal,
+    closed,
+    destination,
+    refused,
+    unanswered,
+    unsettled,
+)
 
 __all__ = ["StreamAnswer", "StreamClient", "StreamError", "StreamHello", "StreamLearnt", "StreamRefusal"]
 
@@ -165,13 +176,13 @@ class StreamClient:
     def _take(self, timeout: float) -> None:
         """Read one message."""
         try:
-            said = self._socket.recv(timeout)
+            message = self._socket.recv(timeout)
         except TimeoutError as error:
             raise unanswered(timeout) from error
         except ConnectionClosed as error:
             raise closed(error) from error
         try:
-            self._exchange.take(said)
+            self._exchange.take(message)
         except StreamError:  # of a layout that this client cannot read
             self.close()
             raise

@@ -13,17 +13,26 @@ from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 import httpx
 
 from service.client import calls
-from service.client.attempts import RETRIES, Attempts, Reach
-from service.client.call import Answer, Call, Page
-from service.client.errors import ApiError, ServiceUnreachableError
-from service.client.sending import Address, Events, answer_of, draft_of, pieces, request_of
-from service.client.signatures import bound
+from service.client.call import Answer, Call, Page, bound
+from service.client.sending import (
+    RETRIES,
+    Address,
+    ApiError,
+    Attempts,
+    Events,
+    Reach,
+    ServiceUnreachableError,
+    answer_of,
+    draft_of,
+    headers_of,
+    pieces,
+    request_of,
+)
 from service.client.stream import StreamClient
 from service.foundation.settings import DEFAULT_URL
 from service.foundation.states import ACTIVE
 from service.learning.control.schema import Learning
 from service.training.schema import Job
-from service.web.access.credentials import headers_of
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -112,12 +121,12 @@ class Client:
     profiles = _sync(calls.datasets.profiles)
     profile = _sync(calls.datasets.profile)
 
-    train = _sync(calls.jobs.train)
-    jobs = _listed(calls.jobs.jobs)
-    job = _sync(calls.jobs.job)
-    job_events = _followed(calls.jobs.job_events)
-    cancel = _sync(calls.jobs.cancel)
-    retry = _sync(calls.jobs.retry)
+    train = _sync(calls.models.train)
+    jobs = _listed(calls.models.jobs)
+    job = _sync(calls.models.job)
+    job_events = _followed(calls.models.job_events)
+    cancel = _sync(calls.models.cancel)
+    retry = _sync(calls.models.retry)
 
     models = _listed(calls.models.models)
     model = _sync(calls.models.model)
@@ -151,16 +160,16 @@ class Client:
     alarms = _listed(calls.learning.alarms)
     live = _followed(calls.learning.live)
 
-    health = _sync(calls.server.health)
-    live_health = _sync(calls.server.live_health)
-    metrics = _sync(calls.server.metrics)
-    echo = _sync(calls.server.echo)
-    server_metadata = _sync(calls.server.server_metadata)
-    server_live = _sync(calls.server.server_live)
-    server_ready = _sync(calls.server.server_ready)
-    model_metadata = _sync(calls.server.model_metadata)
-    model_ready = _sync(calls.server.model_ready)
-    infer = _sync(calls.server.infer)
+    health = _sync(calls.inference.health)
+    live_health = _sync(calls.inference.live_health)
+    metrics = _sync(calls.inference.metrics)
+    echo = _sync(calls.inference.echo)
+    server_metadata = _sync(calls.inference.server_metadata)
+    server_live = _sync(calls.inference.server_live)
+    server_ready = _sync(calls.inference.server_ready)
+    model_metadata = _sync(calls.inference.model_metadata)
+    model_ready = _sync(calls.inference.model_ready)
+    infer = _sync(calls.inference.infer)
 
     def ready(self) -> bool:
         """Whether the service can answer queries now."""

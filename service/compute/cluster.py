@@ -20,6 +20,11 @@ JOB, GPU = "JOB", "GPU"
 """Tags of workers that take jobs, and of those that have a GPU."""
 
 
+def needs_gpu(request: dict[str, Any]) -> bool:
+    """Whether a job, by its request, has to run on a worker with a GPU."""
+    return bool(request.get("options", {}).get("device") == "cuda")
+
+
 class Cluster:
     """A cluster as one service sees it. All but `close` return at once, whatever the scheduler does.
 
@@ -76,10 +81,10 @@ class Cluster:
                 self._look()
                 self.problem = None
             except Exception as error:
-                said = str(error) or type(error).__name__
-                if self.problem != said:
-                    logger.warning("the cluster cannot be used: %s", said)
-                self.problem, self.jobs, self.gpus = said, 0, 0
+                reason = str(error) or type(error).__name__
+                if self.problem != reason:
+                    logger.warning("the cluster cannot be used: %s", reason)
+                self.problem, self.jobs, self.gpus = reason, 0, 0
             self._closing.wait(LOOK_S)
 
     def _look(self) -> None:

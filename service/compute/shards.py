@@ -95,7 +95,7 @@ def summed(
                 if error is None:
                     results[number] = future.result()
                 elif lost(error):
-                    logger.warning("shard %d of %d is computed again: %s", number + 1, len(shards), _said(error))
+                    logger.warning("shard %d of %d is computed again: %s", number + 1, len(shards), _reason(error))
                     again.append(number)
                 else:
                     raise error
@@ -118,5 +118,5 @@ def _error(future: Future[Any]) -> BaseException | None:
         return error
 
 
-def _said(error: BaseException) -> str:
+def _reason(error: BaseException) -> str:
     return str(error) or type(error).__name__

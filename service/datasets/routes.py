@@ -25,10 +25,10 @@ from service.foundation.errors import (
     invalid_request,
     responses,
 )
-from service.foundation.names import NameForPeople
+from service.foundation.fields import NameForPeople
 from service.storage.storage import StorageDep
 from service.web.idempotency import KeyHeader, identity
-from service.web.limits.turns import UploadsDep
+from service.web.limits.requests import UploadsDep
 from service.web.limits.upload import Kinds, receive_to
 from service.web.pagination import PageQuery
 from service.web.route import Route

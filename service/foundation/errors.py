@@ -206,9 +206,9 @@ def responses(*errors: type[ServiceError]) -> dict[int | str, dict[str, Any]]:
     """OpenAPI responses of a route for the errors it can answer with."""
     out: dict[int | str, dict[str, Any]] = {}
     for error in errors:
-        said = (error.__doc__ or "").strip()
+        meaning = (error.__doc__ or "").strip()
         known = out.get(error.status)
-        text = f"`{error.code}`: {said}"
+        text = f"`{error.code}`: {meaning}"
         out[error.status] = {
             "model": ErrorResponse,
             "description": f"{known['description']} {text}" if known else text,
@@ -264,16 +264,16 @@ async def _validation_error(request: Request, error: Exception) -> JSONResponse:
 def _explain(item: dict[str, Any]) -> Problem:
     where = [part for part in item["loc"] if part not in ("body", "query", "path", "header")]
     field = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in where).lstrip(".") or "body"
-    kind, found, said = item["type"], item.get("input"), str(item["msg"])
+    kind, value, message = item["type"], item.get("input"), str(item["msg"])
     if kind == "json_invalid":
         return problem("body", f"not JSON at character {where[0]}: {item['ctx']['error']}", "JSON")
-    if isinstance(found, bytes):
-        return problem("body", found, "JSON, with the content-type application/json")
+    if isinstance(value, bytes):
+        return problem("body", value, "JSON, with the content-type application/json")
     if kind == "missing":
         return problem(field, "missing", "a value")
     if kind == "extra_forbidden":
-        return problem(field, found, "no field of that name")
-    return problem(field, found, said.removeprefix("Input should be ").replace("String should", "to", 1))
+        return problem(field, value, "no field of that name")
+    return problem(field, value, message.removeprefix("Input should be ").replace("String should", "to", 1))
 
 
 async def _cut_off(request: Request, error: Exception) -> JSONResponse:
@@ -296,12 +296,12 @@ async def _http_error(request: Request, error: Exception) -> JSONResponse:
 
 def _methods(request: Request) -> list[str]:
     """What may be asked for at the path of a request."""
-    found: set[str] = set()
+    allowed: set[str] = set()
     for route in iter_route_contexts(request.app.routes):
         pattern, methods = getattr(route, "path_regex", None), getattr(route, "methods", None)
         if pattern is not None and methods and pattern.match(request.scope["path"]):
-            found.update(methods)
-    return sorted(found)
+            allowed.update(methods)
+    return sorted(allowed)
 
 
 async def _unexpected_error(request: Request, error: Exception) -> JSONResponse:

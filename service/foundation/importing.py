@@ -14,8 +14,8 @@ def imported(name: str) -> ModuleType:
     """
     gc.disable()
     try:
-        found = importlib.import_module(name)
+        module = importlib.import_module(name)
         gc.freeze()
     finally:
         gc.enable()
-    return found
+    return module

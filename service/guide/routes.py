@@ -1,15 +1,173 @@
-"""Serves the guide at `/guide`: rendered pages, their pictures, one style sheet beside the dashboard's."""
+"""The documentation's Markdown as HTML: which pages there are, and how one is rendered."""
 
 from __future__ import annotations
 
+import posixpath
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from html import escape
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from fastapi import FastAPI
 from starlette.responses import FileResponse, HTMLResponse, Response
 
 from service.dashboard.routes import HEADERS
-from service.guide import pages
+
+if TYPE_CHECKING:
+    from markdown_it import MarkdownIt
+    from markdown_it.token import Token
+
+HERE = Path(__file__).resolve().parent
+CHECKOUT = HERE.parents[1] / "docs"
+INDEX = "README.md"
+ORDER = (
+    "concepts.md",
+    "tutorial.md",
+    "own-robot.md",
+    "control-loop.md",
+    "safety.md",
+    "numbers.md",
+    "method.md",
+    "architecture.md",
+    "operations.md",
+    "monitoring.md",
+    "reverse-proxy.md",
+    "scaling.md",
+    "kubernetes.md",
+    "sizing.md",
+    "errors.md",
+    "reference/api.md",
+    "reference/cli.md",
+    "reproduction/results.md",
+)
+"""Pages beside the index, as the guide lists them. What is not listed here is not a page."""
+SLUGS = {"reproduction/results.md": "reproduction"}
+"""Addresses of pages that are not called as their file is."""
+_COMMENT = re.compile(r"^<!--.*?-->\n?", re.MULTILINE)
+_ELSEWHERE = re.compile(r"[a-z][a-z0-9+.-]*:|//|#", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Page:
+    """One page. slug: last part of its address, empty of the index; file: below the folder; title: its heading."""
+
+    slug: str
+    file: str
+    title: str
+
+    @property
+    def address(self) -> str:
+        """Path of the page's address."""
+        return f"/guide/{self.slug}" if self.slug else "/guide"
+
+
+def folder() -> Path:
+    """The documentation's folder, in a checkout or in an installed package."""
+    packaged = HERE / "docs"
+    return packaged if packaged.is_dir() else CHECKOUT
+
+
+@lru_cache(1)
+def pages() -> dict[str, Page]:
+    """Every page by its slug, in the guide's order, the index first."""
+    pages = {}
+    for file in (INDEX, *ORDER):
+        if (path := folder() / file).is_file():
+            slug = "" if file == INDEX else SLUGS.get(file, path.stem)
+            pages[slug] = Page(slug, file, _title(path))
+    return pages
+
+
+@lru_cache(1)
+def images() -> dict[str, Path]:
+    """Every picture by the name that the guide gives it: its path with dashes, which no other file can be named by."""
+    paths = sorted(path for kind in ("*.png", "*.svg") for path in folder().rglob(kind))
+    return {_flat(path.relative_to(folder()).as_posix()): path for path in paths}
+
+
+@lru_cache(64)
+def content(slug: str) -> str:
+    """A page's content as HTML; raise KeyError where there is no such page."""
+    file = pages()[slug].file
+    text = (folder() / file).read_text("utf-8")
+    return str(_markdown().render(_COMMENT.sub("", text), {"file": file}))
+
+
+def anchor(heading: str) -> str:
+    """What a heading is linked by, the same as on GitHub."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+
+
+def target(href: str, file: str) -> str | None:
+    """Where a link on the page of a file leads in the guide, None where it leads to what the guide does not have."""
+    if _ELSEWHERE.match(href):
+        return href
+    path, _, fragment = href.partition("#")
+    leads_to = posixpath.normpath(posixpath.join(posixpath.dirname(file), path))
+    for page in pages().values():
+        if page.file == leads_to:
+            return page.address + (f"#{fragment}" if fragment else "")
+    name = _flat(leads_to)
+    return f"/guide/files/{name}" if name in images() else None
+
+
+def _flat(path: str) -> str:
+    return path.replace("/", "--")
+
+
+def _title(path: Path) -> str:
+    first = next((line for line in path.read_text("utf-8").splitlines() if line.startswith("# ")), f"# {path.stem}")
+    return first.removeprefix("# ").strip().replace("`", "")
+
+
+@lru_cache(1)
+def _markdown() -> MarkdownIt:
+    from markdown_it import MarkdownIt  # noqa: PLC0415 - a service whose guide nobody reads does without
+
+    made = MarkdownIt("commonmark", {"html": False}).enable("table")
+    made.core.ruler.push("guide", _adapt)
+    made.add_render_rule("table_open", _table_open)
+    made.add_render_rule("table_close", _table_close)
+    return made
+
+
+def _adapt(state: Any) -> None:
+    """Give headings their anchors, and links and pictures their addresses in the guide."""
+    tokens: Sequence[Token] = state.tokens
+    for index, token in enumerate(tokens):
+        if token.type == "heading_open":
+            token.attrSet("id", anchor(_text(tokens[index + 1])))
+        for child in token.children or ():
+            _redirect(child, state.env["file"])
+
+
+def _redirect(token: Token, file: str) -> None:
+    name = {"link_open": "href", "image": "src"}.get(token.type)
+    if name is None:
+        return
+    leads = target(str(token.attrs[name]), file)
+    if leads is None:
+        del token.attrs[name]  # an anchor without an address is shown as its text
+    else:
+        token.attrSet(name, leads)
+        if token.type == "image":
+            token.attrSet("loading", "lazy")
+
+
+def _text(inline: Token) -> str:
+    return "".join(child.content for child in inline.children or ())
+
+
+def _table_open(*_: Any) -> str:
+    return f'<div class="scroll" role="region" aria-label="{escape("Table, may be scrolled")}" tabindex="0"><table>\n'
+
+
+def _table_close(*_: Any) -> str:
+    return "</table></div>\n"
+
 
 ADDRESS, FILES = "/guide", "/guide/files"
 STYLE = "guide.css"
@@ -71,18 +229,18 @@ def index() -> Response:
 
 def page(page: str) -> Response:
     """A page, or one that says that there is none of that name."""
-    known = pages.pages().get(page)
+    known = pages().get(page)
     if known is None:
         missing = (
             '<h1>There is no such page</h1>\n<p>The guide has those on its list, <a href="/guide">from here on</a>.</p>'
         )
         return _shown("Not found", missing, None, 404)
-    return _shown(known.title, pages.content(page), page)
+    return _shown(known.title, content(page), page)
 
 
 def file(name: str) -> Response:
     """A picture or the style sheet, by its name in the guide; nothing else can be named."""
-    path = Path(__file__).with_name(STYLE) if name == STYLE else pages.images().get(name)
+    path = Path(__file__).with_name(STYLE) if name == STYLE else images().get(name)
     if path is None:
         return Response(status_code=404, headers=HEADERS)
     return FileResponse(path, headers=HEADERS)
@@ -90,7 +248,7 @@ def file(name: str) -> Response:
 
 def _shown(title: str, content: str, current: str | None, status: int = 200) -> HTMLResponse:
     lines = []
-    for slug, each in pages.pages().items():
+    for slug, each in pages().items():
         here = ' aria-current="page"' if slug == current else ""
         lines.append(f'          <li><a href="{each.address}"{here}>{escape(each.title)}</a></li>')
     text = _PAGE.format(title=escape(title), contents="\n".join(lines), content=content)

@@ -10,7 +10,6 @@ from lipcore.metrics import evaluate
 from lipcore.paired import Answer, Comparison, Difference
 from lipcore.samples import Array, Samples
 from service.foundation.errors import invalid_request
-from service.inference.answer import measured
 from service.inference.comparison_schema import (
     CompareRequest,
     CompareResponse,
@@ -20,6 +19,7 @@ from service.inference.comparison_schema import (
     TotalDifference,
     VersionFigures,
 )
+from service.inference.evaluating import measured
 from service.models.loaded import LoadedModels, Served
 
 
@@ -29,20 +29,20 @@ def compare(loaded: LoadedModels, model: str, request: CompareRequest) -> Compar
     Not for the event loop.
     """
     first, second = versions = _versions(loaded, model, request)
-    found = measured(loaded, request.dataset, *versions)
-    answers = [_answer(each, found.used) for each in versions]
-    compared = paired.compare(found.used, *answers)
+    recorded = measured(loaded, request.dataset, *versions)
+    answers = [_answer(each, recorded.used) for each in versions]
+    compared = paired.compare(recorded.used, *answers)
     outcome, verdict = _verdict(first.version, second.version, compared)
-    in_training = [found.in_training_of(each) for each in versions]
+    in_training = [recorded.in_training_of(each) for each in versions]
     return CompareResponse(
         model=model,
-        dataset=found.id,
+        dataset=recorded.id,
         joint_names=list(first.model.joint_names),
-        samples=found.samples,
-        samples_used=len(found.used),
+        samples=recorded.samples,
+        samples_used=len(recorded.used),
         blocks=compared.blocks,
         versions=[
-            _figures(each, answer, found.used, trained)
+            _figures(each, answer, recorded.used, trained)
             for each, answer, trained in zip(versions, answers, in_training, strict=True)
         ],
         differences=JointDifferences(
@@ -124,16 +124,16 @@ def _amount(difference: Difference, place: int) -> str:
 
 def _warnings(versions: Collection[Served], in_training: Collection[bool]) -> list[str]:
     """What makes figures flatter one of the versions."""
-    found = []
+    warnings = []
     for served, trained in zip(versions, in_training, strict=True):
         if trained:
-            found.append(f"version {served.version} was trained on this data set: its figures flatter it")
+            warnings.append(f"version {served.version} was trained on this data set: its figures flatter it")
         if served.revision:
-            found.append(
+            warnings.append(
                 f"version {served.version} has learnt online since, up to revision {served.revision}: where that was "
                 "from the motion of this data set, its figures flatter it"
             )
-    return found
+    return warnings
 
 
 def _shown(difference: Difference) -> dict[str, list[float | None]]:

@@ -1,11 +1,12 @@
-"""Routes of torque queries."""
+"""Routes of torque queries, and the echo: what a request costs before anything is computed."""
 
 from __future__ import annotations
 
 from enum import Enum
+from typing import Any
 
 from anyio import CapacityLimiter, to_thread
-from fastapi import APIRouter, Response
+from fastapi import APIRouter, Request, Response
 from starlette.types import Scope
 
 from service.foundation.errors import (
@@ -17,17 +18,50 @@ from service.foundation.errors import (
     UnreadableVersionError,
     responses,
 )
-from service.inference import answer, comparison, trace
-from service.inference.comparison_schema import CompareRequest, CompareResponse
+from service.inference import comparison, evaluating, predicting, trace
+from service.inference.comparison_schema import CompareRequest, CompareResponse, TraceRequest, TraceResponse
+from service.inference.predicting import decode, encode
 from service.inference.schema import EvaluateRequest, EvaluateResponse, PredictRequest, PredictResponse
-from service.inference.trace_schema import TraceRequest, TraceResponse
-from service.inference.wire import decode, encode
 from service.models.loaded import LoadedModels, LoadedModelsDep
-from service.models.served import Served
-from service.models.waiting import reached
-from service.web.hot import Reply, hot_route
-from service.web.limits.turns import PredictionsDep
-from service.web.route import Route, is_json
+from service.models.served import Served, reached
+from service.web.limits.requests import PredictionsDep
+from service.web.route import OCTETS, Reply, Route, hot_route, is_json, media_type
+
+_CONTENT: dict[str, Any] = {
+    "application/json": {"schema": {}, "example": {"q": [0.0, -0.5], "dq": [0.1, 0.0], "ddq": [0.0, 0.5]}},
+    "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
+}
+_DOCUMENTED: dict[str, Any] = {
+    "requestBody": {"required": True, "content": _CONTENT},
+    "responses": {"200": {"description": "The body as it came", "content": _CONTENT}},
+}
+
+echo_hot = APIRouter(tags=["inference"], responses=responses(TooLargeError))
+
+
+async def _echo(scope: Scope, body: bytes) -> Reply | None:
+    given = media_type(scope)
+    return Reply(body, given) if given else None
+
+
+async def echo(request: Request) -> Response:
+    """Answer the body as it came, with its media type, on the way that a query takes, limits and all.
+
+    What a query takes longer is what the service computes; what the echo takes is HTTP, and the measuring client.
+    """
+    return Reply(await request.body(), OCTETS).response()  # with a media type, it has been answered before
+
+
+echo_hot.add_api_route(
+    "/v1/echo",
+    echo,
+    methods=["POST"],
+    summary="Answer what was sent: the floor of latency benchmarks",
+    response_class=Response,
+    openapi_extra=_DOCUMENTED,
+    route_class_override=hot_route(_echo),
+)
+
 
 _ERRORS = responses(InvalidRequestError, NotFoundError, TooLargeError)
 _LATE = responses(RevisionNotReachedError)
@@ -50,7 +84,7 @@ async def _answer(scope: Scope, body: bytes) -> Reply | None:
     if query.min_revision is not None:
         served = await reached(loaded, model, query.version, query.alias, query.min_revision)
     if served is not None and motion is not None:
-        at_once = answer.at_once(served, motion, loaded.storage.settings.max_position)
+        at_once = predicting.at_once(served, motion, loaded.storage.settings.max_position)
         if at_once is not None:
             return Reply(encode(at_once))
     request = query.request()
@@ -64,10 +98,10 @@ async def _in_thread(
 
 
 def _encoded(loaded: LoadedModels, model: str, request: PredictRequest, served: Served | None) -> bytes:
-    return encode(answer.predict(loaded, model, request, served))
+    return encode(predicting.predict(loaded, model, request, served))
 
 
-async def _wanted(loaded: LoadedModels, model: str, request: PredictRequest | EvaluateRequest) -> Served | None:
+async def _revised(loaded: LoadedModels, model: str, request: PredictRequest | EvaluateRequest) -> Served | None:
     """The version that answers, where the request waits for a revision of it; None where it does not."""
     if request.min_revision is None:
         return None
@@ -77,7 +111,7 @@ async def _wanted(loaded: LoadedModels, model: str, request: PredictRequest | Ev
 async def predict(loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: PredictRequest) -> Response:
     """Answer one query or a batch. Nothing is clipped; `tau_std` grows where the model knows little."""
     # a right query has been answered before: this reads the others, to say what is wrong, or in JSON of other dialects
-    served = await _wanted(loaded, model, request)
+    served = await _revised(loaded, model, request)
     return Reply(await _in_thread(loaded, turns, model, request, served)).response()
 
 
@@ -97,8 +131,8 @@ async def evaluate(
     loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: EvaluateRequest
 ) -> EvaluateResponse:
     """Error, coverage and density of the model's torques against measured ones, joint by joint."""
-    served = await _wanted(loaded, model, request)
-    return await to_thread.run_sync(answer.evaluate, loaded, model, request, served, limiter=turns)
+    served = await _revised(loaded, model, request)
+    return await to_thread.run_sync(evaluating.evaluate, loaded, model, request, served, limiter=turns)
 
 
 @router.post("/{model}/trace", summary="Follow a model along a data set", responses=responses(DamagedDataError))

@@ -20,8 +20,7 @@ from pydantic import (
 
 from lipcore.vocabulary import COMPONENTS, ComponentName, TorqueConvention
 from service.foundation.errors import invalid_request
-from service.foundation.matrices import to_array
-from service.inference import checks
+from service.foundation.fields import to_array
 from service.models.schema import AliasName, VersionNumber
 
 _NUMBERS: dict[str, Any] = {"type": "array", "items": {"type": "number"}}
@@ -67,6 +66,12 @@ Part = Literal["all", "held_out"]
 Nested = float | list[float] | list[list[float]] | list[list[list[float]]]
 
 
+def one_choice(version: int | None, alias: str | None) -> None:
+    """Raise InvalidRequestError where a version is named by its number and by an alias."""
+    if version is not None and alias is not None:
+        raise invalid_request("alias", alias, f"no alias beside the version, {version}: name one of the two")
+
+
 class VersionChoice(BaseModel):
     """Which version is meant: a number, an alias, or the one that serves."""
 
@@ -75,7 +80,7 @@ class VersionChoice(BaseModel):
 
     @model_validator(mode="after")
     def _one_of_both(self) -> Self:
-        checks.one_choice(self.version, self.alias)
+        one_choice(self.version, self.alias)
         return self
 
 

@@ -12,8 +12,8 @@ from lipcore import dynamics
 from lipcore.motion import Motion
 from lipcore.samples import Array, Samples
 from service.foundation.errors import invalid_request
-from service.inference import answer
-from service.inference.trace_schema import TraceComponent, TraceComponentValues, TraceRequest, TraceResponse
+from service.inference import evaluating
+from service.inference.comparison_schema import TraceComponent, TraceComponentValues, TraceRequest, TraceResponse
 from service.models.loaded import LoadedModels
 from service.models.served import Served
 from service.storage import sample_file
@@ -33,19 +33,19 @@ def trace(loaded: LoadedModels, model: str, request: TraceRequest) -> TraceRespo
     served = loaded.get(model, request.version, request.alias)
     offered = dynamics.available(served.model.estimator)
     _check(served, request.components, offered)
-    dataset = answer.fitting(loaded, request.dataset, served)
+    dataset = evaluating.fitting(loaded, request.dataset, served)
     path = loaded.files.samples_file(dataset.id, dataset.sha256)
     episode, t = (sample_file.read_array(path, name) for name in ("episode", "t"))
     part = np.arange(len(t), dtype=np.int64)
     if request.part == "held_out":
         try:
-            part = np.flatnonzero(answer.split_of(loaded, dataset, served).held_out(episode, t)).astype(np.int64)
+            part = np.flatnonzero(evaluating.split_of(loaded, dataset, served).held_out(episode, t)).astype(np.int64)
         except CannotHoldOutError as error:
-            raise answer.not_held_out(str(error)) from None
+            raise evaluating.not_held_out(str(error)) from None
     chosen = _within(part, request, len(t))
     rows = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), request.points)).round().astype(np.int64)]
     samples = Samples(served.model.joint_names, **sample_file.read(path, rows))
-    found = served.model.predict(samples.q, samples.dq, samples.ddq)
+    predicted = served.model.predict(samples.q, samples.dq, samples.ddq)
     return TraceResponse(
         model=served.name,
         version=served.version,
@@ -61,9 +61,9 @@ def trace(loaded: LoadedModels, model: str, request: TraceRequest) -> TraceRespo
         t=samples.t.tolist(),
         breaks=_breaks(part, episode, rows),
         tau=samples.tau.tolist(),
-        mean=found.tau.tolist(),
-        std=found.tau_std.tolist(),
-        noise_std=found.noise_std.tolist(),
+        mean=predicted.tau.tolist(),
+        std=predicted.tau_std.tolist(),
+        noise_std=predicted.noise_std.tolist(),
         offered=[name for name in get_args(TraceComponent) if name in offered],
         components=_components(served, samples, request.components, loaded.storage.settings.max_component_batch),
         in_training=request.part == "all" and served.has_learnt_from(dataset.id, dataset.sha256),
@@ -109,10 +109,10 @@ def _components(
     std: dict[TraceComponent, list[Array]] = {name: [] for name in names}
     for first in range(0, len(samples), batch):
         some = samples.rows(slice(first, first + batch))
-        found = dynamics.components(served.model, Motion.from_arrays(some.q, some.dq, some.ddq), names)
+        estimates = dynamics.components(served.model, Motion.from_arrays(some.q, some.dq, some.ddq), names)
         for name in names:
-            mean[name].append(found[name].mean.numpy())
-            std[name].append(found[name].std.numpy())
+            mean[name].append(estimates[name].mean.numpy())
+            std[name].append(estimates[name].std.numpy())
     return {
         name: TraceComponentValues(mean=np.concatenate(mean[name]).tolist(), std=np.concatenate(std[name]).tolist())
         for name in names

@@ -15,7 +15,7 @@ from service.learning.ingest.monitor import Monitor
 from service.learning.learners import Learners
 from service.models.loaded import Served
 from service.storage.database import StreamRow
-from service.web.observability.metric import MetricKind
+from service.web.observability.meters import MetricKind
 
 FIGURES = {
     "nmse": "Mean squared error / variance of the measured torque; every row is predicted before it is learnt",

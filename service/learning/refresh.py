@@ -27,7 +27,7 @@ from service.models import registry
 from service.models.loaded import LoadedModels
 from service.storage.database import AlarmRow, Database, LearnerRow, ServingRow
 from service.training import jobs, refreshes
-from service.training import refresh_scope as scope
+from service.training import refresh_data as scope
 from service.training.queue import JobQueue
 from service.training.schema import Job
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema
 
 from service.foundation.errors import ServiceError, invalid_request
-from service.foundation.matrices import to_array
+from service.foundation.fields import to_array
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 

@@ -7,9 +7,9 @@ from sqlalchemy.orm import Session
 
 from service.foundation.errors import ConflictError, invalid_request, not_found
 from service.models import moves, registry
-from service.models.alias_schema import Alias, AliasList, AliasMove, AliasRequest
 from service.models.loaded import LoadedModels
 from service.models.moves import SERVING
+from service.models.schema import Alias, AliasList, AliasMove, AliasRequest
 from service.storage.database import AliasMoveRow, AliasRow, ModelRow, VersionRow
 
 
@@ -29,8 +29,8 @@ def put(loaded: LoadedModels, model: str, alias: str, request: AliasRequest) -> 
     ConflictError beyond `max_aliases`, UnreadableVersionError. Not for the event loop.
     """
     if (request.version is None) == (request.alias is None):
-        found = "neither" if request.version is None else "both"
-        raise invalid_request("version or alias", found, "exactly one of the two")
+        given = "neither" if request.version is None else "both"
+        raise invalid_request("version or alias", given, "exactly one of the two")
     return _move(loaded, model, alias, loaded.get(model, request.version, request.alias).version)
 
 
@@ -116,10 +116,10 @@ def _check_room(loaded: LoadedModels, session: Session, model: str, alias: str) 
 
 
 def _show(loaded: LoadedModels, session: Session, model: str, alias: str) -> Alias:
-    found = moves.history(session, model, alias, loaded.storage.settings.max_alias_moves)
+    past = moves.history(session, model, alias, loaded.storage.settings.max_alias_moves)
     if alias == SERVING:
         version = registry.answering(session, model)
-        changed_at = found[0].at if found else session.get_one(VersionRow, (model, version)).created_at
+        changed_at = past[0].at if past else session.get_one(VersionRow, (model, version)).created_at
     else:
         row = session.get_one(AliasRow, (model, alias))
         version, changed_at = row.version, row.changed_at
@@ -131,6 +131,6 @@ def _show(loaded: LoadedModels, session: Session, model: str, alias: str) -> Ali
         previous=None if move is None else move.before,
         history=[
             AliasMove(version=each.version, before=each.before, at=each.at, rollback=each.takes_back is not None)
-            for each in found
+            for each in past
         ],
     )

@@ -39,11 +39,11 @@ _KINDS = {
 
 
 class ArchiveError(ValueError):
-    """The file is no archive that can be taken. member: where that is; found, expected: what is wrong there."""
+    """The file is no archive that can be taken. member: where that is; given, expected: what is wrong there."""
 
-    def __init__(self, member: str, found: str, expected: str) -> None:
-        super().__init__(f"{member} is {found}, expected {expected}")
-        self.member, self.found, self.expected = member, found, expected
+    def __init__(self, member: str, given: str, expected: str) -> None:
+        super().__init__(f"{member} is {given}, expected {expected}")
+        self.member, self.given, self.expected = member, given, expected
 
 
 class Part(NamedTuple):
@@ -92,7 +92,7 @@ def members(path: Path, limits: Mapping[str, int]) -> dict[str, Member]:
 
     Raise ArchiveError for anything but plain files with these names, each once, complete and within its limit.
     """
-    found: dict[str, Member] = {}
+    places: dict[str, Member] = {}
     length = path.stat().st_size
     with path.open("rb") as file:
         while True:
@@ -101,15 +101,15 @@ def members(path: Path, limits: Mapping[str, int]) -> dict[str, Member]:
                 raise ArchiveError("archive", f"cut off at byte {length}", "a complete tar file")
             if not any(header):
                 _check_end(file)
-                return found
+                return places
             name, count = _header(header)
             if name not in limits:
                 raise ArchiveError(name, "a file that no model has", f"one of {', '.join(limits)}")
-            if name in found:
+            if name in places:
                 raise ArchiveError(name, "there twice", "each file once")
             if count > limits[name]:
                 raise ArchiveError(name, f"a file of {count} bytes", f"at most {limits[name]}")
-            found[name] = Member(file.tell(), count)
+            places[name] = Member(file.tell(), count)
             following = file.tell() + count + _padding(count)
             if following > length:
                 raise ArchiveError(name, f"cut off at byte {length - file.tell()}", f"{count} bytes")
@@ -140,9 +140,9 @@ def _check_end(file: IO[bytes]) -> None:
 
 def _header(header: bytes) -> tuple[str, int]:
     """Name and size of a plain file; raise ArchiveError."""
-    said = _number(header[148:156])
+    checksum = _number(header[148:156])
     # its own field counts as spaces
-    if said != sum(header[:148]) + 8 * ord(" ") + sum(header[156:]):
+    if checksum != sum(header[:148]) + 8 * ord(" ") + sum(header[156:]):
         raise ArchiveError("archive", "not a tar file, or damaged: a header does not have its checksum", "a tar file")
     if header[257:265] not in _MAGIC:
         raise ArchiveError("archive", "a tar file of an old form", "the form ustar or that of GNU tar")

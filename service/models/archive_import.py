@@ -19,9 +19,8 @@ from service.foundation.errors import InvalidDataError, invalid_data, problem
 from service.foundation.settings import Settings
 from service.models import archive, registry
 from service.models.archive import CHECKSUMS, EXPORT, ArchiveError
-from service.models.holdout_schema import HoldoutLineage
 from service.models.loaded import LoadedModels
-from service.models.schema import ModelName, Version
+from service.models.schema import HoldoutLineage, ModelName, Version
 from service.storage.database import LearnerRow, ServingRow, now
 from service.storage.files import new_id
 from service.web.storage_errors import undecided
@@ -132,22 +131,22 @@ def _read(upload: Path, settings: Settings) -> dict[str, bytes]:
         ROBOT: settings.max_urdf_bytes,
     }
     try:
-        found = archive.members(upload, limits)
+        places = archive.members(upload, limits)
     except ArchiveError as error:
-        raise invalid_data(error.member, error.found, error.expected) from None
+        raise invalid_data(error.member, error.given, error.expected) from None
     for name in archive.MEMBERS:
-        if name not in found and name != ROBOT:
+        if name not in places and name != ROBOT:
             raise invalid_data(name, "missing", "a file of that name in the archive")
-    sums = _json(CHECKSUMS, archive.read(upload, found.pop(CHECKSUMS)))
-    files = {name: archive.read(upload, member) for name, member in found.items()}
+    sums = _json(CHECKSUMS, archive.read(upload, places.pop(CHECKSUMS)))
+    files = {name: archive.read(upload, member) for name, member in places.items()}
     _check_sums(files, sums)
     return files
 
 
 def _check_sums(files: Mapping[str, bytes], sums: Any) -> None:
     if not isinstance(sums, dict) or sums.keys() != files.keys():
-        found = f"of {', '.join(map(strict_json.quote, sums))}" if isinstance(sums, dict) else strict_json.quote(sums)
-        raise invalid_data(CHECKSUMS, found, f"the sha256 of each of {', '.join(files)}")
+        given = f"of {', '.join(map(strict_json.quote, sums))}" if isinstance(sums, dict) else strict_json.quote(sums)
+        raise invalid_data(CHECKSUMS, given, f"the sha256 of each of {', '.join(files)}")
     for name, content in files.items():
         if persistence.sha256(content) != sums[name]:
             raise invalid_data(name, "not what its sha256 in checksums.json says", "an undamaged file")

@@ -81,7 +81,7 @@ def delete_model(loaded: LoadedModels, model: str) -> None:
                 session.execute(delete(table).where(table.model == model))
             session.execute(delete(VersionRow).where(VersionRow.model == model))
             session.execute(delete(ModelRow).where(ModelRow.name == model))
-        loaded.forget(model, [each.version for each in versions], whole=True)
+        loaded.forget(model, [each.version for each in versions], entirely=True)
     _remove_files(loaded.files, [each.folder for each in versions], snapshots)
     loaded.wake(model)
     logger.info("deleted model %s with %d versions", model, len(versions))

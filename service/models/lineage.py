@@ -32,7 +32,7 @@ def software() -> dict[str, str | int]:
     model_format: of the files that this release writes; git_commit: only in a checkout, with the suffix `-dirty` where
     it was changed since.
     """
-    found: dict[str, str | int] = {
+    versions: dict[str, str | int] = {
         "lipserve": __version__,
         "model_format": FORMAT_VERSION,
         "python": platform.python_version(),
@@ -40,7 +40,7 @@ def software() -> dict[str, str | int]:
         "numpy": np.__version__,
     }
     commit = git_commit(CHECKOUT)
-    return found if commit is None else {**found, "git_commit": commit}
+    return versions if commit is None else {**versions, "git_commit": commit}
 
 
 def named(rows: Sequence[DatasetRow]) -> list[dict[str, Any]]:
@@ -60,8 +60,8 @@ def named(rows: Sequence[DatasetRow]) -> list[dict[str, Any]]:
 
 def learnt_from(lineage: dict[str, Any]) -> frozenset[str]:
     """Ids and hashes of the data sets that a version has learnt from, be it from part of them."""
-    whole = {each["id"] for each in (lineage.get("holdout") or {}).get("datasets", []) if each["whole"]}
-    learnt = [each for each in lineage.get("datasets", []) if each["id"] not in whole]
+    left_out = {each["id"] for each in (lineage.get("holdout") or {}).get("datasets", []) if each["whole"]}
+    learnt = [each for each in lineage.get("datasets", []) if each["id"] not in left_out]
     return frozenset(each[field] for each in learnt for field in ("id", "sha256") if field in each)
 
 
@@ -82,8 +82,8 @@ def figures(model: TorqueModel, samples: Samples, most: int, of: int) -> dict[st
     used = samples.rows(np.linspace(0, len(samples) - 1, count).round().astype(np.int64))
     # not by the compiled form of the model: a process that trains and never serves would wait for it
     answer = model.posterior.predict(used.motion())
-    found = metrics.evaluate(used.tau, answer.mean.numpy(), answer.std.numpy(), model.noise_std)
-    values = {name: getattr(found, name) for name in ("nmse", "rmse", "coverage", "nlpd")}
+    compared = metrics.evaluate(used.tau, answer.mean.numpy(), answer.std.numpy(), model.noise_std)
+    values = {name: getattr(compared, name) for name in ("nmse", "rmse", "coverage", "nlpd")}
     shown = {name: [float(each) if np.isfinite(each) else None for each in values[name]] for name in values}
     return {"samples": len(used), "of": of, **shown}
 

@@ -22,8 +22,7 @@ from service.foundation.states import PartState
 from service.models import moves, registry
 from service.models.lineage import learnt_from
 from service.models.registry import Serving
-from service.models.served import Alias, Key, LearntStates, Served, Snapshot
-from service.models.waiting import Waiting
+from service.models.served import Alias, Key, LearntStates, Served, Snapshot, Waiting
 from service.storage.database import VersionRow
 from service.storage.storage import Storage
 
@@ -75,10 +74,10 @@ class LoadedModels:
             if version is None:
                 return None
         key = (model, version)
-        found = snapshot.served.get(key)
-        if found is not None:
+        served = snapshot.served.get(key)
+        if served is not None:
             self._used[key] = next(self._clock)
-        return found
+        return served
 
     def newest(self, model: str, alias: str | None = None) -> int | None:
         """Return the version that answers where an alias is named, or none, in memory or dropped since; never waits."""
@@ -93,15 +92,15 @@ class LoadedModels:
 
         With neither it is the one that serves. Raise NotFoundError or UnreadableVersionError.
         """
-        found = self.hot(model, version, alias)
-        while found is None:
+        served = self.hot(model, version, alias)
+        while served is None:
             number, serving = self._find(model, version, alias)
             try:
-                found = self._load(registry.find(self.database, model, number), serving)
+                served = self._load(registry.find(self.database, model, number), serving)
             except NotFoundError:
                 if self._find(model, version, alias)[0] == number:
                     raise  # else the alias has moved on, and the version before was deleted
-        return found
+        return served
 
     def _find(self, model: str, version: int | None, alias: str | None) -> tuple[int | None, Serving | None]:
         """The number of the version that is meant, and what serves where that is it; raise NotFoundError."""
@@ -124,7 +123,7 @@ class LoadedModels:
             if version is not None:
                 aliases[model, alias] = version
             self._snapshot = replace(self._snapshot, aliases=aliases)
-        self.waiting.tell(model)
+        self.waiting.wake(model)
 
     def aliases(self) -> Mapping[Alias, int]:
         """Where every alias points that has been given, but for those that serve."""
@@ -136,27 +135,27 @@ class LoadedModels:
             kept = {} if models is None else {k: v for k, v in self._snapshot.aliases.items() if k[0] not in models}
             self._snapshot = replace(self._snapshot, aliases=kept | dict(aliases))
         for model in {model for model, _ in aliases}:
-            self.waiting.tell(model)
+            self.waiting.wake(model)
 
-    def forget(self, model: str, versions: Collection[int], whole: bool = False) -> None:
+    def forget(self, model: str, versions: Collection[int], entirely: bool = False) -> None:
         """Answer no more with these versions, which have been deleted; `moving` is held.
 
-        whole: the model has been deleted with them. Queries in flight keep theirs. To be called before their files go:
-        who finds them gone has to know why.
+        entirely: the model has been deleted with them. Queries in flight keep theirs. To be called before their files
+        go: who finds them gone has to know why.
         """
         gone = {(model, version) for version in versions}
         with self._revising, self._lock:
             self._deleted |= gone
-            self._snapshot = self._snapshot.without(gone, model if whole else None)
+            self._snapshot = self._snapshot.without(gone, model if entirely else None)
             for key in gone:
                 self._revisions.pop(key, None)
                 self._held.pop(key, None)
                 self._used.pop(key, None)
                 self._unreadable.pop(key, None)
-        self.waiting.tell(model)
-        if whole:
-            for tell in self.when_deleted:
-                tell(model)
+        self.waiting.wake(model)
+        if entirely:
+            for deleted in self.when_deleted:
+                deleted(model)
 
     def announce(self, models: Collection[str]) -> None:
         """Answer for these models with the versions that now serve. Not for the event loop."""
@@ -179,9 +178,9 @@ class LoadedModels:
         """Versions that anyone here may answer with, and their revisions: those in memory, of streams too, and those
         that serve, which may have been dropped (None)."""
         snapshot = self._snapshot
-        found: dict[Key, int | None] = {(model, each.version): None for model, each in snapshot.serving.items()}
+        revisions: dict[Key, int | None] = {(model, each.version): None for model, each in snapshot.serving.items()}
         streamed = [each for ref in self._held.valuerefs() if (each := ref()) is not None]
-        return found | {(each.name, each.version): each.revision for each in (*streamed, *snapshot.served.values())}
+        return revisions | {(each.name, each.version): each.revision for each in (*streamed, *snapshot.served.values())}
 
     def versions(self) -> Collection[Key]:
         """Versions that are in memory; asking does not count as using them."""
@@ -227,10 +226,10 @@ class LoadedModels:
             self._revisions[key] = (revision, learnt)  # the last that came is the last to go
             while len(self._revisions) > 2 * self.capacity:
                 del self._revisions[next(iter(self._revisions))]
-            found = self._snapshot.served.get(key) or self._held.get(key)
-            if found is None or found.revision >= revision:
+            known_version = self._snapshot.served.get(key) or self._held.get(key)
+            if known_version is None or known_version.revision >= revision:
                 return False
-            served = replace(found, model=_warm(learnt.apply(found.base)), revision=revision)
+            served = replace(known_version, model=_warm(learnt.apply(known_version.base)), revision=revision)
             return self._publish(served) is served
 
     def preload(self) -> int:
@@ -320,7 +319,7 @@ class LoadedModels:
                 del entries[oldest]
                 self._used.pop(oldest, None)
             self._snapshot = replace(self._snapshot, served=entries, serving=pointers)
-        self.waiting.tell(served.name)
+        self.waiting.wake(served.name)
         return current
 
 
@@ -331,8 +330,8 @@ def _warm(model: TorqueModel) -> TorqueModel:
 
 
 async def _loaded(request: Request) -> LoadedModels:
-    found: LoadedModels = request.app.state.loaded
-    return found
+    loaded: LoadedModels = request.app.state.loaded
+    return loaded
 
 
 LoadedModelsDep = Annotated[LoadedModels, Depends(_loaded)]

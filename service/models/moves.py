@@ -67,9 +67,9 @@ def standing(session: Session, model: str, alias: str) -> AliasMoveRow | None:
 def pointing(session: Session, model: str, version: int) -> list[str]:
     """Names of the aliases that point to a version, `serving` last."""
     query = select(AliasRow.alias).where(AliasRow.model == model, AliasRow.version == version)
-    found = list(session.scalars(query.order_by(AliasRow.alias)))
+    aliases = list(session.scalars(query.order_by(AliasRow.alias)))
     serves = select(ServingRow.model).where(ServingRow.model == model, ServingRow.version == version)
-    return found if session.scalar(serves) is None else [*found, SERVING]
+    return aliases if session.scalar(serves) is None else [*aliases, SERVING]
 
 
 def count(session: Session, model: str) -> int:

@@ -143,10 +143,10 @@ def serving(database: Database, models: Collection[str]) -> dict[str, Serving]:
         .group_by(VersionRow.model, ServingRow.version, ServingRow.change)
     )
     with database.session() as session:
-        found = session.execute(newest).all()
+        rows = session.execute(newest).all()
     return {
         model: Serving(latest, 0) if chosen is None else Serving(chosen, change)
-        for model, latest, chosen, change in found
+        for model, latest, chosen, change in rows
     }
 
 

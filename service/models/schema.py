@@ -1,11 +1,12 @@
-"""Models and versions as the API shows them."""
+"""Models, versions, aliases and what was held out of their training, as the API shows them."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
+from lipcore.splits import Kind, Split
 from lipcore.vocabulary import JointType, TorqueConvention
 
 ModelName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")]
@@ -119,3 +120,92 @@ class ModelPage(BaseModel):
 
     items: list[Model]
     next_cursor: str | None
+
+
+class AliasRequest(BaseModel):
+    """Where an alias shall point: to a version, or to where another alias points now."""
+
+    model_config = ConfigDict(
+        extra="forbid", strict=True, json_schema_extra={"examples": [{"version": 2}, {"alias": "candidate"}]}
+    )
+
+    version: VersionNumber | None = Field(None, description="A version of the model")
+    alias: AliasName | None = Field(None, description="Another alias of the model, instead of a number")
+
+
+class AliasMove(BaseModel):
+    """One move of an alias."""
+
+    version: int | None = Field(description="Where to; null where the alias was removed")
+    before: int | None = Field(description="Where from; null where the alias was new")
+    at: str
+    rollback: bool = Field(description="Whether it took back an earlier move")
+
+
+class Alias(BaseModel):
+    """A name of a version, which can be moved to another one."""
+
+    alias: str
+    version: int
+    changed_at: str
+    previous: int | None = Field(description="Where a rollback would lead; null where there is nothing to go back to")
+    history: list[AliasMove] = Field(description="The last moves, newest first")
+
+
+class AliasList(BaseModel):
+    """Every alias of a model, `serving` first; all are on one page."""
+
+    items: list[Alias]
+    next_cursor: None = None
+
+
+_DEFAULTS = Split()
+
+
+class Holdout(BaseModel):
+    """Part of the data that is not learnt from, so that the version can be evaluated on it: never rows at random."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [{"share": 0.3}]})
+
+    kind: Kind = Field(
+        _DEFAULTS.kind,
+        description="Of each data set: whole `episodes`, chosen by the seed; its `last` part; or some of many equal "
+        "`blocks`, chosen by the seed. Of several data sets of one episode each, `episodes` holds out whole data sets",
+    )
+    share: float = Field(
+        _DEFAULTS.share, gt=0, lt=1, description="Of the samples, as nearly as whole episodes or blocks allow"
+    )
+    blocks: int = Field(_DEFAULTS.blocks, ge=2, le=1000, description="Equal stretches that `blocks` chooses from")
+    guard_s: float | None = Field(
+        None,
+        ge=0,
+        le=3600,
+        description="Samples as near as that to the other side are left out of both, s; by default one period of the "
+        "low-pass that the data set was prepared with. Of a data set without times 25 samples are",
+    )
+    seed: int = Field(_DEFAULTS.seed, ge=0, lt=2**31, description="Of the choice")
+
+
+class HeldOutSet(BaseModel):
+    """What was held out of one data set: enough to find the same samples again."""
+
+    model_config = ConfigDict(strict=True)
+
+    id: str = Field(max_length=40)
+    sha256: str = Field(max_length=64)
+    whole: bool = Field(description="Whether nothing of it was learnt")
+    guard: float = Field(ge=0, description="See `guard_unit`")
+    guard_unit: Literal["s", "rows"]
+    rows: int = Field(ge=1, lt=2**63, description="Samples held out")
+    guarded: int = Field(ge=0, lt=2**63, description="Samples left out of both sides")
+
+
+class HoldoutLineage(BaseModel):
+    """What a version's lineage says of it; the figures that go with it are shown and not read."""
+
+    model_config = ConfigDict(strict=True)
+
+    split: Holdout
+    datasets: list[HeldOutSet] = Field(min_length=1, max_length=10_000)
+    rows: int = Field(ge=1, lt=2**63)
+    guarded: int = Field(ge=0, lt=2**63)

@@ -10,37 +10,76 @@ from numpy.typing import NDArray
 
 from lipcore.dynamics import available
 from lipcore.model import TorqueModel
+from lipcore.vocabulary import COMPONENTS, ComponentName
 from service.foundation.errors import invalid_request
 from service.foundation.settings import Settings
-from service.inference import checks
-from service.oip.outputs import DEFAULT, FORWARD, NEED_TORQUE, PARTS, QUICK, Array, shapes
-from service.oip.schema import BINARY, DATATYPES, INPUTS, TORQUE, InferInput, InferOutput, InferRequest
-from service.oip.wire import HEADER, Message
+from service.inference.predicting import Query
+from service.oip.schema import BINARY, DATATYPES, HEADER, INPUTS, TORQUE, InferInput, InferOutput, InferRequest
+from service.oip.wire import Message
+
+Array = NDArray[np.float64]
+Shape = tuple[int, ...]
+
+DEFAULT = ("tau", "tau_std")
+QUICK = frozenset({"tau", "tau_std", "noise_std"})
+"""Outputs of which one query is answered on the event loop."""
+FORWARD: ComponentName = "forward_dynamics"
+_STD = "_std"
+_TORQUES = ("gravity", "coriolis", "inertial", "friction")
+
+
+class Part(NamedTuple):
+    """A component as a tensor: its mean, or its standard deviation."""
+
+    component: ComponentName
+    std: bool
+
+
+PARTS: dict[str, Part] = {
+    (f"tau_{name}" if name in _TORQUES else name) + suffix: Part(name, bool(suffix))
+    for name in COMPONENTS
+    for suffix in ("", _STD)
+}
+"""Tensors of components by name; components that are torques begin with `tau_`."""
+NEED_TORQUE = frozenset(name for name, part in PARTS.items() if part.component == FORWARD)
+
+
+def shapes(model: TorqueModel) -> dict[str, Shape]:
+    """Every tensor that a model can answer, and its shape at N queries; -1 stands for N."""
+    n, offered = model.n_joints, available(model.estimator)
+    tensors: dict[str, Shape] = {"tau": (-1, n), "tau_std": (-1, n), "noise_std": (n,), "covariance": (-1, n, n)}
+    for name, part in PARTS.items():
+        if part.component in offered:
+            tensors[name] = _shape(part.component, n)
+    return tensors
+
+
+def _shape(component: ComponentName, n: int) -> Shape:
+    if component == "inertia_matrix":
+        return (-1, n, n)
+    # an energy is a tensor of one number a query: not every client takes a tensor without axes
+    return (-1, 1) if component in ("kinetic_energy", "potential_energy") else (-1, n)
+
 
 _DTYPES: dict[str, np.dtype[np.floating]] = {"FP64": np.dtype("<f8"), "FP32": np.dtype("<f4")}
 _NO_TENSORS = f"tensors in the body: of the extensions, {BINARY} is supported"
 
 
-class Query(NamedTuple):
-    """What to compute, and how to answer it.
+class Question(NamedTuple):
+    """What to compute, and how to answer it: names of outputs in the order asked for, each with whether it is answered
+    in binary."""
 
-    motion: q, dq and ddq, (3, N, n); tau: (N, n) or None; single: the query has no axis of queries, nor has its answer;
-    outputs: names in the order asked for, each with whether it is answered in binary.
-    """
-
-    motion: Array
-    tau: Array | None
-    single: bool
+    query: Query
     outputs: dict[str, bool]
 
     @property
     def quick(self) -> bool:
         """Whether the answer is one of a control loop: one query, and of it torques alone."""
-        return self.motion.shape[1] == 1 and self.outputs.keys() <= QUICK
+        return self.query.values.shape[1] == 1 and self.outputs.keys() <= QUICK
 
 
-def read(message: Message, body: bytes, model: TorqueModel, settings: Settings) -> Query:
-    """Turn a request into a query; raise InvalidRequestError."""
+def read(message: Message, body: bytes, model: TorqueModel, settings: Settings) -> Question:
+    """Turn a request into a question; raise InvalidRequestError."""
     request, offset = message
     outputs = _outputs(request, model)
     tensors = _inputs(request, bool(NEED_TORQUE & outputs.keys()))
@@ -48,32 +87,34 @@ def read(message: Message, body: bytes, model: TorqueModel, settings: Settings) 
     _check_shape(request.inputs[0], shape, model, settings, bool(PARTS.keys() & outputs.keys()))
     _check_payload(request, len(body) - offset)
     single, rows = len(shape) == 1, 1 if len(shape) == 1 else shape[0]
-    found = np.empty((len(tensors), rows, model.n_joints))
+    values = np.empty((len(tensors), rows, model.n_joints))
     places = {name: place for place, name in enumerate(tensors)}
     for tensor in request.inputs:  # binary data lie in this order, whatever the order of the names
         if tensor.shape != shape:
             raise invalid_request(f"{tensor.name}.shape", tensor.shape, f"that of {request.inputs[0].name}, {shape}")
-        values, offset = _values(tensor, body, offset)
-        found[places[tensor.name]] = values.reshape(rows, -1)
-    _check_numbers(found, tensors, request, single, settings.max_position)
-    return Query(found[:3], found[3] if len(tensors) > 3 else None, single, outputs)
+        numbers, offset = _values(tensor, body, offset)
+        values[places[tensor.name]] = numbers.reshape(rows, -1)
+    query = Query(values, single)
+    datatypes = {tensor.name: tensor.datatype for tensor in request.inputs}
+    query.check(settings.max_position, lambda name: f"a finite number of {datatypes[name]}")
+    return Question(query, outputs)
 
 
 def _outputs(request: InferRequest, model: TorqueModel) -> dict[str, bool]:
     usual = bool(request.parameters and request.parameters.binary_data_output)
     if not request.outputs:
         return dict.fromkeys(DEFAULT, usual)
-    found: dict[str, bool] = {}
+    outputs: dict[str, bool] = {}
     for index, output in enumerate(request.outputs):
         name, field = output.name, f"outputs[{index}]"
-        if name in found:
+        if name in outputs:
             raise invalid_request(f"{field}.name", name, "each output once")
         part = PARTS.get(name)
         if (part is None or part.component not in available(model.estimator)) and name not in (*QUICK, "covariance"):
             expected = f"what a model with the estimator {model.estimator.name} offers: {', '.join(shapes(model))}"
             raise invalid_request(f"{field}.name", name, expected)
-        found[name] = _binary(output, field, usual)
-    return found
+        outputs[name] = _binary(output, field, usual)
+    return outputs
 
 
 def _binary(output: InferOutput, field: str, usual: bool) -> bool:
@@ -136,8 +177,8 @@ def _values(tensor: InferInput, body: bytes, offset: int) -> tuple[Array, int]:
         raise invalid_request(f"{name}.parameters.shared_memory_region", given.shared_memory_region, _NO_TENSORS)
     size = None if given is None else given.binary_data_size
     if (size is None) == (tensor.data is None):
-        found = "missing" if size is None else "given, and binary_data_size too"
-        raise invalid_request(f"{name}.data", found, "numbers in data, or binary_data_size and binary data")
+        given_data = "missing" if size is None else "given, and binary_data_size too"
+        raise invalid_request(f"{name}.data", given_data, "numbers in data, or binary_data_size and binary data")
     if size is None:
         return _as_read(_listed(tensor, count), dtype), offset
     if size != count * dtype.itemsize:
@@ -161,16 +202,6 @@ def _listed(tensor: InferInput, count: int) -> Array:
     except ValueError:
         raise invalid_request(field, "numbers and lists, or lists of different lengths", expected) from None
     if values.size != count or (values.ndim == 2 and list(values.shape) != tensor.shape):
-        found = f"{values.size} numbers" if values.ndim == 1 else f"rows of shape {list(values.shape)}"
-        raise invalid_request(field, found, expected)
+        given = f"{values.size} numbers" if values.ndim == 1 else f"rows of shape {list(values.shape)}"
+        raise invalid_request(field, given, expected)
     return values
-
-
-def _check_numbers(values: Array, names: tuple[str, ...], request: InferRequest, single: bool, limit: float) -> None:
-    finite = np.isfinite(values)
-    if not finite.all():
-        place, row, joint = np.argwhere(~finite)[0]
-        datatype = next(each.datatype for each in request.inputs if each.name == names[place])
-        field = checks.element(names[place], *((joint,) if single else (row, joint)))
-        raise invalid_request(field, f"{values[place, row, joint]:g}", f"a finite number of {datatype}")
-    checks.positions(values[0, 0] if single else values[0], limit)

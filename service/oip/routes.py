@@ -1,22 +1,117 @@
-"""Routes of the Open Inference Protocol."""
+"""Routes of the Open Inference Protocol, and models and versions as it names and describes them."""
 
 from __future__ import annotations
 
+import re
 from enum import Enum
 
-from anyio import to_thread
+from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Request, Response
 from starlette.types import Scope
 
+from lipcore.model import TorqueModel
 from service import __version__
-from service.models.loaded import LoadedModels
-from service.oip import answer, versions, wire
-from service.oip.openapi import MODEL, VERSION, failures, infer_answer, infer_body
-from service.oip.schema import BINARY, ModelMetadata, ModelReady, ServerLive, ServerMetadata, ServerReady
+from service.foundation.errors import NotFoundError, NotReadyError, UnreadableVersionError, problem, sentence
+from service.models import registry
+from service.models.loaded import LoadedModels, Served
+from service.models.schema import ALIAS
+from service.oip import answer, wire
+from service.oip.query import FORWARD, shapes
+from service.oip.schema import (
+    BINARY,
+    INPUTS,
+    MODEL,
+    TORQUE,
+    VERSION,
+    ModelMetadata,
+    ModelReady,
+    ServerLive,
+    ServerMetadata,
+    ServerReady,
+    TensorMetadata,
+    failures,
+    infer_answer,
+    infer_body,
+)
 from service.web import health
-from service.web.hot import Reply, hot_route
 from service.web.observability.readiness import ReadinessDep
-from service.web.route import Route
+from service.web.route import Reply, Route, hot_route
+
+_LISTED = 20
+
+
+async def find(loaded: LoadedModels, turns: CapacityLimiter, name: str, version: str | None) -> Served:
+    """Return a version by its number or an alias, the one that serves where None, loaded if need be.
+
+    turns: of what loads. Raise NotFoundError naming those there are.
+    """
+    number, alias = (None, None) if version is None else _meant(version)
+    served = loaded.hot(name, number, alias)
+    if served is not None:
+        return served
+    return await to_thread.run_sync(_load, loaded, name, version, number, alias, limiter=turns)
+
+
+async def ready_version(loaded: LoadedModels, turns: CapacityLimiter, name: str, version: str | None) -> Served:
+    """Like `find`, but raise NotReadyError where the version cannot be loaded."""
+    try:
+        return await find(loaded, turns, name, version)
+    except UnreadableVersionError as error:
+        raise NotReadyError(error.message) from error
+
+
+def metadata(loaded: LoadedModels, served: Served) -> ModelMetadata:
+    """Describe a version and name all of its model; raise NotFoundError. Not for the event loop."""
+    model = served.model
+    inputs = [TensorMetadata(name=each, shape=[-1, model.n_joints]) for each in INPUTS]
+    outputs = shapes(model)
+    if FORWARD in outputs:
+        inputs.append(TensorMetadata(name=TORQUE, shape=[-1, model.n_joints], parameters={"optional": True}))
+    return ModelMetadata(
+        name=served.name,
+        versions=_known(loaded, served.name),
+        platform=f"lipserve_{model.estimator.name}",
+        inputs=inputs,
+        outputs=[TensorMetadata(name=each, shape=list(shape)) for each, shape in outputs.items()],
+        parameters=_parameters(served, model),
+    )
+
+
+def _parameters(served: Served, model: TorqueModel) -> dict[str, str | int]:
+    return {
+        "version": str(served.version),
+        "revision": served.revision,
+        "torque_convention": model.torque_convention,
+        "joint_names": ",".join(model.joint_names),
+    }
+
+
+def _meant(version: str) -> tuple[int | None, str | None]:
+    """A version's number or an alias; the number 0, which no version has, for what is neither."""
+    if re.fullmatch(ALIAS, version):
+        return None, version
+    number = int(version) if version.isascii() and version.isdigit() and len(version) < 10 else 0
+    return number if str(number) == version else 0, None
+
+
+def _load(loaded: LoadedModels, name: str, version: str | None, number: int | None, alias: str | None) -> Served:
+    try:
+        return loaded.get(name, number, alias)
+    except NotFoundError as error:
+        if error.detail[0].field == "model":
+            raise NotFoundError(f"no model {name[:200]!r}: GET /v1/models lists all", error.detail) from error
+        item = problem("version", version, f"one of {', '.join(_names(loaded, name)[-_LISTED:])}")
+        raise NotFoundError(f"{sentence(item)}, of model {name!r}", [item]) from error
+
+
+def _names(loaded: LoadedModels, name: str) -> list[str]:
+    """Aliases and numbers."""
+    return [*registry.show(loaded.database, name).aliases, *_known(loaded, name)]
+
+
+def _known(loaded: LoadedModels, name: str) -> list[str]:
+    return [str(each.version) for each in registry.show(loaded.database, name).versions]
+
 
 SMALL = 16 * 1024
 """Bytes of a body that is decoded on the event loop: one query of the largest robot fits many times."""
@@ -67,8 +162,8 @@ async def model_metadata(request: Request) -> ModelMetadata:
     loaded: LoadedModels = request.app.state.loaded
     turns = request.app.state.turns.predictions
     where = request.path_params
-    served = await versions.find(loaded, turns, where["model"], where.get("version"))
-    return await to_thread.run_sync(versions.metadata, loaded, served)
+    served = await find(loaded, turns, where["model"], where.get("version"))
+    return await to_thread.run_sync(metadata, loaded, served)
 
 
 @router.get(
@@ -88,7 +183,7 @@ async def model_ready(request: Request) -> ModelReady:
     loaded: LoadedModels = request.app.state.loaded
     turns = request.app.state.turns.predictions
     where = request.path_params
-    served = await versions.ready(loaded, turns, where["model"], where.get("version"))
+    served = await ready_version(loaded, turns, where["model"], where.get("version"))
     return ModelReady(name=served.name)
 
 
@@ -97,11 +192,11 @@ async def _answer(scope: Scope, body: bytes) -> Reply:
     loaded: LoadedModels = scope["app"].state.loaded
     limiter, settings = scope["app"].state.turns.predictions, loaded.storage.settings
     headers, where = scope["headers"], scope["path_params"]
-    served = await versions.find(loaded, limiter, where["model"], where.get("version"))
+    served = await find(loaded, limiter, where["model"], where.get("version"))
     if len(body) > SMALL:
         return await to_thread.run_sync(answer.infer, served, body, headers, settings, limiter=limiter)
     message = wire.decode(body, headers)
-    query = answer.question(served, message, body, settings)
+    query = answer.read_question(served, message, body, settings)
     if query.quick:
         return answer.respond(served, message.request, query)
     return await to_thread.run_sync(answer.respond, served, message.request, query, limiter=limiter)
@@ -116,7 +211,7 @@ async def infer(request: Request) -> Response:
     return reply.response()
 
 
-for _path, _summary, _parameters in (
+for _path, _summary, _documented in (
     ("/models/{model}/infer", "Torque at a motion", _ONE),
     ("/models/{model}/versions/{version}/infer", "Torque at a motion, by a version", _VERSIONED),
 ):
@@ -127,6 +222,6 @@ for _path, _summary, _parameters in (
         summary=_summary,
         response_class=Response,
         responses={200: infer_answer(), **failures(400, 404, 413, 415)},
-        openapi_extra=infer_body(_parameters),
+        openapi_extra=infer_body(_documented),
         route_class_override=hot_route(_answer),
     )

@@ -11,11 +11,9 @@ from typing import Any, NamedTuple
 import msgspec
 
 from service.foundation.errors import InvalidRequestError, UnsupportedMediaTypeError, invalid_request, problem, sentence
-from service.oip.schema import InferRequest, InferResponse
-from service.web.hot import Reply
-from service.web.route import OCTETS
+from service.oip.schema import HEADER, InferRequest, InferResponse
+from service.web.route import OCTETS, Reply
 
-HEADER = "Inference-Header-Content-Length"
 _HEADER, _ENCODING = HEADER.lower().encode(), b"content-encoding"
 _decode = msgspec.json.Decoder(InferRequest).decode
 _encode = msgspec.json.Encoder().encode
@@ -85,9 +83,9 @@ def _explain(error: Exception, text: bytes, alone: bool) -> InvalidRequestError:
     """Say what is wrong with a request's JSON. alone: nothing was said to follow it."""
     loose = _loosely(text)
     if isinstance(error, msgspec.ValidationError):
-        said = _SAID.fullmatch(str(error))
-        assert said is not None  # the pattern takes any text
-        return _explain_value(said["what"], said["path"] or "", loose)
+        match = _SAID.fullmatch(str(error))
+        assert match is not None  # the pattern takes any text
+        return _explain_value(match["what"], match["path"] or "", loose)
     for path, value in _leaves(loose):
         if isinstance(value, float) and not isfinite(value):  # Python and others write NaN, which JSON does not know
             return invalid_request(path or "the body", value, "a finite number" if path else "an object")

@@ -14,7 +14,7 @@ from service.foundation.errors import ServiceError
 from service.learning.learners import Learners
 from service.models import moves
 from service.storage.database import Database, EventRow, LearnerRow, VersionRow
-from service.storage.database.notices import Notice
+from service.storage.database.engine import Notice
 
 logger = logging.getLogger(__name__)
 
@@ -137,7 +137,7 @@ class Listener:
 
     def _listen(self) -> None:
         self._receiving = False
-        with closing(self._database.heard(PAUSE_S)) as notices:
+        with closing(self._database.changes_of_others(PAUSE_S)) as notices:
             for notice in notices:
                 if self._ending.is_set():
                     return

@@ -16,7 +16,7 @@ from service.foundation.errors import (
     UnsupportedMediaTypeError,
     responses,
 )
-from service.foundation.names import NameForPeople
+from service.foundation.fields import NameForPeople
 from service.robots import store
 from service.robots.schema import UPLOAD_BODY, ProfileList, Robot, RobotPage, RobotProfile
 from service.storage.storage import StorageDep

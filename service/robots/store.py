@@ -25,7 +25,7 @@ from service.foundation.errors import (
     not_found,
     problem,
 )
-from service.foundation.names import LONGEST, for_people
+from service.foundation.fields import LONGEST, for_people
 from service.foundation.states import ACTIVE
 from service.robots.schema import ProfileJoint, Robot, RobotPage, RobotProfile
 from service.storage.database import Database, JobRow, RobotRow, now

@@ -55,9 +55,9 @@ def check_home(settings: Settings) -> None:
             raise
         except OSError as error:
             raise HomeError(_unusable(home, error)) from error
-        found = _damage(settings)
-    if found is not None:
-        raise HomeError(_unusable_database(settings, found))
+        damage = _damage(settings)
+    if damage is not None:
+        raise HomeError(_unusable_database(settings, damage))
 
 
 @contextmanager
@@ -95,11 +95,11 @@ def _unusable_files(settings: Settings, error: OSError) -> str:
     return f"files_url is {settings.files_url!r}, expected {expected}: {error.strerror or error}"
 
 
-def _unusable_database(settings: Settings, found: str) -> str:
+def _unusable_database(settings: Settings, damage: str) -> str:
     if settings.database_url is not None:
-        return f"the database of LIPSERVE_DATABASE_URL cannot be used: {found}"
+        return f"the database of LIPSERVE_DATABASE_URL cannot be used: {damage}"
     path = settings.home / FILE
     return (
-        f"the database {path} cannot be used: {found}. Where it is damaged, restore a copy of the home, or what "
+        f"the database {path} cannot be used: {damage}. Where it is damaged, restore a copy of the home, or what "
         f'can be read of it with `sqlite3 {path} ".recover"`; or set LIPSERVE_HOME to another folder'
     )

@@ -94,9 +94,9 @@ class Replicas:
 
     def _change(self, statement: Any, owner: str | None) -> bool:
         with self.database.session() as session:  # a single statement: it needs no lock of all writers
-            found = session.execute(statement.values(owner=owner).returning(JobRow.id)).all()
+            changed = session.execute(statement.values(owner=owner).returning(JobRow.id)).all()
             session.commit()
-        return bool(found)
+        return bool(changed)
 
     def _run(self) -> None:
         while not self._closing.wait(self.settings.replica_beat_s):

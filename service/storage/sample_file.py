@@ -128,7 +128,7 @@ class Reader:
             for name in ARRAYS:
                 parts[name].append(self.array(name, first, last)[index[at:to] - first])
             at = to
-        return {name: np.concatenate(found) if found else self.array(name, 0, 0) for name, found in parts.items()}
+        return {name: np.concatenate(arrays) if arrays else self.array(name, 0, 0) for name, arrays in parts.items()}
 
 
 def _shape(name: str, rows: int, n_joints: int) -> list[int]:

@@ -11,7 +11,7 @@ from time import perf_counter
 from starlette.types import Message, Receive, Send
 
 from service.foundation.settings import Settings
-from service.web.access.credentials import subprotocol_of
+from service.web.access.middleware import subprotocol_of
 from service.web.server.stream_protocol import StreamProtocol
 
 

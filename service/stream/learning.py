@@ -110,10 +110,10 @@ class Learning:
         try:
             while self._due():
                 block = self._take()
-                said = await self._learn(block)
+                outcome = await self._learn(block)
                 self._flushed.set()
                 if not self._ended:
-                    await self._say(json.dumps(said))
+                    await self._say(json.dumps(outcome))
         finally:
             self._task = None
             self._go_on()
@@ -132,13 +132,13 @@ class Learning:
         try:
             result = await self._learners.threads.run(self._hand_over, block)
         except ServiceError as error:
-            said = error
+            refusal = error
         except Exception as error:  # the next block may be logged
             known = translated(error)
             logger.error(
                 "error while stream %r was learnt from: %s", self._stream_id, error, exc_info=None if known else error
             )
-            said = known or ServiceError("an unexpected error; the service's log says more")
+            refusal = known or ServiceError("an unexpected error; the service's log says more")
         else:
             return {
                 "learnt": {
@@ -150,8 +150,8 @@ class Learning:
                 }
             }
         if self._ended:
-            logger.warning("frames %d to %d of stream %r are not learnt: %s", first, through, self._stream_id, said)
-        body = ErrorBody(code=said.code, message=said.message, detail=said.detail)
+            logger.warning("frames %d to %d of stream %r are not learnt: %s", first, through, self._stream_id, refusal)
+        body = ErrorBody(code=refusal.code, message=refusal.message, detail=refusal.detail)
         return {"refused": {"first": first, "through": through, "error": body.model_dump()}}
 
     def _hand_over(self, block: list[Taught]) -> FramesResult:
@@ -179,13 +179,13 @@ class Learning:
         """Times of arrival, Unix time in s, each later than the one before."""
         ticks = TICK * np.arange(1, len(block) + 1)
         arrived = np.array([each.arrived for each in block]) + self._clock
-        found: Array = np.maximum.accumulate(np.maximum(arrived - ticks, self._time)) + ticks
-        self._time = float(found[-1])
-        return found
+        times: Array = np.maximum.accumulate(np.maximum(arrived - ticks, self._time)) + ticks
+        self._time = float(times[-1])
+        return times
 
 
 def _columns(rows: list[bytes], count: int) -> Array:
     """Numbers of N rows with `count` vectors each, as one array (count, N, n) of its own."""
     numbers = np.frombuffer(b"".join(rows), NUMBER).reshape(len(rows), count, -1)
-    found: Array = np.array(numbers.transpose(1, 0, 2), np.float64, order="C")
-    return found
+    columns: Array = np.array(numbers.transpose(1, 0, 2), np.float64, order="C")
+    return columns

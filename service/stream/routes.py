@@ -13,10 +13,10 @@ from starlette.types import Receive, Scope, Send
 from uvicorn.protocols.utils import ClientDisconnected
 
 from service.foundation.errors import BusyError, NotFoundError, NotReadyError, invalid_request
-from service.inference import checks
+from service.inference.schema import one_choice
 from service.learning.learners import Learners
 from service.models.schema import ALIAS
-from service.models.waiting import reached
+from service.models.served import reached
 from service.stream.conversation import Conversation, Echo
 from service.stream.session import Session
 from service.web.server.stream_protocol import CONNECTION, StreamProtocol
@@ -28,12 +28,12 @@ PATH, ECHO_PATH = "/v1/models/{model}/stream", "/v1/echo/stream"
 def router() -> APIRouter:
     """Return the routes, which count their connections together."""
     streams = Streams()
-    found = APIRouter()
+    router = APIRouter()
     # objects, not functions: those Starlette would wrap in its own WebSocket
-    found.add_websocket_route(PATH, StreamRoute(streams), name="stream")  # type: ignore[arg-type]
-    found.add_websocket_route(ECHO_PATH, EchoRoute(streams), name="echo")  # type: ignore[arg-type]
-    found.add_websocket_route("/{path:path}", NoRoute(), name="no stream")  # type: ignore[arg-type]
-    return found
+    router.add_websocket_route(PATH, StreamRoute(streams), name="stream")  # type: ignore[arg-type]
+    router.add_websocket_route(ECHO_PATH, EchoRoute(streams), name="echo")  # type: ignore[arg-type]
+    router.add_websocket_route("/{path:path}", NoRoute(), name="no stream")  # type: ignore[arg-type]
+    return router
 
 
 class Streams:
@@ -137,12 +137,12 @@ def _parameters(query: bytes) -> Asked:
             min_revision = int(value)
         else:
             raise invalid_request(name, value, "no parameter but version, alias, std, stream_id and min_revision")
-    checks.one_choice(version, alias)
+    one_choice(version, alias)
     return Asked(version, alias, std, stream_id, min_revision)
 
 
 def _connection(scope: Scope) -> StreamProtocol:
-    found = scope.get("state", {}).get(CONNECTION)
-    if not isinstance(found, StreamProtocol):
+    connection = scope.get("state", {}).get(CONNECTION)
+    if not isinstance(connection, StreamProtocol):
         raise NotReadyError("streams need the server that `lipserve serve` starts")
-    return found
+    return connection

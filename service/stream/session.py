@@ -6,21 +6,76 @@ import json
 import logging
 from math import inf
 from time import perf_counter
+from typing import TYPE_CHECKING
 
+import numpy as np
 from anyio import to_thread
 from starlette.types import Message, Receive, Send
 
 from service.foundation.errors import ErrorBody, ErrorResponse, ServiceError, invalid_request
-from service.inference import checks
+from service.inference.predicting import Query, check_answer
 from service.learning.learners import Learners
 from service.models.loaded import Served
 from service.models.moves import SERVING
 from service.stream.conversation import Conversation
-from service.stream.frames import ANSWER, ASK_LEARN, ASK_STD, ERROR, HAS_STD, LATE, LAYOUT, REQUEST, UNREAD
+from service.stream.frames import (
+    ANSWER,
+    ASK_LEARN,
+    ASK_STD,
+    ERROR,
+    HAS_STD,
+    LATE,
+    LAYOUT,
+    NUMBER,
+    REQUEST,
+    UNREAD,
+    request_bytes,
+)
 from service.stream.learning import Learning, Taught
-from service.stream.reading import FrameReader
 from service.web.observability.meters import StreamMeter
 from service.web.server.stream_protocol import StreamProtocol
+
+if TYPE_CHECKING:
+    from lipcore.samples import Array
+
+
+class FrameReader:
+    """Reads frames of one robot into a single buffer, which the next frame overwrites."""
+
+    def __init__(self, joint_names: tuple[str, ...], max_position: float) -> None:
+        self.joint_names, self.n_joints, self.max_position = joint_names, len(joint_names), max_position
+        self.motion: Array = np.zeros((3, self.n_joints))
+        self._numbers, self._query = self.motion.reshape(-1), Query(self.motion[:, None], single=True)
+        self._length = request_bytes(self.n_joints)
+        self._learn_length = request_bytes(self.n_joints, learn=True)
+
+    def read(self, data: bytes, flags: int, n: int, budget: float) -> Array:
+        """Return q, dq, ddq of a frame, (3, n), whose header is already read; raise InvalidRequestError.
+
+        Torque that it carries must be there, and is not looked at.
+        """
+        if n != self.n_joints:
+            raise invalid_request("n", n, f"{self.n_joints} joints: {', '.join(self.joint_names)}")
+        if flags > ASK_STD:
+            data = self._without_torque(data, flags)
+        if len(data) != self._length:
+            raise invalid_request("frame", f"{len(data)} bytes long", f"{self._length} bytes for {n} joints")
+        if not 0.0 <= budget < inf:
+            raise invalid_request("deadline", budget, "seconds, or 0 for none")
+        # a copy, because the model takes aligned and writable memory, and the message is neither for certain
+        self._numbers[:] = np.frombuffer(data, NUMBER, offset=REQUEST.size)
+        self._query.check(self.max_position)
+        return self.motion
+
+    def _without_torque(self, data: bytes, flags: int) -> bytes:
+        if flags & ~(ASK_STD | ASK_LEARN):
+            expected = f"0, {ASK_STD} to be answered tau_std, {ASK_LEARN} to be learnt from, or {ASK_STD | ASK_LEARN}"
+            raise invalid_request("flags", flags, expected)
+        if len(data) != self._learn_length:
+            expected = f"{self._learn_length} bytes for {self.n_joints} joints with tau"
+            raise invalid_request("frame", f"{len(data)} bytes long", expected)
+        return data[: self._length]
+
 
 logger = logging.getLogger(__name__)
 
@@ -102,15 +157,15 @@ class Session(Conversation):
             if asked > ASK_STD:
                 await self._admit(sequence, asked)
             tau, std = self._answer(motion, self._std or asked != 0)
-            checks.answer("tau", tau)
+            check_answer("tau", tau)
             if std is not None:
-                checks.answer("tau_std", std)
+                check_answer("tau_std", std)
         except ServiceError as error:
             return self._refuse(sequence, flags, arrived, error)
         except Exception as error:  # the next frame may be answered
             logger.error("unexpected error in a stream of model %s", self._name, exc_info=error)
-            said = ServiceError("an unexpected error; the service's log says more")
-            return self._refuse(sequence, flags, arrived, said)
+            unexpected = ServiceError("an unexpected error; the service's log says more")
+            return self._refuse(sequence, flags, arrived, unexpected)
         served, numbers = self._served, tau.tobytes()
         if std is not None:
             flags = HAS_STD

@@ -15,14 +15,14 @@ from sqlalchemy import select
 
 from service import __version__
 from service.compute import remote
-from service.compute.cluster import Cluster
+from service.compute.cluster import Cluster, needs_gpu
 from service.compute.executors import ClusterUnavailableError, lost
+from service.compute.process import Slot
 from service.foundation.states import QUEUED
 from service.storage.database import JobRow
-from service.training import history, hosting
+from service.training import lifecycle
+from service.training.lifecycle import Ended, Hand
 from service.training.queue import JobQueue
-from service.training.slots import Slot
-from service.training.watch import Ended, Hand
 
 logger = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ class ClusterQueue(JobQueue):
     def _look_around(self) -> None:
         self._reconciled = -float("inf")
 
-    def _found(self, row: JobRow, ours: bool) -> None:
+    def _see_to(self, row: JobRow, ours: bool) -> None:
         """Watch a job that runs on some worker."""
         self._hands.append(Hand(row.id, None, None, time.monotonic(), away=True))
 
@@ -87,10 +87,10 @@ class ClusterQueue(JobQueue):
             row = session.scalar(select(JobRow).where(JobRow.id == job))
             if row is None or row.state != QUEUED or row.owner not in (None, self.replicas.id):
                 return None
-            gpu = hosting.needs_gpu(row.request)
-            said = f"waits for a worker of the cluster{' with a GPU' if gpu else ''}"
-            if not row.history or row.history[-1]["message"] != said:
-                history.enter(row, QUEUED, said)
+            gpu = needs_gpu(row.request)
+            message = f"waits for a worker of the cluster{' with a GPU' if gpu else ''}"
+            if not row.history or row.history[-1]["message"] != message:
+                lifecycle.enter(row, QUEUED, message)
             row.owner = self.replicas.id
         return gpu
 

@@ -57,8 +57,8 @@ class Feed:
             while not closing.is_set():
                 await changed.wait()
                 changed.clear()
-                if (found := self._rows.get(row.id)) is not None:
-                    yield found
+                if (row_now := self._rows.get(row.id)) is not None:
+                    yield row_now
         finally:
             self._followers[row.id].remove(changed)
             if not self._followers[row.id]:
@@ -68,11 +68,11 @@ class Feed:
     async def _read(self, closing: asyncio.Event) -> None:
         while self._followers and not closing.is_set():
             try:
-                found = await to_thread.run_sync(self._look, list(self._followers))
+                rows = await to_thread.run_sync(self._look, list(self._followers))
             except Exception:  # of the database: the next look may find it well again
                 logger.exception("jobs that are followed could not be read")
-                found = []
-            for row in found:
+                rows = []
+            for row in rows:
                 known = self._rows.get(row.id)
                 if row.id in self._followers and (known is None or _mark(known) != _mark(row)):
                     self._rows[row.id] = row

@@ -15,7 +15,7 @@ import numpy as np
 from lipcore.samples import Array
 from lipcore.splits import GUARD_S, Mask, Numbers, Parts, Split, SplitError, choose, split
 from service.foundation.errors import invalid_request
-from service.models.holdout_schema import HeldOutSet, Holdout, HoldoutLineage
+from service.models.schema import HeldOutSet, Holdout, HoldoutLineage
 from service.storage.database import DatasetRow
 
 UNTIMED_GUARD = 25.0
@@ -30,12 +30,12 @@ class CannotHoldOutError(ValueError):
 class SetSplit:
     """How one data set is split.
 
-    whole: nothing of it is learnt from; guard: in `unit`; known: rows held out and guarded where it was split before.
+    entire: nothing of it is learnt from; guard: in `unit`; known: rows held out and guarded where it was split before.
     """
 
     dataset: str
     asked: Holdout
-    whole: bool
+    entire: bool
     guard: float
     unit: Literal["s", "rows"]
     known: tuple[int, int] | None = None
@@ -49,18 +49,18 @@ class SetSplit:
     def parts(self, episode: Numbers, t: Array) -> Parts:
         """Split rows by their episodes and times, (N,) each; raise CannotHoldOutError, also where another split comes
         out than before."""
-        if self.whole:
-            found = Parts(np.zeros(len(t), dtype=bool), np.ones(len(t), dtype=bool))
+        if self.entire:
+            parts = Parts(np.zeros(len(t), dtype=bool), np.ones(len(t), dtype=bool))
         else:
             how = Split(self.asked.kind, self.asked.share, self.asked.blocks, self.guard, self.asked.seed)
             try:
-                found = split(episode, t if self.unit == "s" else np.arange(len(t), dtype=np.float64), how)
+                parts = split(episode, t if self.unit == "s" else np.arange(len(t), dtype=np.float64), how)
             except SplitError as error:
                 raise CannotHoldOutError(f"data set {self.dataset!r}: {error}") from error
-        counts = (int(np.count_nonzero(found.held_out)), found.guarded)
+        counts = (int(np.count_nonzero(parts.held_out)), parts.guarded)
         if self.known is not None and counts != self.known:
             raise CannotHoldOutError(f"data set {self.dataset!r} does not split as it did before")
-        return found
+        return parts
 
     def held_out(self, episode: Numbers, t: Array) -> Mask:
         """Rows that are held out, see `parts`."""
@@ -108,37 +108,37 @@ def hold_out(rows: Sequence[DatasetRow], clocks: Sequence[Clock], asked: Holdout
     single = {row.id for row, clock in zip(rows, clocks, strict=True) if len(np.unique(clock.episode)) < 2}
     if asked.kind != "episodes" or len(rows) == 1:
         single = set()
-    whole = _whole([row for row in rows if row.id in single], asked) if len(single) > 1 else set()
+    entire = _entire([row for row in rows if row.id in single], asked) if len(single) > 1 else set()
     splits = {}
     for row in rows:
-        if row.id in whole or row.id not in single:  # else the one episode that it has is learnt from
-            splits[row.id] = _first(row, asked, row.id in whole)
+        if row.id in entire or row.id not in single:  # else the one episode that it has is learnt from
+            splits[row.id] = _first(row, asked, row.id in entire)
     return _divide(rows, clocks, splits)
 
 
 def hold_out_again(rows: Sequence[DatasetRow], clocks: Sequence[Clock], lineage: dict[str, Any]) -> Divided:
     """Divide data sets of a version as they were for it, by its lineage; raise CannotHoldOutError."""
-    found = {row.id: remembered(row, lineage) for row in rows}
-    return _divide(rows, clocks, {name: each for name, each in found.items() if each is not None})
+    splits = {row.id: remembered(row, lineage) for row in rows}
+    return _divide(rows, clocks, {name: each for name, each in splits.items() if each is not None})
 
 
 def remembered(row: DatasetRow, lineage: dict[str, Any]) -> SetSplit | None:
     """How a version's data set was split, or the same samples uploaded another time; None where nothing of it was held
     out."""
-    if (found := lineage.get("holdout")) is None:
+    if (record := lineage.get("holdout")) is None:
         return None
-    said = HoldoutLineage.model_validate(found)
-    for each in sorted(said.datasets, key=lambda one: one.id != row.id):  # itself first
+    holdout = HoldoutLineage.model_validate(record)
+    for each in sorted(holdout.datasets, key=lambda one: one.id != row.id):  # itself first
         if row.id == each.id or row.sha256 == each.sha256:
             counts = (each.rows, each.guarded)
-            return SetSplit(row.id, said.split, each.whole, each.guard, each.guard_unit, counts)
+            return SetSplit(row.id, holdout.split, each.whole, each.guard, each.guard_unit, counts)
     return None
 
 
 def _divide(rows: Sequence[DatasetRow], clocks: Sequence[Clock], splits: dict[str, SetSplit]) -> Divided:
     train: list[Mask | None] = []
     held: list[Mask | None] = []
-    said: list[HeldOutSet] = []
+    sets: list[HeldOutSet] = []
     for row, clock in zip(rows, clocks, strict=True):
         how = splits.get(row.id)
         if how is None:
@@ -148,36 +148,36 @@ def _divide(rows: Sequence[DatasetRow], clocks: Sequence[Clock], splits: dict[st
         parts = how.parts(clock.episode, clock.t)
         train.append(parts.train)
         held.append(parts.held_out)
-        said.append(
+        sets.append(
             HeldOutSet(
                 id=row.id,
                 sha256=row.sha256,
-                whole=how.whole,
+                whole=how.entire,
                 guard=how.guard,
                 guard_unit=how.unit,
                 rows=int(np.count_nonzero(parts.held_out)),
                 guarded=parts.guarded,
             )
         )
-    if not said:
+    if not sets:
         return Divided(train, held, None)
     asked = next(iter(splits.values())).asked
-    total = {name: sum(getattr(each, name) for each in said) for name in ("rows", "guarded")}
-    return Divided(train, held, HoldoutLineage(split=asked, datasets=said, **total))
+    total = {name: sum(getattr(each, name) for each in sets) for name in ("rows", "guarded")}
+    return Divided(train, held, HoldoutLineage(split=asked, datasets=sets, **total))
 
 
-def _first(row: DatasetRow, asked: Holdout, whole: bool) -> SetSplit:
+def _first(row: DatasetRow, asked: Holdout, entire: bool) -> SetSplit:
     """How a data set is split that was not split before."""
     if not _is_timed(row):
-        return SetSplit(row.id, asked, whole, UNTIMED_GUARD, "rows")
+        return SetSplit(row.id, asked, entire, UNTIMED_GUARD, "rows")
     guard = asked.guard_s
     if guard is None:  # one period of the low-pass that it was prepared with, where it says so
         cutoff = (row.report.get("recipe") or {}).get("cutoff_hz")
         guard = GUARD_S if cutoff is None else 1.0 / float(cutoff)
-    return SetSplit(row.id, asked, whole, guard, "s")
+    return SetSplit(row.id, asked, entire, guard, "s")
 
 
-def _whole(rows: Sequence[DatasetRow], asked: Holdout) -> set[str]:
+def _entire(rows: Sequence[DatasetRow], asked: Holdout) -> set[str]:
     """Ids of those data sets of one episode that are held out as a whole."""
     ordered = sorted(rows, key=lambda row: row.sha256)
     chosen = choose(np.array([row.rows for row in ordered]), asked.share, asked.seed)

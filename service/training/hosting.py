@@ -1,34 +1,42 @@
-"""What a worker of the cluster does with a job: run a training process for it, and end that where it has to be.
+"""A worker of a Dask cluster: it joins, joins again after the scheduler was away, runs jobs, and leaves in order.
 
-A thread of the worker could not be ended; a process can, and ends with its worker. The rules are those of one machine,
-see `watch`. The outcome is written to the job's row: nothing of it travels.
+For each job it runs a training process, and ends that where it has to be: a thread of the worker could not be ended; a
+process can, and ends with its worker. The rules are those of one machine, see `lifecycle`. The outcome is written to
+the job's row: nothing of it travels. Needs the extra `cluster`.
 """
 
 from __future__ import annotations
 
+import asyncio
 import logging
+import signal
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from typing import Any, TypeVar
 
+import dask
+import distributed
 from sqlalchemy import select
+from sqlalchemy.exc import SQLAlchemyError
 
 from service import __version__
-from service.compute.executors import placed
-from service.compute.process import training_place
+from service.compute import executors
+from service.compute.cluster import GPU, JOB, needs_gpu
+from service.compute.executors import GPU_SHARD, SHARD, placed
+from service.compute.process import Slot, training_place
+from service.foundation.errors import ServiceError
 from service.foundation.settings import Settings
 from service.foundation.states import ACTIVE, CANCELLED, QUEUED, RUNNING
 from service.storage.database import Database, JobRow
 from service.storage.files import Files
-from service.training import history, leftovers, worker
-from service.training.settling import Settler
-from service.training.slots import Slot
-from service.training.watch import Ended, Facts, Hand
+from service.training import lifecycle, worker
+from service.training.lifecycle import Ended, Facts, Hand, Settler
 
 T = TypeVar("T")
 logger = logging.getLogger(__name__)
@@ -45,11 +53,6 @@ _stopping = threading.Event()
 
 class VersionsDifferError(RuntimeError):
     """The service and the worker are of different versions."""
-
-
-def needs_gpu(request: dict[str, Any]) -> bool:
-    """Whether a job has to run on a worker with a GPU."""
-    return bool(request.get("options", {}).get("device") == "cuda")
 
 
 def host(version: str, job: str) -> None:
@@ -173,8 +176,8 @@ class Host:
 
     def _row(self, job: str) -> JobRow | None:
         with self.database.session() as session:
-            found: JobRow | None = session.scalar(select(JobRow).where(JobRow.id == job))
-        return found
+            row: JobRow | None = session.scalar(select(JobRow).where(JobRow.id == job))
+        return row
 
     def _hand_back(self, job: str, attempt: int) -> None:
         with self.database.transaction() as session:
@@ -182,11 +185,11 @@ class Host:
             if row is None or row.state != RUNNING or row.attempts != attempt:
                 return
             if row.cancel_requested:
-                history.enter(row, CANCELLED, "cancelled: its worker was stopped while it ran")
+                lifecycle.enter(row, CANCELLED, "cancelled: its worker was stopped while it ran")
             else:
                 row.attempts -= 1  # handed back in order: such a start is no failed attempt
-                history.enter(row, QUEUED, "its worker was stopped while it ran: queued again")
-        leftovers.remove(self.database, self.files, job)
+                lifecycle.enter(row, QUEUED, "its worker was stopped while it ran: queued again")
+        lifecycle.remove_leftovers(self.database, self.files, job)
 
     def _settle(self, ended: Ended) -> None:
         self._patiently(lambda: self.settler.settle(ended))
@@ -200,3 +203,88 @@ class Host:
                 logger.warning("the database could not be used: tried again", exc_info=True)
                 if _stopping.wait(AGAIN_S):
                     return None
+
+
+THREADS = 2
+"""Of a worker: one waits for the process of a job, one computes a shard."""
+REJOIN_S = 2.0
+"""Seconds after which a worker that has lost its scheduler tries to join again."""
+STOP_S = 10.0
+"""Longest wait in s for the end of a job when a worker stops: it is handed back."""
+WRITE_S = 10.0
+"""Longest wait in s for the database when a worker starts."""
+
+
+class CannotJoinError(RuntimeError):
+    """A worker lacks what it needs; the message says what."""
+
+
+def check_storage(settings: Settings) -> None:
+    """See that the database and the files can be used, before anything is asked of a worker. Raise CannotJoinError."""
+    try:
+        settings.home.mkdir(parents=True, exist_ok=True)
+        database = Database.of(settings, WRITE_S)
+        try:
+            database.adapter.check(WRITE_S)
+        finally:
+            database.close()
+        Files.of(settings).try_out()
+    except (OSError, RuntimeError, SQLAlchemyError, ServiceError) as error:
+        raise CannotJoinError(f"the worker cannot start: {getattr(error, 'orig', None) or error}") from None
+
+
+def join(settings: Settings, gpus: int = 0, name: str | None = None) -> None:
+    """Be a worker until SIGTERM or SIGINT. gpus: that it has; name: in the cluster, its address where None."""
+    assert settings.cluster is not None
+    executors.place(settings)
+    resources: dict[str, float] = {JOB: 1, SHARD: 1, **({GPU: gpus, GPU_SHARD: gpus} if gpus else {})}
+    asyncio.run(_work(settings, settings.cluster, resources, name))
+
+
+class _Worker(distributed.Worker):
+    async def close(self, *given: Any, **options: Any) -> Any:  # threads of jobs see to their end themselves
+        return await super().close(*given, **{**options, "executor_wait": False})
+
+
+async def _work(settings: Settings, scheduler: str, resources: dict[str, float], name: str | None) -> None:
+    """Be a worker until told to stop; what runs goes on while the scheduler is away."""
+    stopped = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
+    stopping = asyncio.create_task(stopped.wait())
+    while not stopped.is_set():
+        joined = asyncio.create_task(_be_member(settings, scheduler, resources, name))
+        await asyncio.wait({joined, stopping}, return_when=asyncio.FIRST_COMPLETED)
+        if stopped.is_set():
+            await asyncio.to_thread(stop, STOP_S)
+            joined.cancel()
+            with suppress(asyncio.CancelledError):
+                await joined
+            return
+        if (error := joined.exception()) is not None:
+            logger.warning("the cluster could not be joined: %s", error)
+        logger.warning("the scheduler %s is gone: joined again once it is there", scheduler)
+        with suppress(TimeoutError):
+            await asyncio.wait_for(stopped.wait(), REJOIN_S)
+
+
+async def _be_member(settings: Settings, scheduler: str, resources: dict[str, float], name: str | None) -> None:
+    """Be a member of the cluster until the scheduler is gone or this is cancelled."""
+    logging.getLogger("distributed").setLevel(logging.WARNING)  # importing it has set another one
+    options = {"distributed.worker.profile.enabled": False, "distributed.worker.daemon": False}
+    with dask.config.set(options):
+        member = _Worker(
+            scheduler,
+            nthreads=THREADS,
+            resources=resources,
+            name=name,
+            memory_limit=0,  # results are few; a container's limit is the one that counts
+            local_directory=str(settings.home / "dask"),
+        )
+        try:
+            await member
+            logger.info("worker %s has joined %s with %s", member.name, scheduler, resources)
+            finished: Any = member.finished  # its module is typed in part
+            await finished()
+        finally:
+            await member.close(timeout=2)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
@@ -19,14 +19,12 @@ from service.models.loaded import LoadedModels
 from service.robots import store as robots
 from service.storage.database import Database, DatasetRow, JobRow, RobotRow, now
 from service.storage.files import new_id
-from service.training import history, holding_out
+from service.training import holding_out, lifecycle
+from service.training.queue import JobQueue
 from service.training.schema import Job, JobPage, JobRequest, Options
 from service.web.idempotency import Identity, done, mark
-from service.web.observability.context import request_id
+from service.web.observability.logs import request_id
 from service.web.pagination import Page, newest
-
-if TYPE_CHECKING:  # the service learns online too, and that queues jobs
-    from service.training.queue import JobQueue
 
 USUAL_WAIT_S, LONGEST_WAIT_S = 30, 3600
 """Seconds after which who finds the queue full may try again: where nothing is known of the jobs that run, and most."""
@@ -51,8 +49,8 @@ def create(queue: JobQueue, request: JobRequest, retry_of: str | None = None, na
     with queue.database.transaction() as session:
         if (row := done(session, JobRow, named)) is not None:  # the same request was faster on another connection
             return shown(row)
-        wanted = {**request.model_dump(mode="json"), "joint_types": joint_types}
-        job = add(session, queue.settings, request.model, wanted, retry_of, named)
+        content = {**request.model_dump(mode="json"), "joint_types": joint_types}
+        job = add(session, queue.settings, request.model, content, retry_of, named)
         present = set(session.scalars(select(DatasetRow.id).where(DatasetRow.id.in_(request.datasets))))
         for dataset in request.datasets:
             if dataset not in present:  # deleted since it was checked
@@ -99,7 +97,7 @@ def add(
         request_id=request_id.get(),
     )
     mark(job, named)
-    history.enter(job, QUEUED, "queued" if retry_of is None else f"queued to repeat job {retry_of}")
+    lifecycle.enter(job, QUEUED, "queued" if retry_of is None else f"queued to repeat job {retry_of}")
     session.add(job)
     return job
 
@@ -149,9 +147,9 @@ def cancel(queue: JobQueue, job: str) -> Job:
         if row.state not in ACTIVE:
             raise ConflictError(f"job {job!r} has {row.state} already")
         if row.state == QUEUED:
-            history.enter(row, CANCELLED, "cancelled while it waited")
+            lifecycle.enter(row, CANCELLED, "cancelled while it waited")
         elif not row.cancel_requested:
-            history.enter(row, RUNNING, "asked to end")
+            lifecycle.enter(row, RUNNING, "asked to end")
         row.cancel_requested = True
     return shown(row)
 
@@ -166,7 +164,7 @@ def _check_joints(request: JobRequest, rows: list[DatasetRow]) -> list[str]:
                 expected = f"the {what} of datasets[0], {getattr(first, what)}"
                 raise invalid_request(f"datasets[{index}]", f"a data set with {getattr(row, what)}", expected)
     n = len(first.joint_names)
-    known = next((found for row in rows if (found := row.report.get("joint_types")) is not None), ["revolute"] * n)
+    known = next((each for row in rows if (each := row.report.get("joint_types")) is not None), ["revolute"] * n)
     types: list[str] = list(known if request.joint_types is None else request.joint_types)
     if len(types) != n:
         raise invalid_request("joint_types", f"{len(types)} types", f"{n}, one a joint: {', '.join(first.joint_names)}")
@@ -196,32 +194,6 @@ def _check_options(options: Options, settings: Settings) -> None:
 
 
 def shown(row: JobRow) -> Job:
-    """A job as the API shows it."""
-    return Job.model_validate(
-        {
-            "estimator": row.request["estimator"],
-            "robot": row.request.get("robot"),
-            "datasets": row.request["datasets"],
-            "holdout": row.request.get("holdout"),
-            "refresh": row.request.get("refresh"),
-            **{
-                name: getattr(row, name)
-                for name in (
-                    "id",
-                    "state",
-                    "model",
-                    "progress",
-                    "attempts",
-                    "version",
-                    "error",
-                    "created_at",
-                    "started_at",
-                    "heartbeat_at",
-                    "finished_at",
-                    "history",
-                    "retry_of",
-                    "request_id",
-                )
-            },
-        }
-    )
+    """A job as the API shows it: columns of its row, and what its request says."""
+    fields = {name: getattr(row, name, row.request.get(name)) for name in Job.model_fields}
+    return Job.model_validate(fields)

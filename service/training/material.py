@@ -16,14 +16,12 @@ from lipcore.urdf import RigidBody
 from lipcore.vocabulary import TorqueConvention
 from service.foundation.settings import Settings
 from service.journal import log
-from service.models.holdout_schema import Holdout, HoldoutLineage
 from service.models.lineage import named
+from service.models.schema import Holdout, HoldoutLineage
 from service.robots import store as robots
 from service.storage.database import Database, DatasetRow, VersionRow
 from service.storage.files import Files
-from service.training import holding_out
-from service.training import refresh_material as material
-from service.training import refresh_scope as scope
+from service.training import holding_out, refresh_data
 from service.training.holding_out import Divided
 from service.training.rows import CANDIDATES, Part, Table, opened
 
@@ -91,26 +89,26 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
     with database.session() as session:
         version = session.get_one(VersionRow, (model, refresh["version"]))
         seen = log.newest(session, model)
-        within = scope.find(session, model, refresh["through"])
-        rows, left_out = scope.split(session, within, version.manifest["lineage"])
+        within = refresh_data.scope_of(session, model, refresh["through"])
+        rows, left_out = refresh_data.split_datasets(session, within, version.manifest["lineage"])
     rows = [row for row in rows if row.id in request["datasets"]]  # what may be deleted meanwhile was not promised
     base = files.load_version(version.folder, version.checksums)
-    logged = material.read(
+    logged = refresh_data.read_log(
         database, model, base.joint_names, within, settings.max_refresh_samples, settings.max_time_gap_s
     )
     parts = opened(files, rows)
     divided = holding_out.hold_out_again(rows, [part.clock() for part in parts], version.manifest["lineage"])
     table = _learnt([replace(part, factor=_aged(part.row, within)) for part in parts], divided)
-    if not table.parts and logged.found < settings.min_samples:
-        raise NothingToLearnError(f"the log has {logged.found} rows to train on, expected {settings.min_samples}")
-    log_lineage: dict[str, Any] = {"through": within.through, "rows": 0, "found": logged.found}
+    if not table.parts and logged.rows < settings.min_samples:
+        raise NothingToLearnError(f"the log has {logged.rows} rows to train on, expected {settings.min_samples}")
+    log_lineage: dict[str, Any] = {"through": within.through, "rows": 0, "found": logged.rows}
     weighted = None
-    if (found := logged.samples) is not None:
-        span = {"first": float(found.t.min()), "last": float(found.t.max())}
-        log_lineage |= {"rows": len(found), **span}
-        ages = material.weights(found.t, within)
-        counted = spacing.recorded(found.t, found.episode)
-        weighted = found, counted if ages is None else counted * ages
+    if (samples := logged.samples) is not None:
+        span = {"first": float(samples.t.min()), "last": float(samples.t.max())}
+        log_lineage |= {"rows": len(samples), **span}
+        ages = refresh_data.age_weights(samples.t, within)
+        counted = spacing.recorded(samples.t, samples.episode)
+        weighted = samples, counted if ages is None else counted * ages
     return Material(
         *_candidates(table, logged.samples),
         table,
@@ -157,16 +155,16 @@ def _candidates(table: Table, logged: Samples | None) -> tuple[Samples, Samples 
     return Samples.concatenate(parts), Samples.concatenate(stretches) if many else None
 
 
-def _aged(row: DatasetRow, within: scope.Scope) -> float:
+def _aged(row: DatasetRow, within: refresh_data.Scope) -> float:
     """What a data set's samples count where the model forgets: their age counts from their upload."""
-    found = material.weights(np.array([datetime.fromisoformat(row.created_at).timestamp()]), within)
-    return 1.0 if found is None else float(found[0])
+    weights = refresh_data.age_weights(np.array([datetime.fromisoformat(row.created_at).timestamp()]), within)
+    return 1.0 if weights is None else float(weights[0])
 
 
 def _datasets(database: Database, names: list[str]) -> list[DatasetRow]:
     with database.session() as session:
-        found = {row.id: row for row in session.scalars(select(DatasetRow).where(DatasetRow.id.in_(names)))}
-    return [found[name] for name in names]
+        rows = {row.id: row for row in session.scalars(select(DatasetRow).where(DatasetRow.id.in_(names)))}
+    return [rows[name] for name in names]
 
 
 def _holdout(lineage: HoldoutLineage | None) -> dict[str, Any]:

@@ -13,8 +13,7 @@ from sqlalchemy.orm import Session
 from service.foundation.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, PartState
 from service.storage.database import Database, JobRow
 from service.training.queue import JobQueue
-from service.web.observability.meters import Durations
-from service.web.observability.metric import MetricKind
+from service.web.observability.meters import Durations, MetricKind
 from service.web.observability.readiness import Lasting
 
 JOBS = MetricKind("gauge", "lipserve_jobs", "Training jobs that wait or run now", ("state",))

@@ -21,17 +21,15 @@ from fastapi import Depends, Request
 from sqlalchemy import select
 
 from service.compute.cluster import Cluster
-from service.compute.process import training_place
+from service.compute.process import Slot, training_place
 from service.foundation.settings import Settings
 from service.foundation.states import ACTIVE, CANCELLED, QUEUED, RUNNING
 from service.storage.database import JobRow
 from service.storage.replicas import Replicas
 from service.storage.storage import Storage
-from service.training import history, worker
+from service.training import lifecycle, worker
 from service.training.feed import Feed
-from service.training.settling import Settled, Settler, queue_again
-from service.training.slots import Slot
-from service.training.watch import Ended, Facts, Hand
+from service.training.lifecycle import Ended, Facts, Hand, Settled, Settler, queue_again
 
 logger = logging.getLogger(__name__)
 
@@ -117,10 +115,10 @@ class JobQueue:
                 if not self.replicas.mine(row.owner):
                     continue
                 if row.cancel_requested:
-                    history.enter(row, CANCELLED, "cancelled: the service was stopped while it ran")
+                    lifecycle.enter(row, CANCELLED, "cancelled: the service was stopped while it ran")
                     continue
                 row.attempts -= 1  # handed back in order: such a start is no failed attempt
-                history.enter(row, QUEUED, "the service was stopped while it ran: queued again")
+                lifecycle.enter(row, QUEUED, "the service was stopped while it ran: queued again")
 
     def _is_ready(self, row: JobRow) -> bool:
         if row.state == QUEUED and not row.cancel_requested:
@@ -197,13 +195,13 @@ class JobQueue:
         jobs = [hand.job for hand in self._hands]
         with self.database.session() as session:
             rows = session.execute(select(JobRow.id, JobRow.owner, *columns).where(JobRow.id.in_(jobs)))
-            found = {
-                job: Facts(state, heard, cancel, attempts, self.replicas.mine(owner))
-                for job, owner, state, heard, cancel, attempts in rows
+            facts = {
+                job: Facts(state, beat, cancel, attempts, self.replicas.mine(owner))
+                for job, owner, state, beat, cancel, attempts in rows
             }
         for hand in self._hands:
-            if hand.job in found:
-                hand.see(found[hand.job], clock)
+            if hand.job in facts:
+                hand.see(facts[hand.job], clock)
             if hand.ran is not None:
                 self.problem = None
 
@@ -241,7 +239,7 @@ class JobQueue:
             if row.state == QUEUED:
                 self.submit(row.id)
             else:
-                self._found(row, ours)
+                self._see_to(row, ours)
 
     def _may_have(self, row: JobRow) -> bool:
         """Whether a job that nobody has, or one who is gone, can be this service's."""
@@ -249,7 +247,7 @@ class JobQueue:
             return True  # it is taken when it is handed out
         return self.replicas.take(row.id, row.owner)
 
-    def _found(self, row: JobRow, ours: bool) -> None:
+    def _see_to(self, row: JobRow, ours: bool) -> None:
         """See to a job that runs, but not in a process of this service. ours: not taken over just now."""
         if not ours:
             self._pass_on(Ended(row.id, "ended", "the service that had it run is gone"))
@@ -302,8 +300,8 @@ def queue_of(settings: Settings) -> type[JobQueue]:
 
 
 async def _queue(request: Request) -> JobQueue:
-    found: JobQueue = request.app.state.jobs
-    return found
+    queue: JobQueue = request.app.state.jobs
+    return queue
 
 
 JobQueueDep = Annotated[JobQueue, Depends(_queue)]

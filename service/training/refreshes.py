@@ -1,4 +1,5 @@
-"""Refreshes: jobs that train the version that serves anew, on its data sets and on what was observed since."""
+"""Refreshes, which train the version that serves anew on its data sets and on what was observed since, and repeats of
+jobs that failed or were cancelled."""
 
 from __future__ import annotations
 
@@ -7,15 +8,15 @@ from typing import Literal
 from sqlalchemy import Select, select
 from sqlalchemy.orm import Session
 
-from service.foundation.errors import ConflictError, not_found
+from service.foundation.errors import ConflictError, NotFoundError, not_found
 from service.foundation.settings import Settings
-from service.foundation.states import ACTIVE
+from service.foundation.states import ACTIVE, CANCELLED, FAILED
 from service.journal import log
 from service.models import registry
 from service.storage.database import JobRow, VersionRow
-from service.training import jobs, refresh_scope
+from service.training import jobs, refresh_data
 from service.training.queue import JobQueue
-from service.training.schema import Job
+from service.training.schema import Job, JobRequest
 from service.web.idempotency import Identity, done
 
 Trigger = Literal["novelty", "linearisation", "asked"]
@@ -58,9 +59,9 @@ def add(
     for job in session.scalars(of(model).where(JobRow.state.in_(ACTIVE))):
         raise ConflictError(f"job {job.id!r} refreshes model {model!r} already: wait for its end or cancel it")
     through = log.newest(session, model)
-    found = refresh_scope.find(session, model, through)
-    kept, left_out = refresh_scope.split(session, found, manifest["lineage"])
-    rows = refresh_scope.rows(session, model, found)
+    scope = refresh_data.scope_of(session, model, through)
+    kept, left_out = refresh_data.split_datasets(session, scope, manifest["lineage"])
+    rows = refresh_data.rows_within(session, model, scope)
     if not kept and rows < settings.min_samples:
         raise ConflictError(_nothing(version, rows, left_out, settings.min_samples))
     made_by = None if version.job is None else session.scalar(select(JobRow).where(JobRow.id == version.job))
@@ -88,3 +89,27 @@ def of(model: str) -> Select[JobRow]:
     """Jobs that refresh a model."""
     refreshed = JobRow.request["refresh"]["version"].as_integer()
     return select(JobRow).where(JobRow.model == model, refreshed.is_not(None))
+
+
+def retry(queue: JobQueue, job: str, named: Identity | None = None) -> Job:
+    """Queue a job that repeats one that failed or was cancelled; a refresh starts from what serves and is known now.
+
+    named: the request, which is not done again where it was before.
+    Raise NotFoundError, ConflictError where the job has not failed or what it needs is no longer there,
+    InvalidRequestError where a limit has become lower since, BusyError for a full queue.
+    """
+    row = jobs.find(queue.database, job)
+    if (before := jobs.done_before(queue.database, named)) is not None:
+        return before
+    if row.state not in (FAILED, CANCELLED):
+        raise ConflictError(f"job {job!r} is {row.state}: only one that has failed or was cancelled can be repeated")
+    try:
+        again = row.request.get("refresh")
+        if again is not None:
+            return ask(queue, row.model, again["trigger"], row.id, named)
+        request = JobRequest.model_validate(
+            {name: row.request[name] for name in JobRequest.model_fields if name in row.request}  # older ones lack some
+        )
+        return jobs.create(queue, request, retry_of=row.id, named=named)
+    except NotFoundError as error:
+        raise ConflictError(f"job {job!r} cannot be repeated: {error.message}") from None

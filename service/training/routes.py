@@ -1,10 +1,13 @@
-"""Routes of training jobs."""
+"""A job's changes as server-sent events."""
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterable
+import asyncio
+from collections.abc import AsyncIterable, AsyncIterator
+from typing import Annotated
 
-from fastapi import APIRouter, Response, status
+from anyio import to_thread
+from fastapi import APIRouter, Depends, Response, status
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from service.foundation.errors import (
@@ -15,14 +18,54 @@ from service.foundation.errors import (
     TooLargeError,
     responses,
 )
-from service.models.loaded import LoadedModelsDep
-from service.training import events, jobs, retrying
-from service.training.queue import JobQueueDep
+from service.foundation.states import ACTIVE
+from service.models.loaded import LoadedModels, LoadedModelsDep
+from service.storage.database import JobRow
+from service.training import jobs, refreshes
+from service.training.queue import JobQueue, JobQueueDep
 from service.training.schema import Job, JobPage, JobRequest
 from service.web.idempotency import KeyHeader, identity
-from service.web.limits.stopping import StoppingDep
+from service.web.observability.readiness import StoppingDep
 from service.web.pagination import PageQuery
 from service.web.route import Route
+
+
+def _row(queue: JobQueueDep, job: str) -> JobRow:
+    return jobs.find(queue.database, job)
+
+
+async def _followed(queue: JobQueueDep, row: Annotated[JobRow, Depends(_row)]) -> AsyncIterator[JobRow]:
+    """The job at the start; one more is counted while the answer lasts."""
+    with queue.feed.one_more(queue.settings.max_job_followers):
+        yield row
+
+
+FollowedDep = Annotated[JobRow, Depends(_followed)]
+
+
+async def _events(
+    queue: JobQueue, loaded: LoadedModels, closing: asyncio.Event, row: JobRow
+) -> AsyncIterator[ServerSentEvent]:
+    """`state` with the job as it is; then `state` or `progress`, each with the whole job; ends with the job."""
+    last: JobRow | None = None
+    async for now in queue.feed.follow(row, closing):
+        kind = None if last is None else _kind(last, now)
+        if last is not None and kind is None:
+            continue
+        if now.version is not None:  # who sees it succeed is answered by its version from then on
+            await to_thread.run_sync(loaded.announce, [now.model])
+        yield ServerSentEvent(event=kind or "state", data=jobs.shown(now))
+        if now.state not in ACTIVE:
+            return
+        last = now
+
+
+def _kind(before: JobRow, now: JobRow) -> str | None:
+    """What has changed, None where nothing has that a reader would care for."""
+    if (before.state, before.history) != (now.state, now.history):
+        return "state"
+    return "progress" if before.progress != now.progress else None
+
 
 router = APIRouter(
     prefix="/v1/jobs", tags=["training jobs"], responses=responses(InvalidRequestError), route_class=Route
@@ -62,12 +105,12 @@ def show(queue: JobQueueDep, loaded: LoadedModelsDep, job: str) -> Job:
     responses=responses(NotFoundError, BusyError),
 )
 async def follow(
-    queue: JobQueueDep, loaded: LoadedModelsDep, stopping: StoppingDep, row: events.FollowedDep
+    queue: JobQueueDep, loaded: LoadedModelsDep, stopping: StoppingDep, row: FollowedDep
 ) -> AsyncIterable[ServerSentEvent]:
     """Server-sent events, each with the whole job as its data: `state` at the start, at every entry of its history and
     at its end; `progress` in between, about twice a second. The answer ends with the job, or when the service stops:
     ask again then, the first event says how it stands."""
-    async for event in events.events(queue, loaded, stopping.closing, row):
+    async for event in _events(queue, loaded, stopping.closing, row):
         yield event
 
 
@@ -85,6 +128,6 @@ def cancel(queue: JobQueueDep, job: str) -> Job:
 )
 def retry(queue: JobQueueDep, job: str, response: Response, idempotency_key: KeyHeader = None) -> Job:
     """Queue a new job with the same request; `retry_of` names the old one. What it needs must still be there."""
-    again = retrying.retry(queue, job, identity(idempotency_key, "retry", job))
+    again = refreshes.retry(queue, job, identity(idempotency_key, "retry", job))
     response.headers["Location"] = f"/v1/jobs/{again.id}"
     return again

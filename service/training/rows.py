@@ -80,7 +80,7 @@ class Part:
         numbered = np.concatenate([np.zeros(min(1, len(index)), np.int64), np.cumsum(begins, dtype=np.int64)])
         return Samples(joint_names=tuple(self.row.joint_names), episode=numbered, **values)
 
-    def worth(self) -> float:
+    def independent_rows(self) -> float:
         """Independent samples that its rows count for."""
         if not self.timed:
             return self.factor * len(self)
@@ -109,13 +109,13 @@ class Table:
 
     def take(self, index: Numbers) -> Samples:
         """Chosen rows, at least one; index: rising."""
-        found, before = [], 0
+        parts, before = [], 0
         for part in self.parts:
             places = index[(index >= before) & (index < before + len(part))] - before
             before += len(part)
             if len(places):
-                found.append(part.take(places))
-        return Samples.concatenate(found)
+                parts.append(part.take(places))
+        return Samples.concatenate(parts)
 
     def thinned(self, most: int) -> Samples:
         """All rows, or of more than `most` so many, evenly."""
@@ -127,9 +127,9 @@ class Table:
         index = np.unique(begins[:, None] + np.arange(STRETCH))
         return self.take(index[index < len(self)])
 
-    def worth(self) -> float:
+    def independent_rows(self) -> float:
         """Independent samples that all rows count for."""
-        return sum(part.worth() for part in self.parts)
+        return sum(part.independent_rows() for part in self.parts)
 
     def weighed(self, most: int) -> Table:
         """The table with what rows without times count: nobody knows how fast they were recorded, and so those of one

@@ -9,8 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from lipcore.fit_options import MOST_SECONDS, FitOptions, GeometryOption, Standing
 from lipcore.vocabulary import AUTO, CHOICES, DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS, JointType
 from service.foundation.states import JobState
-from service.models.holdout_schema import Holdout
-from service.models.schema import ModelName
+from service.models.schema import Holdout, ModelName
 
 _DEFAULTS = FitOptions()
 

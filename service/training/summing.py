@@ -63,7 +63,7 @@ def all_rows(
     Raise FitCancelledError when `cancelled` says so.
     """
     gpu = options.device == "cuda"
-    found: Told | None = None
+    total: Told | None = None
     shards = table.shards()
     if shards:
         progress(0.0)
@@ -71,12 +71,12 @@ def all_rows(
         with shard_executor(settings, gpu) as executor:
             work = partial(shard_told, context)
             done = partial(_report, progress, len(table) / material.rows, len(shards))
-            found = summed(executor, work, shards, cancelled, done=done)
+            total = summed(executor, work, shards, cancelled, done=done)
     if material.logged is not None:
         logged = told(Summing.of(model.posterior), *material.logged, cancelled)
-        found = logged if found is None else found + logged
-    assert found is not None  # a job has samples
-    return conditioned(model, found, material.rows)
+        total = logged if total is None else total + logged
+    assert total is not None  # a job has samples
+    return conditioned(model, total, material.rows)
 
 
 def shard_told(context: Context, shard: Shard) -> Told:

@@ -23,16 +23,14 @@ from service.models.lineage import figures, software, training_metrics
 from service.storage.database import Database, JobRow, LearnerRow, now
 from service.storage.disk import Disk
 from service.storage.files import PATIENCE_S, Files
-from service.training import history, leftovers
-from service.training import refresh_scope as scope
+from service.training import lifecycle, refresh_data
 from service.training.holding_out import CannotHoldOutError
 from service.training.material import Material, observed, recorded
-from service.training.pulse import Pulse, SupersededError
-from service.training.remaining import Remaining
+from service.training.pulse import Pulse, Remaining, SupersededError
 from service.training.rows import CANDIDATES
 from service.training.summing import all_rows
 from service.web import storage_errors
-from service.web.observability.context import job_id
+from service.web.observability.logs import job_id
 
 logger = logging.getLogger(__name__)
 
@@ -77,7 +75,7 @@ def _claim(settings: Settings, database: Database, job: str) -> Claim | None:
         if row is None or row.state != QUEUED:
             return None
         row.attempts += 1
-        history.enter(row, RUNNING, f"started: attempt {row.attempts} of at most {settings.max_job_attempts}")
+        lifecycle.enter(row, RUNNING, f"started: attempt {row.attempts} of at most {settings.max_job_attempts}")
         row.started_at = row.heartbeat_at = now()
         row.progress = {"stage": "loading"}
         return Claim(job, row.attempts, row.model, row.request)
@@ -99,10 +97,10 @@ def _train(settings: Settings, database: Database, files: Files, claim: Claim) -
             if material.held_out is not None:
                 pulse.stage("evaluating")
                 held_out, of = material.held_out
-                found = figures(trained, held_out, settings.max_evaluation_samples, of)
-                lineage["holdout"] = {**lineage["holdout"], **found}
+                held_out_figures = figures(trained, held_out, settings.max_evaluation_samples, of)
+                lineage["holdout"] = {**lineage["holdout"], **held_out_figures}
             pulse.stage("saving")
-            folder = leftovers.new_folder(claim.job)
+            folder = lifecycle.new_folder(claim.job)
             Disk(settings).require()
             with files.new_version(folder) as target:
                 manifest = lipcore.save(trained, target, lineage)
@@ -112,7 +110,7 @@ def _train(settings: Settings, database: Database, files: Files, claim: Claim) -
                 raise lipcore.FitCancelledError("cancelled after the last look at the flag")
             row.version = _publish(session, claim, material, folder, manifest)
             row.progress = {**pulse.shown(), "stage": "done", "fraction": 1.0, "remaining_s": 0.0}
-            history.enter(row, SUCCEEDED, f"version {row.version} is trained")
+            lifecycle.enter(row, SUCCEEDED, f"version {row.version} is trained")
     except lipcore.FitCancelledError:
         _finish(database, files, claim, CANCELLED, "cancelled while it ran")
     except SupersededError:
@@ -136,7 +134,7 @@ def _fit(settings: Settings, claim: Claim, material: Material, pulse: Pulse) -> 
     options = lipcore.FitOptions(**request["options"])
     table = material.table.weighed(options.posterior_samples)
     # the version that serves has learnt all rows of a refresh, not only the few that a fit chooses
-    every = request.get("refresh") is not None or wanted(options, material.rows, table.worth())
+    every = request.get("refresh") is not None or wanted(options, material.rows, table.independent_rows())
     if every:
         pulse.plan(material.rows)
     if not every or material.rows <= CANDIDATES:  # else it is the pass that takes long
@@ -165,7 +163,7 @@ def _publish(session: Session, claim: Claim, material: Material, folder: str, ma
     refresh = claim.request.get("refresh")
     if refresh is None:
         return registry.publish(session, claim.model, folder, manifest, claim.job)
-    if scope.taken_back(session, claim.model, refresh["through"], material.seen):
+    if refresh_data.taken_back(session, claim.model, refresh["through"], material.seen):
         raise TakenBackError("part of what was observed has been taken back while it was trained on: refresh again")
     earlier = (LearnerRow.model == claim.model, LearnerRow.role == "candidate")
     session.execute(update(LearnerRow).where(*earlier).values(role="dismissed"))  # the newer one has seen more
@@ -204,6 +202,6 @@ def _finish(
 ) -> None:
     with database.transaction() as session:
         row = _own(session, claim)
-        history.enter(row, state, message)
+        lifecycle.enter(row, state, message)
         row.error = None if code is None else {"code": code, "message": message}
-    leftovers.remove(database, files, claim.job)
+    lifecycle.remove_leftovers(database, files, claim.job)

@@ -1,14 +1,39 @@
-"""Health: is the process alive, and can it answer."""
+"""Health as the API tells it."""
 
 from __future__ import annotations
 
+from typing import Literal
+
 from fastapi import APIRouter
+from pydantic import BaseModel, Field
 
 from service import __version__
 from service.foundation.errors import NotReadyError, problem, responses
-from service.web.health_schema import Live, Part, Ready
 from service.web.observability.readiness import ReadinessDep
 from service.web.route import Route
+
+
+class Live(BaseModel):
+    """The process answers."""
+
+    status: Literal["alive"] = "alive"
+
+
+class Part(BaseModel):
+    """One part of the service."""
+
+    name: str = Field(examples=["database"])
+    state: Literal["ok", "warning"] = Field(description="warning: some clients may notice something")
+    message: str = Field(examples=["can be read and written"])
+
+
+class Ready(BaseModel):
+    """The service can do what it is for."""
+
+    status: Literal["ready"] = "ready"
+    version: str
+    checks: list[Part]
+
 
 router = APIRouter(prefix="/health", tags=["health"], route_class=Route)
 

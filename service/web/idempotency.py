@@ -43,11 +43,11 @@ class Identity:
     digest: str
 
 
-def identity(key: str | None, *said: Any, file: Path | None = None) -> Identity | None:
-    """The identity of a request; None where it has no key. said: JSON of what it says; file: what it brings."""
+def identity(key: str | None, *content: Any, file: Path | None = None) -> Identity | None:
+    """The identity of a request; None where it has no key. content: JSON of what it asks; file: what it brings."""
     if key is None:
         return None
-    digest = hashlib.sha256(json.dumps(said, sort_keys=True).encode())
+    digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
     if file is not None:
         with file.open("rb") as opened:
             digest.update(hashlib.file_digest(opened, "sha256").digest())

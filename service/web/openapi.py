@@ -1,4 +1,5 @@
-"""What the OpenAPI document says of errors that more than one route answers, and the table of all error codes."""
+"""What the OpenAPI document says of keys and scopes, and of errors that more than one route answers; the table of all
+error codes."""
 
 from __future__ import annotations
 
@@ -9,7 +10,44 @@ from fastapi import FastAPI
 
 from service.foundation import errors
 from service.foundation.errors import ServiceError
-from service.web.access.scopes import OPEN
+from service.web.access.scopes import OPEN, SCOPES, TABLE
+
+SCHEME = "key"
+DESCRIPTION = "An API key with scopes, `Authorization: Bearer lip_…`:\n\n" + "\n".join(
+    f"- `{scope}`: {allows}" for scope, allows in SCOPES.items()
+)
+
+
+def install(app: FastAPI, keys_needed: bool) -> None:
+    """Complete the document that the application makes of its routes, once it is asked for; see `add_scopes`."""
+    made = app.openapi
+
+    def openapi() -> dict[str, Any]:
+        if app.openapi_schema is None:
+            document = made()
+            _add_errors(document)
+            add_scopes(document, keys_needed)
+        return made()
+
+    app.openapi = openapi  # type: ignore[method-assign]
+
+
+def add_scopes(document: dict[str, Any], keys_needed: bool) -> None:
+    """Write the scheme of keys into the document, and into every operation the scope that it needs.
+
+    keys_needed: whether the service that is described asks for keys; one that does not takes requests without as well.
+    """
+    schemes = document.setdefault("components", {}).setdefault("securitySchemes", {})
+    schemes[SCHEME] = {"type": "http", "scheme": "bearer", "description": DESCRIPTION}
+    for path, methods in document["paths"].items():
+        for method, operation in methods.items():
+            scope = TABLE.get((method.upper(), path))
+            if scope is None:
+                operation["security"] = []
+                continue
+            operation["security"] = [{SCHEME: [scope]}] if keys_needed else [{}, {SCHEME: [scope]}]
+            operation["description"] = f"{operation.get('description', '')}\n\nScope: `{scope}`.".strip()
+
 
 METHODS = ("get", "put", "post", "delete")
 ANY = (errors.InvalidRequestError, errors.ForbiddenError, errors.RateLimitedError, ServiceError, errors.NotReadyError)
@@ -27,27 +65,15 @@ BEFORE_ROUTES = {
 """Errors that are no class, because no route raises them."""
 
 
-def install(app: FastAPI) -> None:
-    """Complete the document that the application makes of its routes, once it is asked for."""
-    made = app.openapi
-
-    def openapi() -> dict[str, Any]:
-        if app.openapi_schema is None:
-            _complete(made())
-        return made()
-
-    app.openapi = openapi  # type: ignore[method-assign]
-
-
 def error_table() -> str:
     """All error codes with status and meaning, in Markdown."""
-    rows = {(kind.status, kind.code): _said(kind) for kind in _below(ServiceError)}
-    rows |= BEFORE_ROUTES | {(ServiceError.status, ServiceError.code): _said(ServiceError)}
-    lines = [f"| {status} | `{code}` | {said} |" for (status, code), said in sorted(rows.items())]
+    rows = {(kind.status, kind.code): _meaning(kind) for kind in _below(ServiceError)}
+    rows |= BEFORE_ROUTES | {(ServiceError.status, ServiceError.code): _meaning(ServiceError)}
+    lines = [f"| {status} | `{code}` | {meaning} |" for (status, code), meaning in sorted(rows.items())]
     return "\n".join(["| status | code | meaning |", "|---|---|---|", *lines]) + "\n"
 
 
-def _complete(document: dict[str, Any]) -> None:
+def _add_errors(document: dict[str, Any]) -> None:
     document["info"]["description"] += f"\n{error_table()}"
     for path, operations in document["paths"].items():
         for method in METHODS:
@@ -69,10 +95,10 @@ def _add(path: str, method: str, operation: dict[str, Any]) -> None:
     own = set(answers)
     for kind in kinds:
         status = str(400 if protocol and kind.status == 422 else kind.status)
-        said = _said(kind) if protocol else f"`{kind.code}`: {_said(kind)}"
+        meaning = _meaning(kind) if protocol else f"`{kind.code}`: {_meaning(kind)}"
         answer = answers.setdefault(status, _answer("Failure" if protocol else "ErrorResponse"))
         if status not in own or (not protocol and f"`{kind.code}`" not in answer["description"]):
-            answer["description"] = f"{answer['description']} {said}".strip()
+            answer["description"] = f"{answer['description']} {meaning}".strip()
     for status, answer in answers.items():
         if int(status) >= 400:  # FastAPI thinks of the media type of what is answered without an error
             (schema,) = answer["content"].values()
@@ -85,7 +111,7 @@ def _answer(schema: str) -> dict[str, Any]:
     return {"description": "", "content": content}
 
 
-def _said(kind: type[ServiceError]) -> str:
+def _meaning(kind: type[ServiceError]) -> str:
     if kind is ServiceError:
         return "An unexpected error: the service's log says more."
     return " ".join((kind.__doc__ or "").split())

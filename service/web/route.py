@@ -1,17 +1,18 @@
-"""What every route refuses in the same way, before its endpoint sees the request."""
+"""What every route refuses in the same way, before its endpoint sees the request; and routes that are answered before
+FastAPI looks at the request: its validation and dependencies cost 0.3 ms."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Coroutine, Iterator
-from typing import Any
+from collections.abc import Awaitable, Callable, Coroutine, Iterator
+from typing import Any, NamedTuple
 from urllib.parse import parse_qsl
 
 from fastapi import Request, Response
 from fastapi.dependencies.models import Dependant
 from fastapi.routing import APIRoute
-from starlette.types import Scope
+from starlette.types import Message, Receive, Scope, Send
 
 from service.foundation.errors import InvalidRequestError, UnsupportedMediaTypeError, invalid_request, problem, sentence
 
@@ -74,14 +75,14 @@ def read_json(body: bytes) -> Any:
     try:
         return json.loads(body.decode("utf-8-sig"), object_pairs_hook=_object)
     except UnicodeDecodeError as error:
-        found = f"not UTF-8 at byte {error.start}"
+        reason = f"not UTF-8 at byte {error.start}"
     except json.JSONDecodeError as error:
-        found = f"not JSON at character {error.pos}: {error.msg}"
+        reason = f"not JSON at character {error.pos}: {error.msg}"
     except RecursionError:
-        found = "nested too deep"
+        reason = "nested too deep"
     except ValueError:  # Python reads no whole number of more digits
-        found = "not JSON that can be read: a whole number has more than 4300 digits"
-    raise invalid_request("body", found, "JSON")
+        reason = "not JSON that can be read: a whole number has more than 4300 digits"
+    raise invalid_request("body", reason, "JSON")
 
 
 def each_once(body: bytes, *names: bytes) -> bool:
@@ -114,13 +115,13 @@ class _JsonRequest(Request):
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    value = dict(pairs)
+    if len(value) < len(pairs):
         names = [name for name, _ in pairs]
         twice = next(name for index, name in enumerate(names) if name in names[:index])
         item = problem(twice, "given twice", "each field once")
         raise InvalidRequestError(sentence(item), [item])
-    return found
+    return value
 
 
 def _check_encoding(scope: Scope) -> None:
@@ -134,3 +135,80 @@ def _parameters(dependant: Dependant) -> Iterator[str]:
     yield from (parameter.alias for parameter in dependant.query_params)
     for below in dependant.dependencies:
         yield from _parameters(below)
+
+
+class Reply(NamedTuple):
+    """An answer of status 200. more: headers beside the usual ones, their names in lower case."""
+
+    body: bytes
+    media_type: bytes = JSON
+    more: tuple[tuple[bytes, bytes], ...] = ()
+
+    def headers(self) -> list[tuple[bytes, bytes]]:
+        """All headers of the answer."""
+        return [
+            (b"content-length", b"%d" % len(self.body)),
+            (b"content-type", self.media_type),
+            (b"x-content-type-options", b"nosniff"),
+            *self.more,
+        ]
+
+    def response(self) -> Response:
+        """Return the same answer for FastAPI to send."""
+        made = Response(self.body)
+        made.raw_headers = self.headers()
+        return made
+
+
+Answerer = Callable[[Scope, bytes], Awaitable[Reply | None]]
+"""Answers a request from its scope and body, or None where it is not as usual; an error it raises is the answer."""
+
+
+def hot_route(answer: Answerer) -> type[Route]:
+    """Make a route class whose POST requests `answer` sees first.
+
+    What it does not answer goes on to the endpoint as if it had not been seen. So the endpoint is what explains a
+    wrong request, and its signature is what documents the route; `answer` only has to know a right one.
+    """
+
+    class HotRoute(Route):
+        async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+            if scope["method"] != "POST":
+                await super().handle(scope, receive, send)
+                return
+            check_query(scope)
+            body = await _read(receive)
+            if body is None:  # the client went away
+                return
+            reply = await answer(scope, body)
+            if reply is None:
+                await super().handle(scope, _again(body, receive), send)
+                return
+            await send({"type": "http.response.start", "status": 200, "headers": reply.headers()})
+            await send({"type": "http.response.body", "body": reply.body})
+
+    return HotRoute
+
+
+async def _read(receive: Receive) -> bytes | None:
+    message = await receive()
+    if not message.get("more_body") and message["type"] == "http.request":
+        body: bytes = message.get("body", b"")
+        return body
+    parts: list[bytes] = []
+    while message["type"] == "http.request":
+        parts.append(message.get("body", b""))
+        if not message.get("more_body"):
+            return b"".join(parts)
+        message = await receive()
+    return None
+
+
+def _again(body: bytes, receive: Receive) -> Receive:
+    """Receive a body that has been read before, then what comes after it."""
+    pending: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
+
+    async def replay() -> Message:
+        return pending.pop() if pending else await receive()
+
+    return replay

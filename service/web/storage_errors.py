@@ -102,8 +102,8 @@ def install(app: FastAPI) -> None:
 
 
 async def _answer(request: Request, error: Exception) -> JSONResponse:
-    said = translated(error)
-    if said is None:
+    answer = translated(error)
+    if answer is None:
         raise error  # as unexpected as any other
-    logger.error("%s at %s: %s", said.code, request.scope["path"], error)
-    return answer_of(request.scope, said)
+    logger.error("%s at %s: %s", answer.code, request.scope["path"], error)
+    return answer_of(request.scope, answer)

@@ -13,7 +13,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import select
 
 from service.app import create_app
-from service.cli.verification import verify
+from service.cli.verify import verify_home
 from service.models import registry
 from service.models.archive import MEDIA_TYPE
 from service.storage.database import Database, VersionRow
@@ -117,13 +117,13 @@ def test_all_that_is_shared_is_verified(shared):
     with service(shared, "one") as api:
         dataset = upload(api, stream())
         registry.find(service_of(api).database, "panda-sim", 1)
-    assert verify(settings).damages == []
+    assert verify_home(settings).damages == []
     client, key = shared.s3.client(), f"{shared.prefix}/datasets/{dataset['id']}.safetensors"
     client.put_object(Bucket=BUCKET, Key=key, Body=b"something else")
-    (found,) = verify(settings).damages  # though this host has a copy that is whole
+    (found,) = verify_home(settings).damages  # though this host has a copy that is whole
     assert (found.kind, found.name) == ("dataset", dataset["id"])
     with outage(shared), pytest.raises(FilesUnreachableError):  # which says nothing of what is stored
-        verify(settings)
+        verify_home(settings)
 
 
 def test_no_service_starts_while_its_bucket_is_away(shared):

@@ -13,7 +13,7 @@ from service.journal import log
 from service.models import moves, registry
 from service.replication.replication import Listener
 from service.storage.database import AlarmRow, Database, DeletedModelRow, EventRow, ModelRow, VersionRow, now
-from service.storage.database.notices import Notice, read
+from service.storage.database.engine import Notice, read_notice
 from tests.cluster.servers import Postgres, Shared
 from tests.service.data import eventually
 from tests.service.updates.batches import MODEL, OTHER, batch
@@ -35,7 +35,7 @@ def database(shared: Shared) -> Iterator[Database]:
 def told(database: Database, *work: Callable[[], object]) -> list[tuple[str, str]]:
     """Kind and model of what a service hears while another one does things, in the order of commits."""
     heard = []
-    with closing(database.heard(0.5)) as notices:
+    with closing(database.changes_of_others(0.5)) as notices:
         assert next(notices) is None
         for do in work:
             do()
@@ -93,14 +93,14 @@ def test_what_is_rolled_back_is_not_told(database):
 
 def test_a_service_alone_tells_and_hears_nothing(tmp_path):
     with closing(Database(tmp_path)) as alone:
-        assert list(alone.heard(60.0)) == []
+        assert list(alone.changes_of_others(60.0)) == []
 
 
 @pytest.mark.parametrize("payload", ["", "log", "other 12 arm"])
 def test_notices_of_other_releases_are_passed_over(payload):
-    found = read(payload)
+    found = read_notice(payload)
     assert found is None or found.model == ""
-    assert read(Notice("log", "arm.b-2", "0a").payload()) == ("log", "arm.b-2", "0a")
+    assert read_notice(Notice("log", "arm.b-2", "0a").payload()) == ("log", "arm.b-2", "0a")
 
 
 def test_a_listener_that_loses_its_connection_says_what_it_may_have_missed(database, shared, postgres: Postgres):

@@ -9,7 +9,7 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
-from service.guide import pages, routes
+from service.guide import routes
 from tests.docs.blocks import ROOT
 
 
@@ -24,11 +24,11 @@ def guide() -> Iterator[TestClient]:
 
 def test_every_page_of_the_documentation_is_in_the_guide():
     there = {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
-    assert there == {page.file for page in pages.pages().values()}
-    assert len(pages.pages()) == len(there)
+    assert there == {page.file for page in routes.pages().values()}
+    assert len(routes.pages()) == len(there)
 
 
-@pytest.mark.parametrize("page", pages.pages().values(), ids=lambda page: page.file)
+@pytest.mark.parametrize("page", routes.pages().values(), ids=lambda page: page.file)
 def test_a_page_has_a_title_and_links_that_lead_on(guide, page):
     answer = guide.get(page.address)
     assert answer.status_code == 200
@@ -72,13 +72,13 @@ def test_html_in_markdown_is_text(monkeypatch, tmp_path):
     (tmp_path / "README.md").write_text(
         "# T\n\n<script>alert(1)</script> [x](javascript:alert(1)) ![y](data:text/html,x)\n"
     )
-    monkeypatch.setattr(pages, "folder", lambda: tmp_path)
-    for cached in (pages.pages, pages.images, pages.content):
+    monkeypatch.setattr(routes, "folder", lambda: tmp_path)
+    for cached in (routes.pages, routes.images, routes.content):
         cached.cache_clear()
     try:
-        shown = pages.content("")
+        shown = routes.content("")
     finally:
-        for cached in (pages.pages, pages.images, pages.content):
+        for cached in (routes.pages, routes.images, routes.content):
             cached.cache_clear()
     assert "<script" not in shown
     assert 'href="javascript' not in shown
@@ -99,4 +99,4 @@ def test_html_in_markdown_is_text(monkeypatch, tmp_path):
     ],
 )
 def test_links_are_those_of_the_guide(href, leads):
-    assert pages.target(href, "numbers.md") == leads
+    assert routes.target(href, "numbers.md") == leads

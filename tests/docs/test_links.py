@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from service.guide.pages import anchor
+from service.guide.routes import anchor
 from tests.docs.blocks import ROOT, all_pages, prose
 
 LINK = re.compile(r"\]\(([^)\s]+)\)")

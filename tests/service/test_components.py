@@ -13,7 +13,7 @@ from lipcore.kernels.se import SquaredExponentialKernel
 from lipcore.motion import Motion
 from service.client import ApiError, Client
 from service.foundation.settings import Settings
-from service.inference import components
+from service.inference import predicting
 from service.inference.schema import PredictRequest
 from tests.service.data import error, service_of
 
@@ -145,7 +145,7 @@ def test_components_that_an_estimator_lacks_are_refused_naming_what_it_offers(tr
         {name: values.tolist() for name, values in motion.items()} | {"components": ["friction", "gravity"]}
     )
     with pytest.raises(Exception, match="components") as caught:
-        components.check(black_box, request, Settings().max_component_batch)
+        predicting.check_components(black_box, request, Settings().max_component_batch)
     (problem,) = caught.value.detail
     assert (problem.field, problem.value) == ("components[1]", "gravity")
     assert problem.expected == "what a model with the estimator se offers: friction"

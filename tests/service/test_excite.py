@@ -10,10 +10,9 @@ import lipcore
 from lipcore.profiles import profile
 from lipcore.robots import load_robot, profile_urdf
 from lipcore.simulation import Stream, inverse_dynamics, simulate
-from service.cli.excite import command
-from service.cli.excite.model import fetch
-from service.cli.excite.model import model as find_model
-from service.cli.excite.robot import find
+from service.cli import excite as command
+from service.cli.excite import fetch, find_model
+from service.cli.excite_robot import find
 from tests.service.data import QUICK, stream, train, upload
 from tests.service.server import free_port
 

@@ -6,7 +6,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service import __version__
-from service.inference import answer as inference
+from service.inference import predicting as inference
 from tests.service.data import ADDRESS, error, service_of
 
 

@@ -17,9 +17,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from service.inference import answer as inference
+from service.inference import predicting as inference
+from service.inference.predicting import PredictBody, Prediction
 from service.inference.schema import PredictRequest, PredictResponse
-from service.inference.wire import Prediction, Query
 from tests.service.data import DEADLINE, error, service_of
 
 QUERY = {"q": [0.25, -1.5], "dq": [1, 0.125], "ddq": [-2.0, 3e-1]}
@@ -215,7 +215,7 @@ def test_a_version_that_is_not_in_memory_is_loaded(api, trained):
 
 
 def test_what_is_decoded_and_encoded_is_what_is_documented():
-    for wire, documented in ((Query, PredictRequest), (Prediction, PredictResponse)):
+    for wire, documented in ((PredictBody, PredictRequest), (Prediction, PredictResponse)):
         fields = {item.name: item.required for item in msgspec.structs.fields(wire)}
         assert fields == {name: field.is_required() for name, field in documented.model_fields.items()}
 

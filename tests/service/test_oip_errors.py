@@ -10,7 +10,8 @@ import torch
 from fastapi.testclient import TestClient
 
 from lipcore import dynamics
-from service.oip import outputs
+from service.oip import answer as answering
+from service.oip import query
 from tests.service.data import ADDRESS, error, service_of
 from tests.service.oip import listed, message, path_of, refused
 
@@ -128,12 +129,11 @@ def test_long_names_are_cut(api, trained):
 
 def test_unknown_outputs_are_answered_with_those_there_are(api, trained):
     said = say(api, message(MOTION, "mass"))
-    for name in outputs.shapes(trained.model):
+    for name in query.shapes(trained.model):
         assert name in said
 
 
 def test_components_that_an_estimator_lacks_are_refused(api, trained, monkeypatch):
-    monkeypatch.setattr(outputs, "available", lambda _: ("friction",))
     monkeypatch.setattr("service.oip.query.available", lambda _: ("friction",))
     offered = "tau, tau_std, noise_std, covariance, tau_friction, tau_friction_std"
     assert say(api, message(MOTION, "tau_gravity")) == (
@@ -168,10 +168,10 @@ def test_inertia_that_cannot_be_inverted_is_refused_naming_the_query(api, traine
 
 @pytest.mark.parametrize("rows", [1, 2])
 def test_answers_that_are_not_finite_are_refused(api, trained, monkeypatch, rows):
-    def overflowing(model, motion, names, tau):
+    def overflowing(model, query, names):
         return {name: np.full((rows, 2), np.inf) for name in names}
 
-    monkeypatch.setattr(outputs, "compute", overflowing)
+    monkeypatch.setattr(answering, "compute", overflowing)
     batch = {name: np.tile(values, (rows, 1)) for name, values in MOTION.items()}
     said = say(api, message(batch, "tau"))
     assert said == "tau[0][0] is inf, expected a finite number: are dq in rad/s and ddq in rad/s²?"
@@ -224,7 +224,7 @@ def test_unexpected_errors_tell_nothing_of_the_inside(api, trained, monkeypatch)
     def broken(*_):
         raise RuntimeError("secret")
 
-    monkeypatch.setattr(outputs, "compute", broken)
+    monkeypatch.setattr(answering, "compute", broken)
     quiet = TestClient(api.app, ADDRESS, raise_server_exceptions=False)
     said = refused(quiet.post(PATH, json=message(MOTION)), 500)
     assert said == "an unexpected error; the service's log says more"

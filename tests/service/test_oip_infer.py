@@ -12,8 +12,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from lipcore import dynamics
 from lipcore.model import TorqueModel
 from lipcore.motion import Motion
-from service.oip import outputs, wire
-from service.oip.outputs import PARTS
+from service.oip import answer as answering
+from service.oip import query as querying
+from service.oip import wire
+from service.oip.query import PARTS
 from tests.service.data import service_of
 from tests.service.oip import ask, listed, message, tensors
 
@@ -100,7 +102,7 @@ def test_components_are_those_of_lipcore(api, trained, motion, name, rows):
 
 
 def test_every_output_at_once(api, trained, motion):
-    names = [*outputs.shapes(trained.model)]
+    names = [*querying.shapes(trained.model)]
     tau = trained.model.predict(**motion).tau
     found = tensors(ask(api, trained.name, message({**motion, "tau": tau}, *names)))
     assert list(found) == names
@@ -166,13 +168,13 @@ def test_nothing_is_computed_that_is_not_asked_for(api, trained, motion, monkeyp
 def test_single_queries_run_on_the_event_loop_and_all_else_in_threads(
     api, trained, motion, monkeypatch, names, rows, here
 ):
-    loop, compute, seen = api.portal.call(threading.get_ident), outputs.compute, []
+    loop, compute, seen = api.portal.call(threading.get_ident), answering.compute, []
 
     def computing(*arguments):
         seen.append(threading.get_ident())
         return compute(*arguments)
 
-    monkeypatch.setattr(outputs, "compute", computing)
+    monkeypatch.setattr(answering, "compute", computing)
     query = first(motion) if rows is None else {name: values[:rows] for name, values in motion.items()}
     ask(api, trained.name, message(query, *names))
     assert [thread == loop for thread in seen] == [here]

@@ -9,7 +9,7 @@ import pytest
 import lipcore
 from lipcore.kernels.se import SquaredExponentialKernel
 from service import __version__
-from service.oip.outputs import shapes
+from service.oip.query import shapes
 from service.storage.files import Files
 from tests.service.data import service_of
 from tests.service.oip import refused

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.foundation.errors import InvalidRequestError, problem, readable
-from service.inference.wire import decode
+from service.inference.predicting import decode
 from service.learning.ingest import routes as observations
 from service.web.route import Route, each_once, read_json
 from tests.service.data import error, service_of

@@ -17,7 +17,7 @@ FITTING = ("scipy.optimize", "scipy.signal", "scipy.stats")
 CLIENTS = (
     "httpx",
     "service.client",
-    "service.cli.demonstration",
+    "service.cli.demo",
     "benchmarks.reproduce",
     "benchmarks",
     "matplotlib",
@@ -53,7 +53,7 @@ def test_listing_commands_imports_none_of_them():
 
 
 def test_help_and_completion_of_what_asks_a_service_import_neither_numerics_nor_a_client():
-    names = ("data", "evaluate", "jobs", "models", "open", "predict", "stream", "train")
+    names = ("answers", "data", "jobs", "models", "open", "stream", "train")
     found = imported("\n".join(f"import service.cli.{name}" for name in names))
     assert found.isdisjoint((*NUMERICS, *CLIENTS, "fastapi"))
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.inference.stretches import stretches
+from service.inference.evaluating import stretches
 from tests.service.data import stream
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.cli import recordings
+from service.cli.simulate import write_recording
 from service.datasets import store
 from tests.service.data import arrays, columns, csv, npz, post, service_of, stream
 
@@ -67,7 +67,7 @@ def test_location_leads_to_the_data_set(api):
 @pytest.mark.parametrize("ending", [".csv", ".npz"])
 def test_written_recordings_are_read_back_exactly(api, reference, tmp_path, ending):
     path = tmp_path / f"recording{ending}"
-    recordings.write(path, TRUE_STREAM)
+    write_recording(path, TRUE_STREAM)
     media_type = {".csv": "text/csv", ".npz": "application/x-npz"}[ending]
     assert created(post(api, path.read_bytes(), media_type))["sha256"] == reference["sha256"]
 

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Unpack
 
-from service.client.call import Call, Page, Route, given, nothing, page, record, route
-from service.client.calls.keys import KEY_HEADER, new_key
-from service.client.results.preview import Preview, read_preview
+from service.client.call import KEY_HEADER, Call, Page, Route, given, new_key, nothing, page, record, route
+from service.client.results.series import Preview, read_preview
 from service.datasets.asking import MEDIA_TYPE_OF, SUFFIXES, Reading, query_of
 from service.datasets.schema import Dataset
 from service.robots.schema import ProfileList, Robot, RobotProfile

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from service.client.call import Call, Page, Route, given, page, record, route
-from service.client.results.live import Live, read_live
+from service.client.results.series import Live, read_live
 from service.learning.control.schema import (
     Alarm,
     Decided,

@@ -2,10 +2,8 @@
 
 from service.client.results.arm import Arm, Frames, Version
 from service.client.results.evaluation import Comparison, Evaluation, Interval, Reliability, VersionFigures
-from service.client.results.live import Live, LivePart, LiveRows
 from service.client.results.prediction import Component, Prediction
-from service.client.results.preview import Preview, PreviewColumn
-from service.client.results.trace import Trace
+from service.client.results.series import Live, LivePart, LiveRows, Preview, PreviewColumn, Trace
 
 __all__ = [
     "Arm",

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from service.client.results.arrays import Array, Plain, array
-from service.client.results.table import html_table, text_table
+from service.client.results.arrays import Array, Plain, array, html_table, text_table
 from service.models import schema
 
 LIMITS = (

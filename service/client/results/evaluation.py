@@ -6,13 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from service.client.call import Answer
-from service.client.results.arrays import Array, Plain, array
-from service.client.results.table import figure, html_table, text_table
+from service.client.results.arrays import Array, Plain, figure, html_table, reading, text_table
 from service.inference.comparison_schema import Outcome
 
 
@@ -109,29 +106,6 @@ class Evaluation(Plain):
 _FIGURES = ("nmse", "rmse", "coverage", "nlpd", "interval_width")
 
 
-def read_evaluation(answer: Answer) -> Evaluation:
-    """Read the answer to `evaluate`."""
-    said = msgspec.json.decode(answer.body)
-    found: dict[str, Any] = {name: said[name] for name in _NAMED} | {name: array(said[name]) for name in _FIGURES}
-    return Evaluation(
-        **found,
-        joint_names=tuple(said["joint_names"]),
-        coverages=tuple(
-            Interval(each["level"], array(each["coverage"]), array(each["interval_width"]))
-            for each in said["coverages"]
-        ),
-        reliability=Reliability(array(said["reliability"]["nominal"]), array(said["reliability"]["observed"])),
-        stretches=Stretches(
-            said["stretches"]["kind"],
-            np.array(said["stretches"]["samples"], np.int64),
-            array(said["stretches"]["nmse"]),
-        ),
-    )
-
-
-_NAMED = ("model", "version", "revision", "dataset", "part", "samples", "samples_used", "level", "in_training")
-
-
 @dataclass(frozen=True, eq=False)
 class VersionFigures(Plain):
     """Figures of one version, (n) each; see `Evaluation`."""
@@ -186,28 +160,5 @@ class Comparison(Plain):
         return "\n".join([self.verdict, *(f"careful: {warning}" for warning in self.warnings)])
 
 
-def read_comparison(answer: Answer) -> Comparison:
-    """Read the answer to `compare`."""
-    said = msgspec.json.decode(answer.body)
-    first, second = (_figures(each) for each in said["versions"])
-    return Comparison(
-        **{name: said[name] for name in ("model", "dataset", "samples", "samples_used", "blocks")},
-        joint_names=tuple(said["joint_names"]),
-        versions=(first, second),
-        differences={name: _difference(each) for name, each in said["differences"].items()},
-        nlpd=_difference(said["nlpd"]),
-        nmse=_difference(said["nmse"]),
-        outcome=said["outcome"],
-        better=said["better"],
-        verdict=said["verdict"],
-        warnings=tuple(said["warnings"]),
-    )
-
-
-def _figures(said: dict[str, Any]) -> VersionFigures:
-    figures = {name: array(said[name]) for name in _FIGURES}
-    return VersionFigures(said["version"], said["revision"], **figures, in_training=said["in_training"])
-
-
-def _difference(said: dict[str, Any]) -> Difference:
-    return Difference(array(said["difference"]), array(said["standard_error"]), array(said["half_width"]))
+read_evaluation = reading(Evaluation)
+read_comparison = reading(Comparison)

@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from statistics import NormalDist
 
-import msgspec
 import numpy as np
 
-from service.client.call import Answer
-from service.client.results.arrays import Array, Plain, array
+from service.client.results.arrays import Array, Plain, reading
 
 
 def interval(mean: Array, std: Array, noise_std: Array, level: float) -> tuple[Array, Array]:
@@ -61,21 +59,4 @@ class Prediction(Plain):
         return interval(self.tau, self.tau_std, self.noise_std, level)
 
 
-def read_prediction(answer: Answer) -> Prediction:
-    """Read the answer to a query."""
-    said = msgspec.json.decode(answer.body)
-    covariance, components = said.get("covariance"), said.get("components")
-    return Prediction(
-        model=said["model"],
-        version=said["version"],
-        revision=said["revision"],
-        joint_names=tuple(said["joint_names"]),
-        torque_convention=said["torque_convention"],
-        tau=array(said["tau"]),
-        tau_std=array(said["tau_std"]),
-        noise_std=array(said["noise_std"]),
-        covariance=None if covariance is None else array(covariance),
-        components=None
-        if components is None
-        else {name: Component(array(each["mean"]), array(each["std"])) for name, each in components.items()},
-    )
+read_prediction = reading(Prediction)

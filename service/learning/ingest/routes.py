@@ -27,8 +27,7 @@ from service.learning.schema import (
     ObservationRequest,
     ObservationResponse,
 )
-from service.web.hot import Reply, hot_route
-from service.web.route import each_once, is_json
+from service.web.route import Reply, each_once, hot_route, is_json
 
 Array = NDArray[np.float64]
 Number = float | None

@@ -18,8 +18,8 @@ from service.learning.control import decisions, status
 from service.learning.control.schema import Held
 from service.learning.learners import Learners, LearnersDep
 from service.learning.live.schema import LiveAnswers, LiveNovelty, LiveStatus
-from service.web.limits.stopping import StoppingDep
 from service.web.observability.meters import OTHER, Meters, MetersDep, StreamMeter
+from service.web.observability.readiness import StoppingDep
 from service.web.pagination import Page
 from service.web.route import Route
 

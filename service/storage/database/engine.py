@@ -1,21 +1,89 @@
-"""Sessions on the database: SQLite below the home, or a PostgreSQL server that several services share."""
+"""Sessions on the database: SQLite below the home, or a PostgreSQL server that several services share.
+
+There a transaction tells the others of which model it has changed what: PostgreSQL sends notices with the commit
+(`NOTIFY`), and of what was rolled back nobody hears. Who was not connected then has missed it, and looks for itself.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from itertools import chain
 from pathlib import Path
 from secrets import token_hex
-from typing import Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
-from sqlalchemy import Connection, Engine, event
+from sqlalchemy import Connection, Engine, event, text
 from sqlalchemy.orm import Session, sessionmaker
 
 from service.foundation.settings import CONNECTIONS, Settings
-from service.storage.database import notices
 from service.storage.database.migrations import migrate
-from service.storage.database.notices import Notice
 from service.storage.database.sqlite import Sqlite
+from service.storage.database.tables import (
+    AliasRow,
+    Base,
+    DeletedModelRow,
+    EventRow,
+    LearnerRow,
+    ServingRow,
+    VersionRow,
+)
+
+CHANNEL = "lipserve"
+Kind = Literal["log", "model"]
+KINDS: dict[type[Base], Kind] = {
+    EventRow: "log",
+    VersionRow: "model",
+    ServingRow: "model",
+    AliasRow: "model",
+    LearnerRow: "model",
+    DeletedModelRow: "model",
+}
+_KEY = "notices"
+
+
+class Notice(NamedTuple):
+    """kind: `log` of a model that has grown, `model` whose versions, aliases or roles have changed or that is gone;
+    origin: who has changed it."""
+
+    kind: Kind
+    model: str
+    origin: str
+
+    def payload(self) -> str:
+        """What is sent; `read` is its inverse."""
+        return f"{self.kind} {self.origin} {self.model}"
+
+
+def read_notice(payload: str) -> Notice | None:
+    """A notice that was sent; None for what is none of this release."""
+    kind, _, rest = payload.partition(" ")
+    origin, _, model = rest.partition(" ")
+    if kind == "log":
+        return Notice("log", model, origin)
+    return Notice("model", model, origin) if kind == "model" else None
+
+
+def collect_notices(session: Session, _: Any) -> None:
+    """Note what is written to a session; to be called after each flush of it.
+
+    Rows that are changed by a statement alone pass unseen: each such change comes with a row that does not.
+    """
+    changes = session.info.setdefault(_KEY, set())
+    row: Any
+    for row in chain(session.new, session.dirty, session.deleted):
+        if type(row) in KINDS:
+            model = row.name if isinstance(row, DeletedModelRow) else row.model
+            changes.add((KINDS[type(row)], model))
+
+
+def send_notices(session: Session, origin: str) -> None:
+    """Tell with the commit of a session what it has changed."""
+    session.flush()
+    for kind, model in sorted(session.info.pop(_KEY, ())):
+        payload = Notice(kind, model, origin).payload()
+        session.execute(text("SELECT pg_notify(:channel, :payload)"), {"channel": CHANNEL, "payload": payload})
+
 
 PATIENCE_S = 30.0
 """Longest wait for another writer, of processes that nobody waits for."""
@@ -38,8 +106,8 @@ class Adapter(Protocol):
     def turn(self, model: str) -> AbstractContextManager[None]:
         """Be the only one, of all services, that takes something for a model while the block runs."""
 
-    def heard(self, pause_s: float) -> Iterator[str | None]:
-        """What other services tell, see `Database.heard`."""
+    def changes_of_others(self, pause_s: float) -> Iterator[str | None]:
+        """What other services tell, see `Database.changes_of_others`."""
 
     def close(self) -> None:
         """Close all connections."""
@@ -70,7 +138,7 @@ class Database:
         self._sessions = sessionmaker(self.engine, expire_on_commit=False)
         self.origin = token_hex(8)
         if self.shared:
-            event.listen(self._sessions, "after_flush", notices.collect)
+            event.listen(self._sessions, "after_flush", collect_notices)
 
     @classmethod
     def of(cls, settings: Settings, timeout_s: float = PATIENCE_S) -> Database:
@@ -99,7 +167,7 @@ class Database:
             self.adapter.lock(session.connection(), model)
             yield session
             if self.shared:
-                notices.send(session, self.origin)
+                send_notices(session, self.origin)
             session.commit()
 
     def turn(self, model: str) -> AbstractContextManager[None]:
@@ -109,13 +177,13 @@ class Database:
         """
         return self.adapter.turn(model)
 
-    def heard(self, pause_s: float) -> Generator[Notice | None, None, None]:
+    def changes_of_others(self, pause_s: float) -> Generator[Notice | None, None, None]:
         """What is changed from the first None on that this yields, as it is committed; and None after each pause, s.
 
         Ends with an error where the connection does. Where there is one service, nothing is told and this ends at once.
         """
-        for payload in self.adapter.heard(pause_s):
-            notice = None if payload is None else notices.read(payload)
+        for payload in self.adapter.changes_of_others(pause_s):
+            notice = None if payload is None else read_notice(payload)
             if payload is None or notice is not None:
                 yield notice
 

@@ -18,7 +18,7 @@ from psycopg.types.string import StrDumperUnknown
 from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url, text
 from sqlalchemy.exc import ArgumentError
 
-from service.storage.database.notices import CHANNEL
+from service.storage.database.engine import CHANNEL
 
 WRITERS, TURNS = 0x4C495053, 0x4C495054
 """Names of the two kinds of locks among those of the database."""
@@ -66,7 +66,7 @@ class Postgresql:
             _take(connection, "pg_advisory_xact_lock", TURNS, _key(model))
             yield
 
-    def heard(self, pause_s: float) -> Iterator[str | None]:
+    def changes_of_others(self, pause_s: float) -> Iterator[str | None]:
         """Payloads of notices, on a connection of its own; None once it listens, and after each pause of so long, s."""
         url = self.engine.url.set(drivername="postgresql").render_as_string(hide_password=False)
         with psycopg.connect(url, autocommit=True, **LISTENING) as connection:

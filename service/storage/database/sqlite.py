@@ -41,7 +41,7 @@ class Sqlite:
         """Nothing to wait for: no other service has this file."""
         yield
 
-    def heard(self, pause_s: float) -> Iterator[str | None]:
+    def changes_of_others(self, pause_s: float) -> Iterator[str | None]:
         """Nothing, at once: nobody else writes to this file."""
         return iter(())
 
@@ -68,8 +68,8 @@ class Sqlite:
 
     def _faults(self, check: str, most: int) -> list[str]:
         with self.engine.connect() as connection:
-            found = [str(each) for each in connection.scalars(text(f"PRAGMA {check}({int(most)})"))]
-        return [] if found == ["ok"] else found
+            faults = [str(each) for each in connection.scalars(text(f"PRAGMA {check}({int(most)})"))]
+        return [] if faults == ["ok"] else faults
 
 
 def _configure(connection: Any, _: object) -> None:

@@ -47,12 +47,12 @@ class Bucket:
 
     def put(self, path: Path, key: str) -> None:
         """Store a file; a large one goes in parts, and is there once all of them are."""
-        with _told(missing=NO_BUCKET):
+        with _of_store(missing=NO_BUCKET):
             self._system.put_file(str(path), self._path(key), chunksize=PART, max_concurrency=PARTS)
 
     def get(self, key: str, path: Path) -> None:
         """Copy an object into a new file; raise FileNotFoundError where there is none."""
-        with _told():
+        with _of_store():
             try:
                 self._system.get_file(self._path(key), str(path), chunksize=PART, max_concurrency=PARTS)
             except FileNotFoundError:
@@ -61,21 +61,21 @@ class Bucket:
 
     def delete(self, key: str) -> None:
         """Delete an object; nothing happens where there is none."""
-        with _told(missing=NO_BUCKET):
+        with _of_store(missing=NO_BUCKET):
             self._system.rm_file(self._path(key))
 
     def list(self, prefix: str) -> Iterator[Found]:
         """Objects whose keys begin so."""
         parent, _, beginning = prefix.rpartition("/")
-        with _told(missing=NO_BUCKET):
-            found: dict[str, Any] = self._system.find(self._path(parent), detail=True, prefix=beginning)
-        for path, about in found.items():
+        with _of_store(missing=NO_BUCKET):
+            objects: dict[str, Any] = self._system.find(self._path(parent), detail=True, prefix=beginning)
+        for path, about in objects.items():
             if about["type"] == "file":
                 yield Found(path.removeprefix(f"{self._root}/"), about["LastModified"].timestamp())
 
     def check(self) -> None:
         """See that the bucket is there and can be listed."""
-        with _told(missing=NO_BUCKET):
+        with _of_store(missing=NO_BUCKET):
             prefix = f"{self._prefix}/" if self._prefix else ""
             asked = {"Bucket": self._bucket, "Prefix": prefix, "MaxKeys": 1}
             sync(self._system.loop, self._system._call_s3, "list_objects_v2", timeout=CHECK_S, **asked)
@@ -85,7 +85,7 @@ class Bucket:
 
 
 @contextmanager
-def _told(missing: str | None = None) -> Iterator[None]:
+def _of_store(missing: str | None = None) -> Iterator[None]:
     """Let errors of the store be FilesUnreachableError, without the address and what else the library says."""
     try:
         yield

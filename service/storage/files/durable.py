@@ -19,10 +19,10 @@ class DamagedFileError(ValueError):
 def check(path: Path, sha256: str) -> None:
     """Raise DamagedFileError unless a file is there and has this sha256."""
     try:
-        found = sample_file.sha256(path)
+        digest = sample_file.sha256(path)
     except FileNotFoundError:
         raise DamagedFileError(f"{path} is missing") from None
-    if found != sha256:
+    if digest != sha256:
         raise DamagedFileError(f"{path} does not have the sha256 that was kept of it")
 
 

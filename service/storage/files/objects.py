@@ -8,11 +8,16 @@ from __future__ import annotations
 import builtins
 import errno
 import logging
+import secrets
+import shutil
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple, Protocol, TypeVar
 from urllib.parse import unquote, urlsplit
+
+from service.storage.files import durable
 
 logger = logging.getLogger(__name__)
 
@@ -103,11 +108,80 @@ def store_of(url: str) -> Objects:
     """
     parts = urlsplit(url)
     if parts.scheme == "file":
-        from service.storage.files.mounted import Mounted  # noqa: PLC0415 - one of the two is needed
-
         return Mounted(Path(unquote(parts.path)))
     try:
         from service.storage.files.bucket import Bucket  # noqa: PLC0415 - its library is an extra
     except ImportError as error:
         raise unreachable(f"{error.name or 'a library'} is not installed: pip install 'lipserve[cluster]'") from None
     return Bucket(parts.netloc, parts.path.strip("/"))
+
+
+DRAFT = ".draft-"
+
+
+class Mounted:
+    """Objects are files below a folder, which has to be there: one that is not mounted is not made in its place."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def put(self, path: Path, key: str) -> None:
+        """Store a file durably."""
+        target = self.root / key
+        with _of_folder():
+            self.check()
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with path.open("rb") as file:
+                draft = target.parent / f"{DRAFT}{secrets.token_hex(8)}"
+                durable.store(target, lambda out: shutil.copyfileobj(file, out, 1 << 20), draft)
+
+    def get(self, key: str, path: Path) -> None:
+        """Copy an object into a new file; raise FileNotFoundError where there is none."""
+        with _of_folder():
+            try:
+                shutil.copyfile(self.root / key, path)
+            except FileNotFoundError:
+                self.check()
+                raise
+
+    def delete(self, key: str) -> None:
+        """Delete an object, and its folder below the first one where it was the last."""
+        path = self.root / key
+        with _of_folder():
+            path.unlink(missing_ok=True)
+            if path.parent.parent != self.root:
+                try:
+                    path.parent.rmdir()
+                except OSError:  # not empty, or gone
+                    return
+
+    def list(self, prefix: str) -> Iterator[Found]:
+        """Objects whose keys begin so; what an interrupted `put` left is among them."""
+        parent, _, beginning = prefix.rpartition("/")
+        with _of_folder():
+            self.check()
+            folder = self.root / parent
+            for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+                if path.name.startswith(beginning):
+                    yield from self._below(path)
+
+    def _below(self, path: Path) -> Iterator[Found]:
+        for each in path.iterdir() if path.is_dir() else [path]:
+            with suppress(FileNotFoundError):  # deleted meanwhile
+                yield Found(each.relative_to(self.root).as_posix(), each.stat().st_mtime)
+
+    def check(self) -> None:
+        """See that the folder is there."""
+        if not self.root.is_dir():
+            raise unreachable(f"there is no folder {str(self.root)!r}: is it mounted?")
+
+
+@contextmanager
+def _of_folder() -> Iterator[None]:
+    """Let errors of the folder be those of a store; a full disk stays one."""
+    try:
+        yield
+    except (FileNotFoundError, FilesUnreachableError):
+        raise
+    except PermissionError:
+        raise unreachable("access is denied: this user may not read and write the folder") from None

@@ -116,16 +116,16 @@ class Shared:
 
     def delete_version(self, name: str) -> None:
         """Delete a version's files for all, and what was begun of it here."""
-        found = sorted(self.objects.list(f"versions/{name}/"), key=lambda each: not each.key.endswith(MANIFEST))
-        for each in found:  # the manifest first: what is left is no version
+        objects = sorted(self.objects.list(f"versions/{name}/"), key=lambda each: not each.key.endswith(MANIFEST))
+        for each in objects:  # the manifest first: what is left is no version
             self.objects.delete(each.key)
         for path in (self.versions / name, *self._drafts.glob(f"{name}-*")):
             shutil.rmtree(path, ignore_errors=True)
 
     def versions_marked(self, mark: str) -> list[str]:
         """Names of versions, also of those begun here, that begin with `mv_` and `mark`."""
-        found = {each.key.split("/")[1] for each in self.objects.list(f"versions/mv_{mark}")}
-        return sorted(found | {path.name.rpartition("-")[0] for path in self._drafts.glob(f"mv_{mark}*")})
+        names = {each.key.split("/")[1] for each in self.objects.list(f"versions/mv_{mark}")}
+        return sorted(names | {path.name.rpartition("-")[0] for path in self._drafts.glob(f"mv_{mark}*")})
 
     def drafts(self) -> Iterable[Path]:
         """What earlier processes had begun to fetch or to write."""
@@ -248,5 +248,5 @@ def _entries(folder: Path) -> Iterator[tuple[float, int, Path]]:
             yield about.st_mtime, size, path
 
 
-def _name(found: Found) -> str:
-    return found.key.rpartition("/")[2]
+def _name(entry: Found) -> str:
+    return entry.key.rpartition("/")[2]

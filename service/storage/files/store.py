@@ -11,12 +11,14 @@ import logging
 import os
 import secrets
 import tempfile
+import threading
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+from sqlalchemy import select
 
 from lipcore import persistence
 from lipcore.manifest import ModelFormatError
@@ -25,6 +27,7 @@ from lipcore.samples import Samples
 from service.foundation.errors import DamagedDataError
 from service.foundation.settings import Settings
 from service.storage import sample_file
+from service.storage.database import Database, DatasetRow, SnapshotRow, VersionRow
 from service.storage.files import durable
 from service.storage.files.durable import DamagedFileError
 from service.storage.files.local import Local, remove
@@ -252,3 +255,35 @@ def _samples(dataset: str) -> str:
 
 def _snapshot(snapshot: str) -> str:
     return f"learning/{snapshot}.safetensors"
+
+
+def start_sweeping(database: Database, files: Files) -> None:
+    """Delete files that no row names: before the service starts, or beside it where a store is shared.
+
+    To list a large store takes minutes, and who starts then may be needed.
+    """
+    if cleared := files.clear():
+        logger.warning("removed %d unfinished uploads of an earlier run", cleared)
+    if files.shared:
+        threading.Thread(target=_beside, args=(database, files), name="sweep", daemon=True).start()
+    else:
+        sweep_unnamed(database, files)
+
+
+def sweep_unnamed(database: Database, files: Files) -> int:
+    """Delete files that no row names; return how many."""
+    with database.session() as session:
+        datasets = set(session.scalars(select(DatasetRow.id)))
+        versions = set(session.scalars(select(VersionRow.folder)))
+        snapshots = set(session.scalars(select(SnapshotRow.id)))
+    swept = files.sweep(datasets, versions, snapshots)
+    if swept:
+        logger.warning("removed %d unfinished files of an earlier run", swept)
+    return swept
+
+
+def _beside(database: Database, files: Files) -> None:
+    try:
+        sweep_unnamed(database, files)
+    except Exception as error:  # it will be done at another start
+        logger.warning("what interrupted writes have left is not swept now: %s", error)

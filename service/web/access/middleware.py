@@ -1,21 +1,112 @@
-"""Lets a request through whose key may do what it asks."""
+"""Who is let through: who has a key for what is asked; without keys, all but the web pages of other sites.
+
+A key is in the header `Authorization`, from browsers in a WebSocket's subprotocol.
+"""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from functools import partial
 
 from anyio import CancelScope
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.foundation.errors import ForbiddenError, NotFoundError, ServiceError, readable, refuse
-from service.web.access.credentials import secret_of
-from service.web.access.keyring import CHALLENGE, Keyring, refusal
-from service.web.access.keys import Key
+from service.foundation.errors import ForbiddenError, NotFoundError, ServiceError, problem, readable, refuse
+from service.foundation.settings import is_loopback
+from service.web.access.keys import CHALLENGE, Key, Keyring, refusal
 from service.web.access.scopes import ADMIN, WEBSOCKET, rule_of, scopes_of_stream
-from service.web.observability.context import KEY_ID
+from service.web.observability.logs import KEY_ID
 from service.web.server.stream_protocol import CONNECTION, StreamProtocol
 
-__all__ = ["KEY_ID", "KeyAccess"]
+SUBPROTOCOL = "lipserve"
+KEY_SUBPROTOCOL = "lipserve.key."
+"""Browsers can give a WebSocket no header: `new WebSocket(url, ["lipserve", "lipserve.key." + key])`."""
+
+
+def secret_of(scope: Scope) -> bytes | None:
+    """Return the key that a request carries, None where it carries none."""
+    for name, value in scope["headers"]:
+        if name == b"authorization":
+            given: bytes = value
+            if given[:7] == b"Bearer " or given[:7].lower() == b"bearer ":
+                return given[7:].strip()
+            return None
+    for offered in scope.get("subprotocols", ()):
+        if offered.startswith(KEY_SUBPROTOCOL):
+            return str(offered).removeprefix(KEY_SUBPROTOCOL).encode("latin-1", "replace")
+    return None
+
+
+def subprotocol_of(offered: Iterable[str]) -> str | None:
+    """Return the subprotocol to agree on, of those that a client offers: browsers insist on one of theirs."""
+    offered = list(offered)
+    if SUBPROTOCOL in offered:
+        return SUBPROTOCOL
+    return next((each for each in offered if each.startswith(KEY_SUBPROTOCOL)), None)
+
+
+SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
+"""Methods that change nothing, and whose answers browsers keep from pages of other sites."""
+MOST_KNOWN = 100
+_HOST = re.compile(r"(?:\[([^\[\]]*)\]|([^:\[\]]*))(?::[0-9]*)?")
+"""An address of IPv6 in brackets, or another name, and a port or none."""
+
+
+class LocalAccess:
+    """Middleware that refuses requests of other sites' web pages.
+
+    Host: a site can let its own name lead to 127.0.0.1 (DNS rebinding), and its pages then pass for this service's own;
+    but the name stays theirs. Origin: a page may send to any address, but has to say from where. Neither header can be
+    changed by a page; a program that asks does without Origin.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+        self._known: set[bytes] = set()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on, or answer it with 403."""
+        if scope["type"] != "lifespan":
+            host = origin = None
+            for name, value in scope["headers"]:
+                if name == b"host":
+                    host = value
+                elif name == b"origin":
+                    origin = value
+            if host is not None and host not in self._known and not self._is_local(host):
+                await refuse(_wrong_host(host), scope, receive, send)
+                return
+            changes = scope["type"] == "websocket" or scope["method"] not in SAFE
+            if origin is not None and changes and origin.partition(b"://")[2] != host:
+                await refuse(_wrong_origin(origin), scope, receive, send)
+                return
+        await self.app(scope, receive, send)
+
+    def _is_local(self, host: bytes) -> bool:
+        name = host.decode("latin-1")
+        match = _HOST.fullmatch(name)
+        if match is None or not is_loopback((match[1] or match[2]).lower().removesuffix(".")):
+            return False
+        if len(self._known) < MOST_KNOWN:
+            self._known.add(host)
+        return True
+
+
+def _wrong_host(host: bytes) -> ServiceError:
+    name = readable(host.decode("latin-1")[:200])
+    message = (
+        f"the host is {name!r}: a service without keys answers to localhost and addresses of loopback only. "
+        "Behind a proxy or a forwarded port let it ask for keys: LIPSERVE_KEYS=on"
+    )
+    return ForbiddenError(message, [problem("host", name, "localhost or an address of loopback")])
+
+
+def _wrong_origin(origin: bytes) -> ServiceError:
+    name = readable(origin.decode("latin-1")[:200])
+    message = f"the origin {name!r} is not this service: web pages of other sites may not ask"
+    return ForbiddenError(message, [problem("origin", name, "this service, or none")])
+
 
 POLICY_VIOLATION = 1008
 
@@ -87,9 +178,9 @@ def _check(key: Key, scopes: tuple[str, ...]) -> None:
     for scope in scopes:
         if not key.allows(scope):
             may = ", ".join(sorted(key.scopes))
-            said = f"the API key {key.id} has the scopes {may}: this needs {scope}"
+            message = f"the API key {key.id} has the scopes {may}: this needs {scope}"
             challenge = f'{CHALLENGE}, error="insufficient_scope", scope="{scope}"'
-            raise ForbiddenError(said, headers={"WWW-Authenticate": challenge})
+            raise ForbiddenError(message, headers={"WWW-Authenticate": challenge})
 
 
 def _check_unknown(key: Key, scope: Scope) -> None:

@@ -149,9 +149,9 @@ class _Patterns(dict[str, list[tuple[Rule, re.Pattern[str]]]]):
 @lru_cache(1)
 def _patterns() -> _Patterns:
     """Rules by method, each with the pattern that Starlette matches paths with: what it routes is what is checked."""
-    found = _Patterns()
+    patterns = _Patterns()
     for route in (*TABLE, *OPEN):
         method, path = route
         rule = Rule((TABLE[route],) if route in TABLE else (), route in LASTING)
-        found.setdefault(method, []).append((rule, compile_path(path)[0]))
-    return found
+        patterns.setdefault(method, []).append((rule, compile_path(path)[0]))
+    return patterns

@@ -1,20 +1,51 @@
-"""Logs: one line an event, for people or as JSON, on the standard error stream.
-
-Whatever uses Python's logging goes through it: the service, uvicorn, warnings, libraries, and the processes that train
-and learn. Fields beside the message are given as `extra={"fields": {...}}`.
-"""
+"""Which request or job the code that runs belongs to, for logs and for what is stored."""
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
+import secrets
 import sys
 import traceback
-from collections.abc import MutableMapping
+from collections.abc import Iterable, MutableMapping
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any, Literal, TextIO
 
-from service.web.observability.context import job_id, request_id
+request_id: ContextVar[str | None] = ContextVar("request_id", default=None)
+"""Id of the request that is answered, None outside of one."""
+job_id: ContextVar[str | None] = ContextVar("job_id", default=None)
+"""Id of the job that is worked on, None outside of one."""
+
+REQUEST_ID = b"x-request-id"
+"""Header that names a request: taken from who asks, and in every answer."""
+LONGEST_ID = 64
+KEY_ID = "lipserve.key_id"
+"""Key of the id of the API key in the ASGI scope of a request that came with one."""
+
+_SEPARATORS = str.maketrans("", "", "._-")
+_prefix = secrets.token_hex(6)
+_numbers = itertools.count(1)
+
+
+def new_request_id() -> str:
+    """Return an id that no other request of this or of another process has: a counter costs less than randomness."""
+    return f"{_prefix}-{next(_numbers):x}"
+
+
+def given_request_id(headers: Iterable[tuple[bytes, bytes]]) -> str | None:
+    """The id that a request brings, None where it brings none that can be taken: letters, digits and `._-`, up to 64.
+
+    Whatever else a header may hold would go into logs and into answers.
+    """
+    for name, value in headers:
+        if name == REQUEST_ID:
+            text = value.decode("latin-1")
+            plain = text.translate(_SEPARATORS)
+            return text if len(text) <= LONGEST_ID and plain.isascii() and plain.isalnum() else None
+    return None
+
 
 Event = MutableMapping[str, Any]
 

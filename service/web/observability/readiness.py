@@ -1,7 +1,8 @@
-"""Whether the service can do what it is for: each part is looked at, and named."""
+"""Whether the service can do what it is for: each part is looked at, and named; and whether it is about to stop."""
 
 from __future__ import annotations
 
+import asyncio
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -12,7 +13,26 @@ from typing import Annotated
 from fastapi import Depends, Request
 
 from service.foundation.states import PartState
-from service.web.limits.stopping import Stopping
+
+
+class Stopping:
+    """begun: the service was told to stop, and says so, though it may still answer.
+
+    closing: set when it takes no more connections: who would answer for long, as with events, ends now.
+    """
+
+    def __init__(self) -> None:
+        self.begun = False
+        self.closing = asyncio.Event()
+
+
+async def _stopping(request: Request) -> Stopping:
+    stopping: Stopping = request.app.state.stopping
+    return stopping
+
+
+StoppingDep = Annotated[Stopping, Depends(_stopping)]
+
 
 KEPT_S = 1.0
 """Seconds for which a report holds: however many ask, a part is looked at once in this time."""
@@ -88,8 +108,8 @@ class Readiness:
 
 
 async def _readiness(request: Request) -> Readiness:
-    found: Readiness = request.app.state.readiness
-    return found
+    readiness: Readiness = request.app.state.readiness
+    return readiness
 
 
 ReadinessDep = Annotated[Readiness, Depends(_readiness)]

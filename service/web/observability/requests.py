@@ -1,21 +1,143 @@
-"""The outermost middleware: every request gets an id, is counted, and logged where it is worth a line."""
+"""The outermost middleware: every request gets an id, is counted, and logged where that tells something; and what is
+reported to OpenTelemetry."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Awaitable
-from time import perf_counter
+from collections.abc import Awaitable, Iterable, MutableMapping
+from importlib.util import find_spec
+from time import monotonic, perf_counter
+from typing import Any
 
+from fastapi.telemetry import TelemetryConfig
 from opentelemetry import trace  # FastAPI's own requirement
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.foundation.errors import ERROR_CODE
-from service.web.observability.context import REQUEST_ID, given_request_id, new_request_id, request_id
+from service.foundation.settings import Settings
+from service.web.observability.logs import KEY_ID, REQUEST_ID, given_request_id, new_request_id, request_id
 from service.web.observability.meters import Kind, Meters
-from service.web.observability.request_log import RequestLog
 
+EXPORTER = "opentelemetry.exporter.otlp.proto.http"
+MONITORING_PATHS = ("/health/", "/v2/health/", "/metrics")
+
+
+def telemetry(settings: Settings) -> TelemetryConfig:
+    """What FastAPI shall report; raise ValueError where the packages for it are missing.
+
+    Metrics are at /metrics, and what went wrong is in the log, with the id of the request: neither goes this way.
+    """
+    on = settings.opentelemetry
+    if on and not _installed():
+        raise ValueError(
+            f"LIPSERVE_OPENTELEMETRY is set, which needs the package {EXPORTER.replace('.', '-')}: "
+            "pip install 'lipserve[opentelemetry]'"
+        )
+    return {
+        "tracing": on,
+        "metrics": False,
+        "logs": False,
+        "operation_spans": on,
+        "auto_configure": on,
+        "exclude": _of_monitoring,
+    }
+
+
+def _installed() -> bool:
+    try:
+        return find_spec(EXPORTER) is not None
+    except ModuleNotFoundError:
+        return False
+
+
+def _of_monitoring(scope: MutableMapping[str, Any]) -> bool:
+    path: str = scope["path"]
+    return path.startswith(MONITORING_PATHS)
+
+
+request_lines = logging.getLogger("service.requests")
 logger = logging.getLogger(__name__)
+
+MONITORING = frozenset({"/health/live", "/health/ready", "/v2/health/live", "/v2/health/ready", "/metrics"})
+SHOWN = 200
+"""Characters of an address that are logged."""
+
+
+class RequestLog:
+    """One line for each request, with three exceptions.
+
+    Queries and batches of a control loop, and what monitoring asks for, are logged from `slow_s` on or where they fail:
+    a line takes longer than an answer. Of equal refusals, `most_refusals` a second are logged and the others counted:
+    a loop that asks wrong, or without a key, must not fill the disk. quiet: routes of control loops.
+    """
+
+    def __init__(self, quiet: Iterable[str], slow_s: float, most_refusals: int) -> None:
+        self.quiet, self.slow_s, self.most_refusals = frozenset(quiet) | MONITORING, slow_s, most_refusals
+        self._refusals: dict[tuple[str, int, str], _Second] = {}
+
+    def may_log(self, route: str, seconds: float) -> bool:
+        """Whether a request that was not refused may be worth a line: a quick look, before more is made of it."""
+        return route not in self.quiet or seconds >= self.slow_s or request_lines.isEnabledFor(logging.DEBUG)
+
+    def answered(self, scope: Scope, kind: Kind, seconds: float) -> None:
+        """Log a request that has been answered; of a stream, its end."""
+        slow, missed = seconds >= self.slow_s and kind.status != 101, 0
+        if kind.status >= 400:
+            level, missed = logging.INFO if kind.status < 500 else logging.WARNING, self._missed(kind)
+        else:
+            level = logging.DEBUG if kind.route in self.quiet and not slow else logging.INFO
+        if missed < 0 or not request_lines.isEnabledFor(level):
+            return
+        fields: dict[str, Any] = {"status": kind.status, "duration_ms": round(seconds * 1e3, 3)}
+        if kind.code:
+            fields["code"] = kind.code
+        if slow:
+            fields["slow"] = True
+        if missed:
+            fields["not_logged"] = missed
+        what = "stream closed" if kind.status == 101 else "request"
+        request_lines.log(level, what, extra={"fields": _of(scope, kind.route) | fields})
+
+    def opened(self, scope: Scope, route: str) -> None:
+        """Log a stream that begins."""
+        if request_lines.isEnabledFor(logging.INFO):
+            request_lines.info("stream opened", extra={"fields": _of(scope, route)})
+
+    def _missed(self, kind: Kind) -> int:
+        """How many equal refusals were not logged before this one; -1 where this one is not either."""
+        second = int(monotonic())
+        seen = self._refusals.get((kind.route, kind.status, kind.code))
+        if seen is None:
+            seen = self._refusals[kind.route, kind.status, kind.code] = _Second(second)
+        missed = 0
+        if seen.second != second:
+            missed = max(seen.count - self.most_refusals, 0)
+            seen.second, seen.count = second, 0
+        seen.count += 1
+        return missed if seen.count <= self.most_refusals else -1
+
+
+def _of(scope: Scope, route: str) -> dict[str, Any]:
+    """What a line says of a request: its address without the query, cut, as clients choose both."""
+    fields = {"route": route, "path": scope["path"][:SHOWN]}
+    if "method" in scope:
+        fields["method"] = scope["method"][:16]
+    if scope.get("client"):
+        fields["client"] = scope["client"][0]
+    if KEY_ID in scope:
+        fields["key"] = scope[KEY_ID]
+    return fields
+
+
+class _Second:
+    """Refusals of one sort within one second."""
+
+    __slots__ = ("count", "second")
+
+    def __init__(self, second: int) -> None:
+        self.second, self.count = second, 0
+
 
 WEBSOCKET = "WEBSOCKET"
 """Stands for the method of a request for a stream."""
@@ -48,21 +170,21 @@ class RequestContext:
         answered = began
 
         # no coroutine of its own, which would cost every frame of a stream
-        def tell(message: Message) -> Awaitable[None]:
+        def note_status(message: Message) -> Awaitable[None]:
             nonlocal status, answered
-            if not status and (found := _status(message)):
-                status, answered = found, perf_counter()
+            if not status and (begun := _status_of(message)):
+                status, answered = begun, perf_counter()
                 message["headers"] = [*message.get("headers", ()), (REQUEST_ID, name.encode())]
-                if found == 101:
+                if begun == 101:
                     self.requests.streams += 1
                     self.log.opened(scope, _template(scope))
             return send(message)
 
         self.requests.in_flight += method is not WEBSOCKET
         try:
-            await self.app(scope, receive, tell)
+            await self.app(scope, receive, note_status)
         except Exception as error:
-            await self._answer(scope, receive, tell, error, begun=bool(status))
+            await self._answer(scope, receive, note_status, error, begun=bool(status))
             raise
         finally:
             self.requests.in_flight -= method is not WEBSOCKET
@@ -77,7 +199,7 @@ class RequestContext:
             if durations is None:
                 durations = self.requests.find(Kind(*kind), status < 400 or _exists(scope, model))
             durations.add(answered - began)
-            if status >= 400 or self.log.worth(path, seconds):
+            if status >= 400 or self.log.may_log(path, seconds):
                 self.log.answered(scope, Kind(*kind), seconds)
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send, error: Exception, begun: bool) -> None:
@@ -90,7 +212,7 @@ class RequestContext:
         await answer(scope, receive, send)
 
 
-def _status(message: Message) -> int:
+def _status_of(message: Message) -> int:
     """Status of the answer that a message begins, 0 where it begins none."""
     kind: str = message["type"]
     if kind.endswith("http.response.start"):
@@ -102,8 +224,8 @@ def _status(message: Message) -> int:
 def _template(scope: Scope) -> str:
     """Path of the route that a request has reached, with the names of its parameters; empty where it reached none."""
     route = scope.get("route") or scope.get("endpoint")  # Starlette names no route of a WebSocket
-    found: str = getattr(route, "path", "")
-    return found
+    path: str = getattr(route, "path", "")
+    return path
 
 
 def _exists(scope: Scope, model: str) -> bool:

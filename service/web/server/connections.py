@@ -16,7 +16,7 @@ from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 
 from service.foundation.errors import BusyError, ErrorBody, ErrorResponse, refuse
 from service.foundation.settings import Settings
-from service.web.limits.gate import HEALTH
+from service.web.limits.requests import HEALTH
 
 REFUSED = 64
 """Connections beyond the most there may be that are told so; others are closed without a word."""
@@ -121,8 +121,8 @@ class GuardedProtocol(HttpToolsProtocol):
         if self.transport.is_closing():
             return
         if self._overhead > 0 and self.cycle is None:
-            said = f"the request's line and headers did not come within {self.settings.header_s:g} s"
-            self._say(HTTPStatus.REQUEST_TIMEOUT, "request_timeout", said)
+            message = f"the request's line and headers did not come within {self.settings.header_s:g} s"
+            self._say(HTTPStatus.REQUEST_TIMEOUT, "request_timeout", message)
         else:
             self.transport.close()
 
@@ -131,8 +131,8 @@ class GuardedProtocol(HttpToolsProtocol):
         if self.transport.is_closing():
             return
         if self.cycle is None or self.cycle.response_complete:
-            said = f"the request's line and headers have more than {self.settings.max_header_bytes} bytes"
-            self._say(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, "too_large", said)
+            message = f"the request's line and headers have more than {self.settings.max_header_bytes} bytes"
+            self._say(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, "too_large", message)
         else:
             self.transport.abort()
 
@@ -152,11 +152,11 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def _waiting(self) -> int:
         """Bytes that the client has not taken: here, and in the kernel, whose buffers hide a slow reader for long."""
-        found = self.transport.get_write_buffer_size()
+        waiting = self.transport.get_write_buffer_size()
         with suppress(OSError, ValueError):  # a kernel that does not tell, a socket that is closed
             number = self.transport.get_extra_info("socket").fileno()
-            found += int.from_bytes(fcntl.ioctl(number, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
-        return found
+            waiting += int.from_bytes(fcntl.ioctl(number, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
+        return waiting
 
     def _say(self, status: HTTPStatus, code: str, message: str) -> None:
         """Answer what did not become a request, and close."""
@@ -177,8 +177,8 @@ class _Crowded:
         if scope["path"].startswith(HEALTH):
             await self.app(scope, receive, send)
             return
-        said = f"{self.most} connections are open, the most there may be (LIPSERVE_MAX_CONNECTIONS): try again"
-        await refuse(BusyError(said, headers={"Retry-After": "1", "Connection": "close"}), scope, receive, send)
+        message = f"{self.most} connections are open, the most there may be (LIPSERVE_MAX_CONNECTIONS): try again"
+        await refuse(BusyError(message, headers={"Retry-After": "1", "Connection": "close"}), scope, receive, send)
 
 
 def guarded(settings: Settings) -> type[GuardedProtocol]:

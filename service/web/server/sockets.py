@@ -18,7 +18,7 @@ from typing import Any
 import uvicorn
 from uvicorn.config import STARTUP_FAILURE
 
-from service.web.limits.stopping import Stopping
+from service.web.observability.readiness import Stopping
 
 logger = logging.getLogger(__name__)
 
@@ -140,19 +140,19 @@ def _make_room(path: Path) -> None:
         raise SocketError(f"uds is {str(path)!r}, where something lies that is no socket: expected another path")
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.settimeout(PROBE_SECONDS)
-        found = probe.connect_ex(os.fspath(path))
-    if found == errno.ECONNREFUSED:
+        code = probe.connect_ex(os.fspath(path))
+    if code == errno.ECONNREFUSED:
         path.unlink(missing_ok=True)
-    elif found in (0, errno.EAGAIN):
+    elif code in (0, errno.EAGAIN):
         raise SocketError(f"uds is {str(path)!r}, where another service listens: stop it, or set another path")
     else:
-        reason = os.strerror(found)
+        reason = os.strerror(code)
         raise SocketError(f"uds is {str(path)!r}, where a socket lies that does not answer: {reason}; set another path")
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
     try:
-        found = path.lstat()
+        status = path.lstat()
     except OSError:
         return None
-    return found.st_dev, found.st_ino
+    return status.st_dev, status.st_ino

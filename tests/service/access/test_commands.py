@@ -9,10 +9,10 @@ import pytest
 
 from service import cli
 from service.client import Client
+from service.client.sending import headers_of
 from service.foundation.settings import Settings
 from service.storage.database import Database
 from service.web.access import keys
-from service.web.access.credentials import headers_of
 from service.web.access.keys import digest_of
 from tests.service.access.conftest import bearer
 from tests.service.data import eventually

@@ -11,9 +11,9 @@ from sqlalchemy import delete, update
 
 from service.foundation.errors import UnauthorizedError
 from service.storage.database import ApiKeyRow
-from service.web.access import keyring as keyring_module
 from service.web.access import keys
-from service.web.access.keyring import Keyring
+from service.web.access import keys as keyring_module
+from service.web.access.keys import Keyring
 from service.web.access.scopes import ADMIN, SCOPES
 from tests.service.access.conftest import REFRESH_S, bearer
 from tests.service.data import error, eventually

@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from service.web.access.local import MOST_KNOWN, LocalAccess
+from service.web.access.middleware import MOST_KNOWN, LocalAccess
 from tests.service.access.conftest import bearer
 from tests.service.data import error
 

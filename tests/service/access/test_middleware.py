@@ -7,7 +7,7 @@ import asyncio
 import pytest
 
 from service.web.access import keys
-from service.web.access.keyring import Keyring
+from service.web.access.keys import Keyring
 from service.web.access.middleware import KEY_ID, KeyAccess
 from tests.service.access.conftest import REFRESH_S
 

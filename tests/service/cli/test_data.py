@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from service.cli import recordings
+from service.cli.simulate import write_recording
 from tests.service.data import stream
 
 
@@ -24,7 +24,7 @@ def data(server, lipserve):
 @pytest.fixture
 def path(tmp_path):
     found = tmp_path / "two-joints.csv"
-    recordings.write(found, stream(samples=600, rate=100.0, seed=72))
+    write_recording(found, stream(samples=600, rate=100.0, seed=72))
     return found
 
 

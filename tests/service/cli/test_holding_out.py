@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from service.cli import recordings
+from service.cli.simulate import write_recording
 from service.client import ApiError, Client
 from tests.service.cli.conftest import QUICKLY
 from tests.service.data import QUICK, stream
@@ -14,7 +14,7 @@ from tests.service.data import QUICK, stream
 
 def test_from_a_recording_to_figures_on_what_was_held_out(lipserve, server, tmp_path):
     path = tmp_path / "stream.npz"
-    recordings.write(path, stream(samples=120, rate=10.0, seed=11))
+    write_recording(path, stream(samples=120, rate=10.0, seed=11))
     asked = ("--hold-out", 0.25, "--hold-out-by", "blocks")
     code, said, err = lipserve("train", path, "--model", "cli-held", "--url", server.url, *asked, *QUICKLY)
     assert code == 0, err
@@ -37,7 +37,7 @@ def test_from_a_recording_to_figures_on_what_was_held_out(lipserve, server, tmp_
 
 def test_mistakes_are_passed_on(lipserve, server, tmp_path):
     path = tmp_path / "stream.npz"
-    recordings.write(path, stream(samples=60, rate=10.0, seed=12))
+    write_recording(path, stream(samples=60, rate=10.0, seed=12))
     code, _, err = lipserve("train", path, "--model", "m", "--url", server.url, "--hold-out-by", "rows")
     assert code == 1
     assert "holdout.kind" in err
@@ -47,8 +47,8 @@ def test_mistakes_are_passed_on(lipserve, server, tmp_path):
 
 def test_the_client_holds_out_and_evaluates(server, tmp_path):
     path, unused = tmp_path / "stream.npz", tmp_path / "unused.npz"
-    recordings.write(path, stream(samples=120, rate=10.0, seed=13))
-    recordings.write(unused, stream(samples=60, rate=10.0, seed=14))
+    write_recording(path, stream(samples=120, rate=10.0, seed=13))
+    write_recording(unused, stream(samples=60, rate=10.0, seed=14))
     with Client(server.url) as client:
         dataset, other = client.upload(path).id, client.upload(unused).id
         job = client.wait(

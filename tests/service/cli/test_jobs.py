@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from service.cli import recordings, watching
+from service.cli.simulate import write_recording
 from service.client import Client
 from tests.service.cli.conftest import QUICKLY
 from tests.service.data import ENDLESS, ended, queue, stream, upload
@@ -24,7 +24,7 @@ def interrupted(monkeypatch):
 
         yield look
 
-    monkeypatch.setattr(watching, "job_bar", bar)
+    monkeypatch.setattr("service.client.progress.job_bar", bar)
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,7 @@ def test_ctrl_c_in_follow_leaves_the_job(lipserve, asked, server, long, interrup
 
 def test_a_job_is_queued_followed_and_listed(lipserve, asked, server, tmp_path):
     path = tmp_path / "arm.npz"
-    recordings.write(path, stream(seed=82))
+    write_recording(path, stream(seed=82))
     job = asked("train", path, "--model", "cli-queued", "--no-wait", *QUICKLY, "--estimator", "se", "--json")["id"]
     assert "cli-queued (se): succeeded, version 1" in asked("jobs", "follow", job)
     assert asked("jobs", "show", job, "--json")["state"] == "succeeded"
@@ -84,7 +84,7 @@ def test_a_job_is_queued_followed_and_listed(lipserve, asked, server, tmp_path):
 
 def test_a_file_is_evaluated(asked, arm, tmp_path):
     path = tmp_path / "unseen.npz"
-    recordings.write(path, stream(seed=83))
+    write_recording(path, stream(seed=83))
     name, dataset = arm
     assert not asked("evaluate", name, path, "--json")["in_training"]
     assert asked("evaluate", name, dataset, "--json")["in_training"]
@@ -94,7 +94,7 @@ def test_a_file_is_evaluated(asked, arm, tmp_path):
 def test_data_sets_are_deleted(lipserve, asked, server, tmp_path):
     paths = [tmp_path / f"{name}.npz" for name in "ab"]
     for path in paths:
-        recordings.write(path, stream(seed=84))
+        write_recording(path, stream(seed=84))
     made = [each["id"] for each in asked("data", "add", *paths, "--json")]
     assert asked("data", "delete", *made, "--yes", "--json") == {"deleted": made}
     code, _, err = lipserve("data", "show", made[0], "--url", server.url)

@@ -8,11 +8,10 @@ import signal
 import numpy as np
 import pytest
 
-from service.cli import recordings
-from service.cli.playing.source import recorded
-from service.cli.playing.tally import Tally
+from service.cli.playing import Tally, recorded
+from service.cli.simulate import write_recording
 from service.client.stream import StreamClient
-from service.stream.messages import StreamAnswer
+from service.stream.exchange import StreamAnswer
 from tests.service.data import stream, train, upload
 
 
@@ -41,7 +40,7 @@ def test_a_simulated_robot_is_played_and_taught(lipserve, server):
 
 def test_a_recording_is_played(lipserve, arm, server, tmp_path):
     path = tmp_path / "motion.csv"
-    recordings.write(path, stream(samples=20, rate=40.0, seed=85))
+    write_recording(path, stream(samples=20, rate=40.0, seed=85))
     code, said, _ = lipserve("stream", arm[0], path, "--url", server.url)
     assert code == 0
     assert "in all  20 rows; round trip p50 " in said
@@ -70,7 +69,7 @@ def test_ctrl_c_ends_a_stream_with_its_figures(lipserve, arm, server, monkeypatc
 
 def test_recordings_are_prepared_as_uploads_are(tmp_path):
     path, samples = tmp_path / "motion.npz", stream(samples=40, rate=20.0, seed=86)
-    recordings.write(path, samples)
+    write_recording(path, samples)
     found = recorded(path)
     np.testing.assert_array_equal(found.tau, samples.tau)
     assert (found.joint_names, found.step) == (samples.joint_names, pytest.approx(0.05))

@@ -10,9 +10,9 @@ import pytest
 from lipcore.estimators import ESTIMATORS
 from lipcore.robots import ROBOTS
 from lipcore.vocabulary import AUTO, CHOICES
-from service.cli import errors, words
+from service.cli import consoles, options
 from service.cli.consoles import plain
-from service.cli.tree import commands
+from service.cli.main import commands
 from service.client import ApiError
 from tests.service.server import free_port
 
@@ -26,7 +26,7 @@ def test_reference_is_up_to_date():
 
 
 def test_names_that_help_lists_are_those_that_there_are():
-    assert list(ROBOTS) == words.ROBOTS
+    assert list(ROBOTS) == options.ROBOTS
     assert [AUTO, *ESTIMATORS] == list(CHOICES)
 
 
@@ -106,15 +106,15 @@ def test_address_of_the_dashboard(asked, server):
     ],
 )
 def test_hints(status, code, hint):
-    told = errors.explain(ApiError(status, code, "no", []), (ApiError,))
+    told = consoles.explain(ApiError(status, code, "no", []), (ApiError,))
     assert told.message == f"no ({code}, {status})"
     assert (told.hint is None) if hint is None else (hint in told.hint)
 
 
 def test_faults_are_not_explained_away():
-    assert errors.explain(KeyError("x")) is None
-    assert errors.explain(BrokenPipeError()) is None
-    assert errors.explain(ValueError("x is 1, expected 2")) == ("x is 1, expected 2", None)
+    assert consoles.explain(KeyError("x")) is None
+    assert consoles.explain(BrokenPipeError()) is None
+    assert consoles.explain(ValueError("x is 1, expected 2")) == ("x is 1, expected 2", None)
 
 
 def test_numbers_that_json_does_not_know_are_null():

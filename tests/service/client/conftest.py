@@ -8,7 +8,7 @@ import httpx
 import pytest
 from fastapi.testclient import TestClient
 
-from service.client import Client, attempts
+from service.client import Client, sending
 from tests.service.data import ADDRESS
 
 
@@ -62,5 +62,5 @@ def losing(api: TestClient, pauses: list[float]) -> Callable[..., tuple[Client, 
         client._reach.reached = True
         return client, transport
 
-    assert attempts.RETRIES > 1
+    assert sending.RETRIES > 1
     return make

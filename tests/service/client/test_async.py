@@ -8,7 +8,7 @@ import httpx
 import numpy as np
 import pytest
 
-from service.cli import recordings
+from service.cli.simulate import write_recording
 from service.client import ApiError, AsyncClient, Client, ServiceUnreachableError
 from service.client.async_stream import AsyncStreamClient
 from service.client.stream import StreamError
@@ -28,7 +28,7 @@ def ask(server, work):
 
 
 def test_from_files_to_torques(streaming, tmp_path):
-    recordings.write(tmp_path / "train.npz", stream())
+    write_recording(tmp_path / "train.npz", stream())
 
     async def work(client):
         dataset = await client.upload(tmp_path / "train.npz")

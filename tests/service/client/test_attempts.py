@@ -6,7 +6,7 @@ import httpx
 import pytest
 
 from service.client import ApiError, ServiceUnreachableError
-from service.client.attempts import FIRST_PAUSE_S, LONGEST_PAUSE_S, RETRIES
+from service.client.sending import FIRST_PAUSE_S, LONGEST_PAUSE_S, RETRIES
 from tests.service.client.conftest import over
 from tests.service.data import QUICK, stream, upload
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.cli import recordings
+from service.cli.simulate import write_recording
 from service.client import ApiError, Client, ServiceUnreachableError
 from tests.service.data import QUICK, stream
 from tests.service.server import free_port
@@ -21,8 +21,8 @@ def client(server):
 def files(tmp_path_factory):
     """A training stream as CSV, an unseen one as NPZ."""
     folder = tmp_path_factory.mktemp("files")
-    recordings.write(folder / "train.csv", stream())
-    recordings.write(folder / "test.npz", stream(seed=2))
+    write_recording(folder / "train.csv", stream())
+    write_recording(folder / "test.npz", stream(seed=2))
     return folder
 
 

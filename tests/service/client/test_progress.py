@@ -7,7 +7,7 @@ import io
 import pytest
 from rich.console import Console
 
-from service.cli import recordings
+from service.cli.simulate import write_recording
 from service.client import progress
 from service.client.progress import follow, upload_bar
 from tests.service.data import ENDLESS, QUICK, running, stream, upload
@@ -26,7 +26,7 @@ def shown(monkeypatch):
 
 
 def test_an_upload_shows_how_far_it_is(local, tmp_path, shown):
-    recordings.write(tmp_path / "arm.npz", stream(seed=91))
+    write_recording(tmp_path / "arm.npz", stream(seed=91))
     local.upload(tmp_path / "arm.npz", progress=True)
     assert "uploading arm.npz: sent, being read" in shown.getvalue()
 

@@ -61,20 +61,20 @@ def test_what_may_be_repeated():
 
     zero = [0.0]
     assert repeatable(calls.inference.predict("m", zero, zero, zero))
-    assert repeatable(calls.jobs.train("m", ["ds_1"]))
+    assert repeatable(calls.models.train("m", ["ds_1"]))
     assert repeatable(calls.learning.unlearn("m", "arm", 1))
     assert repeatable(calls.models.set_alias("m", "production", 1))
     for call in (
         calls.learning.rollback("m", revision=1),
         calls.learning.replay("m", "arm", 1),
         calls.models.rollback_alias("m", "production"),
-        calls.jobs.cancel("job_1"),
-        calls.server.health(),
+        calls.models.cancel("job_1"),
+        calls.inference.health(),
     ):
         assert not repeatable(call), call.path
 
 
 def test_names_are_quoted_and_paths_chosen_by_what_is_given():
     assert calls.models.model("a/../b?c").path == "/v1/models/a%2F..%2Fb%3Fc"
-    assert calls.server.model_ready("m").path == "/v2/models/m/ready"
-    assert calls.server.model_ready("m", 2).path == "/v2/models/m/versions/2/ready"
+    assert calls.inference.model_ready("m").path == "/v2/models/m/ready"
+    assert calls.inference.model_ready("m", 2).path == "/v2/models/m/versions/2/ready"

@@ -99,13 +99,13 @@ def test_shards_weigh_rows_as_the_whole_does(settings, parts):
         weights = np.concatenate([weights for _, weights in read_back])
         np.testing.assert_array_equal(weights, spacing.recorded(samples.t, samples.episode)[mask])
         np.testing.assert_array_equal(np.concatenate([each.tau for each, _ in read_back]), samples.tau[mask])
-        assert part.worth() == pytest.approx(weights.sum())
+        assert part.independent_rows() == pytest.approx(weights.sum())
 
 
 def test_rows_without_times_count_for_no_more_than_the_chosen_ones(parts):
     table = Table(parts).weighed(500)
     assert [part.factor for part in table.parts] == [1.0, 500 / ROWS]
-    assert table.worth() == pytest.approx(0.1 * ROWS + 500, rel=0.01)
+    assert table.independent_rows() == pytest.approx(0.1 * ROWS + 500, rel=0.01)
     assert Table([parts[1]]).weighed(500).worth() == pytest.approx(500)
 
 

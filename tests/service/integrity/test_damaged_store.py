@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from lipcore import ModelFormatError
 from lipcore.online import state
 from service import cli
-from service.cli.verification import verify
+from service.cli.verify import verify_home
 from service.foundation.errors import DamagedDataError
 from service.foundation.settings import Settings
 from service.journal import snapshots
@@ -107,7 +107,7 @@ def test_snapshot_of_an_earlier_release_has_no_checksum_and_is_read(arm):
     name = snapshot(arm, 1)
     with arm.database.transaction() as session:
         session.scalar(select(SnapshotRow).where(SnapshotRow.id == name)).sha256 = None
-    assert verify(arm.settings).damages == []
+    assert verify_home(arm.settings).damages == []
 
 
 @pytest.fixture
@@ -130,7 +130,7 @@ def store(arm):
 
 
 def test_whole_store_is_said_to_be_whole(store):
-    found = verify(store.settings)
+    found = verify_home(store.settings)
     assert found.damages == []
     assert found.read == {"datasets": 1, "robots": 1, "versions": 1, "snapshots": 1, "observations": 1}
 
@@ -162,7 +162,7 @@ DAMAGES = {
 @pytest.mark.parametrize("what", DAMAGES)
 def test_each_damage_is_found_and_nothing_else(store, what):
     DAMAGES[what](store)
-    (damage,) = verify(store.settings).damages
+    (damage,) = verify_home(store.settings).damages
     assert damage.kind == what.split("'")[0].split()[0]
     assert damage.reason
 
@@ -178,7 +178,7 @@ def test_command_says_what_is_damaged_and_ends_with_1(store, monkeypatch):
 
 def test_home_without_a_database_is_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="expected a folder with the database"):
-        verify(Settings(home=tmp_path / "none"))
+        verify_home(Settings(home=tmp_path / "none"))
     assert not (tmp_path / "none").exists()
 
 
@@ -189,4 +189,4 @@ def test_what_is_deleted_meanwhile_is_not_damaged(store, monkeypatch):
         raise DamagedDataError("its file is gone")
 
     monkeypatch.setattr(Files, "read_samples", read)
-    assert verify(store.settings).damages == []
+    assert verify_home(store.settings).damages == []

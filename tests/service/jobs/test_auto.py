@@ -7,7 +7,7 @@ import json
 import pytest
 
 from lipcore.fitting import FitProgress
-from service.training.remaining import LEAST_FRACTION, Remaining
+from service.training.pulse import LEAST_FRACTION, Remaining
 from tests.service.data import QUICK, ended, job, queue, stream, train, upload
 
 NAMES = ["rigid-body", "lip-chain", "rigid-body+lip-chain"]

@@ -49,7 +49,7 @@ def test_a_process_without_a_sign_of_life_is_ended_and_its_job_started_again_but
 
 
 def test_a_job_whose_process_cannot_start_fails_in_the_end_and_the_service_knows(bench, monkeypatch):
-    monkeypatch.setattr("service.training.settling.FIRST_PAUSE_S", 0.05)
+    monkeypatch.setattr("service.training.lifecycle.FIRST_PAUSE_S", 0.05)
     jobs = bench(workers.stillborn, max_job_attempts=2)
     seen = jobs.ended(jobs.submit("stillborn"))
     assert (seen.state, seen.attempts, seen.error["code"]) == ("failed", 0, "interrupted")
@@ -59,7 +59,7 @@ def test_a_job_whose_process_cannot_start_fails_in_the_end_and_the_service_knows
 
 
 def test_where_the_system_starts_no_process_the_job_waits_for_one(bench, monkeypatch):
-    monkeypatch.setattr("service.training.settling.FIRST_PAUSE_S", 0.05)
+    monkeypatch.setattr("service.training.lifecycle.FIRST_PAUSE_S", 0.05)
     jobs = bench(workers.well)
     (slot,) = jobs.queue._slots
     start, refusals = slot.start, iter([OSError(11, "Resource temporarily unavailable")])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from lipcore.fitting import FitProgress
-from service.training.remaining import POSTERIOR_ITERATIONS, Remaining
+from service.training.pulse import POSTERIOR_ITERATIONS, Remaining
 
 
 def at(iteration, stage="hyperparameters", most=50):

@@ -8,9 +8,8 @@ from sqlalchemy import select
 from service.foundation.settings import Settings
 from service.storage.database import Database, JobRow
 from service.storage.files import Files
-from service.training import history, leftovers
-from service.training.settling import Settled, Settler
-from service.training.watch import Ended
+from service.training import lifecycle
+from service.training.lifecycle import Ended, Settled, Settler
 from tests.service.jobs.conftest import new_row
 
 
@@ -83,18 +82,18 @@ def test_one_that_is_not_there_is_nobody_s(store):
 
 def test_what_a_job_did_not_publish_is_deleted_and_nothing_else(store):
     database, files = store
-    own, others = leftovers.new_folder("job_x1x"), leftovers.new_folder("job_y2y")
+    own, others = lifecycle.new_folder("job_x1x"), lifecycle.new_folder("job_y2y")
     for name in (own, others, f".draft-{own}-abc", "mv_published"):
         (files.versions / name).mkdir()
-    assert leftovers.remove(database, files, "job_x1x") == 2
+    assert lifecycle.remove_leftovers(database, files, "job_x1x") == 2
     assert {path.name for path in files.versions.iterdir()} == {others, "mv_published"}
-    assert leftovers.remove(database, files, "job_x1x") == 0
+    assert lifecycle.remove_leftovers(database, files, "job_x1x") == 0
 
 
 def test_a_history_keeps_its_first_and_its_newest_entries():
     row = new_row("x")
-    for number in range(history.MOST_ENTRIES + 5):
-        history.enter(row, "queued", str(number))
+    for number in range(lifecycle.MOST_ENTRIES + 5):
+        lifecycle.enter(row, "queued", str(number))
     messages = [entry["message"] for entry in row.history]
-    assert len(messages) == history.MOST_ENTRIES
-    assert (messages[0], messages[1], messages[-1]) == ("0", "6", str(history.MOST_ENTRIES + 4))
+    assert len(messages) == lifecycle.MOST_ENTRIES
+    assert (messages[0], messages[1], messages[-1]) == ("0", "6", str(lifecycle.MOST_ENTRIES + 4))

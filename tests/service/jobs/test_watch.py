@@ -6,7 +6,7 @@ import pytest
 
 from service.foundation.settings import Settings
 from service.training import queue
-from service.training.watch import LINGER_S, Facts, Hand
+from service.training.lifecycle import LINGER_S, Facts, Hand
 
 SETTINGS = Settings(job_cancel_grace_s=1.0, job_heartbeat_s=60.0, job_start_s=120.0, max_job_s=1000.0)
 

@@ -12,7 +12,7 @@ from typing import Any, Self
 import uvicorn
 
 from service.foundation.settings import Settings
-from service.web.limits.stopping import Stopping
+from service.web.observability.readiness import Stopping
 from service.web.server.connections import guarded
 from service.web.server.sockets import Server
 from tests.service.data import DEADLINE, eventually

@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from service.web.limits.gate import Gate
+from service.web.limits.requests import Gate
 
 
 class Client:

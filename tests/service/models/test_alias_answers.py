@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import pytest
 
-from service.inference.wire import decode
+from service.inference.predicting import decode
 from tests.service.data import error, service_of, stream, upload
 from tests.service.models.versions import QUERY, predict, publish, worse
 

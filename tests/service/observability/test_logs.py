@@ -13,8 +13,7 @@ import pytest
 
 from service.compute.process import Place, start_process
 from service.web.observability import logs
-from service.web.observability.context import job_id, request_id
-from service.web.observability.logs import LogOptions
+from service.web.observability.logs import LogOptions, job_id, request_id
 
 
 def record(message="said %s", *args, **more):
@@ -89,7 +88,7 @@ def test_readable_texts_stay_as_they_are():
 
 CONFIGURED = """
 import json, logging, warnings
-from service.observability import logs
+from service.web.observability import logs
 logs.configure(logs.LogOptions("debug", "json"))
 logs.configure(logs.LogOptions("debug", "json"))
 logging.getLogger("service.a").debug("ours")

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from service.web.observability.meters import BOUNDS, OTHER, Durations, Kind, Meters, RequestMeter
-from service.web.observability.metric import MetricKind, merged
+from service.web.observability.meters import BOUNDS, OTHER, Durations, Kind, Meters, MetricKind, RequestMeter, merged
 
 
 def test_a_duration_counts_up_to_its_bound():

@@ -49,7 +49,7 @@ def test_the_table_has_what_is_shown(api):
     assert {name for name in shown if name.startswith("lipserve_")} == set(documented)
     for name, kind in documented.items():
         family = shown[name]
-        assert (family.type, family.documentation) == (kind.kind, kind.said)
+        assert (family.type, family.documentation) == (kind.kind, kind.meaning)
         for sample in family.samples:
             assert set(sample.labels) - {"le"} == set(kind.labels)
 

@@ -9,7 +9,7 @@ import pytest
 
 from service.learning.learner.process import LearnerProcess
 from service.learning.learners import RESTART_S
-from service.storage import looks
+from service.storage import storage
 from service.training.metrics import START_S
 from service.web.observability.readiness import KEPT_S, Readiness
 from tests.service.data import QUICK, error, service_of, stream, upload
@@ -61,7 +61,7 @@ def test_what_does_not_work_is_named(api, fresh_looks, monkeypatch):
 
 
 def test_a_locked_database_is_found(api, look, monkeypatch):
-    monkeypatch.setattr(looks, "WRITE_S", 0.05)
+    monkeypatch.setattr(storage, "WRITE_S", 0.05)
     service = service_of(api)
     with closing(sqlite3.connect(service.database.engine.url.database, isolation_level=None)) as other:
         other.execute("BEGIN IMMEDIATE")

@@ -10,12 +10,11 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.compute.process import Place
-from service.inference import answer as inference
+from service.inference import predicting as inference
 from service.learning.learners import IngestThreads
-from service.web.observability.context import given_request_id, new_request_id, request_id
+from service.web.observability.logs import given_request_id, new_request_id, request_id
 from service.web.observability.meters import Meters
-from service.web.observability.request_log import RequestLog
-from service.web.observability.requests import RequestContext
+from service.web.observability.requests import RequestContext, RequestLog
 from tests.service.data import ADDRESS
 
 MADE = re.compile(r"[0-9a-f]{12}-[0-9a-f]+")

@@ -6,10 +6,10 @@ import logging
 
 import pytest
 
-from service.web.observability import request_log
-from service.web.observability.context import KEY_ID
+from service.web.observability import requests
+from service.web.observability.logs import KEY_ID
 from service.web.observability.meters import Kind
-from service.web.observability.request_log import RequestLog
+from service.web.observability.requests import RequestLog
 from tests.service.data import upload
 from tests.service.observability.test_request_ids import QUERY
 
@@ -69,8 +69,8 @@ def test_a_control_loop_has_one_where_it_is_wrong(api, lines):
 
 def test_a_control_loop_has_one_where_it_is_slow(lines):
     log = RequestLog([HOT], slow_s=0.25, most_refusals=10)
-    assert not log.worth(HOT, 0.249)
-    assert log.worth(HOT, 0.25)
+    assert not log.may_log(HOT, 0.249)
+    assert log.may_log(HOT, 0.25)
     answered(log, seconds=0.249)
     answered(log, seconds=0.25)
     assert [(line["duration_ms"], line["slow"]) for line in lines()] == [(250.0, True)]
@@ -79,7 +79,7 @@ def test_a_control_loop_has_one_where_it_is_slow(lines):
 def test_a_control_loop_has_one_at_debug(caplog, lines):
     caplog.set_level(logging.DEBUG, "service.requests")
     log = RequestLog([HOT], slow_s=0.25, most_refusals=10)
-    assert log.worth(HOT, 0.001)
+    assert log.may_log(HOT, 0.001)
     answered(log)
     assert [line["level"] for line in lines()] == ["DEBUG"]
 
@@ -92,7 +92,7 @@ def test_what_fails_is_a_warning_that_names_the_key(lines):
 
 def test_equal_refusals_are_counted_instead(lines, monkeypatch):
     now = [100.0]
-    monkeypatch.setattr(request_log, "monotonic", lambda: now[0])
+    monkeypatch.setattr(requests, "monotonic", lambda: now[0])
     log = RequestLog([], slow_s=1.0, most_refusals=3)
     for _ in range(50):
         answered(log, 401, code="unauthorized")
@@ -107,7 +107,7 @@ def test_equal_refusals_are_counted_instead(lines, monkeypatch):
 def test_an_address_is_cut(lines):
     answered(RequestLog([], 1.0, 10), 404, route="", path="/" + "x" * 5000, method="Y" * 5000)
     (line,) = lines()
-    assert len(line["path"]) == request_log.SHOWN
+    assert len(line["path"]) == requests.SHOWN
     assert len(line["method"]) <= 16
 
 

@@ -13,7 +13,7 @@ from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanE
 
 from service.app import create_app
 from service.foundation.settings import Settings
-from service.web.observability import logs, tracing
+from service.web.observability import logs, requests
 from tests.service.data import ADDRESS
 
 
@@ -24,7 +24,7 @@ def spans(monkeypatch):
     provider = TracerProvider()
     provider.add_span_processor(SimpleSpanProcessor(exporter))
     monkeypatch.setattr(trace, "get_tracer_provider", lambda: provider)
-    monkeypatch.setattr(tracing, "_installed", lambda: True)
+    monkeypatch.setattr(requests, "_installed", lambda: True)
     return exporter.get_finished_spans
 
 
@@ -54,7 +54,7 @@ def test_nothing_is_traced_unless_it_is_asked_for(spans, home):
 
 
 def test_without_the_package_the_start_says_what_to_install(monkeypatch, home):
-    monkeypatch.setattr(tracing, "EXPORTER", "opentelemetry.exporter.nowhere")
+    monkeypatch.setattr(requests, "EXPORTER", "opentelemetry.exporter.nowhere")
     with pytest.raises(ValueError, match=r"pip install 'lipserve\[opentelemetry\]'"):
         client(home, opentelemetry=True)
 

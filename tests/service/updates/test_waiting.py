@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from service.learning.learner.process import LearnerProcess
-from service.models.waiting import Waiting
+from service.models.served import Waiting
 from tests.service.data import error, service_of
 from tests.service.updates.lessons import QUERIES, lesson
 
@@ -69,7 +69,7 @@ def test_a_waiter_misses_nothing_and_leaves_nothing():
 
     async def wait() -> None:
         with waiting.waiter("arm") as first, waiting.waiter("arm") as second:
-            waiting.tell("other")
+            waiting.wake("other")
             thread = threading.Thread(target=waiting.tell, args=("arm",))
             thread.start()
             thread.join()
@@ -78,4 +78,4 @@ def test_a_waiter_misses_nothing_and_leaves_nothing():
 
     asyncio.run(wait())
     assert waiting._waiters == {}
-    waiting.tell("arm")
+    waiting.wake("arm")

@@ -26,9 +26,9 @@ def migrate(engine: Engine, lock: Callable[[Connection, None], None]) -> None:
             return
         connection.rollback()
         lock(connection, None)
-        found = revision(connection)
-        if found != HEAD:
-            _upgrade(connection, found)
+        known = revision(connection)
+        if known != HEAD:
+            _upgrade(connection, known)
         connection.commit()
 
 
@@ -36,8 +36,8 @@ def revision(connection: Connection) -> str | None:
     """The revision of a database; None of a new one and of those from before there were revisions."""
     if not inspect(connection).has_table("alembic_version"):
         return None
-    found: str | None = connection.scalar(text("SELECT version_num FROM alembic_version"))
-    return found
+    number: str | None = connection.scalar(text("SELECT version_num FROM alembic_version"))
+    return number
 
 
 def _upgrade(connection: Connection, found: str | None) -> None:

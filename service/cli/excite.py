@@ -1,0 +1,240 @@
+"""The model that a motion is planned for: saved in a folder, or served under a name."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+import lipcore
+from lipcore import TorqueModel, persistence
+from lipcore.estimators import ESTIMATORS
+from lipcore.excitation import Belief, Limits, Plan, PlanOptions, plan
+from lipcore.linalg import NotPositiveDefiniteError
+from lipcore.manifest import DEFAULT_LIMITS, MANIFEST, ROBOT, TENSORS, ModelFormatError
+from lipcore.profiles import names
+from lipcore.robots import Robot, SimulationUnavailableError
+from lipcore.samples import Array
+from lipcore.simulation import FAST, Stream, sinusoids
+from lipcore.vocabulary import JointType
+from service.cli import plotting
+from service.cli.consoles import err, print_json
+from service.cli.excite_robot import Arm, find
+from service.cli.options import Json
+from service.client import ApiError, Client
+from service.foundation.settings import DEFAULT_URL
+from service.models import archive
+
+MAX_TENSOR_BYTES = 1 << 30
+SMALL = 64 * 1024
+MEMBER_LIMITS: Mapping[str, int] = {
+    archive.EXPORT: SMALL,
+    archive.CHECKSUMS: SMALL,
+    MANIFEST: DEFAULT_LIMITS.manifest_bytes,
+    TENSORS: MAX_TENSOR_BYTES,
+    ROBOT: DEFAULT_LIMITS.robot_bytes,
+}
+
+
+def find_model(given: str, url: str, version: int | None = None, alias: str | None = None) -> TorqueModel:
+    """The model in a folder of that path, or of that name from the service at `url`.
+
+    Raise ModelFormatError for what is no model, ApiError or ServiceUnreachableError where the service has none.
+    """
+    folder = Path(given)
+    if (folder / MANIFEST).is_file():
+        return lipcore.load(folder)
+    if folder.is_dir():
+        raise ModelFormatError(f"{given} holds no {MANIFEST}, expected the folder of a saved model", MANIFEST)
+    return fetch(given, url, version, alias)
+
+
+def fetch(name: str, url: str, version: int | None = None, alias: str | None = None) -> TorqueModel:
+    """A served model as it is now, with all that it has learnt online."""
+    with TemporaryDirectory(prefix="lipserve-excite-") as folder, Client(url) as client:
+        path = client.export(name, Path(folder) / "model.tar", version, alias)
+        try:
+            places = archive.members(path, MEMBER_LIMITS)
+        except archive.ArchiveError as error:
+            raise ModelFormatError(str(error), error.member) from None
+        files = {each: archive.read(path, member) for each, member in places.items()}
+        for each in (archive.EXPORT, archive.CHECKSUMS):
+            files.pop(each, None)
+        return persistence.decode(files)
+
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+ERRORS = (ApiError, NotPositiveDefiniteError, SimulationUnavailableError, plotting.PlotUnavailableError)
+"""What a user is told without a traceback, beside ValueError and OSError."""
+COMPARED = 5
+"""Random motions whose expected value the planned one is compared with."""
+COMPARED_SAMPLES = 500
+WARNING = (
+    "The plan knows joint limits only, neither obstacles nor the robot's own links: watch it in a simulator or slowly "
+    "before you drive a robot along it."
+)
+
+
+@dataclass(frozen=True)
+class Random:
+    """What the paper's random sinusoids would leave of the variance, mean over draws: (n,) each."""
+
+    slow: Array
+    fast: Array
+
+
+@app.command()
+def excite(
+    out: Annotated[Path, typer.Option(help="CSV file to write: t, q1…, dq1…, ddq1….", dir_okay=False)],
+    model: Annotated[
+        str | None,
+        typer.Option(help="What is known already: a saved model's folder, or the name of a served model."),
+    ] = None,
+    robot: Annotated[
+        str | None,
+        typer.Option(help=f"A .urdf file or one of {', '.join(names())}. By default as the model's joints tell."),
+    ] = None,
+    seconds: Annotated[float, typer.Option(help="Length of the motion.")] = 50.0,
+    rate: Annotated[float, typer.Option(help="Samples a second.")] = 100.0,
+    position: Annotated[float, typer.Option("--range", help="Share of each joint's range that may be used.")] = 0.95,
+    reach: Annotated[float | None, typer.Option(help="At most so far from the middle of the range, rad (m).")] = None,
+    scale: Annotated[float, typer.Option(help="Share of the speed, acceleration and torque limits.")] = 0.9,
+    noise: Annotated[
+        float | None, typer.Option(help="Std of the torque noise expected without a model, N·m; 1 % of the torque's.")
+    ] = None,
+    estimator: Annotated[
+        str, typer.Option(help=f"What will be trained, without a model: one of {', '.join(ESTIMATORS)}.")
+    ] = "rigid-body",
+    harmonics: Annotated[
+        int | None, typer.Option(min=2, help="Of the Fourier series; by default as the limits allow.")
+    ] = None,
+    iterations: Annotated[int, typer.Option(min=0, help="Of the search.")] = PlanOptions.iterations,
+    budget: Annotated[float, typer.Option(help="Most seconds of the search.")] = PlanOptions.budget_s,
+    seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal motions where the budget suffices.")] = 0,
+    plot: Annotated[Path | None, typer.Option(dir_okay=False, help="Also draw the motion, .png or .svg.")] = None,
+    url: Annotated[str, typer.Option("--url", envvar="LIPSERVE_URL", help="Address of the service.")] = DEFAULT_URL,
+    as_json: Json = False,
+) -> None:
+    """Plan a motion within a robot's limits that tells most of what its model does not know yet."""
+    if plot is not None:
+        plotting.pyplot()  # before a minute of planning
+    known = None if model is None else find_model(model, url)
+    arm = find(robot, known)
+    limits = arm.limits.within(position, scale, reach)
+    options = PlanOptions(seconds, rate, harmonics, iterations, budget_s=budget, seed=seed)
+    belief = Belief.of_model(known) if known is not None else _prior(arm, limits, noise, estimator, seed)
+
+    console = Console(width=None if sys.stdout.isatty() else 120)
+    with (err if as_json else console).status("planning") as status:
+        made = plan(
+            belief,
+            limits,
+            options,
+            arm.robot,
+            lambda step, left: status.update(f"planning, step {step}: {left:.2%} of the variance would be left"),
+        )
+    write(out, made)
+    if plot is not None:
+        plotting.draw_motion(plot, made)
+    random = random_motion(made)
+    if as_json:
+        print_json(shown(made, random, out, plot))
+        return
+    console.print(table(made, random), highlight=False)
+    console.print(summary(made, "the model" if known is not None else f"a {estimator} prior"), highlight=False)
+    for path in filter(None, (out, plot)):
+        console.print(f"written to {path}", highlight=False)
+    console.print(WARNING, style="yellow", highlight=False)
+
+
+def write(path: Path, made: Plan) -> None:
+    """Write the motion as CSV: t, then q1 … qn, dq1 … dqn, ddq1 … ddqn in the order of the joints, SI units."""
+    t, *parts = made.table()
+    joints = range(1, made.limits.n_joints + 1)
+    header = ["t", *(f"{name}{joint}" for name in ("q", "dq", "ddq") for joint in joints)]
+    np.savetxt(path, np.column_stack([t, *parts]), fmt="%.12g", delimiter=",", header=",".join(header), comments="")
+
+
+def random_motion(made: Plan) -> Random:
+    """What the paper's random sinusoids of the same length, range and speed limits would leave."""
+    limits, options = made.limits, made.options
+    kinds: list[JointType] = ["revolute"] * limits.n_joints  # of no consequence here
+    bare = Robot("", None, limits.joint_names, tuple(kinds), limits.lower, limits.upper, limits.speed)
+    samples = min(options.samples, COMPARED_SAMPLES)
+    t = np.arange(samples) * options.seconds / samples
+    repeats = options.samples / samples
+
+    def left(speed: float) -> Array:
+        stream = Stream(motion="full", speed=speed)
+        draws = (sinusoids(bare, stream, t, np.random.default_rng([options.seed, k])) for k in range(COMPARED))
+        return np.asarray(np.mean([made.left_by(*motion, repeats) for motion in draws], axis=0))
+
+    return Random(left(1.0), left(FAST))
+
+
+def shown(made: Plan, random: Random, out: Path, plot: Path | None) -> dict[str, Any]:
+    """The plan for JSON: per joint the shares of variance expected to be left, and of the limits that are used."""
+    start = made.series.at(np.zeros(1))[0][0]
+    return {
+        "files": [each for each in (out, plot) if each is not None],
+        "seconds": made.options.seconds,
+        "rate_hz": made.options.rate,
+        "harmonics": made.series.harmonics,
+        "iterations": made.iterations,
+        "out_of_time": made.out_of_time,
+        "joint_names": list(made.limits.joint_names),
+        "start_q": start,
+        "left": made.left,
+        "left_by_random": random.slow,
+        "left_by_random_fast": random.fast,
+        "used": dict(zip(("position", "speed", "acceleration", "torque"), made.used, strict=True)),
+        "warnings": [WARNING],
+    }
+
+
+def table(made: Plan, random: Random) -> Table:
+    """What is expected of the motion, joint by joint, and how much of the limits it uses."""
+    grid = Table(title="share of the torque's variance that is expected to be left, and of the limits that is used")
+    columns = ("planned", "random", "random, fast", "position", "speed", "acceleration", "torque")
+    grid.add_column("joint")
+    for heading in columns:
+        grid.add_column(heading, justify="right")
+    rows = zip(made.limits.joint_names, made.left, random.slow, random.fast, made.used.T, strict=True)
+    for joint, *left, used in rows:
+        grid.add_row(joint, *(f"{share:.2%}" for share in left), *("-" if np.isnan(u) else f"{u:.0%}" for u in used))
+    means = [f"{np.exp(np.log(each).mean()):.2%}" for each in (made.left, random.slow, random.fast)]
+    grid.add_section()
+    grid.add_row("geometric mean", *means, "", "", "", "")
+    return grid
+
+
+def summary(made: Plan, known: str) -> str:
+    """In words: what was planned, for what, and from where the robot starts."""
+    start = ", ".join(f"{value:.3f}" for value in made.series.at(np.zeros(1))[0][0])
+    options = made.options
+    ended = f"{made.iterations} iterations in {made.seconds:.0f} s"
+    if made.out_of_time:
+        ended += ", which the budget ended"
+    return (
+        f"{options.seconds:g} s at {options.rate:g} Hz, {made.series.harmonics} harmonics, for what {known} does not "
+        f"know; {ended}. Random: the paper's sums of 50 sinusoids, mean of {COMPARED}, at their own and at {FAST:g} "
+        f"times their frequencies. Starts and ends at rest at q = {start}."
+    )
+
+
+def _prior(arm: Arm, limits: Limits, noise: float | None, estimator: str, seed: int) -> Belief:
+    if arm.robot is None:
+        raise ValueError(
+            f"no URDF of robot {arm.name!r} is installed, so nothing tells how large its torques are: give --model, "
+            "or a .urdf file as --robot"
+        )
+    bodies = arm.bodies if estimator.startswith("rigid-body") else None
+    return Belief.prior(arm.robot, limits, noise, estimator, bodies, seed)

@@ -1,1 +1,0 @@
-"""`lipserve excite`: a motion within a robot's limits that tells its model most."""

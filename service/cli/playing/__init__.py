@@ -1,1 +1,0 @@
-"""Playing a motion to a model in real time: `lipserve stream`."""

@@ -1,0 +1,153 @@
+"""Results row by row: recordings thinned for a plot, measured torque beside a model's, and what a model is told as it
+comes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.client.call import Answer
+from service.client.results.arrays import Array, Plain, reading, shape_arrays
+from service.client.results.prediction import Component, interval
+from service.learning.live.schema import LiveLost, LiveStatus
+
+
+@dataclass(frozen=True, eq=False)
+class PreviewColumn(Plain):
+    """Points (K) of one quantity of one joint: rows, counted from 0; t: their times, s; values in `unit`."""
+
+    quantity: str
+    joint: str
+    unit: str
+    rows: NDArray[np.int64]
+    t: Array
+    values: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Preview(Plain):
+    """Columns of a data set, thinned so that no extreme is lost. samples: rows of the data set; starts: first rows of
+    its episodes."""
+
+    samples: int
+    starts: NDArray[np.int64]
+    columns: tuple[PreviewColumn, ...]
+
+    def column(self, quantity: str, joint: str) -> PreviewColumn:
+        """One column; raise KeyError."""
+        for each in self.columns:
+            if (each.quantity, each.joint) == (quantity, joint):
+                return each
+        raise KeyError(f"no column of {quantity} of {joint}")
+
+
+read_preview = reading(Preview)
+
+
+@dataclass(frozen=True, eq=False)
+class Trace(Plain):
+    """Torques (K, n) at K rows of a data set, N·m (prismatic: N).
+
+    samples: of the data set or the part; in_range: of these between start and stop; shown: K, evenly chosen where there
+    are more, so that peaks may be missing; rows: (K) counted from 0; t: (K) s; breaks: places in `rows` that lines are
+    not to be drawn across; tau: measured; mean: predicted; std: (K, n) of the function; noise_std: (n) of a
+    measurement; offered: components that may be asked for; components: by name, where asked for; in_training: whether
+    the model was trained on these samples: then it looks better than it is.
+    """
+
+    model: str
+    version: int
+    revision: int
+    dataset: str
+    part: str
+    joint_names: tuple[str, ...]
+    torque_convention: str
+    samples: int
+    in_range: int
+    shown: int
+    rows: NDArray[np.int64]
+    t: Array
+    breaks: NDArray[np.int64]
+    tau: Array
+    mean: Array
+    std: Array
+    noise_std: Array
+    offered: tuple[str, ...]
+    components: Mapping[str, Component]
+    in_training: bool
+
+    def __post_init__(self) -> None:
+        shape = (len(self.rows), len(self.joint_names))
+        for each in (self, *self.components.values()):
+            shape_arrays(each, shape, *({"tau", "mean", "std"} & vars(each).keys()))
+
+    def interval(self, level: float = 0.95) -> tuple[Array, Array]:
+        """Lower and upper end (K, n) of the interval that shall hold a share `level` of the *measurements*."""
+        return interval(self.mean, self.std, self.noise_std, level)
+
+
+read_trace = reading(Trace)
+
+
+@dataclass(frozen=True, eq=False)
+class LivePart(Plain):
+    """Rows of one stream that were judged since the last event, predicted by one revision before it learnt them.
+
+    rows: all that were judged; counts: what became of them, by code; worst: (n) largest |tau - mean| of all of them in
+    standard deviations of a measurement, NaN where none could be predicted; q: (n) positions of the newest row shown,
+    rad (m). Of the rows shown, K of them: time: (K) Unix seconds; tau: (K, n) measured; mean: predicted; std: of the
+    function, noise_std: (n) of a measurement around it, N·m; code: what became of each. NaN for what there is none of.
+    """
+
+    stream_id: str
+    version: int
+    revision: int
+    rows: int
+    counts: dict[str, int]
+    worst: Array
+    noise_std: Array
+    q: Array
+    time: Array
+    tau: Array
+    mean: Array
+    std: Array
+    code: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        shape_arrays(self, (len(self.time), len(self.noise_std)), "tau", "mean", "std")
+        if not len(self.q):
+            object.__setattr__(self, "q", np.full_like(self.noise_std, np.nan))
+
+    @property
+    def innovation(self) -> Array:
+        """(K, n) of tau - mean in standard deviations of a measurement."""
+        innovation: Array = (self.tau - self.mean) / np.hypot(self.std, self.noise_std)
+        return innovation
+
+
+@dataclass(frozen=True, eq=False)
+class LiveRows:
+    """Rows that came."""
+
+    parts: tuple[LivePart, ...]
+
+
+Live = LiveRows | LiveStatus | LiveLost | None
+"""Rows, where the model stands (about once a second), how many events were lost; None for what a later release adds."""
+
+
+_read_rows = reading(LiveRows)
+
+
+def read_live(answer: Answer) -> Live:
+    """Read an event."""
+    if answer.event == "rows":
+        return _read_rows(answer)
+    if answer.event == "status":
+        return LiveStatus.model_validate_json(answer.body)
+    if answer.event == "lost":
+        return LiveLost.model_validate_json(answer.body)
+    return None

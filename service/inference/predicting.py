@@ -1,0 +1,264 @@
+"""Torque queries: decoded, checked, answered and encoded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from math import isfinite
+from typing import Annotated, Any, NamedTuple
+
+import msgspec
+import numpy as np
+import torch
+from msgspec import Meta, Struct
+from numpy.typing import NDArray
+
+from lipcore import dynamics
+from lipcore.functionals import Estimate
+from lipcore.model import TorqueModel
+from lipcore.motion import Motion
+from lipcore.vocabulary import ComponentName, TorqueConvention
+from service.foundation.errors import invalid_request
+from service.inference.schema import PredictRequest
+from service.models.loaded import LoadedModels, Served
+from service.models.schema import ALIAS
+from service.web.route import each_once
+
+Array = NDArray[np.float64]
+QUANTITIES = ("q", "dq", "ddq", "tau")
+
+
+class Query(NamedTuple):
+    """Motions that torque is asked for, whatever has brought them: JSON, tensors or a frame.
+
+    values: q, dq and ddq, for forward dynamics tau too, (3 or 4, N, n) in SI units; single: whether this is one query
+    without an axis of queries, as its answer then is.
+    """
+
+    values: Array
+    single: bool
+
+    def check(self, max_position: float, expected: Callable[[str], str] = lambda _: "a finite number") -> None:
+        """Raise InvalidRequestError where a number is not finite or a position beyond ±`max_position`, rad (m).
+
+        expected: says what a number of q, dq, ddq or tau has to be.
+        """
+        if not np.isfinite(self.values).all():
+            part, row, joint = np.argwhere(~np.isfinite(self.values))[0]
+            number = f"{self.values[part, row, joint]:g}"
+            raise invalid_request(self._name(QUANTITIES[part], row, joint), number, expected(QUANTITIES[part]))
+        size = np.abs(self.values[0])
+        if size.max() > max_position:
+            row, joint = np.unravel_index(size.argmax(), size.shape)
+            within = f"radians (or metres) within ±{max_position:g}: are these degrees?"
+            raise invalid_request(self._name("q", row, joint), f"{self.values[0, row, joint]:g}", within)
+
+    def components(self, model: TorqueModel, names: Sequence[ComponentName]) -> dict[str, Estimate]:
+        """Estimates of parts of the dynamics by name, (N, …) each; raise InvalidRequestError where inertia cannot be
+        inverted."""
+        q, dq, ddq, *tau = (torch.from_numpy(each) for each in self.values)
+        try:
+            return dynamics.components(model, Motion(q, dq, ddq), names, *tau)
+        except dynamics.IndefiniteInertiaError as error:
+            raise invalid_request(
+                "q" if self.single else f"q[{error.index}]",
+                "a posture whose learnt inertia matrix is not positive definite",
+                "for forward_dynamics a posture whose inertia the training data tell",
+            ) from error
+
+    def _name(self, name: str, row: np.intp, joint: np.intp) -> str:
+        return f"{name}[{joint}]" if self.single else f"{name}[{row}][{joint}]"
+
+
+def check_answer(name: str, values: Array) -> None:
+    """Raise InvalidRequestError where a number of an answer, of any shape, is not finite."""
+    if isfinite(np.vdot(values, values)):  # at one query a third of what np.isfinite takes
+        return
+    wrong = np.argwhere(~np.isfinite(values))
+    if len(wrong):  # else their squares alone are beyond numbers
+        place = tuple(wrong[0])
+        expected = "a finite number: are dq in rad/s and ddq in rad/s²?"
+        field = name + "".join(f"[{index}]" for index in place)
+        raise invalid_request(field, f"{values[place]:g}", expected)
+
+
+def check_components(model: TorqueModel, request: PredictRequest, limit: int) -> None:
+    """Raise InvalidRequestError for components the model lacks, too many queries, or a torque missing or in vain."""
+    offered = dynamics.available(model.estimator)
+    for index, name in enumerate(request.components):
+        if name not in offered:
+            expected = f"what a model with the estimator {model.estimator.name} offers: {', '.join(offered)}"
+            raise invalid_request(f"components[{index}]", name, expected)
+    if request.components and request.q.ndim == 2 and len(request.q) > limit:
+        raise invalid_request("q", f"{len(request.q)} queries", f"at most {limit} in one request with components")
+    forward = "forward_dynamics" in request.components
+    if forward and request.tau is None:
+        raise invalid_request("tau", "missing", "the torque that forward_dynamics is asked for, shaped as q")
+    if request.tau is not None and not forward:
+        raise invalid_request("tau", "given", "no tau, or forward_dynamics among the components")
+
+
+_ALIAS = ALIAS.replace("$", r"\Z")  # Python's own expressions let a line end follow
+Numbers = list[float | list[float]]
+"""One query or a batch; that it is one of the two, and not some of each, is left to be checked."""
+
+
+class PredictBody(Struct, forbid_unknown_fields=True):
+    """A PredictRequest as it comes: types are right and numbers finite, shapes are left to be checked."""
+
+    q: Numbers
+    dq: Numbers
+    ddq: Numbers
+    version: Annotated[int, Meta(ge=1, lt=2**31)] | None = None
+    alias: Annotated[str, Meta(pattern=_ALIAS)] | None = None
+    covariance: bool = False
+    components: list[ComponentName] = []
+    tau: Numbers | None = None
+    min_revision: Annotated[int, Meta(ge=0, lt=2**31)] | None = None
+
+    def single(self) -> Array | None:
+        """Return the motion (3, n) where this is one query for a torque and no more."""
+        batch = bool(self.q) and isinstance(self.q[0], list)
+        if batch or self.covariance or self.components or self.tau is not None:
+            return None
+        try:
+            return np.array((self.q, self.dq, self.ddq), np.float64)
+        except ValueError:  # shapes differ
+            return None
+
+    def request(self) -> PredictRequest | None:
+        """Return what it says with arrays (n,) or (N, n), or None where a list is ragged or a component comes twice."""
+        q, dq, ddq = _array(self.q), _array(self.dq), _array(self.ddq)
+        tau = None if self.tau is None else _array(self.tau)
+        if q is None or dq is None or ddq is None or (tau is None and self.tau is not None):
+            return None
+        if len(set(self.components)) < len(self.components):
+            return None
+        return PredictRequest.model_construct(
+            q=q,
+            dq=dq,
+            ddq=ddq,
+            tau=tau,
+            version=self.version,
+            alias=self.alias,
+            covariance=self.covariance,
+            components=self.components,
+            min_revision=self.min_revision,
+        )
+
+
+class Prediction(Struct, omit_defaults=True):
+    """A PredictResponse as it goes out; what was not asked for is left out."""
+
+    model: str
+    version: int
+    revision: int
+    joint_names: tuple[str, ...]
+    torque_convention: TorqueConvention
+    tau: list[Any]
+    tau_std: list[Any]
+    noise_std: list[float]
+    covariance: list[Any] | None = None
+    components: dict[ComponentName, dict[str, Any]] | None = None
+
+
+_decoder = msgspec.json.Decoder(PredictBody)
+_FIELDS = tuple(name.encode() for name in PredictBody.__struct_fields__)
+_encoder = msgspec.json.Encoder()
+
+
+def decode(body: bytes) -> PredictBody | None:
+    """Decode a query, or return None where anything in it is not as it should be."""
+    try:
+        query = _decoder.decode(body)
+    except msgspec.MsgspecError:
+        return None
+    if query.alias is not None and query.version is not None:
+        return None
+    # the usual query has the quotes of q, dq and ddq, which are all there, and no others
+    return query if body.count(b'"') == 6 or each_once(body, *_FIELDS) else None
+
+
+def encode(answer: Prediction) -> bytes:
+    """Encode an answer; its numbers read back are the same numbers."""
+    return _encoder.encode(answer)
+
+
+def _array(values: Numbers) -> Array | None:
+    try:
+        return np.array(values, np.float64) if values else None
+    except ValueError:  # ragged
+        return None
+
+
+def at_once(served: Served, motion: Array, max_position: float) -> Prediction | None:
+    """Torque at one motion (3, n), for the event loop; None where the motion or the answer is not as it should be."""
+    if motion.shape[1] != served.model.n_joints or abs(motion[0]).max() > max_position:
+        return None
+    mean, deviation = served.model.answer(motion)
+    assert deviation is not None  # it is, unless declined
+    tau, tau_std = mean.tolist(), deviation.tolist()
+    if not isfinite(sum(tau) + sum(tau_std)):
+        return None
+    return _prediction_of(served, tau, tau_std)
+
+
+def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: Served | None = None) -> Prediction:
+    """Torque with uncertainty at the queries; raise InvalidRequestError or NotFoundError. Not for the event loop.
+
+    served: what answers, where that is found already.
+    """
+    settings = loaded.storage.settings
+    served = served or loaded.get(model, request.version, request.alias)
+    known = served.model
+    single = request.q.ndim == 1
+    check_components(known, request, settings.max_component_batch)
+    parts = [values for name in QUANTITIES if (values := getattr(request, name)) is not None]
+    for name, values in zip(QUANTITIES, parts, strict=False):
+        if values.shape[-1] != known.n_joints:
+            expected = f"{known.n_joints} numbers: {', '.join(known.joint_names)}"
+            raise invalid_request(name, f"{values.shape[-1]} numbers long", expected)
+        if values.shape != request.q.shape:
+            raise invalid_request(name, f"of shape {values.shape}", f"the shape of q, {request.q.shape}")
+    query = Query(np.stack([np.atleast_2d(values) for values in parts]), single)
+    if (count := query.values.shape[1]) > settings.max_batch:
+        raise invalid_request("q", f"{count} queries", f"at most {settings.max_batch} in one request")
+    query.check(settings.max_position)
+
+    q, dq, ddq, *_ = query.values
+    answer = known.predict(q, dq, ddq, request.covariance)
+    arrays = {"tau": answer.tau, "tau_std": answer.tau_std}
+    if answer.covariance is not None:
+        arrays["covariance"] = answer.covariance
+    lists: dict[str, list[Any]] = {}
+    for name, values in arrays.items():
+        shaped = values[0] if single else values
+        check_answer(name, shaped)
+        lists[name] = shaped.tolist()
+    prediction = _prediction_of(served, **lists)
+    if request.components:
+        estimates = query.components(known, request.components)
+        prediction.components = {
+            name: {
+                "mean": (estimates[name].mean[0] if single else estimates[name].mean).tolist(),
+                "std": (estimates[name].std[0] if single else estimates[name].std).tolist(),
+            }
+            for name in request.components
+        }
+    return prediction
+
+
+def _prediction_of(
+    served: Served, tau: list[Any], tau_std: list[Any], covariance: list[Any] | None = None
+) -> Prediction:
+    model = served.model
+    return Prediction(
+        model=served.name,
+        version=served.version,
+        revision=served.revision,
+        joint_names=model.joint_names,
+        torque_convention=model.torque_convention,
+        tau=tau,
+        tau_std=tau_std,
+        noise_std=served.noise_std,
+        covariance=covariance,
+    )

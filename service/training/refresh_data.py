@@ -1,0 +1,179 @@
+"""What a refresh learns from: what of a model's log, and of the data of its version, is of the robot as it is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from lipcore.online.batch import Rows
+from lipcore.samples import Array, Samples
+from service.journal import log
+from service.journal.log import decode
+from service.storage.database import Database, DatasetRow, EventRow
+
+MEMORY = 5.0
+"""Forgetting times after which a sample is left out: it would count less than one per cent."""
+
+
+@dataclass(frozen=True)
+class Scope:
+    """What a refresh learns from: rows of the log up to event `through` with an event time of at least `since`, s.
+
+    newest: the latest event time of the log so far, s, None without rows; forgetting_s: time constant of forgetting;
+    changed: event time of the last change of the robot, before which all data are of another robot.
+    """
+
+    through: int
+    since: float
+    newest: float | None
+    forgetting_s: float | None
+    changed: float | None
+
+    def left_out(self, recorded: DatasetRow) -> str | None:
+        """Why a data set is not learnt from; None where it is. Its age counts from its upload."""
+        if self.changed is not None:
+            return "the robot has changed since"
+        if datetime.fromisoformat(recorded.created_at).timestamp() < self.since:
+            return f"it is older than {MEMORY:g} forgetting times"
+        return None
+
+
+def scope_of(session: Session, model: str, through: int) -> Scope:
+    """Scope of the log up to an event, as it stands now."""
+    live = (EventRow.model == model, EventRow.number <= through, EventRow.void.is_(False))
+    newest = session.scalar(select(func.max(EventRow.last)).where(*live, EventRow.learnt > 0))
+    details = session.scalars(select(EventRow.detail).where(*live, EventRow.kind == "change"))
+    changed = max((float((detail or {})["t"]) for detail in details), default=None)
+    forgetting_s = log.forgetting(session, model, through)
+    since = -math.inf if changed is None else changed
+    if forgetting_s is not None and newest is not None:
+        since = max(since, newest - MEMORY * forgetting_s)
+    return Scope(through, since, newest, forgetting_s, changed)
+
+
+def rows_within(session: Session, model: str, scope: Scope) -> int:
+    """How many rows of the log are in scope, or up to one batch more: only whole batches are counted."""
+    live = (EventRow.model == model, EventRow.number <= scope.through, EventRow.void.is_(False))
+    return session.scalar(select(func.sum(EventRow.learnt)).where(*live, EventRow.last >= scope.since)) or 0
+
+
+def split_datasets(
+    session: Session, scope: Scope, lineage: dict[str, Any]
+) -> tuple[list[DatasetRow], list[dict[str, str]]]:
+    """Data sets of a version's lineage that a refresh learns from, in order, and why it leaves out the others."""
+    named = [item["id"] for item in lineage.get("datasets", [])]
+    known = {row.id: row for row in _datasets(session, named)}
+    kept, left_out = [], []
+    for name in named:
+        why = scope.left_out(known[name]) if name in known else "it has been deleted"
+        if why is None:
+            kept.append(known[name])
+        else:
+            left_out.append({"id": name, "reason": why})
+    return kept, left_out
+
+
+def taken_back(session: Session, model: str, through: int, after: int) -> bool:
+    """Whether an event above number `after` has unlearnt or rolled back something up to event `through`."""
+    later = (EventRow.model == model, EventRow.number > after)
+    undone = select(EventRow.kind, EventRow.detail).where(*later, EventRow.kind.in_(("unlearn", "rollback")))
+    return any(
+        detail["event"] <= through if kind == "unlearn" else detail["to"] < through
+        for kind, detail in session.execute(undone)
+    )
+
+
+def _datasets(session: Session, names: Collection[str]) -> list[DatasetRow]:
+    return list(session.scalars(select(DatasetRow).where(DatasetRow.id.in_(names))))
+
+
+PAGE = 50
+"""Events read at a time."""
+
+
+@dataclass(frozen=True)
+class Logged:
+    """Samples of the log, t their event time, None where there are none; rows: how many before they were thinned."""
+
+    samples: Samples | None
+    rows: int
+
+
+def read_log(
+    database: Database, model: str, joint_names: tuple[str, ...], scope: Scope, most: int, longest_step: float
+) -> Logged:
+    """Rows in scope that teach, at most `most` of them, thinned evenly.
+
+    Sorted by stream and time; where time steps by more than `longest_step` seconds a new episode begins.
+    """
+    kept, count = _thinned(database, model, scope, most)
+    if count == 0:
+        return Logged(None, 0)
+    rows, source = Rows.concatenate([part for part, _ in kept]), np.concatenate([stream for _, stream in kept])
+    order = np.lexsort((rows.time, source))
+    rows, source = rows.take(order), source[order]
+    breaks = (np.diff(source) != 0) | (np.diff(rows.time) > longest_step)
+    episode = np.concatenate([[0], np.cumsum(breaks)]).astype(np.int64)
+    return Logged(Samples(joint_names, rows.time, episode, rows.q, rows.dq, rows.ddq, rows.tau), count)
+
+
+def age_weights(times: Array, scope: Scope) -> Array | None:
+    """Weight of samples of these times, Unix s: exp(−age/forgetting_s), (N,); None where nothing is forgotten."""
+    if scope.forgetting_s is None or scope.newest is None:
+        return None
+    return np.exp(np.minimum(times - scope.newest, 0.0) / scope.forgetting_s)
+
+
+def _thinned(database: Database, model: str, scope: Scope, most: int) -> tuple[list[tuple[Rows, Array]], int]:
+    """Every k-th row in scope in the order of the log, each with the number of its stream, and how many there are.
+
+    One pass, and never more than twice `most` rows in memory: k doubles whenever there are that many.
+    """
+    kept: list[tuple[Rows, Array]] = []
+    streams: dict[str | None, int] = {}
+    step, count, held, after = 1, 0, 0, 0
+    while True:
+        with database.session() as session:
+            events = log.events(session, model, after, PAGE)
+        for event in events:
+            if event.number > scope.through or event.payload is None:
+                continue
+            rows = decode(event.payload).learnt
+            rows = rows.take(rows.time >= scope.since)
+            chosen = rows.take((np.arange(count, count + len(rows)) % step) == 0)
+            count, held = count + len(rows), held + len(chosen)
+            kept.append((chosen, np.full(len(chosen), streams.setdefault(event.stream_id, len(streams)))))
+            if held > 2 * most:
+                kept, step = _every(kept, 2), 2 * step
+                held = sum(len(part) for part, _ in kept)
+        if len(events) < PAGE or events[-1].number >= scope.through:
+            break
+        after = events[-1].number
+    kept = [pair for pair in kept if len(pair[0])]
+    if held > most:
+        chosen_rows = np.zeros(held, dtype=bool)
+        chosen_rows[np.linspace(0, held - 1, most).round().astype(np.int64)] = True
+        kept = _where(kept, chosen_rows)
+    return kept, count
+
+
+def _every(parts: list[tuple[Rows, Array]], step: int) -> list[tuple[Rows, Array]]:
+    return _where(parts, np.arange(sum(len(rows) for rows, _ in parts)) % step == 0)
+
+
+def _where(parts: list[tuple[Rows, Array]], mask: NDArray[np.bool_]) -> list[tuple[Rows, Array]]:
+    """Rows of all parts together where the mask is set."""
+    out, at = [], 0
+    for rows, stream in parts:
+        chosen = mask[at : at + len(rows)]
+        at += len(rows)
+        out.append((rows.take(chosen), stream[chosen]))
+    return out

@@ -1,0 +1,151 @@
+"""How many requests are answered at a time, how many of a kind compute at once, and how often one client may ask."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from ipaddress import IPv6Address, ip_address
+from math import ceil
+from time import monotonic
+from typing import Annotated
+
+from anyio import CapacityLimiter
+from fastapi import Depends, Request
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from service.foundation.errors import BusyError, RateLimitedError, refuse
+from service.web.observability.logs import KEY_ID
+
+HEALTH = "/health/"
+"""Requests below it are always answered: a service that is busy is not one that is dead."""
+
+
+class Gate:
+    """Middleware that refuses requests while `most` others are answered. Streams have a limit of their own.
+
+    open: requests that are answered now.
+    """
+
+    def __init__(self, app: ASGIApp, most: int) -> None:
+        self.app, self.most, self.open = app, most, 0
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on, or answer it with 429."""
+        if scope["type"] != "http" or (self.open >= self.most and scope["path"].startswith(HEALTH)):
+            await self.app(scope, receive, send)
+            return
+        if self.open >= self.most:
+            message = (
+                f"{self.open} requests are being answered, the most there may be (LIPSERVE_MAX_REQUESTS): try again"
+            )
+            await refuse(BusyError(message, headers={"Retry-After": "1"}), scope, receive, send)
+            return
+        self.open += 1
+        try:
+            await self.app(scope, receive, send)
+        finally:
+            self.open -= 1
+
+
+@dataclass(frozen=True)
+class Turns:
+    """One limiter a kind; to be made where an event loop runs."""
+
+    predictions: CapacityLimiter
+    uploads: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(2))
+    archives: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))
+
+
+def _of(kind: str) -> Callable[[Request], Awaitable[CapacityLimiter]]:
+    async def limiter(request: Request) -> CapacityLimiter:
+        kind_limiter: CapacityLimiter = getattr(request.app.state.turns, kind)
+        return kind_limiter
+
+    return limiter
+
+
+PredictionsDep = Annotated[CapacityLimiter, Depends(_of("predictions"))]
+UploadsDep = Annotated[CapacityLimiter, Depends(_of("uploads"))]
+ArchivesDep = Annotated[CapacityLimiter, Depends(_of("archives"))]
+
+
+MAX_CLIENTS = 10_000
+"""Clients that are told apart at a time; those beyond share one rate."""
+FORGET_S = 1.0
+"""Shortest time in s between two searches for clients that need not be remembered any more."""
+NETWORK_BITS = 64
+"""Leading bits of an IPv6 address that tell clients apart: who has one address has all that begin with them."""
+OTHERS, LOCAL = "others", "a local socket"
+
+
+class Rate:
+    """A token bucket for each client: `burst` tokens at most, of which `per_s` are put in every second.
+
+    Kept as one time per client, when its bucket will be full again.
+    """
+
+    def __init__(self, per_s: float, burst: int, most: int = MAX_CLIENTS) -> None:
+        self.step, self.depth, self.most = 1 / per_s, burst / per_s, most
+        self._full: dict[str, float] = {}
+        self._forgotten = -FORGET_S
+
+    def wait(self, client: str, at: float) -> float:
+        """Take a token at a time in s; 0 where there was one, else the s until there will be."""
+        full = self._full.get(client)
+        if full is None and len(self._full) >= self.most:
+            self._forget(at)
+            if len(self._full) >= self.most:
+                client = OTHERS
+                full = self._full.get(client)
+        then = (at if full is None or full < at else full) + self.step
+        if then - at > self.depth * (1 + 1e-9):
+            return then - at - self.depth
+        self._full[client] = then
+        return 0.0
+
+    def _forget(self, at: float) -> None:
+        """Forget those whose buckets are full: they are as good as new."""
+        if at - self._forgotten >= FORGET_S:
+            self._forgotten = at
+            self._full = {client: full for client, full in self._full.items() if full > at}
+
+
+class RateLimit:
+    """Middleware that refuses the requests of a client beyond its rate. Inside the one that knows keys.
+
+    A stream counts when it is opened, not its frames.
+    """
+
+    def __init__(self, app: ASGIApp, per_s: float, burst: int) -> None:
+        self.app, self.per_s, self.rate = app, per_s, Rate(per_s, burst)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on, or answer it with 429."""
+        if scope["type"] != "lifespan" and not scope["path"].startswith(HEALTH):
+            client = client_of(scope)
+            wait = self.rate.wait(client, monotonic())
+            if wait:
+                message = f"{client} asks more than {self.per_s:g} times per s (LIPSERVE_MAX_REQUESTS_PER_S)"
+                error = RateLimitedError(message, headers={"Retry-After": str(ceil(wait))})
+                await refuse(error, scope, receive, send)
+                return
+        await self.app(scope, receive, send)
+
+
+def client_of(scope: Scope) -> str:
+    """Who asks, in words: an API key, else an address or the network it is in, else a local socket."""
+    key: str | None = scope.get(KEY_ID)
+    if key is not None:
+        return f"the API key {key}"
+    client = scope.get("client")
+    host: str = client[0] if client else ""
+    if ":" in host:
+        try:
+            address = ip_address(host.partition("%")[0])
+        except ValueError:  # what a proxy says
+            return host[:100]
+        if isinstance(address, IPv6Address) and address.ipv4_mapped is None:
+            host_bits = address.max_prefixlen - NETWORK_BITS
+            return f"{IPv6Address(int(address) >> host_bits << host_bits)}/{NETWORK_BITS}"
+        host = str(address.ipv4_mapped) if isinstance(address, IPv6Address) else host
+    return host[:100] or LOCAL
