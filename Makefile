@@ -6,9 +6,9 @@ BIN := $(VENV)/bin
 TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
 # the longest first
-PARTS := test-packages test-service test-lipcore test-updates test-cluster test-browser test-docs test-shared
+PARTS := test-packages test-service test-lipcore test-learning test-cluster test-browser test-docs test-shared
 
-.PHONY: demo test warm-lip warm-chain bytecode test-lipcore test-service test-packages test-updates test-cluster test-shared test-docs \
+.PHONY: demo test warm-lip warm-chain bytecode test-lipcore test-service test-packages test-learning test-cluster test-shared test-docs \
 	test-browser test-all screenshots lint install serve image clean
 
 demo: install
@@ -39,10 +39,10 @@ test-service: install
 	$(TEST) -m "not slow" $(wildcard tests/service/test_*.py)
 
 test-packages: install
-	$(TEST) -m "not slow" $(filter-out %/updates/ %/__pycache__/,$(wildcard tests/service/*/))
+	$(TEST) -m "not slow" $(filter-out %/learning/ %/__pycache__/,$(wildcard tests/service/*/))
 
-test-updates: install
-	$(TEST) -m "not slow" tests/service/updates
+test-learning: install
+	$(TEST) -m "not slow" tests/service/learning
 
 # several services with a real PostgreSQL server, S3 endpoint and Dask cluster, which the tests start
 test-cluster: install
@@ -54,8 +54,8 @@ SHARED := models/test_aliases.py models/test_deletion.py access/test_keys.py tes
 MORE_SHARED := models/test_alias_answers.py access/test_scopes.py access/test_commands.py test_dataset_listing.py \
 	test_training.py test_cancelling.py test_evaluating.py test_robots.py test_upload_transport.py bad_requests \
 	client/test_idempotency.py archives/test_round_trip.py observability/test_metrics_of_service.py \
-	updates/test_observations.py updates/test_learning_routes.py updates/test_rollback.py updates/test_unlearning.py \
-	updates/test_inspection.py updates/test_alarm_routes.py updates/test_log.py
+	learning/test_observations.py learning/test_learning_routes.py learning/test_rollback.py learning/test_unlearning.py \
+	learning/test_inspection.py learning/test_alarm_routes.py learning/test_log.py
 
 # (pytest's own tracebacks run into a limit of Python's parser on rewritten assertions of this depth)
 test-shared: install

@@ -14,7 +14,7 @@ from service.storage.database import Database
 from service.storage.files import Files, new_id
 from tests.cluster.servers import Shared
 from tests.service.data import QUICK, service_of, stream
-from tests.service.updates.lessons import QUERIES, Pupil
+from tests.service.learning.lessons import QUERIES, Pupil
 
 Result = TypeVar("Result")
 HARMLESS = {"contact_threshold": 1e6, "on_change": "learn", "auto_refresh": False}

@@ -17,8 +17,8 @@ from tests.cluster.pairs import Pair, publish, train
 from tests.service.data import ADDRESS, ENDLESS, arrays, ended, error, eventually, npz, queue, running, stream, upload
 from tests.service.data import job as looked
 from tests.service.data import train as train_job
+from tests.service.learning.lessons import Pupil, lesson
 from tests.service.server import Server
-from tests.service.updates.lessons import Pupil, lesson
 
 ARM = "arm"
 

@@ -16,7 +16,7 @@ from service.storage.database import AlarmRow, Database, DeletedModelRow, EventR
 from service.storage.database.engine import Notice, read_notice
 from tests.cluster.servers import Postgres, Shared
 from tests.service.data import eventually
-from tests.service.updates.batches import MODEL, OTHER, batch
+from tests.service.learning.batches import MODEL, OTHER, batch
 
 
 @pytest.fixture

@@ -13,8 +13,8 @@ import pytest
 from service.storage.database import Database, EventRow
 from tests.cluster.pairs import HARMLESS, answers, folder_store, made, train
 from tests.cluster.servers import Shared
+from tests.service.learning.lessons import Pupil, lesson
 from tests.service.server import Server
-from tests.service.updates.lessons import Pupil, lesson
 
 MODEL = "arm"
 BATCHES = 30

@@ -20,9 +20,9 @@ from service.storage.database import AlarmRow, EventRow, LearnerRow, ServingRow
 from tests.cluster.pairs import Pair, answers, both, publish, train
 from tests.cluster.servers import S3, Postgres, Shared, sharing
 from tests.service.data import ADDRESS, error, eventually, service_of
-from tests.service.updates.lessons import QUERIES, Pupil, lesson
-from tests.service.updates.test_changes import PUSH, WATCHFUL, drive
-from tests.service.updates.test_following_monitor import state
+from tests.service.learning.lessons import QUERIES, Pupil, lesson
+from tests.service.learning.test_changes import PUSH, WATCHFUL, drive
+from tests.service.learning.test_following_monitor import state
 
 QUICK_PUBLISHING = {"publish_every_s": 0.02, "min_revision_wait_s": 20.0}
 NAMES = (f"shared-{number}" for number in count())

@@ -27,9 +27,8 @@ MOST_INNOVATIONS = 1000
 class ContactGate:
     """Rejects rows far outside a stream's predictive interval for as long as that can be a contact; immutable.
 
-    It stands back while a changed robot is learnt anew.
-
-    patience: how long rows have been contacts. calm: how long they have not, while the gate stands back; else None.
+    It stands back while a changed robot is learnt anew. patience: how long rows have been contacts. calm: how long they
+    have not, while the gate stands back; else None.
     """
 
     patience: Patience

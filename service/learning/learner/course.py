@@ -26,7 +26,7 @@ class Taking:
     """What an unlearning takes out: the batch and its replays, as far as they are learnt, in their order.
 
     number: its event; batch: the number of the batch; reweighed: whether forgetting was set otherwise in between, so
-    that nobody can tell what the rows weigh by now.
+    that it is not known what the rows weigh by now.
     """
 
     number: int

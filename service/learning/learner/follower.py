@@ -58,7 +58,7 @@ class Follower:
     """A version in the learner process. Times are seconds of `time.monotonic`.
 
     base: the version as trained; known: what it has learnt, and up to which event; answering: the model as it was last
-    solved, which has not seen the batches that `watchers` are told of.
+    solved, which has not seen the batches that `watchers` are called with.
     watchers: called with the follower and the batches of a page before it learns them, in order.
     """
 

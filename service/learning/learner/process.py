@@ -104,7 +104,7 @@ class LearnerProcess:
                 self._connection = connection
                 self._waiting |= self._models
                 self._changed.notify_all()
-                if self._closing:  # while it was started: nobody will tell it to end
+                if self._closing:  # while it was started: the sender has gone already
                     self._process.kill()
             self._listen(connection)
             self._process.join()

@@ -22,7 +22,7 @@ from service.storage.database import DatasetRow, EventRow, RobotRow, SnapshotRow
 from service.storage.files import DamagedFileError, Files
 from service.training.material import recorded
 from tests.service.data import error, service_of, stream, upload
-from tests.service.updates.pendulums import ARM, Arm
+from tests.service.learning.pendulums import ARM, Arm
 
 
 def flip(path):

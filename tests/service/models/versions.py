@@ -10,7 +10,7 @@ from lipcore import FitOptions, TorqueModel
 from service.models import registry
 from service.storage.files import new_id
 from tests.service.data import QUICK, service_of, stream
-from tests.service.updates.pendulums import trained
+from tests.service.learning.pendulums import trained
 
 __all__ = ["QUERY", "predict", "publish", "trained", "worse"]
 

@@ -112,7 +112,7 @@ def test_a_version_in_memory_answers_whatever_its_files_are(api, trained, look, 
 
 def test_a_learner_that_is_gone_for_long_is_found(api, look, clock, monkeypatch):
     service = service_of(api)
-    monkeypatch.setattr(LearnerProcess, "wanted", True)
+    monkeypatch.setattr(LearnerProcess, "needed", True)
     monkeypatch.setattr(LearnerProcess, "pid", None)
     assert look(service)["learner"][0] == "warning"
     clock.now += RESTART_S

@@ -1,0 +1,39 @@
+"""A service that models learn in, shared by the tests: starting one starts a process."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from service.learning.learner import course
+from service.models import registry
+from tests.service.conftest import Trained
+from tests.service.data import service_of
+from tests.service.learning.lessons import School
+from tests.service.learning.lessons import school as opened
+from tests.service.learning.pendulums import Arm
+
+
+@pytest.fixture(scope="session")
+def school(api: object, trained: Trained, tmp_path_factory: pytest.TempPathFactory) -> Iterator[School]:
+    """A service; every test enrols models of its own."""
+    service = service_of(api)
+    folder = service.files.version_folder(registry.find(service.database, trained.name, 1).folder)
+    with opened(tmp_path_factory.mktemp("school"), folder) as started:
+        yield started
+
+
+@pytest.fixture
+def arm(home: Path) -> Iterator[Arm]:
+    """A model of one version."""
+    opened = Arm.open(home)
+    yield opened
+    opened.database.close()
+
+
+@pytest.fixture(params=[1, 25, 500], ids="pages of {} rows".format)
+def pages(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages of one batch, of a few, and of all."""
+    monkeypatch.setattr(course, "PAGE_ROWS", request.param)

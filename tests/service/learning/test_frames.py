@@ -1,0 +1,204 @@
+"""Frames of a stream as the log takes them: in order, each once, with the answers that were given."""
+
+from __future__ import annotations
+
+import time
+from itertools import count
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lipcore.online.record import Record
+from lipcore.online.spacing import INDEPENDENT_HZ, weights
+from service.foundation.errors import BusyError, ConflictError
+from service.journal import log, retention
+from service.learning.ingest.frames import Frames, FramesResult
+from service.learning.schema import ExpiredError, LearningDisabledError
+from tests.service.learning.lessons import apart
+from tests.service.learning.recordings import codes, learnt_from, logged, part, recording, send
+
+EXACT = 1e-8
+
+
+def frames(school: Any, pupil: Any, sequences: Any, stream_id: str = "socket", **changes: Any) -> Frames:
+    """Frames whose rows are those of a recording at their sequences, as a connection hands them over."""
+    rows, places = recording(), np.array(list(sequences))
+    served = school.service.loaded.get(pupil.model, None)
+    given = {name: getattr(rows, name)[places] for name in ("q", "dq", "ddq", "tau")}
+    answer = served.model.predict(given["q"], given["dq"], given["ddq"])
+    now = time.time() + 1e-3 * np.arange(len(places))
+    whole = {"time": now, **given, "mean": answer.tau, "std": answer.tau_std, **changes}
+    return Frames(pupil.model, stream_id, served, places, **whole)
+
+
+COUNT = count()
+
+
+@pytest.fixture
+def pupil(school):
+    """A model of the test's own."""
+    return school.enrol(f"frames-{next(COUNT)}")
+
+
+@pytest.fixture
+def observe(school, pupil):
+    def send_frames(sequences: Any, **more: Any) -> FramesResult:
+        return school.service.learners.observe_frames(frames(school, pupil, sequences, **more))
+
+    return send_frames
+
+
+def test_frames_are_logged_together_and_learnt(school, pupil, observe):
+    assert observe(range(10)) == FramesResult(9, 10, 0, {}, 1)
+    assert observe(range(10, 25)) == FramesResult(24, 15, 0, {}, 2)
+    assert [len(rows) for rows in logged(school, pupil)] == [10, 15]
+    assert apart(pupil.settled(2), learnt_from(school, part(recording(), 0, 25), _weights(school, pupil))) < EXACT
+    with school.service.database.session() as session:
+        event = log.find_batch(session, pupil.model, "socket", 10)
+        assert (event.last_sequence, event.rows, event.learnt, event.version) == (24, 15, 15, 1)
+        assert log.stream(session, pupil.model, "socket").kind == "frames"
+
+
+def test_the_record_is_that_of_the_answers_that_were_given(school, pupil, observe):
+    given = frames(school, pupil, range(10))
+    off = {"mean": given.mean + 0.01, "std": given.std * 1.5}
+    observe(range(10), **off)
+    with school.service.database.session() as session:
+        record = Record.from_json(log.find_batch(session, pupil.model, "socket", 0).record)
+    error = given.tau - off["mean"]
+    np.testing.assert_allclose(record.squared, (error**2).mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(record.variance, (off["std"] ** 2).mean(axis=0), rtol=1e-12)
+
+
+def test_sequences_may_leave_gaps(school, pupil, observe):
+    assert observe([0, 1, 5, 9]) == FramesResult(9, 4, 0, {}, 1)
+    assert observe([9, 12]) == FramesResult(12, 1, 1, {}, 2)
+    assert observe([1, 5]) == FramesResult(5, 0, 2, {}, 1)
+    assert apart(pupil.settled(2), learnt_from(school, _picked([0, 1, 5, 9, 12]), _weights(school, pupil))) < EXACT
+
+
+@pytest.mark.parametrize("sequence", [2, 4, 10])
+def test_a_frame_that_was_skipped_cannot_come_later(school, pupil, observe, sequence):
+    observe([0, 1, 5, 9])
+    observe([11])
+    with pytest.raises(ConflictError, match=f"frame {sequence} of stream 'socket' comes after one of a higher"):
+        observe([sequence])
+    assert len(logged(school, pupil)) == 2
+
+
+def test_frames_that_are_repeated_after_a_lost_connection_are_applied_once(school, pupil, observe):
+    observe(range(10))
+    observe(range(10, 20))
+    # cut otherwise than the first time, from before the first batch's end to beyond the last
+    assert observe(range(5, 26)) == FramesResult(25, 6, 15, {}, 3)
+    assert observe(range(26)) == FramesResult(25, 0, 26, {}, 3)
+    assert observe(range(3)) == FramesResult(2, 0, 3, {}, 1)
+    assert [len(rows) for rows in logged(school, pupil)] == [10, 10, 6]
+    assert apart(pupil.settled(3), learnt_from(school, part(recording(), 0, 26), _weights(school, pupil))) < EXACT
+
+
+@pytest.mark.parametrize("name", ["q", "dq", "ddq", "tau"])
+def test_a_sequence_used_for_another_frame_is_refused_and_nothing_is_logged(school, pupil, observe, name):
+    observe(range(10))
+    other = getattr(frames(school, pupil, range(8, 14)), name).copy()
+    other[1, 1] += 1e-9
+    with pytest.raises(ConflictError, match=f"frame 9 of stream 'socket' has come before with another {name}"):
+        observe(range(8, 14), **{name: other})
+    assert len(logged(school, pupil)) == 1
+    assert observe(range(8, 14)) == FramesResult(13, 4, 2, {}, 2)
+
+
+def test_times_and_answers_are_no_part_of_a_frame(observe, school, pupil):
+    observe(range(10))
+    again = frames(school, pupil, range(10))
+    assert observe(range(10), time=again.time + 50.0, mean=again.mean + 1.0).duplicates == 10
+
+
+def test_bad_frames_are_kept_out_by_code_and_known_again(school, pupil, observe):
+    given = frames(school, pupil, range(10))
+    tau, dq, mean = given.tau.copy(), given.dq.copy(), given.mean.copy()
+    tau[2, 1], dq[4], tau[7, 0] = np.nan, 0.0, 1e7
+    bad = {"tau": tau, "dq": dq, "mean": mean}
+    expected = {"non_finite": 1, "stationary": 1, "limit": 1}
+    assert observe(range(10), **bad) == FramesResult(9, 7, 0, expected, 1)
+    assert codes(school, pupil)[2::1][:6] == ["non_finite", "learnt", "stationary", "learnt", "learnt", "limit"]
+    assert observe(range(10), **bad) == FramesResult(9, 0, 10, {}, 1)
+    assert apart(pupil.settled(1), learnt_from(school, _picked([0, 1, 3, 5, 6, 8, 9]), _weights(school, pupil))) < EXACT
+
+
+def test_contacts_are_kept_out(school):
+    pupil = school.enrol("frames-contact", contact_threshold=8.0)
+    given = frames(school, pupil, range(10))
+    tau = given.tau.copy()
+    tau[6] += 1.0
+    found = school.service.learners.observe_frames(frames(school, pupil, range(10), tau=tau))
+    assert found.rejected == {"contact": 1}
+
+
+def test_an_answer_that_is_not_finite_keeps_its_frame_out(school, pupil, observe):
+    mean = frames(school, pupil, range(4)).mean.copy()
+    mean[1, 0] = np.inf
+    assert observe(range(4), mean=mean).rejected == {"limit": 1}
+
+
+@pytest.mark.parametrize("sequences", [[3, 3], [3, 2], [0, 1, 1, 2]])
+def test_sequences_rise(school, pupil, observe, sequences):
+    with pytest.raises(ConflictError, match="sequences must rise"):
+        observe(sequences)
+    assert logged(school, pupil) == []
+
+
+def test_a_stream_carries_frames_or_batches(school, pupil, observe):
+    observe(range(3))
+    send(pupil, 0, part(recording(), 0, 3), "http")
+    with pytest.raises(ConflictError, match="carries batches, not frames"):
+        observe(range(3), stream_id="http")
+    body = {"stream_id": "socket", "sequence": 9, **part(recording(), 0, 3)}
+    said = pupil.refused("POST", "observations", 409, "conflict", json=body)
+    assert "carries frames, not batches" in said["message"]
+
+
+def test_a_model_whose_learning_is_switched_off_takes_no_frames(pupil, observe):
+    pupil.put("learning", {"enabled": False})
+    with pytest.raises(LearningDisabledError, match="switched off"):
+        observe(range(3))
+
+
+def test_frames_that_are_no_longer_kept_are_not_taken_for_new(school, pupil, observe):
+    for first in (0, 5, 10):
+        observe(range(first, first + 5))
+    with school.service.database.transaction() as session:
+        event = log.find_batch(session, pupil.model, "socket", 0)
+        retention._forget(session, event)
+        session.delete(event)
+    with pytest.raises(ExpiredError, match="whether batch 3 of stream"):
+        observe([3])
+    assert observe(range(5, 16)) == FramesResult(15, 1, 10, {}, 4)
+
+
+def test_there_are_no_more_streams_than_a_model_may_have(school, pupil, observe, monkeypatch):
+    intake = school.service.learners._intake
+    monkeypatch.setattr(intake, "settings", intake.settings.model_copy(update={"max_observation_streams": 1}))
+    observe(range(3))
+    with pytest.raises(BusyError, match="sources of observations"):
+        observe(range(3), stream_id="another")
+
+
+def _picked(places):
+    return {name: getattr(recording(), name)[places].tolist() for name in ("q", "dq", "ddq", "tau")}
+
+
+def _weights(school, pupil):
+    """Weights of the rows that teach, as they are logged."""
+    return np.concatenate([rows.learnt.weight for rows in logged(school, pupil)])
+
+
+def test_frames_count_for_the_time_since_the_frame_before(school, pupil, observe):
+    observe(range(10))
+    (first,) = logged(school, pupil)
+    np.testing.assert_array_equal(first.weight, weights(first.time))
+    observe(range(10, 20), time=first.time[-1] + 0.02 + 1e-3 * np.arange(10))
+    second = logged(school, pupil)[1]
+    expected = INDEPENDENT_HZ * np.array([0.02, *[1e-3] * 9])
+    np.testing.assert_allclose(second.weight, expected, rtol=1e-3)

@@ -1,0 +1,243 @@
+"""The learner as a process of its own: woken, heard, killed, started again, and out of serving's way."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from sqlalchemy import select
+
+from service.learning.learner import process as processes
+from service.learning.learner import publication
+from service.learning.learner.learnt import LearntVersions
+from service.learning.learner.process import LearnerProcess, learner_place
+from service.learning.learner.publication import Published
+from service.models.loaded import LoadedModels
+from service.storage.database import SnapshotRow
+from tests.service.data import DEADLINE, eventually
+from tests.service.learning.pendulums import ARM, Arm, adopt, at_once, same
+
+linux = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="reads /proc")
+
+
+class Serving:
+    """What the service does with a learner process: answer with what it publishes. arm: a model that learns."""
+
+    def __init__(self, home):
+        self.arm = Arm.open(home, learner_niceness=1)
+        self.loaded = LoadedModels(self.arm.storage, LearntVersions(self.arm.database, self.arm.files), capacity=4)
+        self.loaded.preload()
+        self.messages = []
+        self.learner = LearnerProcess(self.arm.settings, self.take)
+
+    def take(self, message):
+        self.messages.append(message)
+        if isinstance(message, Published):
+            adopt(self.loaded, message)
+
+    def teach(self, *numbers):
+        """Log batches and wake the learner."""
+        self.arm.batches(*numbers)
+        self.learner.wake(self.arm.model)
+
+    def answering(self, revision):
+        """The model that answers once a revision does."""
+        return eventually(
+            lambda: (served := self.loaded.hot(self.arm.model, None)).revision >= revision and served
+        ).model
+
+    def stored(self):
+        """Numbers of the snapshots."""
+        with self.arm.database.session() as session:
+            return sorted(session.scalars(select(SnapshotRow.number)))
+
+    def close(self):
+        self.learner.close()
+        self.arm.database.close()
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory):
+    """A service whose learner runs."""
+    started = Serving(tmp_path_factory.mktemp("learner"))
+    started.teach(0)
+    started.answering(1)
+    yield started
+    started.close()
+
+
+@pytest.fixture
+def serving(service, request):
+    """That service with a model of the test's own."""
+    service.arm = replace(service.arm, model=request.node.name[:60].replace("[", "-").rstrip("]"))
+    service.arm.publish()
+    service.loaded.get(service.arm.model, None)
+    service.messages.clear()
+    return service
+
+
+@pytest.fixture
+def alone(home):
+    """A service of the test's own, whose learner has not been needed yet."""
+    started = Serving(home)
+    yield started
+    started.close()
+
+
+def test_what_is_logged_is_learnt_and_answered(serving):
+    serving.teach(0, 1, 2)
+    same(serving.answering(3), at_once(range(3)))
+    serving.teach(3)
+    same(serving.answering(4), at_once(range(4)))
+    assert list(publication.folder(serving.arm.files).iterdir()) == []
+    serving.arm.unlearn(2)
+    serving.learner.wake(serving.arm.model)
+    same(serving.answering(5), at_once([0, 2, 3]))
+
+
+def test_a_killed_learner_comes_back_and_catches_up(serving, caplog):
+    serving.teach(0, 1)
+    serving.answering(2)
+    first = serving.learner.pid
+    os.kill(first, signal.SIGKILL)
+    serving.teach(2, 3)
+    same(serving.answering(4), at_once(range(4)))
+    assert serving.learner.pid not in (None, first)
+    assert "the learner process ended with exit code -9; it is started again" in caplog.text
+    revisions = [each.revision for each in serving.messages if each.model == serving.arm.model]
+    assert revisions == sorted(revisions)
+    assert revisions[-1] == 4
+
+
+@pytest.mark.slow
+def test_one_that_is_killed_again_and_again_loses_nothing_and_learns_nothing_twice(serving, monkeypatch):
+    monkeypatch.setattr(processes, "LONGEST_PAUSE", 0.0)  # as if it had lived long each time
+    for number in range(4):
+        serving.teach(2 * number, 2 * number + 1)
+        if number < 3:
+            os.kill(eventually(lambda: serving.learner.pid), signal.SIGKILL)
+    same(serving.answering(8), at_once(range(8)))
+
+
+def test_what_it_knows_is_stored_when_the_service_ends(alone):
+    assert alone.learner.pid is None  # not before there is something to learn
+    alone.teach(0, 1, 2)
+    alone.answering(3)
+    assert alone.stored() == []
+    os.kill(alone.learner.pid, signal.SIGTERM)  # to all processes of a service, which then ends in order
+    os.kill(alone.learner.pid, signal.SIGINT)
+    alone.learner.close()
+    assert alone.stored() == [3]
+    assert alone.learner.pid is None
+    alone.learner.wake(ARM)  # too late: nothing is started
+    assert alone.learner.pid is None
+
+
+def test_one_that_was_never_needed_ends_at_once(alone):
+    alone.learner.close()
+    assert alone.learner.pid is None
+
+
+def test_ending_while_it_starts_does_not_wait_for_it(alone):
+    alone.learner.wake(ARM)
+    alone.learner.close()
+    assert alone.learner.pid is None
+
+
+@pytest.mark.slow
+def test_one_that_does_not_end_is_killed(alone, monkeypatch, caplog):
+    alone.teach(0)
+    alone.answering(1)
+    monkeypatch.setattr(processes, "END_SECONDS", 0.1)
+    os.kill(alone.learner.pid, signal.SIGSTOP)
+    alone.learner.close()
+    assert alone.learner.pid is None
+    assert "the learner process does not end: killed" in caplog.text
+
+
+def test_waking_one_that_is_busy_does_not_wait(serving):
+    serving.teach(0)
+    serving.answering(1)
+    pid = serving.learner.pid
+    os.kill(pid, signal.SIGSTOP)
+    for _ in range(5000):  # more than a pipe holds, were each sent
+        serving.learner.wake(serving.arm.model)
+    os.kill(pid, signal.SIGCONT)
+    serving.teach(1)
+    same(serving.answering(2), at_once(range(2)))
+
+
+def test_a_message_that_cannot_be_taken_does_not_end_the_listening(serving, monkeypatch, caplog):
+    refused = threading.Event()
+
+    def take(message):
+        if not refused.is_set():
+            refused.set()
+            raise RuntimeError("no room")
+        serving.take(message)
+
+    monkeypatch.setattr(serving.learner, "on_message", take)
+    serving.teach(0)
+    assert refused.wait(DEADLINE)
+    serving.teach(1)
+    same(serving.answering(2), at_once(range(2)))
+    assert "a message of the learner process was not taken" in caplog.text
+
+
+@linux
+def test_it_gives_way_to_serving(serving):
+    serving.teach(0)
+    serving.answering(1)
+    place, pid = learner_place(serving.arm.settings), serving.learner.pid
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        fields = (task / "stat").read_text().rpartition(")")[2].split()
+        assert int(fields[16]) == os.nice(0) + serving.arm.settings.learner_niceness
+        assert frozenset(os.sched_getaffinity(int(task.name))) == place.cpus
+    assert (place.threads, place.niceness) == (1, serving.arm.settings.learner_niceness)
+
+
+def test_it_takes_its_place_before_numerics_are_imported():
+    """Spawning imports the module of the process's function before that runs."""
+    said = "import sys, service.learning.learner.process; print(sorted({'numpy', 'torch', 'scipy'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", said], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@linux
+def test_it_ends_with_the_service(serving, tmp_path):
+    script = (
+        "import sys, time\n"
+        "from pathlib import Path\n"
+        "from service.foundation.settings import Settings\n"
+        "from service.learning.learner.process import LearnerProcess\n"
+        "if __name__ == '__main__':\n"
+        "    learner = LearnerProcess(Settings(home=Path(sys.argv[1])), print)\n"
+        "    learner.wake('arm')\n"
+        "    while not learner.pid: time.sleep(0.01)\n"
+        "    print(learner.pid, flush=True)\n"
+        "    time.sleep(600)\n"
+    )
+    path = tmp_path / "parent.py"
+    path.write_text(script)
+    env = {**os.environ, "PYTHONPATH": str(Path(processes.__file__).parents[3])}
+    parent = subprocess.Popen(
+        [sys.executable, str(path), str(serving.arm.settings.home)], stdout=subprocess.PIPE, text=True, env=env
+    )
+    pid = int(parent.stdout.readline())
+    parent.kill()
+    parent.wait()
+    eventually(lambda: not alive(pid))
+
+
+def alive(pid):
+    """Whether a process runs, and is not only waiting to be buried."""
+    try:
+        return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return False

@@ -1,0 +1,136 @@
+"""The log stays within its size and age, and nothing goes that a version has still to learn."""
+
+from __future__ import annotations
+
+import pytest
+
+from service.foundation.settings import Settings
+from service.journal import log, retention
+from service.journal.log import encode
+from service.storage.database import LearnerRow, ServingRow, SnapshotRow, now
+from tests.service.learning.batches import MODEL, OTHER, batch, everything, note, opened, rows, source, take_back, write
+
+SIZE = len(encode(rows()))
+LATE = 1e9
+
+
+@pytest.fixture
+def database(home):
+    database = opened(home)
+    yield database
+    database.close()
+
+
+def snapshot(database, number, version=1):
+    with database.transaction() as session:
+        name = f"snap_{version}_{number}"
+        session.add(SnapshotRow(id=name, model=MODEL, version=version, number=number, created_at=now()))
+
+
+def learner(database, version, start, role):
+    with database.transaction() as session:
+        session.add(LearnerRow(model=MODEL, version=version, start=start, role=role))
+
+
+def retain(database, batches=10**6, age=1e12, at=0.0, model=MODEL):
+    settings = Settings(observation_retention_bytes=max(batches * SIZE, 1), observation_retention_s=age)
+    return retention.retain(database, settings, model, at)
+
+
+def kept(database, model=MODEL):
+    return [event.number for event in everything(database, model)]
+
+
+def test_the_oldest_go_until_the_rest_is_small_enough(database):
+    write(database, *(batch(k) for k in range(10)))
+    write(database, *(batch(k) for k in range(10)), model=OTHER)
+    snapshot(database, 9)
+    assert retain(database, batches=10) == 0
+    assert retain(database, batches=6) == 4
+    assert kept(database) == [5, 6, 7, 8, 9, 10]
+    assert kept(database, OTHER) == list(range(1, 11))
+    assert retain(database, batches=6) == 0
+
+
+def test_those_that_are_too_old_go(database):
+    write(database, *(batch(k) for k in range(10)))  # received at 1000, 1001, ...
+    snapshot(database, 9)
+    assert retain(database, age=100.0, at=1103.0) == 3
+    assert kept(database) == [4, 5, 6, 7, 8, 9, 10]
+
+
+def test_more_go_than_one_transaction_deletes(database, monkeypatch):
+    monkeypatch.setattr(retention, "CHUNK", 3)
+    write(database, *(batch(k) for k in range(12)))
+    snapshot(database, 12)
+    assert retain(database, batches=1) == 11
+    assert kept(database) == [12]
+
+
+def test_the_newest_stays_so_that_numbers_go_on(database):
+    write(database, *(batch(k) for k in range(3)))
+    snapshot(database, 3)
+    assert retain(database, age=1.0, at=LATE) == 2
+    assert write(database, batch(3)) == [4]
+
+
+def test_what_is_in_no_snapshot_stays(database):
+    write(database, *(batch(k) for k in range(10)))
+    assert retain(database, batches=0) == 0
+    snapshot(database, 3)
+    snapshot(database, 6)
+    assert retain(database, batches=0) == 6
+    assert kept(database) == [7, 8, 9, 10]
+
+
+def test_what_any_learning_version_needs_stays(database):
+    write(database, *(batch(k) for k in range(10)))
+    with database.transaction() as session:
+        session.add(ServingRow(model=MODEL, version=2, change=2))
+    learner(database, 2, 0, "serving")
+    snapshot(database, 9, version=2)
+    learner(database, 3, 2, "candidate")  # trained on 1 and 2, no snapshot yet
+    learner(database, 4, 0, "dismissed")
+    snapshot(database, 1, version=1)  # served once
+    assert retain(database, batches=0) == 2
+    snapshot(database, 5, version=3)
+    assert retain(database, batches=0) == 3
+    assert kept(database) == [6, 7, 8, 9, 10]
+
+
+def test_other_events_go_with_the_batches_but_settings_in_force_stay(database):
+    note(database, "settings", {"forgetting_s": 60.0})  # 1
+    write(database, batch(0), batch(1))  # 2, 3
+    note(database, "change", {"t": 5.0})  # 4
+    note(database, "replay", {"event": 2}, rows=rows())  # 5
+    take_back(database, 2)  # 6: takes out 2 and 5
+    write(database, batch(2))  # 7
+    snapshot(database, 7)
+    assert retain(database, batches=1) == 3  # 2, 3 and 5
+    assert kept(database) == [1, 6, 7]
+    with database.session() as session:
+        assert log.forgetting(session, MODEL, 7) == 60.0
+
+
+def test_what_a_version_has_still_to_unlearn_stays(database):
+    write(database, batch(0), batch(1))  # 1, 2
+    note(database, "replay", {"event": 1}, rows=rows())  # 3
+    write(database, batch(2))  # 4
+    snapshot(database, 4)
+    take_back(database, 1)  # 5
+    assert retain(database, batches=0) == 2
+    assert kept(database) == [1, 3, 5]
+    snapshot(database, 5)
+    write(database, batch(3))  # 6
+    assert retain(database, batches=0) == 2
+    assert kept(database) == [6]
+
+
+def test_a_deleted_batch_is_not_taken_for_a_new_one(database):
+    write(database, *(batch(k, stream_id="robot-2") for k in (0, 1)))
+    write(database, *(batch(k) for k in (4, 6, 5, 9)))
+    snapshot(database, 6)
+    assert retain(database, batches=1) == 5
+    robot = source(database)
+    assert (robot.forgotten, source(database, "robot-2").forgotten) == (6, 1)
+    assert [log.is_forgotten(robot, k) for k in (3, 4, 5, 6, 7, 9)] == [False, True, True, True, False, False]
