@@ -181,11 +181,11 @@ def in_words(excitation: Excitation) -> str:
             sentences.append(
                 f"{term}: " + ", ".join(f"{verdict} for {listed(who)}" for verdict, who in by.items() if who)
             )
-    whole = excitation.whole
-    if whole is not None:
-        how = "none" if whole.condition is None else f"{whole.condition:.3g}"
+    bodies = excitation.whole
+    if bodies is not None:
+        how = "none" if bodies.condition is None else f"{bodies.condition:.3g}"
         sentences.append(
-            f"{whole.rank} of {whole.parameters} base parameters of the rigid bodies are excited (condition {how}), "
-            f"the least at {whole.weakest:.2g} of what random motion over the whole range would do"
+            f"{bodies.rank} of {bodies.parameters} base parameters of the rigid bodies are excited (condition {how}), "
+            f"the least at {bodies.weakest:.2g} of what random motion over the whole range would do"
         )
     return "; ".join(sentences)
