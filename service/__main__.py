@@ -1,7 +1,7 @@
 """The command `lipserve`, also `python -m service`.
 
 It imports nothing of ours before it runs: spawned processes import their parent's main module again, and training
-processes shall take their place on the machine before anything else is loaded (see `training.process`).
+processes shall take their place on the machine before anything else is loaded (see `compute.process`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""An asynchronous client of torque streams: that of `client.py`, awaited."""
+"""An asynchronous client of torque streams: that of `stream`, awaited."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ from service.stream.exchange import (
     Exchange,
     StreamAnswer,
     StreamError,
-    StreamHello,
     StreamLearnt,
-    StreamRefusal,
+    StreamSide,
     closed,
     destination,
     refused,
@@ -28,7 +27,7 @@ from service.stream.exchange import (
 )
 
 
-class AsyncStreamClient:
+class AsyncStreamClient(StreamSide):
     """One stream, open while `async with` lasts. Not to be shared between tasks.
 
     Arguments, methods and errors are those of `StreamClient`; methods that wait are awaited.
@@ -85,22 +84,6 @@ class AsyncStreamClient:
         """Close the connection."""
         if self._connection is not None:
             await self._connection.close()
-
-    @property
-    def hello(self) -> StreamHello:
-        """What the service said of the version that answers, so far as it has been read."""
-        assert self._exchange.hello is not None, "the stream is not open: use `async with`"
-        return self._exchange.hello
-
-    @property
-    def learnt(self) -> StreamLearnt:
-        """What the service has acknowledged of the torques sent over this connection, so far as it has been read."""
-        return self._exchange.learnt
-
-    @property
-    def refusals(self) -> tuple[StreamRefusal, ...]:
-        """The last 1000 times that the service could not log torques, so far as it has been read."""
-        return tuple(self._exchange.refusals)
 
     async def ask(
         self,

@@ -22,6 +22,7 @@ from service.stream.exchange import (
     StreamHello,
     StreamLearnt,
     StreamRefusal,
+    StreamSide,
     closed,
     destination,
     refused,
@@ -32,7 +33,7 @@ from service.stream.exchange import (
 __all__ = ["StreamAnswer", "StreamClient", "StreamError", "StreamHello", "StreamLearnt", "StreamRefusal"]
 
 
-class StreamClient:
+class StreamClient(StreamSide):
     """One stream; use it as a context manager or close it. Not to be shared between threads.
 
     model: its name; unix: path of the service's Unix-domain socket, instead of host and port of the address; version:
@@ -89,22 +90,6 @@ class StreamClient:
     def close(self) -> None:
         """Close the connection."""
         self._stack.close()
-
-    @property
-    def hello(self) -> StreamHello:
-        """What the service said of the version that answers, so far as it has been read."""
-        assert self._exchange.hello is not None  # its first message
-        return self._exchange.hello
-
-    @property
-    def learnt(self) -> StreamLearnt:
-        """What the service has acknowledged of the torques sent over this connection, so far as it has been read."""
-        return self._exchange.learnt
-
-    @property
-    def refusals(self) -> tuple[StreamRefusal, ...]:
-        """The last 1000 times that the service could not log torques, so far as it has been read."""
-        return tuple(self._exchange.refusals)
 
     def ask(
         self,

@@ -1,11 +1,12 @@
-"""Fields of requests that several rooms check: names for people, rows of numbers."""
+"""What several rooms take of requests: names for people, rows of numbers, and what the application keeps for routes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Annotated, Any
 
 import numpy as np
+from fastapi import Request
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, ValidationInfo
 
@@ -47,3 +48,12 @@ def to_array(name: str, value: Any, read: Callable[[str, list[Any]], list[float]
             raise invalid_request(f"{name}[{index}]", row, f"a list of {width} numbers, as {name}[0] has")
         rows.append(read(f"{name}[{index}]", row))
     return np.array(rows).reshape(len(rows), width)
+
+
+def of_app(name: str) -> Callable[[Request], Awaitable[Any]]:
+    """A dependency of routes: what the running application keeps under this name."""
+
+    async def kept(request: Request) -> Any:
+        return getattr(request.app.state, name)
+
+    return kept

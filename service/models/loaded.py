@@ -12,12 +12,13 @@ from typing import Annotated
 from weakref import WeakValueDictionary
 
 import numpy as np
-from fastapi import Depends, Request
+from fastapi import Depends
 
 import lipcore
 from lipcore.model import TorqueModel
 from lipcore.online.revision import Revision
 from service.foundation.errors import NotFoundError, UnreadableVersionError, not_found
+from service.foundation.fields import of_app
 from service.foundation.states import PartState
 from service.models import moves, registry
 from service.models.lineage import learnt_from
@@ -329,9 +330,4 @@ def _warm(model: TorqueModel) -> TorqueModel:
     return model
 
 
-async def _loaded(request: Request) -> LoadedModels:
-    loaded: LoadedModels = request.app.state.loaded
-    return loaded
-
-
-LoadedModelsDep = Annotated[LoadedModels, Depends(_loaded)]
+LoadedModelsDep = Annotated[LoadedModels, Depends(of_app("loaded"))]

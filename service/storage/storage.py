@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from fastapi import Depends, Request
+from fastapi import Depends
 from sqlalchemy import text
 
+from service.foundation.fields import of_app
 from service.foundation.settings import Settings
 from service.foundation.states import PartState
 from service.storage.database import Database
@@ -30,12 +31,7 @@ class Storage:
         return cls(settings, Database.of(settings, settings.database_timeout_s), Files.of(settings), Disk(settings))
 
 
-async def _storage(request: Request) -> Storage:
-    storage: Storage = request.app.state.storage
-    return storage
-
-
-StorageDep = Annotated[Storage, Depends(_storage)]
+StorageDep = Annotated[Storage, Depends(of_app("storage"))]
 
 
 WRITE_S = 2.0

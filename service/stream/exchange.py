@@ -226,6 +226,28 @@ class Exchange:
             self.unsettled.popleft()
 
 
+class StreamSide:
+    """What every client of a stream tells of it. _exchange: its state."""
+
+    _exchange: Exchange
+
+    @property
+    def hello(self) -> StreamHello:
+        """What the service said of the version that answers, so far as it has been read."""
+        assert self._exchange.hello is not None, "the stream is not open: use `async with`"
+        return self._exchange.hello
+
+    @property
+    def learnt(self) -> StreamLearnt:
+        """What the service has acknowledged of the torques sent over this connection, so far as it has been read."""
+        return self._exchange.learnt
+
+    @property
+    def refusals(self) -> tuple[StreamRefusal, ...]:
+        """The last 1000 times that the service could not log torques, so far as it has been read."""
+        return tuple(self._exchange.refusals)
+
+
 def refused(status: int, body: bytes | bytearray | None) -> StreamError:
     """The error of a connection that could not be had."""
     try:

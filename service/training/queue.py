@@ -17,11 +17,12 @@ from datetime import UTC, datetime
 from functools import partial
 from typing import Annotated
 
-from fastapi import Depends, Request
+from fastapi import Depends
 from sqlalchemy import select
 
 from service.compute.cluster import Cluster
 from service.compute.process import Slot, training_place
+from service.foundation.fields import of_app
 from service.foundation.settings import Settings
 from service.foundation.states import ACTIVE, CANCELLED, QUEUED, RUNNING
 from service.storage.database import JobRow
@@ -299,9 +300,4 @@ def queue_of(settings: Settings) -> type[JobQueue]:
     return ClusterQueue
 
 
-async def _queue(request: Request) -> JobQueue:
-    queue: JobQueue = request.app.state.jobs
-    return queue
-
-
-JobQueueDep = Annotated[JobQueue, Depends(_queue)]
+JobQueueDep = Annotated[JobQueue, Depends(of_app("jobs"))]

@@ -1,16 +1,54 @@
-"""Files below the home of the only service that there is."""
+"""Files that outlive a power cut, whole or not at all; and those below the home of the only service that there is."""
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TypeVar
 
-from service.storage.files import durable
+from service.storage import sample_file
 
 Result = TypeVar("Result")
+
+
+class DamagedFileError(ValueError):
+    """A file does not have the sha256 that was kept of it, or is not there."""
+
+
+def check_sha256(path: Path, sha256: str) -> None:
+    """Raise DamagedFileError unless a file is there and has this sha256."""
+    try:
+        digest = sample_file.sha256(path)
+    except FileNotFoundError:
+        raise DamagedFileError(f"{path} is missing") from None
+    if digest != sha256:
+        raise DamagedFileError(f"{path} does not have the sha256 that was kept of it")
+
+
+def write_durably(path: Path, write: Callable[[IO[bytes]], Result], draft: Path | None = None) -> Result:
+    """Write a file that outlives a power cut, whole or not at all; return what `write` does.
+
+    draft: what it is called until it is whole; beside it by default.
+    """
+    draft = path.with_suffix(".draft") if draft is None else draft
+    try:
+        with draft.open("wb") as file:
+            result = write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        draft.rename(path)
+    except (OSError, ValueError):
+        draft.unlink(missing_ok=True)  # on a full disk, room for what comes next
+        raise
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)  # the new name, before a row tells of it
+    finally:
+        os.close(folder)
+    return result
 
 
 class Local:
@@ -38,7 +76,7 @@ class Local:
 
     def write(self, key: str, write: Callable[[IO[bytes]], Result]) -> Result:
         """Store a file durably, whole or not at all; return what `write` does."""
-        return durable.store(self._home / key, write)
+        return write_durably(self._home / key, write)
 
     def delete(self, key: str) -> None:
         """Delete a file; nothing happens where there is none."""

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol, TypeVar
 from urllib.parse import unquote, urlsplit
 
-from service.storage.files import durable
+from service.storage.files import local
 
 logger = logging.getLogger(__name__)
 
@@ -133,7 +133,7 @@ class Mounted:
             target.parent.mkdir(parents=True, exist_ok=True)
             with path.open("rb") as file:
                 draft = target.parent / f"{DRAFT}{secrets.token_hex(8)}"
-                durable.store(target, lambda out: shutil.copyfileobj(file, out, 1 << 20), draft)
+                local.write_durably(target, lambda out: shutil.copyfileobj(file, out, 1 << 20), draft)
 
     def get(self, key: str, path: Path) -> None:
         """Copy an object into a new file; raise FileNotFoundError where there is none."""

@@ -28,9 +28,8 @@ from service.foundation.errors import DamagedDataError
 from service.foundation.settings import Settings
 from service.storage import sample_file
 from service.storage.database import Database, DatasetRow, SnapshotRow, VersionRow
-from service.storage.files import durable
-from service.storage.files.durable import DamagedFileError
-from service.storage.files.local import Local, remove
+from service.storage.files import local
+from service.storage.files.local import DamagedFileError, Local, remove
 from service.storage.files.objects import FilesUnreachableError, Patient, store_of
 from service.storage.files.shared import Shared
 from service.storage.sample_file import ArrayOf, PartOf
@@ -231,12 +230,12 @@ class Files:
         """Where a file lies that has the sha256; raise DamagedFileError."""
         path = self._place.file(key)
         try:
-            durable.check(path, sha256)
+            local.check_sha256(path, sha256)
         except DamagedFileError:
             if not self.shared:
                 raise
             path = self._place.file(key, again=True)  # the copy may be damaged, not the object
-            durable.check(path, sha256)
+            local.check_sha256(path, sha256)
         return path
 
 

@@ -11,8 +11,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple
 
-from fastapi import Depends, Request
+from fastapi import Depends
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
+
+from service.foundation.fields import of_app
 
 BOUNDS = (
     *(0.000_05, 0.000_1, 0.000_25, 0.000_5, 0.001, 0.002, 0.005, 0.01, 0.025),
@@ -116,12 +118,7 @@ class Meters:
         return dict(self._streams)
 
 
-async def _meters(request: Request) -> Meters:
-    meters: Meters = request.app.state.meters
-    return meters
-
-
-MetersDep = Annotated[Meters, Depends(_meters)]
+MetersDep = Annotated[Meters, Depends(of_app("meters"))]
 
 
 _FAMILIES: dict[str, Any] = {

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Annotated
 
-from fastapi import Depends, Request
+from fastapi import Depends
 
+from service.foundation.fields import of_app
 from service.foundation.states import PartState
 
 
@@ -26,12 +27,7 @@ class Stopping:
         self.closing = asyncio.Event()
 
 
-async def _stopping(request: Request) -> Stopping:
-    stopping: Stopping = request.app.state.stopping
-    return stopping
-
-
-StoppingDep = Annotated[Stopping, Depends(_stopping)]
+StoppingDep = Annotated[Stopping, Depends(of_app("stopping"))]
 
 
 KEPT_S = 1.0
@@ -107,9 +103,4 @@ class Readiness:
         return self._clock() - self._wrong_since.setdefault(what, self._clock())
 
 
-async def _readiness(request: Request) -> Readiness:
-    readiness: Readiness = request.app.state.readiness
-    return readiness
-
-
-ReadinessDep = Annotated[Readiness, Depends(_readiness)]
+ReadinessDep = Annotated[Readiness, Depends(of_app("readiness"))]
