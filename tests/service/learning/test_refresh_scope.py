@@ -9,9 +9,9 @@ import pytest
 
 from service.journal import log
 from service.storage.database import DatasetRow, now
-from service.training import refresh_material as material
-from service.training import refresh_scope as scope
-from service.training.refresh_scope import Scope
+from service.training import refresh_data as material
+from service.training import refresh_data as scope
+from service.training.refresh_data import Scope
 from tests.service.learning import batches
 from tests.service.learning.batches import MODEL, everything, note, opened, roll_back, rows, take_back, write
 

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from service.models.waiting import Waiting
+from service.models.served import Waiting
 from tests.service.data import error, service_of
 from tests.service.learning.lessons import QUERIES, lesson
 
