@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lipcore.kernels.compiled.compile import inlined
 from lipcore.kernels.compiled.lanes import LANES, spread
-from lipcore.kernels.compiled.views import lay
+from lipcore.kernels.compiled.views import lay, numbers
 
 Array = NDArray[np.float64]
 
@@ -43,9 +43,10 @@ def multiply(panels: Array, panel: int, columns: Array, first: int, count: int, 
     All arrays are flat; count is the number of the panel's columns.
     """
     (x,), (y,) = lay(columns, first, ((count,),))[0], lay(out, at, ((ROWS,),))[0]
+    rows = numbers(panels, panel, (count, ROWS))
     a = b = c = d = e = f = spread(0.0)
     for k in range(count):
-        i, factors = panel + ROWS * k, x[k]
-        a, b, c = a + panels[i] * factors, b + panels[i + 1] * factors, c + panels[i + 2] * factors
-        d, e, f = d + panels[i + 3] * factors, e + panels[i + 4] * factors, f + panels[i + 5] * factors
+        factors = x[k]
+        a, b, c = a + rows[k, 0] * factors, b + rows[k, 1] * factors, c + rows[k, 2] * factors
+        d, e, f = d + rows[k, 3] * factors, e + rows[k, 4] * factors, f + rows[k, 5] * factors
     y[0], y[1], y[2], y[3], y[4], y[5] = a, b, c, d, e, f
