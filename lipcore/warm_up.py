@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from lipcore.data.motion import Motion
 from lipcore.evaluator import Evaluator
 from lipcore.kernels.chain import ChainKernel
 from lipcore.kernels.friction import FrictionKernel
@@ -19,7 +20,6 @@ from lipcore.kernels.gip import GeometricallyInspiredKernel
 from lipcore.kernels.lip import LipKernel
 from lipcore.kernels.lse import LagrangianSEKernel
 from lipcore.kernels.se import SquaredExponentialKernel
-from lipcore.motion import Motion
 
 
 def warm_up(*names: str) -> None:

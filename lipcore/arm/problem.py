@@ -15,9 +15,9 @@ import numpy as np
 from numpy.linalg import LinAlgError
 from scipy.linalg import cho_solve, lapack, solve_triangular
 
+from lipcore.data.samples import Array
 from lipcore.kernels.compiled.arm import PARAMETERS, arm_masses, arm_shapes
 from lipcore.kernels.geometry import Geometry
-from lipcore.samples import Array
 
 ANGLE, LENGTH = 1.0, 0.5
 """Prior widths of a geometry that nothing is known of, rad and m."""
@@ -74,7 +74,7 @@ class Problem:
     """Samples that a geometry is to explain.
 
     motions: (N, 3, n), q, dq and ddq from base to tip; tau: (N, n); counts: (N,), independent samples that a row stands
-    for; friction: (N, n, f), its features; centre, scale: (k,), μ and s of w; noise: (n,), where its prior lies;
+    for; friction: (N, n, f n), its features; centre, scale: (k,), μ and s of w; noise: (n,), where its prior lies;
     floor: (n,), the smallest admitted; expected: prior of the geometry,
     None where it is fixed.
     """
@@ -93,6 +93,11 @@ class Problem:
     def n_joints(self) -> int:
         """Number of joints n."""
         return int(self.tau.shape[1])
+
+    @property
+    def friction_terms(self) -> int:
+        """Terms of a joint's friction: f = 3, or 4 with more friction at low speed."""
+        return int(self.friction.shape[2]) // self.n_joints
 
     def rows(self, rows: Array) -> Problem:
         """The same with some of the samples."""

@@ -18,9 +18,9 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from lipcore.arm.problem import NOISE_WIDTH, Point, Problem, root_of
+from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import KINDS
 from lipcore.kernels.compiled.arm import PARAMETERS
-from lipcore.samples import Array
 
 WIDTH = 2.0
 """Prior width of each logarithm's parts: a factor of seven either way within one deviation."""

@@ -12,8 +12,8 @@ from numpy.linalg import LinAlgError
 
 from lipcore.arm.problem import Point, Problem
 from lipcore.arm.starts import draw, hop
+from lipcore.data.samples import Array
 from lipcore.kernels.geometry import Geometry
-from lipcore.samples import Array
 from lipcore.vocabulary import JointType
 
 SCREENED, STARTS = 400, 20
@@ -35,8 +35,8 @@ FAVOUR = 1.5
 
 
 @dataclass(frozen=True)
-class Found:
-    """What a search found: optima, best first, and how.
+class SearchResult:
+    """Where a search ended: optima, best first, and how.
 
     points: up to KEPT distinct optima; starts, hops: descents; distinct: optima seen that differ by more than SAME;
     times_best: descents that ended in the best; explained: whether its residuals look like the sensor's noise;
@@ -62,7 +62,7 @@ def search(
     seed: int = 0,
     known: Sequence[Geometry] = (),
     step: Callable[[float, float], None] | None = None,
-) -> Found:
+) -> SearchResult:
     """Find the geometry of the best evidence; `problem` holds few rows, some eighty.
 
     sensor_noise: (n,) N·m, what the signals say of their white noise; seconds: time limit; known: geometries to begin
@@ -107,7 +107,7 @@ def search(
         if step is not None:
             step(pool.best, 0.4 + 0.6 * max(quiet / IDLE, (time.monotonic() - began) / seconds))
     best = pool.points[0]
-    return Found(
+    return SearchResult(
         tuple(pool.points),
         starts,
         hops,

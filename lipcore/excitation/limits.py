@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.samples import Array
 from lipcore.profiles import Profile
-from lipcore.robots import Robot
-from lipcore.samples import Array
+from lipcore.robots.library import Robot
 from lipcore.vocabulary import JointType
 
 USUAL_SPEED: dict[str, float] = {"revolute": 1.0, "prismatic": 0.2}

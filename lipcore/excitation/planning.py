@@ -8,17 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lipcore.excitation.belief import Belief
-from lipcore.excitation.information import Information
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Array
+from lipcore.excitation.information import Belief, Information
 from lipcore.excitation.limits import Limits
-from lipcore.excitation.reference import draw
+from lipcore.excitation.motions import Series, Shape, draw, harmonics
 from lipcore.excitation.searching import INSTANTS, Goal, search
-from lipcore.excitation.series import Series
-from lipcore.excitation.shape import Shape, harmonics
 from lipcore.excitation.torque import TorqueCheck
-from lipcore.motion import Motion
-from lipcore.robots import Robot
-from lipcore.samples import Array
+from lipcore.robots.library import Robot
 
 
 @dataclass(frozen=True)

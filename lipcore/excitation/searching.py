@@ -10,12 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Array
 from lipcore.excitation.information import Information
-from lipcore.excitation.series import Series
-from lipcore.excitation.shape import Shape
+from lipcore.excitation.motions import Series, Shape
 from lipcore.excitation.torque import TorqueCheck
-from lipcore.motion import Motion
-from lipcore.samples import Array
 
 INSTANTS = 128
 """Instants that a motion is judged by: samples between them tell little more."""

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lipcore.data.samples import Array
 from lipcore.excitation.limits import Limits
-from lipcore.excitation.series import Series
-from lipcore.robots import Robot, pinocchio
-from lipcore.samples import Array
-from lipcore.simulation import inverse_dynamics
+from lipcore.excitation.motions import Series
+from lipcore.robots.library import Robot, pinocchio
+from lipcore.robots.simulation import inverse_dynamics
 
 WATCHED = 16
 """Instants for each harmonic that the torque is looked at: between them it may rise a little, hence the margin."""

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lipcore.data.motion import Motion, check_joint_types
 from lipcore.kernels.base import Params, State
 from lipcore.kernels.compiled.cross import Cross
 from lipcore.kernels.compiled.kernel import Array, CompiledKernel, arrays, inner
@@ -22,7 +23,6 @@ from lipcore.kernels.energy import (
 )
 from lipcore.kernels.polynomial import Derivatives, base_kernels, product
 from lipcore.kernels.weights import PRIOR_STD, initial_weights, velocity_weights
-from lipcore.motion import Motion, check_joint_types
 from lipcore.vocabulary import JointType
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from lipcore.data.motion import Motion
 from lipcore.kernels.base import PairKernel, Params, State
 from lipcore.kernels.compiled.cross import Cross
 from lipcore.kernels.compiled.se_cross import SquaredExponentialCross
-from lipcore.motion import Motion
 
 SPREAD_SHARE = 0.1
 """Smallest spread credited to a joint, relative to that of the joint that moves most: some joints stand still."""

@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from lipcore.data.samples import Array
 from lipcore.online.record import Record, number
-from lipcore.samples import Array
 
 Kind = Literal["sudden", "drift"]
 

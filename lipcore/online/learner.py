@@ -10,11 +10,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lipcore.compact.posterior import CompactPosterior
-from lipcore.compact.statistics import Solution, Statistics, add_to, copied, decay, empty, mirror, solve
-from lipcore.model import TorqueModel
+from lipcore.data.samples import Array
+from lipcore.model.torque_model import TorqueModel
 from lipcore.online.batch import Rows
-from lipcore.samples import Array
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.statistics import Solution, Statistics, add_to, copied, decay, empty, mirror, solve
 
 CHUNK = 500
 """Rows whose features are computed together: they take 28 MB at a thousand variables."""
@@ -46,7 +46,7 @@ class OnlineModel:
     """A trained version and what it has learnt since; immutable, every method returns another one.
 
     The posterior is a function of the rows learnt, not of their order: a row of event time t counts its own weight (see
-    `spacing`), times exp(−(reference − t) / forgetting_s) where there is forgetting. What is forgotten leaves its mean
+    `data.independence`), times exp(−(reference − t) / forgetting_s) where there is forgetting. What is forgotten leaves its mean
     behind, with the prior's uncertainty: the version as trained where that is forgotten. A change begins a new regime,
     whose prior has the mean of what was known before and the variance that a robot never seen has.
 

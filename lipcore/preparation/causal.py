@@ -6,12 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from lipcore.data.samples import Array
+from lipcore.data.signals import ORDER
 from lipcore.preparation.errors import PreparationError
 from lipcore.preparation.filtering import QUANTITIES, Work, settle
 from lipcore.preparation.recipe import Recipe
 from lipcore.preparation.resampling import SAME_RATE
-from lipcore.samples import Array
-from lipcore.signals import ORDER
 
 
 class CausalFilter:

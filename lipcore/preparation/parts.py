@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.samples import Array
 from lipcore.preparation.causal import CausalFilter
 from lipcore.preparation.filtering import QUANTITIES
 from lipcore.preparation.resampling import BLOCK, between, interpolate
-from lipcore.samples import Array
 
 
 @dataclass(frozen=True)

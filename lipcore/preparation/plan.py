@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.samples import Array
 from lipcore.preparation import steps as said
 from lipcore.preparation.causal import CausalFilter
 from lipcore.preparation.errors import PreparationError
@@ -16,7 +17,6 @@ from lipcore.preparation.filtering import QUANTITIES, Work, ZeroPhase, derived, 
 from lipcore.preparation.parts import Kept, OnClock, Part, in_blocks, inner, taken_at
 from lipcore.preparation.recipe import Recipe
 from lipcore.preparation.resampling import Clock, clock_of, grid, thinned
-from lipcore.samples import Array
 
 BRIDGE = 0.3
 """Longest gap, in periods of the cut-off, that is bridged rather than split at where signals are low-passed.

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from lipcore.motion import Array
+from lipcore.data.motion import Array
 from lipcore.profiles.names import Assignment, assignments, is_number, makes
 from lipcore.vocabulary import EffortMeaning, JointType
 

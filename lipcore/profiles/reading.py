@@ -9,9 +9,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from lipcore.motion import Array
+from lipcore.data.motion import Array
 from lipcore.profiles.profile import Profile
-from lipcore.urdf import MOVABLE, UrdfError, describe
+from lipcore.robots.urdf import MOVABLE, UrdfError, describe
 from lipcore.vocabulary import JointType
 
 NOTE = "A URDF does not say what the effort field means: say it with `effort`."

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lipcore.motion import Array
+from lipcore.data.motion import Array
 from lipcore.vocabulary import EffortMeaning
 
 FREE = (-np.inf, np.inf)

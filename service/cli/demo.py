@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lipcore.robots import SimulationUnavailableError
+from lipcore.robots.library import SimulationUnavailableError
 from service.cli.consoles import out
 from service.cli.demonstration import DemoError, run
 from service.client import ApiError

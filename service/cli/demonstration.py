@@ -16,9 +16,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from lipcore.robots import Robot, load_robot
-from lipcore.samples import Samples
-from lipcore.simulation import FAST, Stream, simulate
+from lipcore.data.samples import Samples
+from lipcore.robots.library import Robot, load_robot
+from lipcore.robots.simulation import FAST, Stream, simulate
 from service.cli import recordings
 from service.cli.plot import draw
 from service.client import Client, Evaluation, Prediction

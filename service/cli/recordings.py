@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lipcore.samples import Samples
+from lipcore.data.samples import Samples
 
 
 def write(path: Path, samples: Samples) -> None:

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from lipcore.robots import ROBOTS, SimulationUnavailableError, load_robot
-from lipcore.simulation import FAST, Payload, Stream, simulate
+from lipcore.robots.library import ROBOTS, SimulationUnavailableError, load_robot
+from lipcore.robots.simulation import FAST, Payload, Stream, simulate
 from service.cli import recordings
 from service.cli.consoles import print_json, say
 from service.cli.options import Json

@@ -12,9 +12,9 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session, undefer
 
 import lipcore
-from lipcore import persistence
-from lipcore.online import state
-from lipcore.probing import probe
+from lipcore.files import persistence
+from lipcore.files.probing import probe
+from lipcore.online import transfer
 from service.foundation.errors import DamagedDataError
 from service.foundation.settings import Settings
 from service.journal.payload import decode
@@ -148,7 +148,7 @@ def _base(files: Files, row: VersionRow | None) -> lipcore.TorqueModel | None:
 def _read_snapshot(files: Files, row: SnapshotRow, base: lipcore.TorqueModel | None) -> None:
     payload = files.read_snapshot(row.id, row.sha256)
     if base is not None:
-        state.load(base, payload)
+        transfer.load(base, payload)
 
 
 def _observations(database: Database, files: Files) -> Iterator[_Finding]:

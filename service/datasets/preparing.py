@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from lipcore.data.samples import Array
 from lipcore.preparation.errors import PreparationError
 from lipcore.preparation.plan import Plan, plan
 from lipcore.preparation.recipe import Recipe
-from lipcore.samples import Array
 from service.datasets.staging import EPISODE, TIME, Staged, column
 from service.foundation.errors import invalid_data
 from service.storage.disk import Disk

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 from fastapi import Query
 
+from lipcore.data.signals import CUTOFF
 from lipcore.preparation.recipe import Filtering, Form, Recipe
-from lipcore.signals import CUTOFF
 from lipcore.vocabulary import TorqueConvention
 from service.datasets.options import Effort, ReadOptions, UploadOptions
 from service.foundation.errors import invalid_request

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.metrics import LEVELS, RELIABILITY_LEVELS
-from lipcore.metrics import evaluate as compare
-from lipcore.samples import Samples
+from lipcore.data.metrics import LEVELS, RELIABILITY_LEVELS
+from lipcore.data.metrics import evaluate as compare
+from lipcore.data.samples import Samples
 from service.datasets import store
 from service.foundation.errors import InvalidRequestError, invalid_request
 from service.inference import checks, components

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lipcore import dynamics
-from lipcore.model import TorqueModel
-from lipcore.motion import Motion
+from lipcore.data.motion import Motion
+from lipcore.model import dynamics
+from lipcore.model.torque_model import TorqueModel
 from lipcore.vocabulary import ComponentName
 from service.foundation.errors import invalid_request
 from service.inference.schema import PredictRequest

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from lipcore.samples import Array, Samples
+from lipcore.data.samples import Array, Samples
 from service.inference.schema import Stretches
 
 FEWEST_EPISODES, MOST_EPISODES = 5, 200

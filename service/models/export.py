@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lipcore import persistence
-from lipcore.manifest import MANIFEST, TENSORS, ModelFormatError
+from lipcore.files import persistence
+from lipcore.files.manifest import MANIFEST, TENSORS, ModelFormatError
 from service.foundation.errors import UnreadableVersionError, invalid_request, not_found
 from service.models import archive, registry
 from service.models.archive import CHECKSUMS, EXPORT, Part

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from lipcore.splits import Kind, Split
+from lipcore.data.splits import Kind, Split
 
 _DEFAULTS = Split()
 

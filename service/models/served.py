@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol
 
-from lipcore.model import TorqueModel
+from lipcore.model.torque_model import TorqueModel
 from service.models.moves import SERVING
 from service.models.registry import Serving
 

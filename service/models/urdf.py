@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lipcore.arm.urdf_writer import urdf_of_parameters
+from lipcore.files.urdf_writer import urdf_of_parameters
 from service.foundation.errors import InvalidRequestError, problem
 from service.models.export import find
 from service.models.loaded import LoadedModels

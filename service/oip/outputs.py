@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lipcore import dynamics
-from lipcore.dynamics import available
-from lipcore.model import TorqueModel
-from lipcore.motion import Motion
+from lipcore.data.motion import Motion
+from lipcore.model import dynamics
+from lipcore.model.dynamics import available
+from lipcore.model.torque_model import TorqueModel
 from lipcore.vocabulary import COMPONENTS, ComponentName
 from service.foundation.errors import invalid_request
 

@@ -6,7 +6,7 @@ import re
 
 from anyio import CapacityLimiter, to_thread
 
-from lipcore.model import TorqueModel
+from lipcore.model.torque_model import TorqueModel
 from service.foundation.errors import NotFoundError, NotReadyError, UnreadableVersionError, problem, sentence
 from service.models import registry
 from service.models.loaded import LoadedModels, Served

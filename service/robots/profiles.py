@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from lipcore import profiles
-from lipcore.motion import Array
+from lipcore.data.motion import Array
 from lipcore.profiles import Profile
 from service.foundation.errors import InvalidRequestError, not_found
 from service.robots import store

@@ -13,8 +13,8 @@ from lipcore import profiles
 from lipcore.profiles import Profile
 from lipcore.profiles.names import is_number
 from lipcore.profiles.reading import read_limits
-from lipcore.robots import ROBOTS, UnknownRobotError, profile_urdf
-from lipcore.urdf import MOVABLE, RigidBody, UrdfError, describe
+from lipcore.robots.library import ROBOTS, UnknownRobotError, profile_urdf
+from lipcore.robots.urdf import MOVABLE, RigidBody, UrdfError, describe
 from service.foundation.errors import ConflictError, InvalidDataError, invalid_request, not_found, problem
 from service.foundation.names import LONGEST, for_people
 from service.foundation.states import ACTIVE

@@ -12,7 +12,7 @@ from service.inference import checks
 from service.stream.frames import ASK_LEARN, ASK_STD, NUMBER, REQUEST, request_bytes
 
 if TYPE_CHECKING:
-    from lipcore.samples import Array
+    from lipcore.data.samples import Array
 
 FIELDS = ("q", "dq", "ddq")
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.samples import Array, Samples
 from lipcore.online.batch import Rows
-from lipcore.samples import Array, Samples
 from service.journal import log
 from service.journal.payload import decode
 from service.storage.database import Database

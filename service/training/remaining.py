@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lipcore.fitting import FitProgress
+from lipcore.fitting.hyperparameters import FitProgress
 
 SEARCH = "hyperparameters"
 LEAST_FRACTION = 0.05

@@ -11,13 +11,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from lipcore.data.motion import Motion
 from lipcore.kernels.base import PairKernel
 from lipcore.kernels.compiled.cross import Array
 from lipcore.kernels.compiled.gip_cross import fill_gip
 from lipcore.kernels.compiled.lane_cross import LANES
 from lipcore.kernels.compiled.lse_cross import fill_lse
 from lipcore.kernels.compiled.se_cross import fill_se
-from lipcore.motion import Motion
 from tests.lipcore.oracles import instant, scale_of, torque_terms
 from tests.lipcore.test_baseline_kernels import BASELINES, KERNELS, gip_loop, lagrangian, random_case, se_loop
 

@@ -10,11 +10,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from lipcore.data.motion import Motion
 from lipcore.kernels.base import Params, State
 from lipcore.kernels.compiled.lip import lip_gradient, lip_gram
 from lipcore.kernels.compiled.lip_data import PAIRS
 from lipcore.kernels.lip import LipKernel, shares
-from lipcore.motion import Motion
 from lipcore.vocabulary import JointType
 from tests.lipcore.problems import random_problem
 

@@ -14,8 +14,8 @@ from lipcore.profiles import from_urdf, names, profile, profiles, recognise
 from lipcore.profiles.arms import ARMS
 from lipcore.profiles.catalogue import SHEETS
 from lipcore.profiles.names import MAKES, words
-from lipcore.robots import ROBOTS, UnknownRobotError, load_robot, profile_urdf
-from lipcore.urdf import RigidBody, UrdfError
+from lipcore.robots.library import ROBOTS, UnknownRobotError, load_robot, profile_urdf
+from lipcore.robots.urdf import RigidBody, UrdfError
 from tests.lipcore.test_urdf import joint, link, robot
 
 ALL = tuple(SHEETS)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from fastapi.testclient import TestClient
 
-from lipcore import dynamics
+from lipcore.model import dynamics
 from service.oip import outputs
 from tests.service.data import ADDRESS, error, service_of
 from tests.service.oip import listed, message, path_of, refused

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lipcore.data.motion import Motion
 from lipcore.kernels.compiled.compile import compiled, inlined
 from lipcore.kernels.compiled.cross import Array
 from lipcore.kernels.compiled.lane_cross import COS, LANES, SIN, A, Flags, LaneCross, Lanes, V, place, turning_joints
-from lipcore.motion import Motion
 
 DYNAMIC, VELOCITY, POSITION = range(3)  # the sums and the product over joints that make up a torque's covariance
 

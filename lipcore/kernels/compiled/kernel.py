@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lipcore.data.motion import Motion
 from lipcore.kernels.base import PairKernel, Params
-from lipcore.motion import Motion
 
 Array = NDArray[np.float64]
 

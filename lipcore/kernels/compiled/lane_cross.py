@@ -13,9 +13,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.motion import Motion
 from lipcore.kernels.compiled.compile import compiled
 from lipcore.kernels.compiled.cross import Array, Cross
-from lipcore.motion import Motion
 
 Flags = NDArray[np.bool_]
 

@@ -14,10 +14,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lipcore.data.motion import Motion
 from lipcore.kernels.compiled.compile import compiled, inlined
 from lipcore.kernels.compiled.cross import Array
 from lipcore.kernels.compiled.lane_cross import COS, LANES, SIN, A, Flags, LaneCross, Lanes, V, place, turning_joints
-from lipcore.motion import Motion
 
 HALF = 0.5  # of an angle
 G, E, D, LEFT, RIGHT, ROW, SCALED_G, SCALED_RIGHT = range(8)  # numbers a joint; the last four are factors of the block

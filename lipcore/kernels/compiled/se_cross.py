@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from lipcore.data.motion import Motion
 from lipcore.kernels.compiled.compile import compiled, inlined
 from lipcore.kernels.compiled.cross import Array
 from lipcore.kernels.compiled.lane_cross import LANES, SIN, A, Flags, LaneCross, Lanes, V, place
-from lipcore.motion import Motion
 
 
 class SquaredExponentialCross(LaneCross):

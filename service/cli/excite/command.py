@@ -12,13 +12,13 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from lipcore.estimators import ESTIMATORS
+from lipcore.data.samples import Array
 from lipcore.excitation import Belief, Limits, Plan, PlanOptions, plan
-from lipcore.linalg import NotPositiveDefiniteError
+from lipcore.fitting.estimators import ESTIMATORS
+from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.profiles import names
-from lipcore.robots import Robot, SimulationUnavailableError
-from lipcore.samples import Array
-from lipcore.simulation import FAST, Stream, sinusoids
+from lipcore.robots.library import Robot, SimulationUnavailableError
+from lipcore.robots.simulation import FAST, Stream, sinusoids
 from lipcore.vocabulary import JointType
 from service.cli.consoles import err, print_json
 from service.cli.excite import plotting

@@ -7,8 +7,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import lipcore
-from lipcore import TorqueModel, persistence
-from lipcore.manifest import DEFAULT_LIMITS, MANIFEST, ROBOT, TENSORS, ModelFormatError
+from lipcore import TorqueModel
+from lipcore.files import persistence
+from lipcore.files.manifest import DEFAULT_LIMITS, MANIFEST, ROBOT, TENSORS, ModelFormatError
 from service.client import Client
 from service.models import archive
 

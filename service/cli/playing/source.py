@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lipcore.robots import SimulationUnavailableError, load_robot
-from lipcore.samples import Array
-from lipcore.simulation import FAST, Payload, Stream, simulate
+from lipcore.data.samples import Array
+from lipcore.robots.library import SimulationUnavailableError, load_robot
+from lipcore.robots.simulation import FAST, Payload, Stream, simulate
 from lipcore.vocabulary import TorqueConvention
 from service.cli.errors import CommandError
 from service.datasets.formats.opening import open_table

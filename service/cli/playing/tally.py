@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.stream.messages import StreamAnswer, StreamLearnt
 
 BAND = 1.959963984540054

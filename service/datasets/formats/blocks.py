@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.datasets.formats.table import BLOCK_ROWS
 from service.foundation.errors import invalid_data
 from service.foundation.settings import Settings

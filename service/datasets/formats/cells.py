@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.datasets.formats.csv_header import NUMBER
 from service.foundation.errors import invalid_data
 

@@ -12,7 +12,7 @@ from typing import IO
 import pyarrow as pa
 import pyarrow.csv as pacsv
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.datasets.formats.blocks import checked_names, left_out, said, stacked
 from service.datasets.formats.cells import MISSING, NumberColumn, StampColumn
 from service.datasets.formats.csv_header import BLANK, Header, not_utf8, read_header

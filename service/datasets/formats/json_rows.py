@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.datasets.formats.blocks import block_rows, checked_names, left_out
 from service.datasets.formats.json_shape import Node, Shape, name_of
 from service.foundation.errors import InvalidDataError, invalid_data

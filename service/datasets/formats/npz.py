@@ -14,7 +14,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.lib import format as npy
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.datasets.formats.blocks import block_rows, checked_names, left_out, said
 from service.datasets.formats.table import Table
 from service.datasets.formats.zips import ERRORS, measure, open_zip

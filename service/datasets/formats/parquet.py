@@ -10,7 +10,7 @@ from typing import IO
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.datasets.formats.blocks import block_rows, checked_names, guarded, left_out, said, stacked
 from service.datasets.formats.flattening import Node, plan
 from service.datasets.formats.parquet_pages import check_pages

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 
 BLOCK_ROWS = 16_384
 """Most rows of a block: what is held in memory of a file, however long it is."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.datasets.report.robot import Limits
 from service.datasets.report.schema import JointLimits, JointSaturation
 

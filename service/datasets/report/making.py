@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from lipcore.data.samples import Array
 from lipcore.preparation.recipe import Recipe
-from lipcore.samples import Array
 from service.datasets.preparing import Prepared
 from service.datasets.report.advice import advice, in_words, warnings
 from service.datasets.report.excitation import SELDOM, joint_excitation, weights

@@ -6,8 +6,8 @@ from math import comb
 
 import numpy as np
 
-from lipcore.samples import Array
-from lipcore.signals import DIFFERENCE_ORDERS
+from lipcore.data.samples import Array
+from lipcore.data.signals import DIFFERENCE_ORDERS
 from service.datasets.report.parts import Rows
 
 NORMAL = 1.4826

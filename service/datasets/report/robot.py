@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from lipcore.vocabulary import JointType
 
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.samples import Array
 from lipcore.online.gates import time_span
-from lipcore.samples import Array
 from service.storage.database import EventRow, StreamRow
 
 FAR_AHEAD = 86400.0

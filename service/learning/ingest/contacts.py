@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.samples import Array
 from lipcore.online.gates import Patience
-from lipcore.samples import Array
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
 from lipcore.online.change import RATIO, Change, ChangeDetector, friction_share
 from lipcore.online.gates import is_contact
 from lipcore.online.record import Record
-from lipcore.samples import Array
 from lipcore.vocabulary import CODES, LEARNT
 from service.learning.ingest.contacts import ContactGate
 from service.learning.ingest.screening import Screened

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lipcore.model import TorqueModel
-from lipcore.samples import Array
+from lipcore.data.samples import Array
+from lipcore.model.torque_model import TorqueModel
 from service.foundation.errors import invalid_request
 from service.foundation.settings import Settings
 from service.learning.schema import ObservationRequest

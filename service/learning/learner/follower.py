@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from sqlalchemy.exc import DBAPIError
 
-from lipcore.arm.linearisation import linearisation_error
-from lipcore.model import TorqueModel
-from lipcore.online import state
+from lipcore.data.samples import Array
+from lipcore.model.torque_model import TorqueModel
+from lipcore.model.warnings import linearisation_error
+from lipcore.online import transfer
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
-from lipcore.online.revision import Revision
-from lipcore.samples import Array
+from lipcore.online.transfer import Revision
 from service.foundation.errors import StorageFullError
 from service.foundation.settings import Settings
 from service.journal import log, snapshots
@@ -142,7 +142,7 @@ class Follower:
         if self.number == self._stored or not self.known.settled or self._is_stored():
             return
         self._stored_at = time.monotonic()
-        payload = state.dump(self.known.online)
+        payload = transfer.dump(self.known.online)
         try:
             self.disk.take(len(payload))
             self._snapshot = snapshots.save(

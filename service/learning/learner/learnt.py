@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from sqlalchemy.orm import Session
 
-from lipcore.model import TorqueModel
-from lipcore.online.consolidation import consolidate
+from lipcore.model.torque_model import TorqueModel
+from lipcore.online.transfer import consolidate
 from service.journal import log, snapshots
 from service.learning.learner import recent
 from service.learning.learner.restore import Restored, restore

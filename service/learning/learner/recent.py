@@ -5,9 +5,8 @@ from __future__ import annotations
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from lipcore.online.floor import error_floor
-from lipcore.online.record import Record
-from lipcore.samples import Array
+from lipcore.data.samples import Array
+from lipcore.online.record import Record, error_floor
 from service.storage.database import Database, EventRow
 
 SECONDS = 2.0

@@ -24,8 +24,8 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from lipcore.model import TorqueModel
-from lipcore.online import state
+from lipcore.model.torque_model import TorqueModel
+from lipcore.online import transfer
 from lipcore.online.batch import Rows
 from lipcore.online.learner import ForgottenError, OnlineModel
 from service.journal import log, snapshots
@@ -158,7 +158,7 @@ def _begin(
         start = log.start_of(session, model, version)
         while (row := snapshots.latest(session, model, version, limit)) is not None:
             try:
-                online = state.load(base, snapshots.read(files, row))
+                online = transfer.load(base, snapshots.read(files, row))
                 return Restored(model, version, start, online, row.number, without, torn)
             except (ValueError, OSError) as error:
                 logger.error("snapshot %s of version %d of model %r cannot be used: %s", row.id, version, model, error)

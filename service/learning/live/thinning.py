@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
-from lipcore.samples import Array
 from lipcore.vocabulary import CODES, LEARNT
 from service.learning.ingest.derivation import EDGE
 from service.learning.ingest.screening import Screened

@@ -17,9 +17,9 @@ from typing import Any, Literal
 import numpy as np
 from scipy.special import stdtrit
 
+from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
 from lipcore.online.record import Record
-from lipcore.samples import Array
 from service.foundation.settings import Settings
 
 Verdict = Literal["promote", "dismiss"]

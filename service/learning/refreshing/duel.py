@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import inf
 
+from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
-from lipcore.samples import Array
 from service.foundation.settings import Settings
 from service.learning.learner.follower import Follower
 from service.learning.learner.messages import Contested

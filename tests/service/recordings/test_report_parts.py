@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lipcore.signals import noise_level
+from lipcore.data.signals import noise_level
 from service.datasets.preview import extremes, make_preview
 from service.datasets.report.noise import noise_or_share, white_noise
 from service.datasets.report.parts import bounds, number_parts, thin

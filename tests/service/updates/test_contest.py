@@ -13,8 +13,8 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import norm
 
-from lipcore.metrics import evaluate
-from lipcore.model import TorquePrediction
+from lipcore.data.metrics import evaluate
+from lipcore.model.torque_model import TorquePrediction
 from lipcore.online.batch import Rows
 from service.foundation.settings import Settings
 from service.learning.refreshing.contest import MAX_BLOCKS, MIN_BLOCKS, ROWS_PER_BATCH, Block, Contest, sample, surprise

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.datasets.formats.bags.container import Bag, Channel
 from service.datasets.formats.bags.joints import MOST_KINDS, choose, describe, holds
 from service.datasets.formats.bags.states import Decoder, Form, Kind

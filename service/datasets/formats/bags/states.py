@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.datasets.formats.bags.container import Channel
 from service.datasets.formats.bags.definitions import Types, parse, well_known
 from service.datasets.formats.bags.layout import Layout, lay_out
