@@ -4,7 +4,7 @@
 
 A simulated arm with friction that no estimator expresses exactly (a jump at zero speed) is learnt from episodes of 50
 seconds, at several rates and for several lengths. Each fit chooses its rows and its basis as a training job does. Then
-the same basis is told of all rows: each counted by the seconds that it stands for (see `lipcore.data.independence`), and
+the same basis takes in all rows: each counted by the seconds that it stands for (see `data.independence`), and
 each in full. `worth` is the sum of what the rows count by their time. Judged on unseen trajectories of twice the
 bandwidth: nMSE, and coverage of the 95 % interval, noise included, each the mean over joints and trajectories.
 """

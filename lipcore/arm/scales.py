@@ -31,7 +31,7 @@ BODY_KINDS = 3
 
 @dataclass(frozen=True)
 class Scaled:
-    """problem: the same with the deviations found; sigma: (n,) noise std, N·m; value: −log evidence, nats."""
+    """problem: with the deviations of largest evidence; sigma: (n,) noise std, N·m; value: −log evidence, nats."""
 
     problem: Problem
     sigma: Array

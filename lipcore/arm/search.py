@@ -66,7 +66,7 @@ def search(
     """Find the geometry of the best evidence; `problem` holds few rows, some eighty.
 
     sensor_noise: (n,) N·m, what the signals say of their white noise; seconds: time limit; known: geometries to begin
-    from, too; step: told the best value and the fraction of the work after each descent, may raise to end it all.
+    from, too; step: called with the best value and the fraction of the work after each descent, may raise to end it.
     Raise LinAlgError where no start has an evidence.
     """
     rng = np.random.default_rng(seed)

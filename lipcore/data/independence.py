@@ -40,8 +40,8 @@ def recording_weights(time: Array, episode: NDArray[np.int64], rate: float = IND
     steps = np.where(joined, np.diff(time), np.nan)
     since = np.concatenate([[np.nan], steps])
     until = np.concatenate([steps, [np.nan]])
-    found = np.where(np.isfinite(since), since, until)
-    return np.clip(rate * np.where(np.isfinite(found), found, np.inf), 0.0, 1.0)
+    seconds = np.where(np.isfinite(since), since, until)
+    return np.clip(rate * np.where(np.isfinite(seconds), seconds, np.inf), 0.0, 1.0)
 
 
 def stream_weights(time: Array, before: float | None = None, rate: float = INDEPENDENT_HZ) -> Array:

@@ -10,14 +10,14 @@ import numpy as np
 from lipcore.data.samples import Array
 
 LEVELS = (0.5, 0.8, 0.95, 0.99)
-"""Probabilities of the intervals whose coverage and width are always told."""
+"""Probabilities of the intervals whose coverage and width are always given."""
 RELIABILITY_LEVELS = (*(k / 20 for k in range(1, 20)), 0.99)
 """Probabilities of the reliability curve: 5, 10 … 95 and 99 %."""
 
 
 @dataclass(frozen=True)
 class Metrics:
-    """Per-joint figures, each (n,) unless said otherwise.
+    """Per-joint figures, each (n,) unless stated otherwise.
 
     nmse: mean squared error / variance of the measured torque; rmse: N·m; coverage: share of measurements inside the
     `level` interval, noise included; nlpd: mean negative log predictive density, nats; width: mean width of that

@@ -128,8 +128,8 @@ def difference(values: Array, starts: NDArray[np.int64]) -> Difference:
     deviation = np.add.reduceat(values, starts, axis=0) - rows[:, None] * mean
     squared = np.sum(deviation**2, axis=0)
     neighbours = np.sum(deviation[1:] * deviation[:-1], axis=0)
-    found = np.divide(neighbours, squared, out=np.zeros_like(squared), where=squared > 0)
-    correlation = np.clip(found + (1 + 4 * np.maximum(found, 0)) / count, 0, MOST_CORRELATION)
+    observed = np.divide(neighbours, squared, out=np.zeros_like(squared), where=squared > 0)
+    correlation = np.clip(observed + (1 + 4 * np.maximum(observed, 0)) / count, 0, MOST_CORRELATION)
     inflation = (1 + correlation) / (1 - correlation)
     standard_error = np.sqrt(count / (count - 1) * squared * inflation) / len(values)
     freedom = np.maximum(count / inflation - 1, 1)

@@ -93,8 +93,8 @@ def split(episode: Numbers, t: Array, how: Split) -> Parts:
         raise SplitError("rows", len(t), "at least 2, one for each side")
     order = np.lexsort((t, episode))
     parts = guarded(episode, t, order, _HELD[how.kind](episode[order], how), how.guard_s)
-    for side, found in (("held out", parts.held_out), ("to train on", parts.train)):
-        if not found.any():
+    for side, rows in (("held out", parts.held_out), ("to train on", parts.train)):
+        if not rows.any():
             expected = f"fewer: no row {side} is further than {how.guard_s:g} s from the other side"
             raise SplitError("guarded rows", parts.guarded, expected)
     return parts
@@ -116,14 +116,14 @@ def choose(lengths: Numbers, share: float, seed: int) -> Mask:
     """
     if len(lengths) < 2:
         raise SplitError("episodes", len(lengths), "at least 2 to hold out whole ones of: hold out `last` or `blocks`")
-    # no generator of random numbers: theirs may change from release to release, and what was held out must be found
-    # again
+    # no generator of random numbers: theirs may change from release to release, and the same rows must be held
+    # out again
     order = sorted(range(len(lengths)), key=lambda each: sha256(f"{seed}/{each}".encode()).digest())
-    rows, wanted = lengths.tolist(), share * int(lengths.sum())
+    rows, goal = lengths.tolist(), share * int(lengths.sum())
     chosen: list[int] = []
     held = 0
     for each in order:
-        if len(chosen) < len(lengths) - 1 and abs(held + rows[each] - wanted) < abs(held - wanted):
+        if len(chosen) < len(lengths) - 1 and abs(held + rows[each] - goal) < abs(held - goal):
             chosen.append(each)
             held += rows[each]
     mask = np.zeros(len(lengths), dtype=bool)

@@ -44,7 +44,7 @@ class Evaluator:
 
     term: the kernel's nonlinear term, None if it has none. params: hyperparameters of all terms. inducing: S samples,
     None without `term`. outputs: (m,), which of their torques, as sample · n + joint. linear: the linear terms in the
-    order of the anchors. weights: (M,). root: Q, (M, M) lower triangular. std_factor: see `fitting.estimators`. floor: (n,)
+    order of the anchors. weights: (M,). root: Q, (M, M) lower triangular. std_factor: calibration. floor: (n,)
     (N·m)², none where None.
 
     Safe from several threads, which answer at the same time: compiled code runs without the GIL and every thread has

@@ -65,27 +65,27 @@ class Information:
         """
         belief = self.belief
         own = belief.kernel.symmetric_gram(belief.params, motion)
-        _, told = self._told(own, self._with_reference(motion), belief.root @ belief.cross(motion), repeats)
-        return self._share(self._after(told))
+        _, explained = self._explained(own, self._with_reference(motion), belief.root @ belief.cross(motion), repeats)
+        return self._share(self._after(explained))
 
     def slope(self, motion: Motion, repeats: float = 1.0) -> tuple[float, Motion]:
         """Mean over joints of log `left`, and its derivatives by position, velocity and acceleration, each (N, n).
 
-        With S = k(X, X) + R, D = k(X, r) and α = S⁻¹ D, what is told of r changes by 2 αᵀ dD − αᵀ dS α.
+        With S = k(X, X) + R, D = k(X, r) and α = S⁻¹ D, what X explains of r changes by 2 αᵀ dD − αᵀ dS α.
         """
         belief, kernel, params = self.belief, self.belief.kernel, self.belief.params
         own, other, cross = kernel.gram(params, motion, motion), self._with_reference(motion), belief.cross(motion)
         learnt = belief.root @ cross
-        solved, told = self._told(own, other, learnt, repeats)
-        after = self._after(told)
-        moves = after == self.now - told  # a variance that has reached its floor stays there
+        solved, explained = self._explained(own, other, learnt, repeats)
+        after = self._after(explained)
+        moves = after == self.now - explained  # a variance that has reached its floor stays there
         weight = -torch.where(moves, 1 / after, 0.0).reshape(-1) / after.numel()
         by_other = 2 * solved * weight
         by_own = -(solved * weight) @ solved.T
         by_cross = belief.root.T @ (-2 * learnt @ by_own - self.learnt @ by_other.T)
         size, n = motion.q.shape
         parts = {"q": motion.q, "dq": motion.dq, "ddq": motion.ddq}
-        found = {name: torch.empty_like(part) for name, part in parts.items()}
+        slopes = {name: torch.empty_like(part) for name, part in parts.items()}
         for name, part in parts.items():
             for joint in range(n):
                 moved = part.clone()
@@ -95,14 +95,14 @@ class Information:
                 total = 2 * (by_own * (kernel.gram(params, near, motion) - own)).sum(1)
                 total += (by_other * (self._with_reference(near) - other)).sum(1)
                 total += (by_cross * (belief.cross(near) - cross)).sum(0)
-                found[name][:, joint] = total.reshape(size, n).sum(1) / STEP
-        return float(self._share(after).log().mean()), Motion(**found)
+                slopes[name][:, joint] = total.reshape(size, n).sum(1) / STEP
+        return float(self._share(after).log().mean()), Motion(**slopes)
 
     def _with_reference(self, motion: Motion) -> Tensor:
         """Prior covariance of the motion's torques with those at the references, (N n, R n)."""
         return self.belief.kernel.gram(self.belief.params, motion, self.reference)
 
-    def _told(self, own: Tensor, other: Tensor, learnt: Tensor, repeats: float) -> tuple[Tensor, Tensor]:
+    def _explained(self, own: Tensor, other: Tensor, learnt: Tensor, repeats: float) -> tuple[Tensor, Tensor]:
         """S⁻¹ D, (N n, R n), and the variance that the motion would take away, (R, n), from prior covariances."""
         noise = (self.belief.noise_variance / repeats).repeat(len(own) // len(self.floor))
         factor = cholesky(own - learnt.T @ learnt + torch.diag(noise))
@@ -110,8 +110,8 @@ class Information:
         solved = torch.linalg.solve_triangular(factor.lower.T, whitened, upper=True)
         return solved, whitened.square().sum(0).reshape(self.now.shape)
 
-    def _after(self, told: Tensor) -> Tensor:
-        return torch.maximum(torch.maximum(self.now - told, self.floor), LEAST * self.now)
+    def _after(self, explained: Tensor) -> Tensor:
+        return torch.maximum(torch.maximum(self.now - explained, self.floor), LEAST * self.now)
 
     def _share(self, after: Tensor) -> Tensor:
         """Geometric mean over the references: what is left of the largest variances alone would tell of extremes."""

@@ -143,8 +143,8 @@ class Shape:
     def series(self, x: Array) -> Series:
         """The motion as a series, held to the limits by their strict bound."""
         shift, sine, cosine = (part.numpy() for part in self.coefficients(torch.from_numpy(x)))
-        found = Series(self.seconds, self.limits.middle + shift, sine, cosine)
-        return found.scaled(self.limits.middle, 1 / np.maximum(1.0, found.used(self.limits).max(0)))
+        series = Series(self.seconds, self.limits.middle + shift, sine, cosine)
+        return series.scaled(self.limits.middle, 1 / np.maximum(1.0, series.used(self.limits).max(0)))
 
     def random(self, rng: np.random.Generator) -> Array:
         """A start for a search: harmonics of random strength and phase, faster ones weaker."""

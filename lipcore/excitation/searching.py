@@ -26,7 +26,7 @@ MEMORY = 20
 
 @dataclass(frozen=True)
 class Goal:
-    """What a matrix x (see Shape) is worth: mean log share of variance left, and a penalty on too large torques.
+    """What is minimised over x (see Shape): mean log share of variance left, and a penalty on too large torques.
 
     t: instants judged; repeats: samples that each of them stands for.
     """
@@ -65,8 +65,8 @@ class Goal:
         value, slope = self.information.slope(motion, self.repeats)
         over, more = self._over(motion)
         slopes = [one + other for one, other in zip((slope.q, slope.dq, slope.ddq), more, strict=True)]
-        (found,) = torch.autograd.grad(parts, variable, slopes)
-        return value + over, found.numpy()
+        (slope,) = torch.autograd.grad(parts, variable, slopes)
+        return value + over, slope.numpy()
 
     def _over(self, motion: Motion) -> tuple[float, list[Tensor]]:
         parts = (motion.q, motion.dq, motion.ddq)
@@ -77,7 +77,7 @@ class Goal:
 
 
 @dataclass(frozen=True)
-class Found:
+class SearchResult:
     """Where a search ended. out_of_time: whether that was because of the time."""
 
     x: Array
@@ -92,10 +92,10 @@ def search(
     seed: int,
     until: float,
     on_progress: Callable[[int, float], None] | None = None,
-) -> Found:
+) -> SearchResult:
     """The best of random starts, followed by L-BFGS for so many iterations, or until that time of the monotonic clock.
 
-    on_progress: told iterations and the exponential of the lowest value so far.
+    on_progress: called with iterations and the exponential of the lowest value so far.
     """
     rng = np.random.default_rng(seed)
     begun = [goal.shape.random(rng) for _ in range(starts)]
@@ -108,7 +108,7 @@ class _OutOfTimeError(Exception):
 
 
 class _Walk:
-    """One descent, which remembers the lowest point that it came by."""
+    """One descent, which remembers the lowest point on its way."""
 
     def __init__(
         self, goal: Goal, begin: Array, until: float, on_progress: Callable[[int, float], None] | None
@@ -116,17 +116,17 @@ class _Walk:
         self.goal, self.begin, self.until, self.on_progress = goal, begin, until, on_progress
         self.best, self.lowest, self.iterations = begin, np.inf, 0
 
-    def run(self, iterations: int) -> Found:
+    def run(self, iterations: int) -> SearchResult:
         from scipy.optimize import minimize  # noqa: PLC0415 - serving does without it
 
         if iterations == 0:
-            return Found(self.best, 0, False)
+            return SearchResult(self.best, 0, False)
         options = {"maxiter": iterations, "maxcor": MEMORY, "ftol": 0.0, "gtol": 0.0}
         try:
             minimize(self, self.begin.ravel(), jac=True, method="L-BFGS-B", callback=self._step, options=options)
         except _OutOfTimeError:
-            return Found(self.best, self.iterations, True)
-        return Found(self.best, self.iterations, False)
+            return SearchResult(self.best, self.iterations, True)
+        return SearchResult(self.best, self.iterations, False)
 
     def __call__(self, flat: Array) -> tuple[float, Array]:
         if time.monotonic() > self.until:

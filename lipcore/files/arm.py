@@ -10,34 +10,32 @@ import torch
 from torch import Tensor
 
 from lipcore.data.samples import Array
+from lipcore.files.checks import LARGEST, check_choice, check_keys, check_list, check_numbers, wrong
 from lipcore.files.strict_json import quote
 from lipcore.kernels.arm_prior import Alternative, Arm
 from lipcore.kernels.friction import friction_terms
 from lipcore.kernels.geometry import Geometry
+from lipcore.model.parameters import STEPS
 from lipcore.robots.urdf import PARAMETERS
 from lipcore.vocabulary import GEOMETRY_MODES, JOINT_TYPES, GeometryMode, JointType
 
-MODES = ("learn", "calibrate", "fixed")
 GEOMETRY = ("mode", "gravity", "order", "joints")
 JOINT = ("joint", "type", "rotation", "translation", "axis", "across", "turn_std", "shift_std", "undetermined")
-NUMBERS = ("turn 1", "turn 2", "shift 1", "shift 2")
-"""What torque may tell of where a joint lies: turns about, and shifts along, the two vectors across its axis."""
 BODY = ("joint", "mean", "std", "plausible")
 MASSES = {"mass": (), "first_moment": (3,), "inertia": (6,)}
 """Entries of a body's ten parameters and their shapes."""
-LARGEST = 1e12
 
 
 def check_inertia(inertia: Any, n: int) -> None:
     """Raise ValueError unless this is the entry `inertia` of n bodies; the message names what is wrong."""
-    _check_keys("inertia", inertia, ("mean_is_plausible", "bodies"), ("plausible_deviation",))
+    check_keys("inertia", inertia, ("mean_is_plausible", "bodies"), ("plausible_deviation",))
     if "plausible_deviation" in inertia:
         numbers("inertia.plausible_deviation", inertia["plausible_deviation"], (n,))
-    for index, body in enumerate(_list("inertia.bodies", inertia["bodies"], n)):
+    for index, body in enumerate(check_list("inertia.bodies", inertia["bodies"], n)):
         where = f"inertia.bodies[{index}]"
-        _check_keys(where, body, BODY, ("undetermined",))
+        check_keys(where, body, BODY, ("undetermined",))
         for key in ("mean", "std", "plausible"):
-            _check_keys(f"{where}.{key}", body[key], MASSES)
+            check_keys(f"{where}.{key}", body[key], MASSES)
             for name, shape in MASSES.items():
                 numbers(f"{where}.{key}.{name}", body[key][name], shape)
         _check_words(f"{where}.undetermined", body.get("undetermined", []), tuple(MASSES))
@@ -45,7 +43,7 @@ def check_inertia(inertia: Any, n: int) -> None:
 
 def check_rotor(rotor: Any, n: int) -> None:
     """Raise ValueError unless this is the entry `rotor` of n joints."""
-    _check_keys("rotor", rotor, ("mean", "std"))
+    check_keys("rotor", rotor, ("mean", "std"))
     for key in ("mean", "std"):
         numbers(f"rotor.{key}", rotor[key], (n,))
 
@@ -55,13 +53,13 @@ def read_geometry(entry: Any, n: int, plausible: bool = False) -> tuple[Geometry
 
     plausible: the one that the plausible bodies are meant for, where it is another one.
     """
-    _check_keys("geometry", entry, GEOMETRY)
-    if entry["mode"] not in MODES:
-        raise _wrong("geometry.mode", entry["mode"], f"one of {', '.join(MODES)}")
-    gravity, order = numbers("geometry.gravity", entry["gravity"], (3,)), _list("geometry.order", entry["order"], n)
+    check_keys("geometry", entry, GEOMETRY)
+    check_choice("geometry.mode", entry["mode"], GEOMETRY_MODES)
+    gravity = numbers("geometry.gravity", entry["gravity"], (3,))
+    order = check_list("geometry.order", entry["order"], n)
     if any(isinstance(each, bool) or not isinstance(each, int) for each in order) or sorted(order) != list(range(n)):
-        raise _wrong("geometry.order", order, f"each of the joints 0 to {n - 1} once")
-    joints = _list("geometry.joints", entry["joints"], n)
+        raise wrong("geometry.order", order, f"each of the joints 0 to {n - 1} once")
+    joints = check_list("geometry.joints", entry["joints"], n)
     for place, joint in enumerate(joints):
         _check_joint(f"geometry.joints[{place}]", joint)
     placed = [{**joint, **(joint.get("plausible", {}) if plausible else {})} for joint in joints]
@@ -88,57 +86,27 @@ def bodies_of(inertia: Mapping[str, Any], kind: str = "plausible") -> Array:
 
 def numbers(name: str, value: Any, shape: tuple[int, ...]) -> Array:
     """Nested lists of numbers as an array of a shape; raise ValueError for anything else."""
-    _check_numbers(name, value, shape)
+    check_numbers(name, value, shape, -LARGEST, LARGEST)
     return np.array(value, np.float64)
 
 
-def _check_numbers(name: str, value: Any, shape: Sequence[int]) -> None:
-    if shape:
-        for index, each in enumerate(_list(name, value, shape[0])):
-            _check_numbers(f"{name}[{index}]", each, shape[1:])
-    elif not isinstance(value, int | float) or isinstance(value, bool) or not -LARGEST <= value <= LARGEST:
-        raise _wrong(name, value, "a number")
-
-
 def _check_joint(where: str, joint: Any) -> None:
-    _check_keys(where, joint, JOINT, ("plausible",))
+    check_keys(where, joint, JOINT, ("plausible",))
     if "plausible" in joint:
-        _check_keys(f"{where}.plausible", joint["plausible"], ("rotation", "translation"))
+        check_keys(f"{where}.plausible", joint["plausible"], ("rotation", "translation"))
         numbers(f"{where}.plausible.rotation", joint["plausible"]["rotation"], (3, 3))
         numbers(f"{where}.plausible.translation", joint["plausible"]["translation"], (3,))
-    if joint["type"] not in JOINT_TYPES:
-        raise _wrong(f"{where}.type", joint["type"], f"one of {', '.join(JOINT_TYPES)}")
+    check_choice(f"{where}.type", joint["type"], JOINT_TYPES)
     for key, shape in (("rotation", (3, 3)), ("translation", (3,)), ("axis", (3,)), ("across", (2, 3))):
         numbers(f"{where}.{key}", joint[key], shape)
     for key in ("turn_std", "shift_std"):
         numbers(f"{where}.{key}", joint[key], (2 if joint[key] else 0,))
-    _check_words(f"{where}.undetermined", joint["undetermined"], NUMBERS)
+    _check_words(f"{where}.undetermined", joint["undetermined"], STEPS)
 
 
 def _check_words(name: str, value: Any, known: Sequence[str]) -> None:
     if not isinstance(value, list) or any(each not in known for each in value):
-        raise _wrong(name, value, f"a list of some of {', '.join(known)}")
-
-
-def _check_keys(name: str, value: Any, required: Sequence[str] | Mapping[str, Any], more: Sequence[str] = ()) -> None:
-    if not isinstance(value, dict):
-        raise _wrong(name, value, "an object")
-    for key in required:
-        if key not in value:
-            raise ValueError(f"{name} lacks {key}")
-    for key in value:
-        if key not in required and key not in more:
-            raise ValueError(f"{name} has the entry {quote(key)}, which this release does not know")
-
-
-def _list(name: str, value: Any, n: int) -> list[Any]:
-    if not isinstance(value, list) or len(value) != n:
-        raise _wrong(name, value, f"a list of {n}")
-    return value
-
-
-def _wrong(name: str, value: object, expected: str) -> ValueError:
-    return ValueError(f"{name} is {quote(value)}, expected {expected}")
+        raise wrong(name, value, f"a list of some of {', '.join(known)}")
 
 
 PREFIX = "arm/"

@@ -125,7 +125,7 @@ def decode(files: Mapping[str, bytes], limits: Limits = DEFAULT_LIMITS) -> Torqu
     except ModelFormatError:
         raise
     except Exception as error:  # whatever numerics make of numbers that no training has made
-        raise ModelFormatError(f"the tensors do not make a valid model: {_said(error)}", TENSORS) from error
+        raise ModelFormatError(f"the tensors do not make a valid model: {_text(error)}", TENSORS) from error
 
 
 def load(folder: Path, checksums: Mapping[str, str] | None = None, limits: Limits = DEFAULT_LIMITS) -> TorqueModel:
@@ -178,8 +178,8 @@ def check(files: Mapping[str, bytes], checksums: Mapping[str, str]) -> None:
 
 def checksums(manifest: Mapping[str, Any]) -> dict[str, str]:
     """sha256 of each file of the model with this manifest, by name."""
-    found = {MANIFEST: sha256(manifest_bytes(manifest)), TENSORS: str(manifest["tensors"]["sha256"])}
-    return {**found, ROBOT: str(manifest["robot"]["sha256"])} if "robot" in manifest else found
+    sums = {MANIFEST: sha256(manifest_bytes(manifest)), TENSORS: str(manifest["tensors"]["sha256"])}
+    return {**sums, ROBOT: str(manifest["robot"]["sha256"])} if "robot" in manifest else sums
 
 
 def manifest_bytes(manifest: Mapping[str, Any]) -> bytes:
@@ -242,7 +242,7 @@ def _robot(files: Mapping[str, bytes], manifest: Mapping[str, Any], limits: Limi
             content.decode(), manifest["joint_names"], manifest["joint_types"], entry["joints"], entry["name"]
         )
     except Exception as error:  # Pinocchio raises what its parser does
-        raise ModelFormatError(f"{ROBOT} is not the robot of this model: {_said(error)}", ROBOT) from error
+        raise ModelFormatError(f"{ROBOT} is not the robot of this model: {_text(error)}", ROBOT) from error
     return replace(robot, matched=entry["matched"])
 
 
@@ -299,12 +299,12 @@ def _arm(manifest: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Arm:
         raise ModelFormatError(str(error), TENSORS) from None
 
 
-def _said(error: Exception) -> str:
+def _text(error: Exception) -> str:
     return (str(error).strip() or type(error).__name__)[:300]
 
 
 def _read(path: Path, most: int | None = None) -> bytes:
-    """A file of a saved model, whole; raise ModelFormatError, also for more than `most` bytes."""
+    """A file of a saved model; raise ModelFormatError, also for more than `most` bytes."""
     try:
         with path.open("rb") as file:
             content = file.read(-1 if most is None else most + 1)

@@ -11,7 +11,7 @@ import math
 from typing import Any, NoReturn
 
 MAX_DEPTH = 32
-"""Objects and lists within one another: what is written again, checked or shown recurses as deep."""
+"""Objects and lists within one another: what is written again, checked or quoted recurses as deep."""
 MAX_INTEGER = 2**63
 
 
@@ -42,13 +42,13 @@ def read(payload: bytes, most_bytes: int) -> Any:
 
 
 def quote(value: object, most: int = 80) -> str:
-    """A value as it is shown in a message: escaped, and cut where it is long."""
+    """A value as a message quotes it: escaped, and cut where it is long."""
     text = ascii(value) if not isinstance(value, list | dict) else f"a {type(value).__name__} of {len(value)} entries"
     return text if len(text) <= most else text[:most] + "…"
 
 
 def _check_tree(root: Any) -> None:
-    """Raise StrictJsonError for texts that cannot be stored or shown, and for a deep nest; does not recurse."""
+    """Raise StrictJsonError for texts that cannot be stored or quoted, and for a deep nest; does not recurse."""
     waiting = [(root, 1)]
     while waiting:
         value, depth = waiting.pop()
@@ -71,12 +71,12 @@ def _check_text(text: str) -> None:
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     for name, value in pairs:
-        if name in found:
+        if name in entries:
             raise StrictJsonError(f"the name {quote(name)} is given twice")
-        found[name] = value
-    return found
+        entries[name] = value
+    return entries
 
 
 def _no_number(name: str) -> NoReturn:

@@ -62,7 +62,7 @@ def _bad(message: str) -> ModelFormatError:
 
 
 def _read_header(payload: bytes) -> dict[str, Entry]:
-    """What the tensors are said to be: together they fill the rest of the file, without holes and overlaps."""
+    """The tensors as the header has them: together they fill the rest of the file, without holes and overlaps."""
     if len(payload) < LENGTH:
         raise _bad(f"{TENSORS} has {len(payload)} bytes, expected a header")
     length = int.from_bytes(payload[:LENGTH], "little")
@@ -91,10 +91,10 @@ def _entry(name: str, value: Any) -> Entry:
     if not isinstance(value, dict) or set(value) != {"dtype", "shape", "data_offsets"}:
         raise _bad(f"tensor {quote(name)} is described by {quote(value)}, expected dtype, shape and data_offsets")
     dtype, shape, offsets = value["dtype"], value["shape"], value["data_offsets"]
-    wanted = "I64" if name == OUTPUTS else "F64"
-    if dtype != wanted:
-        found = TYPES.get(dtype, quote(dtype)) if isinstance(dtype, str) else quote(dtype)
-        raise _bad(f"tensor {quote(name)} is of type {found}, expected {TYPES[wanted]}")
+    expected = "I64" if name == OUTPUTS else "F64"
+    if dtype != expected:
+        kind = TYPES.get(dtype, quote(dtype)) if isinstance(dtype, str) else quote(dtype)
+        raise _bad(f"tensor {quote(name)} is of type {kind}, expected {TYPES[expected]}")
     if not _are_counts(shape) or len(shape) > MAX_DIMENSIONS:
         raise _bad(f"tensor {quote(name)} has the shape {quote(shape)}, expected at most {MAX_DIMENSIONS} lengths")
     if not _are_counts(offsets) or len(offsets) != 2 or offsets[1] - offsets[0] != WIDTH * math.prod(shape):
@@ -120,16 +120,16 @@ def _check_sizes(entries: dict[str, Entry], n: int, limits: Limits) -> None:
     outputs, b = entries[OUTPUTS].shape, entries[B].shape
     if len(outputs) != 1 or len(b) != 1:
         raise _bad(f"{OUTPUTS} and {B} have shapes {outputs} and {b}, expected one dimension each")
-    found = {
+    counts = {
         "inducing_samples": samples[0],
         "inducing_torques": samples[0] * n,
         "inducing_outputs": max(outputs[0], b[0] - 64 * n),  # each linear term has a few weights a joint
     }
-    for what, count in found.items():
+    for what, count in counts.items():
         if count > getattr(limits, what):
             raise _bad(f"{TENSORS} has {count} {what.replace('_', ' ')}, expected at most {getattr(limits, what)}")
     if entries[A].shape != (b[0] * (b[0] + 1) // 2,):
-        wanted = b[0] * (b[0] + 1) // 2
-        raise _bad(f"{A} has shape {entries[A].shape}, expected M (M + 1) / 2 numbers, {wanted}, as {B} has {b[0]}")
+        length = b[0] * (b[0] + 1) // 2
+        raise _bad(f"{A} has shape {entries[A].shape}, expected M (M + 1) / 2 numbers, {length}, as {B} has {b[0]}")
     if FLOOR in entries and entries[FLOOR].shape != (n,):
         raise _bad(f"tensor {FLOOR!r} has shape {entries[FLOOR].shape}, expected ({n},)")

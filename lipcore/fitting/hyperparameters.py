@@ -162,7 +162,7 @@ def _best_start(screening: _Search, starts: int) -> tuple[int, Array]:
     """
     rng = np.random.default_rng(0)
     centre, width = screening.pack(screening.start), screening.pack(screening.width_tensors())
-    best, found, origin = np.inf, 0, centre
+    best, chosen, origin = np.inf, 0, centre
     for number in range(starts):
         begin = centre if number == 0 else centre + START_SPREAD * width * rng.standard_normal(len(centre))
         screening.best = np.inf
@@ -173,8 +173,8 @@ def _best_start(screening: _Search, starts: int) -> tuple[int, Array]:
                 raise
             continue
         if result.fun < best:
-            best, found, origin = float(result.fun), number, result.x
-    return found, origin
+            best, chosen, origin = float(result.fun), number, result.x
+    return chosen, origin
 
 
 class _Search:

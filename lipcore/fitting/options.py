@@ -1,4 +1,4 @@
-"""What a fit may be told."""
+"""The options of a fit."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class FitOptions:
     compact_tolerance: largest deviation of the compact posterior from the exact one, in standard deviations;
     max_inducing_outputs: where that would take more, the compact posterior deviates more, and answers stay fast;
     statistics: what the posterior of the chosen basis stands on in the end: the samples `chosen` before, or `all`, each
-    counted for the time that it stands for (`lipcore.data.independence`); `auto`: all where together they are worth more
+    counted for the time that it stands for (`data.independence`); `auto`: all where together they count as more
     than posterior_samples independent ones, which was measured to answer better (benchmarks/studies/all_rows.py).
     """
 

@@ -80,25 +80,25 @@ def components(
     Raise UnavailableComponentError for a name that is unknown or not on offer; ValueError for a wrong number of joints,
     or where `tau` is missing, of another shape or given in vain; IndefiniteInertiaError.
     """
-    wanted = _check(model, motion, names, tau)
+    asked = _check(model, motion, names, tau)
     posterior, terms = model.posterior, _dynamics_terms(model.estimator)
-    found: dict[str, Estimate] = {}
-    torques = [name for name in wanted if name in _TORQUES or name == "inertia_matrix"]
+    estimates: dict[str, Estimate] = {}
+    torques = [name for name in asked if name in _TORQUES or name == "inertia_matrix"]
     if torques:
-        found |= _torque_parts(posterior, SumKernel(*terms), motion, torques)
-    if "friction" in wanted:
+        estimates |= _torque_parts(posterior, SumKernel(*terms), motion, torques)
+    if "friction" in asked:
         friction = model.estimator.terms["friction"]
-        found["friction"] = combine_torques(
+        estimates["friction"] = combine_torques(
             posterior, friction, [motion], torch.eye(model.n_joints, dtype=torch.float64)
         )
     energetic = _energy_terms(model.estimator)
-    if "kinetic_energy" in wanted:
-        found["kinetic_energy"] = kinetic_energy(posterior, energetic, motion)
-    if "potential_energy" in wanted:
-        found["potential_energy"] = potential_energy(posterior, energetic, motion, reference_posture(model))
-    if "forward_dynamics" in wanted and tau is not None:
-        found["forward_dynamics"] = forward_dynamics(model, motion, tau)
-    return {name: found[name] for name in wanted}
+    if "kinetic_energy" in asked:
+        estimates["kinetic_energy"] = kinetic_energy(posterior, energetic, motion)
+    if "potential_energy" in asked:
+        estimates["potential_energy"] = potential_energy(posterior, energetic, motion, reference_posture(model))
+    if "forward_dynamics" in asked and tau is not None:
+        estimates["forward_dynamics"] = forward_dynamics(model, motion, tau)
+    return {name: estimates[name] for name in asked}
 
 
 def reference_posture(model: TorqueModel) -> Tensor:

@@ -137,7 +137,9 @@ def combine_torques(
         grams = [kernel.symmetric_gram(posterior.params, stack[k * size : (k + 1) * size]) for k in range(queries)]
         variance = torch.stack([(coefficients @ gram * coefficients).sum(1) for gram in grams])
         mean = kernel.mean(stack).reshape(queries, -1) @ coefficients.T
-        found = condition(posterior, mean.reshape(-1), variance.reshape(-1), cross.reshape(len(posterior.weights), -1))
-        means.append(found.mean.reshape(queries, -1))
-        stds.append(found.std.reshape(queries, -1))
+        estimate = condition(
+            posterior, mean.reshape(-1), variance.reshape(-1), cross.reshape(len(posterior.weights), -1)
+        )
+        means.append(estimate.mean.reshape(queries, -1))
+        stds.append(estimate.std.reshape(queries, -1))
     return Estimate(torch.cat(means), torch.cat(stds))

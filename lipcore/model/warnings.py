@@ -31,7 +31,7 @@ def linearisation_error(model: TorqueModel) -> Array | None:
 
         Y(θ + δθ) π + r ∘ ddq − Φ w    over    √(tau_std² + noise_std²)    at    w = ŵ + (I − C Λ⁻¹) (μ − ŵ)
 
-    where μ and C are posterior mean and covariance, Λ the prior's: the step towards μ as far as samples have told it.
+    where μ and C are posterior mean and covariance, Λ the prior's: the step towards μ as far as samples determine it.
     Along what they leave open μ may lie anywhere, for no torque depends on it. The motions are those that the basis
     keeps. None for a model without an arm, or with a geometry that is fixed: it is linear.
     """
@@ -55,7 +55,7 @@ def linearisation_error(model: TorqueModel) -> Array | None:
 ALWAYS_OPEN = 2
 """Numbers of a geometry that no torque depends on: its turn about gravity, and a place along the first axis."""
 TOGETHER = 0.7
-"""Independent motions, as a share of the joints, below which joints are said to move together."""
+"""Independent motions, as a share of the joints, below which joints count as moving together."""
 FARTHER = 2.0
 """How much farther, or faster, a joint moves than it did where alternative arms are compared."""
 LISTED = 8

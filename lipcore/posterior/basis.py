@@ -82,7 +82,7 @@ class Basis:
             return torch.zeros_like(query.q)
         return self._open(self.term.variance(self.params, query).diagonal(dim1=1, dim2=2), features)
 
-    def told(self, query: Motion) -> tuple[Tensor, Tensor]:
+    def features_and_uncovered(self, query: Motion) -> tuple[Tensor, Tensor]:
         """`features` and `uncovered` of N queries, for few of them at a time: compiled, on the CPU."""
         if self._cross is None:
             features = self.features(query)

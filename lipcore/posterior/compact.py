@@ -27,7 +27,8 @@ class CompactPosterior(Posterior):
 
     where φ does not reach, the variance is the prior's. root: Q, (M, M) lower triangular; noise_variance: (n,) R;
     floor: (n,) (N·m)², which the variance of a torque is never below, whatever the samples say; zero but for models
-    that learn online (see `online.record.error_floor`). statistics: what it was made from; None where that is more than one sum.
+    that learn online (see `online.record.error_floor`). statistics: what it was made from; None where that is more than
+    one sum.
     """
 
     basis: Basis
@@ -46,8 +47,8 @@ class CompactPosterior(Posterior):
         std_factor: float = 1.0,
     ) -> CompactPosterior:
         """Posterior of statistics; raise NotPositiveDefiniteError for such as no samples have."""
-        found = cls.solved(kernel, basis, solve(statistics), noise_variance, std_factor)
-        return replace(found, statistics=statistics)
+        posterior = cls.solved(kernel, basis, solve(statistics), noise_variance, std_factor)
+        return replace(posterior, statistics=statistics)
 
     @classmethod
     def restore(
@@ -103,11 +104,11 @@ class CompactPosterior(Posterior):
 
         The floor is one of the whole torque: no term's share of it is known.
         """
-        found = super().predict(query, component)
+        prediction = super().predict(query, component)
         if component is not None:
-            return found
-        short = (self.floor - found.covariance.diagonal(dim1=1, dim2=2)).clamp_min(0.0)
-        return Prediction(found.mean, found.covariance + torch.diag_embed(short))
+            return prediction
+        short = (self.floor - prediction.covariance.diagonal(dim1=1, dim2=2)).clamp_min(0.0)
+        return Prediction(prediction.mean, prediction.covariance + torch.diag_embed(short))
 
     def whiten(self, cross: Tensor) -> Tensor:
         """Q c."""

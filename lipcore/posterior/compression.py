@@ -172,8 +172,8 @@ class _Candidates:
             samples, places = torch.unique(outputs // kernel.n_joints, return_inverse=True)
             cross = term.gram(params, motion[samples], check)[places * kernel.n_joints + outputs % kernel.n_joints]
             root = order.lower[outputs]  # Cholesky factor of the chosen outputs' covariance in units of the noise
-            found = torch.linalg.solve_triangular(root, cross * precision[outputs][:, None], upper=False)
-            trained, asked = torch.cat([trained, order.lower.T]), torch.cat([asked, found])
+            whitened = torch.linalg.solve_triangular(root, cross * precision[outputs][:, None], upper=False)
+            trained, asked = torch.cat([trained, order.lower.T]), torch.cat([asked, whitened])
         residual = (tau - kernel.mean(motion)).reshape(-1) * precision
         variance = kernel.variance(params, check).diagonal(dim1=1, dim2=2)
         return cls(exact, noise, order, trained @ trained.T, trained @ residual, asked, variance, kernel.mean(check))

@@ -32,7 +32,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Posterior(ABC):
-    """What is known of anything jointly Gaussian with M anchors u, which hold all that the data said.
+    """What is known of anything jointly Gaussian with M anchors u, which hold all that the data say.
 
     A quantity s with prior mean E s, prior variance var s and c = cov(u, s) has the posterior mean E s + cᵀ weights and
     the posterior variance var s − |whiten(c)|².

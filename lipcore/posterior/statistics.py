@@ -18,7 +18,7 @@ from lipcore.posterior.linalg import NotPositiveDefiniteError
 ROUNDING = 1e-8
 """Share of the largest eigenvalue of the statistics by which the smallest may lie below zero."""
 BLOCK = 256
-"""Rows below which a product with itself is computed as a whole."""
+"""Rows below which a product with itself is computed at once."""
 
 
 @dataclass(frozen=True)
@@ -126,27 +126,27 @@ def solve(statistics: Statistics, centre: Tensor | None = None) -> Solution:
     Mean (I + A)⁻¹ (centre + b), covariance Σ = (I + A)⁻¹. centre: (M,), zero where None.
     Raise NotPositiveDefiniteError for statistics that no samples have.
     """
-    said = statistics.b if centre is None else centre + statistics.b
-    return _by_cholesky(statistics.a, said) or _by_eigenvalues(statistics.a, said)
+    right = statistics.b if centre is None else centre + statistics.b
+    return _by_cholesky(statistics.a, right) or _by_eigenvalues(statistics.a, right)
 
 
-def _by_cholesky(a: Tensor, said: Tensor) -> Solution | None:
+def _by_cholesky(a: Tensor, right: Tensor) -> Solution | None:
     """The posterior where samples tell of every variable, so that I − Σ is positive definite; None elsewhere."""
     total = a.clone()
     total.diagonal().add_(1.0)
     factor, failed = torch.linalg.cholesky_ex(total)
     if failed:
         return None
-    told = torch.cholesky_inverse(factor).neg_()
-    told.diagonal().add_(1.0)
-    # with the variables in reverse order, told = Uᵀ U: the factor that is sought is the lower triangular one
-    upper, failed = torch.linalg.cholesky_ex(told.flip(0, 1), upper=True)
+    explained = torch.cholesky_inverse(factor).neg_()
+    explained.diagonal().add_(1.0)
+    # with the variables in reverse order, explained = Uᵀ U: the factor that is sought is the lower triangular one
+    upper, failed = torch.linalg.cholesky_ex(explained.flip(0, 1), upper=True)
     if failed:
         return None
-    return Solution(torch.cholesky_solve(said[:, None], factor)[:, 0], upper.flip(0, 1))
+    return Solution(torch.cholesky_solve(right[:, None], factor)[:, 0], upper.flip(0, 1))
 
 
-def _by_eigenvalues(a: Tensor, said: Tensor) -> Solution:
+def _by_eigenvalues(a: Tensor, right: Tensor) -> Solution:
     """The same from any statistics, at three times the cost; raise NotPositiveDefiniteError for impossible ones."""
     values, vectors = torch.linalg.eigh(a)
     if not float(values[0]) >= -ROUNDING * max(float(values[-1]), 1.0):
@@ -154,7 +154,7 @@ def _by_eigenvalues(a: Tensor, said: Tensor) -> Solution:
             f"statistics of size {len(values)} have the eigenvalue {float(values[0]):.3g}, expected none below zero"
         )
     values = values.clamp_min(0.0)
-    mean = vectors @ ((vectors.T @ said) / (1 + values))
+    mean = vectors @ ((vectors.T @ right) / (1 + values))
     root = (values / (1 + values)).sqrt()[:, None] * vectors.T
     return Solution(mean, torch.linalg.qr(root.flip(1), mode="r").R.flip(0, 1))
 

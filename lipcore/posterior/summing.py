@@ -73,11 +73,11 @@ class Summing:
         from scipy.linalg.blas import dsyrk  # noqa: PLC0415 - serving does without it
 
         scale = np.ones(len(samples)) if weights is None else np.ascontiguousarray(weights, np.float64)
-        found = (
+        features = (
             self._on_cpu(total, samples, scale) if self.device.type == "cpu" else self._elsewhere(total, samples, scale)
         )
         # in place: `a` is in Fortran's order, and so are the features' transpose
-        dsyrk(1.0, found.T, beta=1.0, c=total.a, lower=1, overwrite_c=1)
+        dsyrk(1.0, features.T, beta=1.0, c=total.a, lower=1, overwrite_c=1)
 
     def _on_cpu(self, total: Total, samples: Samples, weights: Array) -> Array:
         """Weighed features of the torques of N samples, (N n, M), piece by piece: a piece stays in the cache."""
@@ -163,7 +163,7 @@ def weigh(
                 explained += row[k] * row[k]
             precision = weights[sample] / (noise[joint] + max(prior[sample, joint] - explained, 0.0))
             root = np.sqrt(precision)
-            said = precision * residual[sample, joint]
+            weighed = precision * residual[sample, joint]
             for k in range(size):
-                b[k] += said * row[k]
+                b[k] += weighed * row[k]
                 row[k] *= root

@@ -115,7 +115,7 @@ def _edges(rate: float, cutoff: float | None, recipe: Recipe) -> tuple[int, int]
 
 
 class ZeroPhase:
-    """`lipcore.data.signals.low_pass` for one column after the other: designed once, and holding one copy of a column."""
+    """`data.signals.low_pass` for one column after the other: designed once, and holding one copy of a column."""
 
     def __init__(self, rate: float, cutoff: float) -> None:
         from scipy.signal import butter, sosfilt, sosfilt_zi  # noqa: PLC0415 - half a second

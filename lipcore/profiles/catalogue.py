@@ -80,13 +80,13 @@ def recognise(joint_names: Sequence[str]) -> tuple[str, ...]:
     have numbers, which every robot has.
     """
     mentioned = frozenset().union(*map(makes, joint_names))
-    found = []
+    fitting = []
     for each in profiles():
-        whole = any(len(reading) == each.n_joints for reading in each.readings(joint_names, bool(mentioned)))
+        all_there = any(len(reading) == each.n_joints for reading in each.readings(joint_names, bool(mentioned)))
         telling = mentioned or not all(is_number(name) for name in each.joint_names)
-        if whole and telling and mentioned <= each.makes:
-            found.append(each)
-    return tuple(each.name for each in sorted(found, key=lambda each: -each.n_joints))
+        if all_there and telling and mentioned <= each.makes:
+            fitting.append(each)
+    return tuple(each.name for each in sorted(fitting, key=lambda each: -each.n_joints))
 
 
 @lru_cache(maxsize=128)

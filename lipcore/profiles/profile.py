@@ -20,7 +20,7 @@ class Profile:
     lower, upper: (n,) rad or m, infinite where the joint turns without end; speed, acceleration: (n,) rad/s, rad/s² or
     m/s, m/s²; torque: (n,) N·m or N. Each is NaN where it is not known. torque_constants: (n,) N·m/A of motor currents.
     joint_aliases: (n) other names of each joint; urdf: its text, None where none is at hand; source: of the numbers;
-    whole: whether data of this robot hold every joint, as those of an uploaded URDF with its fingers need not.
+    complete: whether data of this robot hold every joint, as those of an uploaded URDF with its fingers need not.
     """
 
     name: str
@@ -38,7 +38,7 @@ class Profile:
     joint_aliases: tuple[tuple[str, ...], ...]
     urdf: str | None = field(repr=False)
     source: str
-    whole: bool = True
+    complete: bool = True
 
     def __post_init__(self) -> None:
         n = len(self.joint_names)
@@ -71,9 +71,9 @@ class Profile:
 
     def match(self, names: Sequence[str]) -> tuple[int | None, ...]:
         """Which joint each of the names means, None where none or not one alone: (N,)."""
-        found = self.readings(names)
-        largest = max(map(len, found), default=0)
-        best = [each for each in found if len(each) == largest]
+        readings = self.readings(names)
+        largest = max(map(len, readings), default=0)
+        best = [each for each in readings if len(each) == largest]
         if len(best) != 1 or 2 * largest <= min(self.n_joints, len(names)):
             return (None,) * len(names)
         joint_at = {place: joint for joint, place in best[0].items()}
@@ -82,11 +82,11 @@ class Profile:
     def order_of(self, names: Sequence[str]) -> list[int] | None:
         """Places of this robot's joints among the names, from base to tip; other names, as of grippers, are left out.
 
-        None where a joint is missing, or where more than one name could be it. Not `whole`: those that are there.
+        None where a joint is missing, or where more than one name could be it. Not `complete`: those that are there.
         """
         matched = self.match(names)
         places = {joint: place for place, joint in enumerate(matched) if joint is not None}
-        if not places or (self.whole and len(places) < self.n_joints):
+        if not places or (self.complete and len(places) < self.n_joints):
             return None
         return [places[joint] for joint in sorted(places)]
 
@@ -109,9 +109,9 @@ class Profile:
         matched = self.match(names)
         pick = np.array([self.n_joints if joint is None else joint for joint in matched], dtype=np.int64)
 
-        def picked(values: Array) -> Array:
-            found: Array = np.append(values, np.nan)[pick]
-            return found
+        def of_names(values: Array) -> Array:
+            picked: Array = np.append(values, np.nan)[pick]
+            return picked
 
         return replace(
             self,
@@ -120,12 +120,12 @@ class Profile:
             joint_aliases=tuple(
                 () if joint is None else (self.joint_names[joint], *self.joint_aliases[joint]) for joint in matched
             ),
-            lower=picked(self.lower),
-            upper=picked(self.upper),
-            speed=picked(self.speed),
-            acceleration=picked(self.acceleration),
-            torque=picked(self.torque),
-            torque_constants=None if self.torque_constants is None else picked(self.torque_constants),
+            lower=of_names(self.lower),
+            upper=of_names(self.upper),
+            speed=of_names(self.speed),
+            acceleration=of_names(self.acceleration),
+            torque=of_names(self.torque),
+            torque_constants=None if self.torque_constants is None else of_names(self.torque_constants),
         )
 
     def why_no_urdf(self) -> str:

@@ -20,7 +20,7 @@ from lipcore.robots.library import ROBOTS, UnknownRobotError, pinocchio, profile
 from lipcore.vocabulary import JointType
 
 Matching = Literal["name", "order", "list"]
-"""How the data's joints were found in the URDF: by their names, by their order (profiles only), by an explicit list."""
+"""How the data's joints were matched with the URDF's: by name, by order (profiles only), by an explicit list."""
 
 MOVABLE: dict[str, JointType] = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 MIN_LENGTH, DEFAULT_LENGTH = 0.01, 0.3
@@ -92,8 +92,8 @@ class RigidBody:
 
         Without `joints` the names have to be equal. Raise UrdfError, JointMismatchError, or ValueError for a type.
         """
-        found = tuple(joint_names if joints is None else joints)
-        return cls._build(urdf, joint_names, joint_types, found, name, "name" if joints is None else "list")
+        urdf_joints = tuple(joint_names if joints is None else joints)
+        return cls._build(urdf, joint_names, joint_types, urdf_joints, name, "name" if joints is None else "list")
 
     @classmethod
     def from_profile(cls, profile: str, joint_names: Sequence[str], joint_types: Sequence[str]) -> RigidBody:
@@ -110,9 +110,9 @@ class RigidBody:
             len(given) != len(free) or any(a != b and a in free for a, b in zip(given, free, strict=True))
         ):
             raise _mismatch(profile, free, given)
-        found = given if by_name else free
+        urdf_joints = given if by_name else free
         urdf = profile_urdf(profile)
-        return cls._build(urdf, given, joint_types, found, profile, "name" if by_name else "order")
+        return cls._build(urdf, given, joint_types, urdf_joints, profile, "name" if by_name else "order")
 
     @classmethod
     def _build(
@@ -133,7 +133,7 @@ class RigidBody:
             raise _mismatch(robot, tuple(movable), names, listed)
         if len(types) != len(names):
             raise ValueError(f"joint_types has {len(types)} entries, expected {len(names)}, one a joint")
-        for data_name, kind, joint in zip(names, types, (movable[found] for found in urdf_joints), strict=True):
+        for data_name, kind, joint in zip(names, types, (movable[joint] for joint in urdf_joints), strict=True):
             if MOVABLE[joint.kind] != kind:
                 raise JointMismatchError(
                     f"joint {data_name!r} is {kind} in the data, but {joint.name!r} of robot {robot!r} is {joint.kind}"
@@ -181,8 +181,8 @@ def describe(urdf: str) -> Description:
 
 
 def _mismatch(robot: str, movable: Sequence[str], data: Sequence[str], listed: str = "") -> JointMismatchError:
-    found, given = ", ".join(movable) or "none", ", ".join(data)
-    return JointMismatchError(f"robot {robot!r} has the movable joints {found}; the data have {given}{listed}")
+    listed_joints, given = ", ".join(movable) or "none", ", ".join(data)
+    return JointMismatchError(f"robot {robot!r} has the movable joints {listed_joints}; the data have {given}{listed}")
 
 
 def _scan(urdf: str) -> tuple[str, tuple[UrdfJoint, ...]]:

@@ -53,14 +53,14 @@ def hold_out(samples: Samples, joint_types: Sequence[str]) -> Unseen:
     if count < LEAST_BLOCKS:
         raise SplitError("seconds", round(lasts, 3), f"at least {LEAST_BLOCKS * BLOCK_S:g} to hold some out")
     edges = np.linspace(0, len(samples), count + 1).round().astype(np.int64)
-    wanted = max(1, round(SHARE * count))
+    number = max(1, round(SHARE * count))
     new = np.flatnonzero(repeated(features(samples.rows(order), joint_types), edges) < REPEATED)
-    repeats = len(new) < max(1, wanted // 2)
+    repeats = len(new) < max(1, number // 2)
     candidates = np.arange(count) if repeats else new
-    wanted = min(wanted, len(candidates))
-    chosen = candidates[((np.arange(wanted) + 0.5) * len(candidates) / wanted).astype(np.int64)]
+    number = min(number, len(candidates))
+    chosen = candidates[((np.arange(number) + 0.5) * len(candidates) / number).astype(np.int64)]
     held: Mask = np.isin(np.repeat(np.arange(count), np.diff(edges)), chosen)
-    return Unseen(guarded(samples.episode, samples.t, order, held, GUARD_S), wanted, repeats)
+    return Unseen(guarded(samples.episode, samples.t, order, held, GUARD_S), number, repeats)
 
 
 def features(samples: Samples, joint_types: Sequence[str]) -> Array:

@@ -137,7 +137,7 @@ def advance(database: Database, known: Restored, at_most: int | None = None, wat
             online = online.with_forgetting(forgetting_s)
     else:
         online = _learn(database, known, online, part, {each.event.number: each.rows for each in arrivals})
-    online = online.whole() if teaches else online
+    online = online.symmetrised() if teaches else online
     return replace(known, online=online, number=part.end, without=_active(replace(known, number=part.end)))
 
 
@@ -225,7 +225,7 @@ def _without_later(database: Database, known: Restored) -> Restored:
     online = known.online.detached()
     for taking in takings:
         online = _take(database, known, online, taking, newest + 1)
-    return replace(known, online=online.whole(), without={}) if takings else known
+    return replace(known, online=online.symmetrised(), without={}) if takings else known
 
 
 def _has_newer(database: Database, known: Restored, at_most: int | None) -> bool:
