@@ -22,7 +22,10 @@ from lipcore.vocabulary import GeometryMode, JointType
 
 
 def mode_of(options: FitOptions, robot: RigidBody | None) -> GeometryMode:
-    """How the geometry is to be come by; raise ValueError where that needs a robot and there is none."""
+    """How a geometry is obtained: learnt, calibrated around a URDF or fixed to it.
+
+    robot: the URDF's bodies, if any. Raise ValueError where `options.geometry` needs a robot and there is none.
+    """
     if options.geometry == "auto":
         return "learn" if robot is None else "calibrate"
     if robot is None and options.geometry != "learn":
@@ -122,7 +125,10 @@ def with_stribeck(problem: Problem) -> Problem:
 
 
 def joint_friction(dq: Array, stribeck: bool = False) -> Array:
-    """Friction's features of N velocities (N, n), joint by joint: (N, n, f n)."""
+    """Friction's features P of N velocities, joint by joint (section 5 of docs/method.md): (N, n, f n).
+
+    dq: (N, n) rad/s or m/s; stribeck: whether friction has its fourth term.
+    """
     size, n = dq.shape
     features = friction_features(torch.from_numpy(np.ascontiguousarray(dq)), stribeck).numpy()  # (f, N, n)
     out = np.zeros((size, n, n, len(features)))

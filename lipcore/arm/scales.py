@@ -39,7 +39,10 @@ class Scaled:
 
 
 def rescale(problem: Problem, point: Point) -> Scaled:
-    """Maximise the evidence over noise and prior deviations around a point; raise LinAlgError where it has none."""
+    """Maximise the evidence over noise and prior deviations around a point (eq. 20 of docs/method.md).
+
+    Raise LinAlgError where there is no evidence.
+    """
     from scipy.optimize import minimize  # noqa: PLC0415 - serving does without it
 
     n, k = problem.n_joints, len(problem.scale)

@@ -141,7 +141,7 @@ class Pool:
         return len(self.ends) + self.failed
 
     def add(self, point: Point) -> None:
-        """Take in the end of a descent."""
+        """Take in the end of a descent, unless a better one of the same arm is there."""
         self.ends.append(point.value)
         torque = self.checks.mean(point)
         for place, (other, its) in enumerate(zip(self.points, self.torques, strict=True)):

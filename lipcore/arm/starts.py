@@ -25,7 +25,10 @@ HOPS = 7
 
 
 def draw(rng: np.random.Generator, joint_types: tuple[JointType, ...], gravity: bool) -> Geometry:
-    """A random arm with right angles, its first axis mostly upright, sometimes any way."""
+    """A random arm with right angles, its first axis mostly upright, sometimes any way.
+
+    joint_types: (n,), base to tip; gravity: whether torques contain it.
+    """
     n = len(joint_types)
     rotation, translation = np.empty((n, 3, 3)), np.zeros((n, 3))
     for j in range(n):
@@ -46,7 +49,7 @@ def draw(rng: np.random.Generator, joint_types: tuple[JointType, ...], gravity: 
 
 
 def hop(rng: np.random.Generator, geometry: Geometry) -> Geometry:
-    """Another arm near an optimum: one or two joints turned, mirrored, or drawn anew."""
+    """Another arm near an optimum: one or two joints turned, mirrored, reversed, moved, shaken or drawn anew."""
     rotation, translation, n = geometry.rotation.copy(), geometry.translation.copy(), geometry.n_joints
     for j in rng.choice(n, min(int(rng.integers(1, 3)), n), replace=False):
         axis, kind = geometry.axis[j], rng.integers(HOPS)

@@ -32,8 +32,10 @@ MOST_CORRELATION = 0.9
 
 @dataclass(frozen=True)
 class Difference:
-    """Mean difference of k figures, each array (k,); standard error and the half width of the 95 % interval are
-    infinite with a single block."""
+    """Mean difference of k figures with its standard error and the half width of the 95 % interval, each (k,).
+
+    Both are infinite with a single block.
+    """
 
     mean: Array
     standard_error: Array
@@ -71,7 +73,7 @@ class Comparison:
 
 
 def compare(samples: Samples, first: Answer, second: Answer) -> Comparison:
-    """Compare two models on samples (N, n), each by what it predicts of them."""
+    """Compare two models on samples (N, n), each by what it predicts of them: the second's figures less the first's."""
     starts, tau = blocks(samples), samples.tau
     (squared, inside, density), (others, insides, densities) = (_figures(tau, each) for each in (first, second))
     # rounding gives a constant column a variance above zero

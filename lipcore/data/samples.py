@@ -47,7 +47,7 @@ class Samples:
         return len(self.joint_names)
 
     def rows(self, index: slice | NDArray[np.int64] | NDArray[np.bool_]) -> Samples:
-        """Return the chosen rows."""
+        """Return the chosen rows. index: a slice, indices, or (N,) whether each is chosen."""
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "joint_names"})
 
     def episodes(self) -> list[slice]:
@@ -57,7 +57,7 @@ class Samples:
         return [slice(a, b) for a, b in pairwise(bounds) if b > a]
 
     def motion(self, device: torch.device | str = "cpu") -> Motion:
-        """Position, velocity and acceleration as tensors."""
+        """Position, velocity and acceleration as tensors, (N, n) each; raise ValueError where one is not finite."""
         return Motion.from_arrays(self.q, self.dq, self.ddq, device)
 
     def torque(self, device: torch.device | str = "cpu") -> Tensor:

@@ -65,7 +65,7 @@ class Split:
 
 @dataclass(frozen=True)
 class Parts:
-    """Which rows are learnt from and which are held out, (N,) each; guarded: how many belong to neither."""
+    """Which rows are learnt from (`train`) and which are held out, (N,) each."""
 
     train: Mask
     held_out: Mask
@@ -101,7 +101,11 @@ def split(episode: Numbers, t: Array, how: Split) -> Parts:
 
 
 def guarded(episode: Numbers, t: Array, order: Numbers, held: Mask, guard_s: float) -> Parts:
-    """Both sides without the rows next to the other one. order: (N,), of the rows; held: (N,), in that order."""
+    """Both sides without the rows next to the other one.
+
+    episode, t: (N,), of rows in any order; order: (N,), their indices by episode and time; held: (N,), in that order;
+    guard_s: how near a row of the other side may be, s.
+    """
     near = _near_other_side(episode[order], t[order], held, guard_s)
     parts = Parts(np.empty(len(t), dtype=bool), np.empty(len(t), dtype=bool))
     parts.train[order], parts.held_out[order] = ~held & ~near, held & ~near
@@ -132,7 +136,10 @@ def choose(lengths: Numbers, share: float, seed: int) -> Mask:
 
 
 def taken(samples: Samples, rows: Mask) -> Samples:
-    """The rows of one side; where an episode is interrupted a new one begins, as what follows is later."""
+    """The samples of one side; where an episode is interrupted a new one begins, as what follows is later.
+
+    rows: (N,), whether each is of that side.
+    """
     index = np.flatnonzero(rows)
     begins = (np.diff(index) > 1) | (np.diff(samples.episode[index]) != 0)
     numbered = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(begins, dtype=np.int64)])

@@ -40,8 +40,8 @@ LEAST = 1e-9
 class Information:
     """What a motion would tell of the torques at R reference motions of an n-joint robot.
 
-    learnt: (M, R n), its square is what the model has learnt of the references; now: (R, n) variance there; floor: (n,)
-    that a variance never falls below.
+    belief: what is known before; learnt: (M, R n), its square is what the model has learnt of the references; now: (R,
+    n) variance there, (N·m)²; floor: (n,) that a variance never falls below.
     """
 
     belief: Belief

@@ -69,7 +69,7 @@ class Limits:
 
     @classmethod
     def of_robot(cls, robot: Robot) -> Limits:
-        """Those of a URDF, which knows no accelerations."""
+        """Those of a URDF's Pinocchio model, which knows no accelerations; usual ones stand in where one is missing."""
         unknown = np.full(robot.n_joints, np.nan)
         torque = np.asarray(robot.model.effortLimit, dtype=np.float64)
         return cls.known(robot.joint_names, robot.joint_types, robot.lower, robot.upper, robot.speed, unknown, torque)

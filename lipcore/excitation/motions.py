@@ -67,12 +67,15 @@ class Series:
 
 
 def frequencies(seconds: float, harmonics: int) -> Array:
-    """kω for k = 1 … K, rad/s."""
+    """kω for k = 1 … K, rad/s, with ω = 2π / seconds: (K,)."""
     return np.asarray(2 * np.pi / seconds * np.arange(1, harmonics + 1), dtype=np.float64)
 
 
 def overshoot(harmonics: int, instants: int) -> float:
-    """Most that a trigonometric polynomial exceeds its largest magnitude at so many even instants, as a factor."""
+    """Most that a trigonometric polynomial exceeds its largest magnitude at so many even instants, as a factor.
+
+    harmonics: its degree K; 1 / cos(π K / m) (Ehlich & Zeller, 1964).
+    """
     return float(1 / np.cos(np.pi * harmonics / instants))
 
 
@@ -103,7 +106,7 @@ class Shape:
 
     @classmethod
     def build(cls, limits: Limits, seconds: float, harmonics: int) -> Shape:
-        """For a motion of so many seconds and harmonics; raise ValueError for fewer than two."""
+        """For a motion of so many seconds and harmonics K; raise ValueError for fewer than two harmonics."""
         if harmonics < 2:
             raise ValueError(f"harmonics is {harmonics}, expected at least 2: one cannot start and end at rest")
         omega = frequencies(seconds, harmonics)[:, None]
@@ -119,7 +122,7 @@ class Shape:
         return 2 * harmonics + 1, n
 
     def coefficients(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Shift from the middle (n,), sine and cosine amplitudes (K, n) of a motion within the limits."""
+        """Shift from the middle (n,), sine and cosine amplitudes (K, n) within the limits. x: (2 K + 1, n)."""
         harmonics, half = len(self.omega), torch.from_numpy(self.limits.half)
         waves = x[1:].reshape(2, harmonics, -1)
         waves = waves - self.at_rest * (self.at_rest * waves).sum(1, keepdim=True)
@@ -141,13 +144,13 @@ class Shape:
         return torch.from_numpy(self.limits.middle) + q, dq, ddq
 
     def series(self, x: Array) -> Series:
-        """The motion as a series, held to the limits by their strict bound."""
+        """The motion of x (2 K + 1, n) as a series, held to the limits by their strict bound."""
         shift, sine, cosine = (part.numpy() for part in self.coefficients(torch.from_numpy(x)))
         series = Series(self.seconds, self.limits.middle + shift, sine, cosine)
         return series.scaled(self.limits.middle, 1 / np.maximum(1.0, series.used(self.limits).max(0)))
 
     def random(self, rng: np.random.Generator) -> Array:
-        """A start for a search: harmonics of random strength and phase, faster ones weaker."""
+        """A start for a search, (2 K + 1, n): harmonics of random strength and phase, faster ones weaker."""
         rows, n = self.size
         x = rng.standard_normal((rows, n))
         x[0] *= 0.3
@@ -166,7 +169,10 @@ class Shape:
 
 
 def harmonics(limits: Limits, seconds: float) -> int:
-    """Up to the frequency at which the acceleration limit takes over from the speed limit."""
+    """How many harmonics K a motion of so many seconds gets.
+
+    Up to the frequency at which the acceleration limit takes over from the speed limit.
+    """
     fastest = float(np.max(limits.acceleration / limits.speed)) / (2 * np.pi)
     return int(np.clip(np.ceil(fastest * seconds), LEAST_HARMONICS, MOST_HARMONICS))
 

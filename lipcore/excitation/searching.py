@@ -39,7 +39,7 @@ class Goal:
 
     @classmethod
     def build(cls, shape: Shape, information: Information, check: TorqueCheck | None, samples: int) -> Goal:
-        """For a motion of so many samples."""
+        """The goal for a motion that is sampled so often; check: of torque limits, None where none are known."""
         count = min(samples, INSTANTS)
         # in the middle of each interval: at the ends of the motion the robot rests
         t = (torch.arange(count, dtype=torch.float64) + 0.5) / count * shape.seconds
@@ -51,7 +51,7 @@ class Goal:
         return np.asarray(self.information.left(motion, self.repeats))
 
     def value(self, x: Array) -> float:
-        """What is to be small."""
+        """What is to be small: the mean log share of variance left, nats, and the penalty. x: (2 K + 1, n)."""
         with torch.no_grad():
             motion = Motion(*self.shape.motion(torch.from_numpy(x), self.t))
             value = float(self.information.left(motion, self.repeats).log().mean())

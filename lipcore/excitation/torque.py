@@ -33,7 +33,10 @@ class TorqueCheck:
         return np.asarray(np.abs(tau).max(0) / self.limits.torque)
 
     def excess(self, q: Array, dq: Array, ddq: Array) -> tuple[float, tuple[Array, Array, Array]]:
-        """Mean over N instants of the squares by which shares exceed one, and its derivatives, each (N, n)."""
+        """Mean over N instants of the squares by which shares exceed one, and its derivatives, each (N, n).
+
+        q, dq, ddq: (N, n), SI.
+        """
         pin, model = pinocchio(), self.robot.model
         data, out = model.createData(), tuple(np.zeros_like(q) for _ in range(3))
         total, limit = 0.0, self.limits.torque * MARGIN

@@ -142,7 +142,7 @@ def arm_tensors(arm: Arm) -> dict[str, Tensor]:
 
 
 def read_mode(mode: object) -> GeometryMode:
-    """How the geometry of a stored arm was come by; raise ValueError for what is no such way."""
+    """How the geometry of a stored arm was obtained; raise ValueError for none of GEOMETRY_MODES."""
     if mode not in GEOMETRY_MODES:
         raise ValueError(f"fit.geometry is {quote(mode)}, expected one of {', '.join(GEOMETRY_MODES)}")
     kind: GeometryMode = mode

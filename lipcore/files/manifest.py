@@ -44,7 +44,8 @@ class ModelFormatError(ValueError):
 class Limits:
     """How large a model may be: what it costs to load is bounded before it is loaded.
 
-    inducing_samples: S; inducing_torques: S n, whose square is the largest matrix computed; inducing_outputs: m.
+    joints: n; inducing_samples: S; inducing_torques: S n, whose square is the largest matrix computed;
+    inducing_outputs: m; manifest_bytes, robot_bytes: of the files.
     """
 
     joints: int = 256
@@ -63,7 +64,10 @@ Check = Callable[[str, Any, int], None]
 
 
 def read_manifest_bytes(payload: bytes, limits: Limits = DEFAULT_LIMITS) -> dict[str, Any]:
-    """Read and check a manifest; raise ModelFormatError."""
+    """The manifest that a file's bytes hold, every entry checked.
+
+    Raise ModelFormatError that names the entry, its value and what was expected.
+    """
     try:
         manifest = strict_json.read(payload, limits.manifest_bytes)
     except strict_json.StrictJsonError as error:

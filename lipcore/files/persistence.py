@@ -60,7 +60,10 @@ def save(model: TorqueModel, folder: Path, lineage: Mapping[str, Any] | None = N
 
 
 def encode(model: TorqueModel, lineage: Mapping[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """The manifest of a model and its files by name; raise ValueError as `save` does."""
+    """The manifest of a model and its files by name: `manifest.json`, `model.safetensors`, `robot.urdf`.
+
+    lineage: where the model comes from, stored as given. Raise ValueError as `save` does.
+    """
     basis, statistics = model.posterior.basis, model.posterior.statistics
     if statistics is None:
         raise ValueError("the model has learnt online since it was trained, expected one as trained")
@@ -168,7 +171,10 @@ def read_files(folder: Path, limits: Limits = DEFAULT_LIMITS) -> dict[str, bytes
 
 
 def check(files: Mapping[str, bytes], checksums: Mapping[str, str]) -> None:
-    """Compare files with the sha256 that is known of each; raise ModelFormatError naming the file."""
+    """Compare files by name with the sha256 that is known of each.
+
+    Raise ModelFormatError naming the file that is missing, one too many, or damaged.
+    """
     for name in sorted(files.keys() | checksums.keys()):
         if name not in files or name not in checksums:
             raise ModelFormatError(f"{name} is {'missing' if name in checksums else 'one file too many'}", name)

@@ -20,7 +20,10 @@ class StrictJsonError(ValueError):
 
 
 def read(payload: bytes, most_bytes: int) -> Any:
-    """Read JSON; raise StrictJsonError, also for more than `most_bytes`."""
+    """The value that the bytes of a JSON document hold.
+
+    Raise StrictJsonError for what is not JSON of one meaning, and for more than `most_bytes`.
+    """
     if len(payload) > most_bytes:
         raise StrictJsonError(f"it has {len(payload)} bytes, expected at most {most_bytes}")
     try:

@@ -40,8 +40,11 @@ class FitCancelledError(RuntimeError):
 
 @dataclass(frozen=True)
 class FitProgress:
-    """stage: `geometry`, `hyperparameters` or `posterior`; objective: penalised −log evidence, nats; fraction: 0..1 of
-    the work; estimator: the one at work, where `auto` trains several."""
+    """How far a fit is.
+
+    stage: `geometry`, `hyperparameters` or `posterior`; iteration, of max_iterations; objective: penalised −log
+    evidence, nats; fraction: 0..1 of the work; elapsed: s; estimator: the one at work, where `auto` trains several.
+    """
 
     stage: str
     iteration: int
@@ -56,9 +59,11 @@ class FitProgress:
 class FitReport:
     """What a fit did.
 
-    objective: penalised −log evidence at the end; rejected_steps: line-search points whose covariance could not be
-    factored; start: number of the start that was followed, 0 for the kernel's own; seconds: wall time of the
-    hyperparameters' fit.
+    objective: penalised −log evidence at the end, nats; iterations: of the search that was followed; evaluations: of it
+    and of the screening; rejected_steps: line-search points whose covariance could not be factored; converged: whether
+    the search ended by itself; start: number of the start that was followed, 0 for the kernel's own; samples_given,
+    samples_hyperparameters, samples_posterior: how many there were, and how many each stage used; seconds: wall time of
+    the hyperparameters' fit; device: that it ran on.
     """
 
     objective: float

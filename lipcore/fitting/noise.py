@@ -43,7 +43,7 @@ def start(samples: Samples, stretches: Samples | None = None) -> Array:
 
 
 def floor(samples: Samples) -> Array:
-    """Smallest noise std admitted, (n,) N·m."""
+    """Smallest noise std admitted for these samples, (n,) N·m."""
     largest = float(np.sqrt(np.mean(samples.tau**2, axis=0)).max())
     return np.asarray(np.maximum(FLOOR_JOINT * samples.tau.std(axis=0), FLOOR_ROBOT * max(largest, 1e-6)))
 

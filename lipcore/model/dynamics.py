@@ -54,7 +54,7 @@ class IndefiniteInertiaError(ValueError):
 
 @dataclass(frozen=True)
 class Energies:
-    """Posterior means in J, each (N,). The potential is known up to a constant."""
+    """Posterior means of kinetic and potential energy in J, each (N,). The potential is known up to a constant."""
 
     kinetic: Tensor
     potential: Tensor
@@ -128,7 +128,11 @@ def forward_dynamics(model: TorqueModel, motion: Motion, tau: Tensor) -> Estimat
 
 
 def inertia_matrix(posterior: Posterior, dynamics: TorqueKernel, q: Tensor) -> Tensor:
-    """Posterior mean of M(q), (N, n, n): the torque per unit acceleration, exact since torque is affine in ddq."""
+    """Posterior mean of M(q), (N, n, n), kg·m² where both joints are revolute.
+
+    dynamics: the kernel's terms but friction; q: (N, n) rad or m. Column j is the torque per unit acceleration of joint
+    j, f(q, 0, e_j) − f(q, 0, 0): exact, since torque is affine in ddq.
+    """
     n = q.shape[1]
     zero = torch.zeros_like(q)
     rest = posterior.mean(Motion(q, zero, zero), dynamics)
@@ -137,13 +141,19 @@ def inertia_matrix(posterior: Posterior, dynamics: TorqueKernel, q: Tensor) -> T
 
 
 def gravity(posterior: Posterior, dynamics: TorqueKernel, q: Tensor) -> Tensor:
-    """Posterior mean of the gravity torque g(q), (N, n) N·m: the torque at standstill, friction excluded."""
+    """Posterior mean of the gravity torque g(q) = f(q, 0, 0), (N, n) N·m: the torque at standstill, friction excluded.
+
+    dynamics: the kernel's terms but friction; q: (N, n) rad or m.
+    """
     zero = torch.zeros_like(q)
     return posterior.mean(Motion(q, zero, zero), dynamics)
 
 
 def energies(posterior: Posterior, dynamics: EnergyKernel, query: Motion) -> Energies:
-    """Posterior means of kinetic and potential energy, learnt without a label on either."""
+    """Posterior means of kinetic and potential energy at N queries, learnt without a label on either.
+
+    dynamics: the term that the energies are of.
+    """
     kinetic, potential = prior_mean([dynamics], query) + posterior.weights @ with_anchors(posterior, [dynamics], query)
     return Energies(kinetic, potential)
 

@@ -25,7 +25,7 @@ KINETIC, POTENTIAL = 0, 1
 
 
 def kinetic_energy(posterior: Posterior, kernels: Sequence[EnergyKernel], query: Motion) -> Estimate:
-    """Posterior of the kinetic energy at N queries, summed over the kernels: (N,) J."""
+    """Posterior of the kinetic energy at N queries, summed over the kernels: (N,) J (eq. 2 of docs/method.md)."""
     mean = prior_mean(kernels, query)[KINETIC]
     variance = covariance(posterior.params, kernels, query, query)[KINETIC]
     return condition(posterior, mean, variance, with_anchors(posterior, kernels, query)[KINETIC])
@@ -51,7 +51,7 @@ def potential_energy(
 
 
 def prior_mean(kernels: Sequence[EnergyKernel], query: Motion) -> Tensor:
-    """Prior means of both energies at N queries, (2, N) J."""
+    """Prior means of the kinetic and the potential energy at N queries, summed over the kernels: (2, N) J."""
     total = torch.zeros((2, len(query)), dtype=torch.float64)
     for kernel in kernels:
         if isinstance(kernel, ArmKernel) and (weights := kernel.prior_weights()) is not None:
@@ -60,7 +60,10 @@ def prior_mean(kernels: Sequence[EnergyKernel], query: Motion) -> Tensor:
 
 
 def covariance(params: Params, kernels: Sequence[EnergyKernel], x: Motion, y: Motion) -> Tensor:
-    """Prior covariance of each energy at sample k of x with the same at sample k of y, or its only one: (2, N) J²."""
+    """Prior covariance of each energy at sample k of x with the same energy at sample k of y: (2, N) J².
+
+    x, y: N samples each; y may be a single one, which then is that of every k.
+    """
     total = torch.zeros((2, len(x)), dtype=torch.float64)
     for kernel in kernels:
         if isinstance(kernel, ArmKernel):
@@ -72,7 +75,7 @@ def covariance(params: Params, kernels: Sequence[EnergyKernel], x: Motion, y: Mo
 
 
 def with_anchors(posterior: Posterior, kernels: Sequence[EnergyKernel], query: Motion) -> Tensor:
-    """Prior covariance of both energies at N queries with the M anchors of the posterior: (2, M, N)."""
+    """Prior covariance of both energies at N queries with the M anchors of the posterior: (2, M, N) (eq. 2)."""
     total = torch.zeros((2, len(posterior.weights), len(query)), dtype=torch.float64)
     for kernel in kernels:
         if isinstance(kernel, ArmKernel):

@@ -84,7 +84,10 @@ class InertialParameters:
 
 
 def weight_posterior(posterior: Posterior, term: LinearKernel) -> WeightPosterior:
-    """Posterior of a linear term's weights, whose prior is N(μ, Λ)."""
+    """Posterior N(E w + cᵀα, Λ − |L⁻¹c|²) of a linear term's p weights, whose prior is N(μ, Λ).
+
+    term: one of the posterior's kernel. The covariance carries the posterior's calibration.
+    """
     prior = term.covariance(posterior.params).detach()
     cross = posterior.with_weights(term, prior)  # (M, p)
     white = posterior.whiten(cross)
@@ -96,7 +99,10 @@ def weight_posterior(posterior: Posterior, term: LinearKernel) -> WeightPosterio
 
 
 def friction_coefficients(posterior: Posterior, estimator: Estimator) -> Friction:
-    """Friction of each joint with standard deviations; raise ValueError for an estimator without friction."""
+    """Friction of each joint with standard deviations, the weights of the friction term.
+
+    Raise ValueError for an estimator without friction.
+    """
     term = estimator.terms.get("friction")
     if not isinstance(term, FrictionKernel):
         raise ValueError(f"estimator {estimator.name!r} has no friction term")
@@ -109,7 +115,10 @@ def friction_coefficients(posterior: Posterior, estimator: Estimator) -> Frictio
 
 
 def inertial_parameters(posterior: CompactPosterior, estimator: Estimator) -> InertialParameters:
-    """Inertial parameters of each body; raise ValueError for an estimator without rigid bodies."""
+    """Inertial parameters of each of n bodies, with the plausible ones nearest to them.
+
+    Raise ValueError for an estimator without rigid bodies.
+    """
     term = _arm_kernel(estimator)
     weights, size = weight_posterior(posterior, term), PARAMETERS * term.n_joints
     mean, std, scale = (part[:size].reshape(-1, PARAMETERS) for part in (weights.mean, weights.std, weights.scale))
@@ -152,7 +161,11 @@ def precision(posterior: CompactPosterior, term: LinearKernel) -> Array:
 
 
 def report(posterior: CompactPosterior, estimator: Estimator, joint_names: Sequence[str]) -> dict[str, Any]:
-    """All parameters of an estimator as plain numbers, for a manifest."""
+    """All parameters of an estimator as plain numbers, for a manifest.
+
+    Friction, and of an arm inertia, rotor and geometry. joint_names: (n,), in the order of the data. `files.arm` reads
+    it.
+    """
     friction = friction_coefficients(posterior, estimator)
     out: dict[str, Any] = {
         "friction": {

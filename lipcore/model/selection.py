@@ -32,7 +32,10 @@ class Candidate(TypedDict):
 
 
 class HeldOut(TypedDict):
-    """What was judged on. repeats: all motion of the recording repeats other motion of it, so that figures flatter."""
+    """What was judged on: how many rows, in how many blocks.
+
+    repeats: all motion of the recording repeats other motion of it, so that figures flatter.
+    """
 
     rows: int
     blocks: int
@@ -40,7 +43,7 @@ class HeldOut(TypedDict):
 
 
 class Selection(TypedDict):
-    """How an estimator was chosen."""
+    """How an estimator was chosen: what was asked for and what was chosen, why, on which rows, and how each did."""
 
     asked: str
     chosen: str
@@ -58,7 +61,7 @@ def selection(
 
 
 def unjudged(estimator: str, seconds: float, error: Exception | None = None) -> Candidate:
-    """An estimator that was trained, or failed, and not judged."""
+    """An estimator that was trained, in so many seconds, or failed with an error, and was not judged."""
     return Candidate(
         estimator=estimator,
         log_density=None,

@@ -49,9 +49,11 @@ def training_range(motion: Motion) -> TrainingRange:
 class TorqueModel:
     """Fitted inverse dynamics of one robot: immutable, safe to share between threads.
 
-    fit: what the fit reported, compact: how near the compact posterior comes to the exact one, both for the manifest;
-    robot: the rigid bodies of an estimator that has them; calibration: how the posterior's deviations are corrected;
-    selection: how `auto` has chosen the estimator, None where it was named.
+    joint_names, joint_types: (n,), in the order of the data; torque_convention: what its torques hold; options: those
+    of the fit; fit: what the fit reported, compact: how near the compact posterior comes to the exact one, both for the
+    manifest; training_range: of the samples behind the posterior; robot: the rigid bodies of an estimator that has
+    them; calibration: how the posterior's deviations are corrected; selection: how `auto` has chosen the estimator,
+    None where it was named.
     """
 
     estimator: Estimator

@@ -64,7 +64,11 @@ class OnlineModel:
 
     @classmethod
     def start(cls, base: TorqueModel, forgetting_s: float | None = None, since: float | None = None) -> OnlineModel:
-        """Nothing learnt yet; raise ValueError for a wrong forgetting time, or a model that has learnt already."""
+        """A version as trained, with nothing learnt yet.
+
+        forgetting_s: time constant of forgetting, s, None for never; since: event time, s, from which on the version's
+        own samples are forgotten. Raise ValueError for a wrong forgetting time, or a model that has learnt already.
+        """
         _check(forgetting_s)
         statistics = base.posterior.statistics
         if statistics is None:
@@ -124,7 +128,7 @@ class OnlineModel:
         return replace(self, before=self.now, now=fresh)
 
     def with_forgetting(self, forgetting_s: float | None) -> OnlineModel:
-        """Forget otherwise from here on; raise ValueError for a forgetting time that is none."""
+        """Forget otherwise from here on. forgetting_s: s, None for never; raise ValueError unless above zero."""
         _check(forgetting_s)
         return replace(self, forgetting_s=forgetting_s)
 

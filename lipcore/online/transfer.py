@@ -84,7 +84,10 @@ ABSENT = float("nan")
 
 
 def dump(online: OnlineModel) -> bytes:
-    """Write all but the version as trained; as large however much was learnt."""
+    """All of an online model but the version as trained, as the bytes of a safetensors file.
+
+    Its size does not grow with what was learnt.
+    """
     numbers = [ABSENT if each is None else each for each in (online.forgetting_s, online.since, online.reference)]
     tensors = {"numbers": torch.tensor(numbers, dtype=torch.float64), "base": _trained(online.base)}
     for name in REGIMES:
@@ -95,7 +98,10 @@ def dump(online: OnlineModel) -> bytes:
 
 
 def load(base: TorqueModel, payload: bytes) -> OnlineModel:
-    """Read what `dump` wrote of the same version; raise ValueError for anything else."""
+    """The online model that `dump` wrote. base: the version as trained that it was started from.
+
+    Raise ValueError for bytes that are no such state, or one of another version.
+    """
     try:
         tensors = load_tensors(payload)
         # weights: written by earlier releases; they are solved for, and to the last bit with as many threads only

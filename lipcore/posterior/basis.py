@@ -36,7 +36,11 @@ class Basis:
 
     @classmethod
     def build(cls, kernel: TorqueKernel, params: Params, inducing: Motion, outputs: Tensor) -> Basis:
-        """Basis of a kernel's terms; raise ValueError where outputs and terms do not fit together."""
+        """Basis of a kernel's terms.
+
+        params: hyperparameters; inducing: S samples, whose torques `outputs` (m,) counts as sample · n + joint. Raise
+        ValueError where outputs and terms do not fit together.
+        """
         term, linear = split(kernel)
         places = len(inducing) * kernel.n_joints
         if outputs.dim() != 1 or len(set(outputs.tolist())) != len(outputs) or (term is None and len(outputs)):
@@ -64,7 +68,7 @@ class Basis:
         raise ValueError("the linear term is none of this basis")
 
     def covariance(self, query: Motion) -> Tensor:
-        """cov(u, f(x)) for the torques of N queries: (M, N n)."""
+        """cov(u, f(x)) for the torques of N queries, before whitening: (M, N n)."""
         parts = []
         if self.term is not None:
             parts.append(self.term.gram(self.params, self.inducing, query)[self.outputs])
@@ -72,7 +76,7 @@ class Basis:
         return torch.cat(parts)
 
     def features(self, query: Motion) -> Tensor:
-        """φ(x) for the torques of N queries: (M, N n)."""
+        """φ(x) = B⁻¹ cov(u, f(x)) for the torques of N queries (eq. 24 of docs/method.md): (M, N n)."""
         solved: Tensor = torch.linalg.solve_triangular(self.root, self.covariance(query), upper=False)
         return solved
 
@@ -83,7 +87,7 @@ class Basis:
         return self._open(self.term.variance(self.params, query).diagonal(dim1=1, dim2=2), features)
 
     def features_and_uncovered(self, query: Motion) -> tuple[Tensor, Tensor]:
-        """`features` and `uncovered` of N queries, for few of them at a time: compiled, on the CPU."""
+        """`features` (M, N n) and `uncovered` (N, n) of N queries, for few of them at a time: compiled, on the CPU."""
         if self._cross is None:
             features = self.features(query)
             return features, self.uncovered(query, features)

@@ -46,7 +46,11 @@ class CompactPosterior(Posterior):
         noise_variance: Tensor,
         std_factor: float = 1.0,
     ) -> CompactPosterior:
-        """Posterior of statistics; raise NotPositiveDefiniteError for such as no samples have."""
+        """Posterior of statistics (eq. 24 of docs/method.md).
+
+        noise_variance: (n,) (N·m)²; std_factor: calibration. Raise NotPositiveDefiniteError for statistics that no
+        samples have.
+        """
         posterior = cls.solved(kernel, basis, solve(statistics), noise_variance, std_factor)
         return replace(posterior, statistics=statistics)
 
@@ -92,7 +96,10 @@ class CompactPosterior(Posterior):
         std_factor: float = 1.0,
         floor: Tensor | None = None,
     ) -> CompactPosterior:
-        """Posterior of the torques, given that of the whitened variables."""
+        """Posterior of the torques, given that of the whitened variables.
+
+        noise_variance: (n,) (N·m)²; floor: (n,) (N·m)², none where None.
+        """
         weights = torch.linalg.solve_triangular(basis.root.T, solution.mean[:, None], upper=True)[:, 0]
         # and not from QᵀQ itself: B⁻¹ is badly conditioned
         root = torch.linalg.solve_triangular(basis.root, solution.learnt, upper=False, left=False)
@@ -111,18 +118,25 @@ class CompactPosterior(Posterior):
         return Prediction(prediction.mean, prediction.covariance + torch.diag_embed(short))
 
     def whiten(self, cross: Tensor) -> Tensor:
-        """Q c."""
+        """Q c, (M, K). cross: covariance of the variables with K quantities, (M, K)."""
         return self.root @ cross
 
     def with_torques(self, term: TorqueKernel, covariance: Callable[[Motion], Tensor]) -> Tensor:
-        """Covariance of the inducing torques with K quantities, zero for the linear terms' weights."""
+        """Covariance of the variables with K quantities of the nonlinear term, zero for linear weights: (M, K).
+
+        covariance: that of the term's torques at N motions with the quantities, (N n, K). Raise ValueError for another
+        term.
+        """
         if term is not self.basis.term:
             raise ValueError("the term is none of this posterior")
         inducing = covariance(self.basis.inducing)[self.basis.outputs]
         return torch.cat([inducing, inducing.new_zeros((len(self.basis) - len(inducing), inducing.shape[1]))])
 
     def with_weights(self, term: LinearKernel, covariance: Tensor) -> Tensor:
-        """Covariance of the linear term's weights with K quantities, zero for all other variables."""
+        """Covariance of the variables with K quantities of a linear term, zero for all other variables: (M, K).
+
+        covariance: cov(w, s), (p, K).
+        """
         out = covariance.new_zeros((len(self.basis), covariance.shape[1]))
         out[self.basis.rows(term)] = covariance
         return out

@@ -58,7 +58,10 @@ class Deviation:
 
 @dataclass(frozen=True)
 class Compression:
-    """A compact posterior and how near it comes. reached: whether it keeps the tolerance asked for."""
+    """A compact posterior, and how near it comes to the exact one. reached: whether it keeps the tolerance asked for.
+
+    deviation: at motions that `checks` draws; tolerance: in standard deviations of the exact one.
+    """
 
     posterior: CompactPosterior
     deviation: Deviation

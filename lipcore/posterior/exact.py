@@ -37,8 +37,8 @@ class Posterior(ABC):
     A quantity s with prior mean E s, prior variance var s and c = cov(u, s) has the posterior mean E s + cᵀ weights and
     the posterior variance var s − |whiten(c)|².
 
-    kernel: prior of the torques; std_factor: calibration of every standard deviation that is not noise (see
-    `fitting.estimators`); weights: (M,).
+    kernel: prior of the torques; params: its hyperparameters; std_factor: calibration of every standard deviation that
+    is not noise (see `fitting.estimators`); weights: (M,).
     """
 
     kernel: TorqueKernel
@@ -59,10 +59,16 @@ class Posterior(ABC):
 
     @abstractmethod
     def with_weights(self, term: LinearKernel, covariance: Tensor) -> Tensor:
-        """Covariance of the anchors with K quantities, from that of a linear term's weights with them: (p, K)."""
+        """Covariance of the anchors with K quantities, from that of a linear term's weights with them.
+
+        term: with p weights; covariance: cov(w, s), (p, K). Return cov(u, s), (M, K).
+        """
 
     def cross(self, kernel: TorqueKernel, query: Motion) -> Tensor:
-        """Covariance of the anchors with all torques of N queries, or with one term's share of them: (M, N n)."""
+        """Covariance of the anchors with all torques of N queries, or with one term's share of them: (M, N n).
+
+        kernel: the posterior's own, or a term of it.
+        """
         total = torch.zeros((len(self.weights), len(query) * kernel.n_joints), dtype=torch.float64)
         for term in kernel.terms if isinstance(kernel, SumKernel) else (kernel,):
             if isinstance(term, LinearKernel):
@@ -74,12 +80,19 @@ class Posterior(ABC):
         return total
 
     def mean(self, query: Motion, component: TorqueKernel | None = None) -> Tensor:
-        """Posterior mean torque, (N, n) N·m; with `component`, a term of the kernel, that term's share of it."""
+        """Posterior mean torque, (N, n) N·m.
+
+        query: N instants; component: a term of the kernel, whose share of the mean is asked for.
+        """
         kernel = component or self.kernel
         return kernel.mean(query) + (self.weights @ self.cross(kernel, query)).reshape(len(query), -1)
 
     def predict(self, query: Motion, component: TorqueKernel | None = None) -> Prediction:
-        """Posterior mean and n×n covariance of the torques at each of N queries, or of one term of the kernel."""
+        """Posterior mean (N, n) N·m and covariance (N, n, n) (N·m)² of the torques at each of N queries.
+
+        component: a term of the kernel, whose share is asked for. The covariance is that between the joints of one
+        query.
+        """
         kernel, n = component or self.kernel, self.kernel.n_joints
         means, covariances = [], []
         for start in range(0, len(query), QUERIES_PER_CHUNK):
@@ -107,7 +120,11 @@ class ExactPosterior(Posterior):
     def fit(
         cls, kernel: TorqueKernel, params: Params, motion: Motion, tau: Tensor, std_factor: float = 1.0
     ) -> ExactPosterior:
-        """Condition the prior on torques tau (N, n) at `motion`; raise NotPositiveDefiniteError if K is singular."""
+        """Condition the prior on measured torques.
+
+        params: hyperparameters, `noise.log_std` among them; motion: N samples; tau: (N, n) N·m; std_factor:
+        calibration. Raise NotPositiveDefiniteError where K cannot be factored.
+        """
         factor = cholesky(noisy_gram(kernel, params, motion))
         weights = factor.solve((tau - kernel.mean(motion)).reshape(-1))
         return cls(kernel, params, std_factor, weights, motion, factor)
@@ -117,17 +134,20 @@ class ExactPosterior(Posterior):
         return self.factor.whiten(cross)
 
     def with_torques(self, term: TorqueKernel, covariance: Callable[[Motion], Tensor]) -> Tensor:
-        """Covariance of the training torques with K quantities."""
+        """Covariance of the training torques with K quantities, from that of a term's torques: (N n, K)."""
         return covariance(self.motion)
 
     def with_weights(self, term: LinearKernel, covariance: Tensor) -> Tensor:
-        """Φ(X) cov(w, s)."""
+        """Φ(X) cov(w, s), (N n, K). covariance: cov(w, s), (p, K)."""
         features = term.features(self.motion)
         return features.reshape(-1, features.shape[-1]) @ covariance
 
 
 def noisy_gram(kernel: TorqueKernel, params: Params, motion: Motion) -> Tensor:
-    """k(X, X) + R: (N n, N n), exactly symmetric."""
+    """K = k(X, X) + R: (N n, N n), exactly symmetric, sample by sample.
+
+    params: hyperparameters, `noise.log_std` among them; motion: N samples.
+    """
     gram = kernel.symmetric_gram(params, motion)
     gram.diagonal().add_(torch.exp(2 * params["noise.log_std"]).repeat(len(motion)))
     return gram

@@ -67,7 +67,10 @@ def pack_symmetric(symmetric: Tensor) -> Tensor:
 
 
 def unpack_symmetric(name: str, packed: Tensor) -> Tensor:
-    """Inverse of `pack_symmetric`; raise ValueError for a length that no triangle has."""
+    """The symmetric matrix (M, M) of `pack_symmetric`; name: of the tensor, for the message.
+
+    Raise ValueError for a length that no triangle has.
+    """
     size = math.isqrt(2 * packed.numel())
     if packed.dim() != 1 or size * (size + 1) // 2 != len(packed):
         raise ValueError(f"{name} has shape {tuple(packed.shape)}, expected M (M + 1) / 2 numbers")

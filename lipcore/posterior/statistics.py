@@ -51,7 +51,11 @@ def empty(size: int) -> Statistics:
 def collect(
     basis: Basis, noise_variance: Tensor, motion: Motion, residual: Tensor, weights: Tensor | None = None
 ) -> Statistics:
-    """Sum over N samples. noise_variance: (n,); residual: torque less its prior mean, (N, n); weights: (N,) or one."""
+    """Sums over N samples, A = Σ φ R⁻¹ φᵀ and b = Σ φ R⁻¹ residual (eq. 24 of docs/method.md).
+
+    noise_variance: (n,) (N·m)²; residual: torque less its prior mean, (N, n) N·m; weights: (N,), what each sample
+    counts, one where None.
+    """
     features = basis.features(motion)
     variance = noise_variance + basis.uncovered(motion, features)
     precision = variance.reciprocal() if weights is None else weights[:, None] / variance
@@ -68,7 +72,7 @@ def update(
     residual: Tensor,
     weights: Tensor | None = None,
 ) -> Statistics:
-    """Statistics with N more samples; see `collect`."""
+    """Statistics with N more samples, arguments as of `collect`."""
     return merge(statistics, collect(basis, noise_variance, motion, residual, weights))
 
 
@@ -78,7 +82,7 @@ def merge(one: Statistics, other: Statistics) -> Statistics:
 
 
 def subtract(all_samples: Statistics, some: Statistics) -> Statistics:
-    """Statistics without some of their samples: what `merge` did is undone."""
+    """Statistics without some of their samples: what `merge` did is undone, to rounding."""
     return Statistics(all_samples.a - some.a, all_samples.b - some.b, all_samples.samples - some.samples)
 
 
@@ -100,7 +104,7 @@ def add_to(
 
 
 def mirror(statistics: Statistics) -> None:
-    """Make the upper triangle of A equal to the lower one, in place."""
+    """Make the upper triangle of A equal to the lower one, in place: what follows a run of `add_to`."""
     statistics.a.copy_(statistics.a.tril() + statistics.a.tril(-1).T)
 
 

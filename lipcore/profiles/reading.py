@@ -19,7 +19,10 @@ NOTE = "A URDF does not say what the effort field means: say it with `effort`."
 
 @dataclass(frozen=True)
 class Limits:
-    """Of joints in the order they were asked for, (n,) each: infinite where a joint turns freely, NaN where unknown."""
+    """Types and limits of joints in the order they were asked for, (n,) each, SI units.
+
+    lower, upper: position; speed; torque. Infinite where a joint turns freely, NaN where unknown.
+    """
 
     types: tuple[JointType, ...]
     lower: Array

@@ -85,7 +85,7 @@ ROBOTS: dict[str, RobotSource] = {
 
 @dataclass(frozen=True)
 class Robot:
-    """A serial arm: its Pinocchio model and what the simulator needs to know of its joints.
+    """A serial arm by name: its Pinocchio model and what the simulator needs to know of its joints.
 
     lower, upper: (n,) position limits in rad or m; speed: (n,) velocity limits in rad/s or m/s.
     """

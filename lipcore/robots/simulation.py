@@ -71,7 +71,10 @@ def simulate(robot: Robot, stream: Stream, seed: int) -> Samples:
 def inverse_dynamics(
     robot: Robot, q: Array, dq: Array, ddq: Array, loaded: Array | None = None, payload: Payload | None = None
 ) -> Array:
-    """Rigid-body torque (N, n) by Pinocchio's recursive Newton–Euler; rows where `loaded` is set carry the payload."""
+    """Rigid-body torque (N, n) by Pinocchio's recursive Newton–Euler.
+
+    q, dq, ddq: (N, n), SI; loaded: (N,), rows that are not zero carry the payload. Raise SimulationUnavailableError.
+    """
     pin = pinocchio()
     model, with_payload = robot.model, robot.model
     if payload is not None:
@@ -87,7 +90,10 @@ def inverse_dynamics(
 
 
 def sinusoids(robot: Robot, stream: Stream, t: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    """Random sums of sinusoids within the joint's range and speed: q, dq, ddq, each (N, n)."""
+    """Random sums of sinusoids within the joint's range and speed (eq. 16 of TR2023-063): q, dq, ddq, each (N, n).
+
+    t: (N,) s; rng: where amplitudes are drawn from.
+    """
     omega = FUNDAMENTAL * stream.speed * np.arange(1, stream.n_sinusoids + 1)
     a, b = rng.uniform(-1, 1, (2, stream.n_sinusoids, robot.n_joints))
     sin, cos = np.sin(np.outer(t, omega)), np.cos(np.outer(t, omega))

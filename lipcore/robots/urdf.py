@@ -68,7 +68,8 @@ class Description:
 class RigidBody:
     """A serial arm with a fixed base, n moving bodies, everything in the order of the data's joints.
 
-    urdf_joints: the URDF's name of each joint of the data; model: Pinocchio's, every other joint locked at neutral.
+    urdf: its text; urdf_joints: the URDF's name of each joint of the data; matched: how these were matched; model:
+    Pinocchio's, every other joint locked at neutral.
     """
 
     name: str

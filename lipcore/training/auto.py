@@ -153,7 +153,10 @@ class Work:
         return learn(task, known, begin, seed)
 
     def fit(self, samples: Samples, name: str, place: str, learnt: Learnt | None = None) -> TorqueModel:
-        """A model of one estimator, around an arm where that is learnt already. place: one of PLACES."""
+        """A model of one estimator, around an arm where that is learnt already.
+
+        samples: of the task's recordings; name: of the estimator; place: one of PLACES.
+        """
         robot, learnt = (self.task.robot, learnt) if name in ROBOT_ESTIMATORS else (None, None)
         task = replace(self.task, samples=samples, robot=robot, on_progress=self.overall.of(name, place))
         return fit_estimator(task, name, learnt)

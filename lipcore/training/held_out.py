@@ -32,8 +32,10 @@ LEAST_SPREAD = (0.01, 0.02, 0.1)
 
 @dataclass(frozen=True)
 class Unseen:
-    """Rows to train on and rows to judge by; blocks: how many are held out; repeats: every block of the recording
-    repeats others, so that those held out do, too."""
+    """Which rows to train on and which to judge by (`parts`).
+
+    blocks: how many are held out; repeats: every block of the recording repeats others, so that those held out do, too.
+    """
 
     parts: Parts
     blocks: int
@@ -64,7 +66,10 @@ def hold_out(samples: Samples, joint_types: Sequence[str]) -> Unseen:
 
 
 def features(samples: Samples, joint_types: Sequence[str]) -> Array:
-    """The state of a robot at N instants, (N, k): cos q and sin q, of sliding joints q, dq and ddq, by their spread."""
+    """The state of a robot at N instants, (N, k): cos q and sin q, of sliding joints q, dq and ddq, by their spread.
+
+    joint_types: (n,).
+    """
     turns = np.array([each == "revolute" for each in joint_types])
     parts = []
     for angle, least in zip((samples.q, samples.dq, samples.ddq), LEAST_SPREAD, strict=True):

@@ -18,15 +18,8 @@ from lipcore.data.motion import Motion
 from lipcore.fitting.estimators import make_estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import arm_of_robot
-from lipcore.model.parameters import (
-    friction_coefficients,
-    inertial_parameters,
-    is_plausible,
-    nearest_plausible,
-    precision,
-    pseudo_inertia,
-    weight_posterior,
-)
+from lipcore.model.parameters import friction_coefficients, inertial_parameters, precision, weight_posterior
+from lipcore.model.plausible import is_plausible, nearest_plausible, pseudo_inertia
 from lipcore.robots.library import load_robot, profile_urdf
 from lipcore.robots.simulation import Stream, simulate
 from lipcore.robots.urdf import JointMismatchError, RigidBody
