@@ -52,7 +52,7 @@ def evaluate(tau: Array, mean: Array, std: Array, noise_std: Array, level: float
         nmse=np.divide(squared, variance, out=np.full_like(squared, np.nan), where=variance > 0),
         rmse=np.sqrt(squared),
         coverage=_coverage(error, total, level),
-        nlpd=np.mean(0.5 * np.log(2 * np.pi * total**2) + 0.5 * (error / total) ** 2, axis=0),
+        nlpd=np.mean(negative_log_density(error, total), axis=0),
         width=_width(total, level),
         level=level,
         coverages=np.array([_coverage(error, total, each) for each in LEVELS]),
@@ -63,12 +63,18 @@ def evaluate(tau: Array, mean: Array, std: Array, noise_std: Array, level: float
 
 def _coverage(error: Array, total: Array, level: float) -> Array:
     """Share of errors (N, n) inside the central `level` interval of a Gaussian with std `total`: (n,)."""
-    return np.asarray(np.mean(np.abs(error) <= _quantile(level) * total, axis=0))
+    return np.asarray(np.mean(np.abs(error) <= quantile(level) * total, axis=0))
 
 
 def _width(total: Array, level: float) -> Array:
-    return np.asarray(np.mean(2 * _quantile(level) * total, axis=0))
+    return np.asarray(np.mean(2 * quantile(level) * total, axis=0))
 
 
-def _quantile(level: float) -> float:
+def negative_log_density(error: Array, std: Array) -> Array:
+    """−log density of errors under Gaussians of these deviations, nats, element by element."""
+    return np.asarray(0.5 * np.log(2 * np.pi * std**2) + 0.5 * (error / std) ** 2)
+
+
+def quantile(level: float) -> float:
+    """Half the width of a Gaussian's central `level` interval, in standard deviations: 1.96 for 0.95."""
     return NormalDist().inv_cdf(0.5 + level / 2)

@@ -11,13 +11,13 @@ widens the standard error and costs degrees of freedom. For equal models whose d
 from __future__ import annotations
 
 from dataclasses import dataclass
-from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from lipcore.data.metrics import negative_log_density, quantile
 from lipcore.data.samples import Array, Samples
 
 LEVEL = 0.95
@@ -95,9 +95,9 @@ def compare(samples: Samples, first: Answer, second: Answer) -> Comparison:
 
 def _figures(tau: Array, answer: Answer) -> tuple[Array, Array, Array]:
     """Squared error, whether the interval holds the measurement, and negative log density, (N, n) each."""
-    error, variance = tau - answer.mean, answer.std**2 + answer.noise_std**2
-    inside = np.abs(error) <= NormalDist().inv_cdf(0.5 + LEVEL / 2) * np.sqrt(variance)
-    return error**2, inside.astype(np.float64), 0.5 * (np.log(2 * np.pi * variance) + error**2 / variance)
+    error, std = tau - answer.mean, np.sqrt(answer.std**2 + answer.noise_std**2)
+    inside = np.abs(error) <= quantile(LEVEL) * std
+    return error**2, inside.astype(np.float64), negative_log_density(error, std)
 
 
 def blocks(samples: Samples) -> NDArray[np.int64]:

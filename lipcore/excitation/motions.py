@@ -19,6 +19,17 @@ from lipcore.excitation.limits import Limits
 
 DENSE = 64
 """Instants for each harmonic that peaks are looked for at: the bound then lies 0.12 % above them."""
+INSTANTS = 12
+"""Instants for each harmonic that limits are watched at while searching."""
+LEAST_HARMONICS, MOST_HARMONICS = 5, 60
+SHARPNESS = 40
+"""Exponent of the norm that stands for the largest share of a limit: large is near, but its slope jumps."""
+SPREAD = 1 / 3
+"""Standard deviation of speed and acceleration, as a share of their limits."""
+SECONDS = 50.0
+"""Length of the random motions."""
+PER_MOTION = 5
+"""Instants that are taken of each of them."""
 
 
 @dataclass(frozen=True)
@@ -77,13 +88,6 @@ def overshoot(harmonics: int, instants: int) -> float:
     harmonics: its degree K; 1 / cos(π K / m) (Ehlich & Zeller, 1964).
     """
     return float(1 / np.cos(np.pi * harmonics / instants))
-
-
-INSTANTS = 12
-"""Instants for each harmonic that limits are watched at while searching."""
-LEAST_HARMONICS, MOST_HARMONICS = 5, 60
-SHARPNESS = 40
-"""Exponent of the norm that stands for the largest share of a limit: large is near, but its slope jumps."""
 
 
 @dataclass(frozen=True)
@@ -175,14 +179,6 @@ def harmonics(limits: Limits, seconds: float) -> int:
     """
     fastest = float(np.max(limits.acceleration / limits.speed)) / (2 * np.pi)
     return int(np.clip(np.ceil(fastest * seconds), LEAST_HARMONICS, MOST_HARMONICS))
-
-
-SPREAD = 1 / 3
-"""Standard deviation of speed and acceleration, as a share of their limits."""
-SECONDS = 50.0
-"""Length of the random motions."""
-PER_MOTION = 5
-"""Instants that are taken of each of them."""
 
 
 def draw(limits: Limits, count: int, seed: int) -> Motion:

@@ -13,8 +13,7 @@ from lipcore.data.samples import Array
 from lipcore.excitation.information import Belief, Information
 from lipcore.excitation.limits import Limits
 from lipcore.excitation.motions import Series, Shape, draw, harmonics
-from lipcore.excitation.searching import INSTANTS, Goal, search
-from lipcore.excitation.torque import TorqueCheck
+from lipcore.excitation.searching import INSTANTS, Goal, TorqueCheck, search
 from lipcore.robots.library import Robot
 
 

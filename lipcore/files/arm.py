@@ -19,11 +19,25 @@ from lipcore.model.parameters import STEPS
 from lipcore.robots.urdf import PARAMETERS
 from lipcore.vocabulary import GEOMETRY_MODES, JOINT_TYPES, GeometryMode, JointType
 
-GEOMETRY = ("mode", "gravity", "order", "joints")
-JOINT = ("joint", "type", "rotation", "translation", "axis", "across", "turn_std", "shift_std", "undetermined")
-BODY = ("joint", "mean", "std", "plausible")
+GEOMETRY_ENTRIES = ("mode", "gravity", "order", "joints")
+JOINT_ENTRIES = ("joint", "type", "rotation", "translation", "axis", "across", "turn_std", "shift_std", "undetermined")
+BODY_ENTRIES = ("joint", "mean", "std", "plausible")
 MASSES = {"mass": (), "first_moment": (3,), "inertia": (6,)}
 """Entries of a body's ten parameters and their shapes."""
+PREFIX = "arm/"
+_GEOMETRY_TENSORS = ("rotation", "translation", "axis", "gravity")
+_ARM_TENSORS = ("parameters", "centre", "unit", "expected", "widths")
+_ALTERNATIVE_TENSORS = ("rotation", "translation", "axis", "parameters", "linear", "probability")
+_TENSORS = {
+    f"{PREFIX}{name}"
+    for name in (
+        *_GEOMETRY_TENSORS,
+        *_ARM_TENSORS,
+        "order",
+        "stribeck",
+        *(f"other/{name}" for name in _ALTERNATIVE_TENSORS),
+    )
+}
 
 
 def check_inertia(inertia: Any, n: int) -> None:
@@ -33,7 +47,7 @@ def check_inertia(inertia: Any, n: int) -> None:
         numbers("inertia.plausible_deviation", inertia["plausible_deviation"], (n,))
     for index, body in enumerate(check_list("inertia.bodies", inertia["bodies"], n)):
         where = f"inertia.bodies[{index}]"
-        check_keys(where, body, BODY, ("undetermined",))
+        check_keys(where, body, BODY_ENTRIES, ("undetermined",))
         for key in ("mean", "std", "plausible"):
             check_keys(f"{where}.{key}", body[key], MASSES)
             for name, shape in MASSES.items():
@@ -53,7 +67,7 @@ def read_geometry(entry: Any, n: int, plausible: bool = False) -> tuple[Geometry
 
     plausible: the one that the plausible bodies are meant for, where it is another one.
     """
-    check_keys("geometry", entry, GEOMETRY)
+    check_keys("geometry", entry, GEOMETRY_ENTRIES)
     check_choice("geometry.mode", entry["mode"], GEOMETRY_MODES)
     gravity = numbers("geometry.gravity", entry["gravity"], (3,))
     order = check_list("geometry.order", entry["order"], n)
@@ -91,7 +105,7 @@ def numbers(name: str, value: Any, shape: tuple[int, ...]) -> Array:
 
 
 def _check_joint(where: str, joint: Any) -> None:
-    check_keys(where, joint, JOINT, ("plausible",))
+    check_keys(where, joint, JOINT_ENTRIES, ("plausible",))
     if "plausible" in joint:
         check_keys(f"{where}.plausible", joint["plausible"], ("rotation", "translation"))
         numbers(f"{where}.plausible.rotation", joint["plausible"]["rotation"], (3, 3))
@@ -109,23 +123,16 @@ def _check_words(name: str, value: Any, known: Sequence[str]) -> None:
         raise wrong(name, value, f"a list of some of {', '.join(known)}")
 
 
-PREFIX = "arm/"
-_GEOMETRY = ("rotation", "translation", "axis", "gravity")
-_ARM = ("parameters", "centre", "unit", "expected", "widths")
-_OTHERS = ("rotation", "translation", "axis", "parameters", "linear", "probability")
-_NAMES = {
-    f"{PREFIX}{name}" for name in (*_GEOMETRY, *_ARM, "order", "stribeck", *(f"other/{name}" for name in _OTHERS))
-}
-
-
 def is_of_arm(name: str) -> bool:
     """Whether a tensor of this name belongs to an arm."""
-    return name in _NAMES
+    return name in _TENSORS
 
 
 def arm_tensors(arm: Arm) -> dict[str, Tensor]:
     """All numbers of an arm, float64, by name."""
-    parts = {name: getattr(arm.geometry, name) for name in _GEOMETRY} | {name: getattr(arm, name) for name in _ARM}
+    parts = {name: getattr(arm.geometry, name) for name in _GEOMETRY_TENSORS} | {
+        name: getattr(arm, name) for name in _ARM_TENSORS
+    }
     parts["order"] = arm.order.astype(np.float64)
     if arm.stribeck:
         parts["stribeck"] = np.ones(1)
@@ -155,14 +162,14 @@ def read_arm(tensors: Mapping[str, Tensor], joint_types: Sequence[JointType], mo
     Raise ValueError for tensors that are missing or do not fit together.
     """
     try:
-        parts = {name: tensors[f"{PREFIX}{name}"].numpy() for name in (*_GEOMETRY, *_ARM, "order")}
+        parts = {name: tensors[f"{PREFIX}{name}"].numpy() for name in (*_GEOMETRY_TENSORS, *_ARM_TENSORS, "order")}
     except KeyError as error:
         raise ValueError(f"tensor {error} is missing: the model is of an earlier release, train it again") from None
     order = parts.pop("order").astype(np.int64)
     if order.shape != (len(joint_types),) or sorted(order.tolist()) != list(range(len(joint_types))):
         raise ValueError(f"tensor 'arm/order' is {order.tolist()}, expected each joint once")
     types = tuple(joint_types[joint] for joint in order)
-    geometry = Geometry(types, *(parts.pop(name) for name in _GEOMETRY))
+    geometry = Geometry(types, *(parts.pop(name) for name in _GEOMETRY_TENSORS))
     stribeck = _stribeck(tensors)
     alternatives = _alternatives(tensors, geometry, len(friction_terms(stribeck)))
     return Arm(geometry, order, mode, stribeck=stribeck, alternatives=alternatives, **parts)
@@ -183,7 +190,7 @@ def _alternatives(tensors: Mapping[str, Tensor], geometry: Geometry, terms: int)
         return ()
     try:
         rotation, translation, axis, parameters, linear, probability = (
-            tensors[f"{PREFIX}other/{name}"].numpy() for name in _OTHERS
+            tensors[f"{PREFIX}other/{name}"].numpy() for name in _ALTERNATIVE_TENSORS
         )
     except KeyError as error:
         raise ValueError(f"tensor {error} is missing") from None

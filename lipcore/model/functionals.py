@@ -22,6 +22,54 @@ from lipcore.posterior.exact import Posterior
 EnergyKernel = LipKernel | ChainKernel | ArmKernel
 """Priors of torques that come from priors of the energies."""
 KINETIC, POTENTIAL = 0, 1
+COLUMNS_PER_CHUNK = 512
+"""Right-hand sides whitened together: enough for fast matrix products, few enough to stay within tens of MB."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Posterior mean and standard deviation of a quantity at N queries, both (N, ...), noise excluded."""
+
+    mean: Tensor
+    std: Tensor
+
+
+def condition(posterior: Posterior, prior_mean: Tensor, prior_variance: Tensor, cross: Tensor) -> Estimate:
+    """Posterior of K quantities from their covariance with the posterior's anchors (see `Posterior`).
+
+    prior_mean, prior_variance: (K,); cross: (M, K).
+    """
+    explained = posterior.whiten(cross).square().sum(0)
+    std = (prior_variance - explained).clamp_min(0.0).sqrt()  # rounding may end below zero where all is known
+    return Estimate(prior_mean + posterior.weights @ cross, posterior.std_factor * std)
+
+
+def combine_torques(
+    posterior: Posterior, kernel: TorqueKernel, motions: Sequence[Motion], coefficients: Tensor
+) -> Estimate:
+    """Posterior of F linear combinations of a kernel's torques at S motions a query, (N, F).
+
+    The joint posterior of all S n torques is used: what they share cancels in a difference, in its uncertainty too.
+    motions: S motions of N queries each; coefficients: (F, S n), motion by motion.
+    """
+    n, size, count = kernel.n_joints, len(motions), len(motions[0])
+    stacked = [torch.stack([getattr(m, name) for m in motions], dim=1) for name in ("q", "dq", "ddq")]  # (N, S, n)
+    step = max(1, COLUMNS_PER_CHUNK // (size * n))
+    means, stds = [], []
+    for start in range(0, count, step):
+        stack = Motion(*(part[start : start + step].reshape(-1, n) for part in stacked))
+        queries = len(stack) // size
+        cross = posterior.cross(kernel, stack)  # (M, queries S n)
+        cross = cross.reshape(-1, size * n) @ coefficients.T
+        grams = [kernel.symmetric_gram(posterior.params, stack[k * size : (k + 1) * size]) for k in range(queries)]
+        variance = torch.stack([(coefficients @ gram * coefficients).sum(1) for gram in grams])
+        mean = kernel.mean(stack).reshape(queries, -1) @ coefficients.T
+        estimate = condition(
+            posterior, mean.reshape(-1), variance.reshape(-1), cross.reshape(len(posterior.weights), -1)
+        )
+        means.append(estimate.mean.reshape(queries, -1))
+        stds.append(estimate.std.reshape(queries, -1))
+    return Estimate(torch.cat(means), torch.cat(stds))
 
 
 def kinetic_energy(posterior: Posterior, kernels: Sequence[EnergyKernel], query: Motion) -> Estimate:
@@ -96,53 +144,3 @@ def _with_torques(kernel: LipKernel | ChainKernel, params: Params, query: Motion
         cross = kernel.energies(params, State.rows(query[rows]), columns)  # (2, n, rows, S)
         out[..., rows] = cross.permute(3, 1, 0, 2)
     return out.reshape(size * n, -1)
-
-
-COLUMNS_PER_CHUNK = 512
-"""Right-hand sides whitened together: enough for fast matrix products, few enough to stay within tens of MB."""
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """Posterior mean and standard deviation of a quantity at N queries, both (N, ...), noise excluded."""
-
-    mean: Tensor
-    std: Tensor
-
-
-def condition(posterior: Posterior, prior_mean: Tensor, prior_variance: Tensor, cross: Tensor) -> Estimate:
-    """Posterior of K quantities from their covariance with the posterior's anchors (see `Posterior`).
-
-    prior_mean, prior_variance: (K,); cross: (M, K).
-    """
-    explained = posterior.whiten(cross).square().sum(0)
-    std = (prior_variance - explained).clamp_min(0.0).sqrt()  # rounding may end below zero where all is known
-    return Estimate(prior_mean + posterior.weights @ cross, posterior.std_factor * std)
-
-
-def combine_torques(
-    posterior: Posterior, kernel: TorqueKernel, motions: Sequence[Motion], coefficients: Tensor
-) -> Estimate:
-    """Posterior of F linear combinations of a kernel's torques at S motions a query, (N, F).
-
-    The joint posterior of all S n torques is used: what they share cancels in a difference, in its uncertainty too.
-    motions: S motions of N queries each; coefficients: (F, S n), motion by motion.
-    """
-    n, size, count = kernel.n_joints, len(motions), len(motions[0])
-    stacked = [torch.stack([getattr(m, name) for m in motions], dim=1) for name in ("q", "dq", "ddq")]  # (N, S, n)
-    step = max(1, COLUMNS_PER_CHUNK // (size * n))
-    means, stds = [], []
-    for start in range(0, count, step):
-        stack = Motion(*(part[start : start + step].reshape(-1, n) for part in stacked))
-        queries = len(stack) // size
-        cross = posterior.cross(kernel, stack)  # (M, queries S n)
-        cross = cross.reshape(-1, size * n) @ coefficients.T
-        grams = [kernel.symmetric_gram(posterior.params, stack[k * size : (k + 1) * size]) for k in range(queries)]
-        variance = torch.stack([(coefficients @ gram * coefficients).sum(1) for gram in grams])
-        mean = kernel.mean(stack).reshape(queries, -1) @ coefficients.T
-        estimate = condition(
-            posterior, mean.reshape(-1), variance.reshape(-1), cross.reshape(len(posterior.weights), -1)
-        )
-        means.append(estimate.mean.reshape(queries, -1))
-        stds.append(estimate.std.reshape(queries, -1))
-    return Estimate(torch.cat(means), torch.cat(stds))

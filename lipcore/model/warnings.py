@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.compiled.arm import PARAMETERS
 from lipcore.model.parameters import weight_posterior
+from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.compression import checks
-
-if TYPE_CHECKING:
-    from lipcore.model.torque_model import TorqueModel
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
-
-from lipcore.data.motion import Motion
 
 QUERIES = 40
 """Motions that are looked at: half of the basis' own, half recombined from them."""
+ALWAYS_OPEN = 2
+"""Numbers of a geometry that no torque depends on: its turn about gravity, and a place along the first axis."""
+TOGETHER = 0.7
+"""Independent motions, as a share of the joints, below which joints count as moving together."""
+FARTHER = 2.0
+"""How much farther, or faster, a joint moves than it did where alternative arms are compared."""
+LISTED = 8
+"""Joints that are named in a sentence, at most."""
+COUNTS = {2: "Two", 3: "Three", 4: "Four"}
 
 
 def linearisation_error(model: TorqueModel) -> Array | None:
@@ -50,17 +55,6 @@ def linearisation_error(model: TorqueModel) -> Array | None:
     stated = answer.covariance.diagonal(dim1=1, dim2=2).clamp_min(0.0) + posterior.noise_variance
     error = term.torque(weights, motion) - linear
     return np.asarray(np.sqrt(np.mean(error**2 / stated.numpy(), axis=0)))
-
-
-ALWAYS_OPEN = 2
-"""Numbers of a geometry that no torque depends on: its turn about gravity, and a place along the first axis."""
-TOGETHER = 0.7
-"""Independent motions, as a share of the joints, below which joints count as moving together."""
-FARTHER = 2.0
-"""How much farther, or faster, a joint moves than it did where alternative arms are compared."""
-LISTED = 8
-"""Joints that are named in a sentence, at most."""
-COUNTS = {2: "Two", 3: "Three", 4: "Four"}
 
 
 def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:

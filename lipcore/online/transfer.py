@@ -18,6 +18,10 @@ from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.linalg import pack_symmetric, unpack_symmetric
 from lipcore.posterior.statistics import Statistics
 
+REGIMES = ("now", "before")
+ABSENT = float("nan")
+"""Stands for None among numbers."""
+
 
 def consolidate(online: OnlineModel, floor: Array | None = None) -> TorqueModel:
     """The model that answers as `online.model(floor)` does, to the last bit, and that can be saved.
@@ -76,11 +80,6 @@ class Revision:
         # the cached property, filled without laying anything out again
         model.__dict__["evaluator"] = base.evaluator.revised(self.packed, self.floor)
         return model
-
-
-REGIMES = ("now", "before")
-ABSENT = float("nan")
-"""Stands for None among numbers."""
 
 
 def dump(online: OnlineModel) -> bytes:

@@ -10,9 +10,8 @@ import numpy as np
 
 from lipcore.profiles.arms import ARMS
 from lipcore.profiles.names import is_number, makes
-from lipcore.profiles.profile import Profile
+from lipcore.profiles.profile import Profile, Sheet, array
 from lipcore.profiles.reading import Limits, read_limits
-from lipcore.profiles.sheet import Sheet, array
 from lipcore.robots.library import ROBOTS, UnknownRobotError, installed_profiles, profile_urdf
 from lipcore.vocabulary import JointType
 

@@ -13,8 +13,7 @@ from lipcore.data.motion import Motion
 from lipcore.excitation import Belief, Limits, PlanOptions, plan
 from lipcore.excitation.information import Information
 from lipcore.excitation.motions import Shape, draw
-from lipcore.excitation.searching import Goal, search
-from lipcore.excitation.torque import MARGIN, TorqueCheck
+from lipcore.excitation.searching import MARGIN, Goal, TorqueCheck, search
 from lipcore.posterior.exact import ExactPosterior
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
