@@ -44,7 +44,7 @@ class Cell(BaseModel):
 
 
 class TestResult(BaseModel):
-    """Figures of one test set, one number a joint; coverage and width one list for each of lipcore.metrics.LEVELS.
+    """Figures of one test set, one number a joint; coverage and width one list for each of data.metrics.LEVELS.
 
     nmse is against the simulator's torque without noise, nmse_noisy against the measured one; torque_std, N·m, is the
     standard deviation of the former.

@@ -1,4 +1,4 @@
-"""White noise of one column of a recording that has many parts: what `lipcore.signals.noise_level` says, in one go."""
+"""White noise of one column of a recording that has many parts: as `data.signals.noise_level` has it, in one go."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ class Published:
     path: of the arrays, see `publication`; samples: weight of the rows learnt in this regime; novel_rows: rows beyond
     the basis since the process follows the version, novel_share: their share of the last ones; seconds: that learning
     and solving took; at: Unix time, s; linearisation: error of taking a learnt arm as linear, one number a joint, in
-    units of what is stated, see `lipcore.arm.linearisation`; None without such an arm.
+    units of what is stated, see `lipcore.model.warnings`; None without such an arm.
     """
 
     model: str
