@@ -3,17 +3,17 @@
 The floors, from the top; what stands higher imports what stands lower, never the other way (import-linter, in
 pyproject.toml, checks it):
 
-    training     samples in, a model out; `auto` chooses the estimator        beside it, on the same floor:
-    files        a model as files: manifest, tensors, URDF, checked when read
-    online       learning from a live stream: gates, records, changes, what is learnt and taken back
-    excitation   the motion that tells a model most
-    warm_up      compiles ahead of the first answer
-    --------------------------------------------------------------------------------------------------
-    arm          the rigid arm learnt from torque alone: geometry, masses, friction (section 5)
-    model        a trained model: torque, dynamics, energies, parameters, warnings
+    training, files, online, excitation, warm_up      on one floor; none of them knows another:
+        training     samples in, a model out; `auto` chooses the estimator
+        files        a model as files: manifest, tensors, URDF, checked when read
+        online       learning from a live stream: gates, records, changes, what is learnt and taken back
+        excitation   the motion that tells a model most
+        warm_up      compiles ahead of the first answer
+    arm          the rigid arm learnt from torque alone: geometry, masses, friction (sections 6 and 7)
+    model        a trained model: torque, dynamics, energies, parameters, warnings (section 9)
     evaluator    the compiled form of a posterior, which answers queries
     fitting      estimators, hyperparameters, noise, options, what a training is given
-    posterior    exact and compact posteriors, sums over samples, linear algebra (section 6)
+    posterior    exact and compact posteriors, sums over samples, linear algebra (section 8)
     kernels      the torque priors and their compiled loops (sections 2 to 5)
     profiles     robots by name: limits, and what their effort field means
     preparation  from recordings to samples: filters, rates, derivatives
