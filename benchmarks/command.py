@@ -31,7 +31,7 @@ from benchmarks.scale.running import PARTS as SCALE_PARTS
 from benchmarks.soak import running as soak_running
 from benchmarks.soak import table as soak_table
 from benchmarks.workload import BenchError, Source, model_folder
-from lipcore.robots import ROBOTS, SimulationUnavailableError
+from lipcore.robots.library import ROBOTS, SimulationUnavailableError
 from service.cli.demo import DemoError
 from service.client import ApiError
 from service.client.stream import StreamError

@@ -14,10 +14,10 @@ from rich.console import Console
 
 import lipcore
 from benchmarks.clients import Address
-from lipcore.model import TorqueModel
-from lipcore.robots import ROBOTS, Robot, load_robot
-from lipcore.samples import Array, Samples
-from lipcore.simulation import Stream, simulate
+from lipcore.data.samples import Array, Samples
+from lipcore.model.torque_model import TorqueModel
+from lipcore.robots.library import ROBOTS, Robot, load_robot
+from lipcore.robots.simulation import Stream, simulate
 from service.cli.demo import ServiceProcess
 from service.cli.simulate import write_recording
 from service.client import Client

@@ -1,4 +1,26 @@
-"""Inverse dynamics of manipulators as physics-informed Gaussian processes."""
+"""Inverse dynamics of manipulators as physics-informed Gaussian processes: the method of docs/method.md.
+
+The floors, from the top; what stands higher imports what stands lower, never the other way (import-linter, in
+pyproject.toml, checks it):
+
+    training, files, online, excitation, warm_up      on one floor; none of them knows another:
+        training     samples in, a model out; `auto` chooses the estimator
+        files        a model as files: manifest, tensors, URDF, checked when read
+        online       learning from a live stream: gates, records, changes, what is learnt and taken back
+        excitation   the motion that tells a model most
+        warm_up      compiles ahead of the first answer
+    arm          the rigid arm learnt from torque alone: geometry, masses, friction (sections 6 and 7)
+    model        a trained model: torque, dynamics, energies, parameters, warnings (section 9)
+    evaluator    the compiled form of a posterior, which answers queries
+    fitting      estimators, hyperparameters, noise, options, what a training is given
+    posterior    exact and compact posteriors, sums over samples, linear algebra (section 8)
+    kernels      the torque priors and their compiled loops (sections 2 to 5)
+    profiles     robots by name: limits, and what their effort field means
+    preparation  from recordings to samples: filters, rates, derivatives
+    robots       URDFs, Pinocchio models, simulated recordings
+    data         samples of motion and torque, splits, metrics
+    vocabulary   the names that things go by
+"""
 
 from __future__ import annotations
 
@@ -6,13 +28,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from lipcore.fit_options import FitOptions
-    from lipcore.fitting import FitCancelledError, FitProgress
-    from lipcore.linalg import NotPositiveDefiniteError
-    from lipcore.manifest import ModelFormatError
-    from lipcore.model import TorqueModel, TorquePrediction, train
-    from lipcore.persistence import copy_model, load, save
-    from lipcore.samples import Samples
+    from lipcore.data.samples import Samples
+    from lipcore.files.manifest import ModelFormatError
+    from lipcore.files.persistence import copy_model, load, save
+    from lipcore.fitting.hyperparameters import FitCancelledError, FitProgress
+    from lipcore.fitting.options import FitOptions
+    from lipcore.model.torque_model import TorqueModel, TorquePrediction
+    from lipcore.posterior.linalg import NotPositiveDefiniteError
+    from lipcore.training.train import train
 
 __all__ = [
     "FitCancelledError",
@@ -29,18 +52,18 @@ __all__ = [
     "train",
 ]
 _PLACES = {
-    "FitCancelledError": "fitting",
-    "FitOptions": "fit_options",
-    "FitProgress": "fitting",
-    "ModelFormatError": "manifest",
-    "NotPositiveDefiniteError": "linalg",
-    "Samples": "samples",
-    "TorqueModel": "model",
-    "TorquePrediction": "model",
-    "copy_model": "persistence",
-    "load": "persistence",
-    "save": "persistence",
-    "train": "model",
+    "FitCancelledError": "fitting.hyperparameters",
+    "FitOptions": "fitting.options",
+    "FitProgress": "fitting.hyperparameters",
+    "ModelFormatError": "files.manifest",
+    "NotPositiveDefiniteError": "posterior.linalg",
+    "Samples": "data.samples",
+    "TorqueModel": "model.torque_model",
+    "TorquePrediction": "model.torque_model",
+    "copy_model": "files.persistence",
+    "load": "files.persistence",
+    "save": "files.persistence",
+    "train": "training.train",
 }
 
 
@@ -48,5 +71,5 @@ def __getattr__(name: str) -> Any:
     """Import what is asked for: numerics take seconds to load, which who only names things (clients) does without."""
     if name not in _PLACES:
         raise AttributeError(f"module 'lipcore' has no attribute {name!r}")
-    found = globals()[name] = getattr(import_module(f"lipcore.{_PLACES[name]}"), name)
-    return found
+    value = globals()[name] = getattr(import_module(f"lipcore.{_PLACES[name]}"), name)
+    return value

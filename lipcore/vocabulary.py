@@ -27,10 +27,10 @@ ComponentName = Literal[
 COMPONENTS: tuple[ComponentName, ...] = get_args(ComponentName)
 
 AUTO = "auto"
-"""Of several estimators, the one that predicts best what it has not seen (`lipcore.auto`)."""
+"""Of several estimators, the one that predicts best what it has not seen (`lipcore.training.auto`)."""
 DEFAULT_ESTIMATOR = AUTO
 CHOICES = (AUTO, "lip", "lip-chain", "se", "gip", "lse", "rigid-body", "rigid-body+lip-chain")
-"""What may be asked for: `auto`, and the estimators of `lipcore.estimators`."""
+"""What may be asked for: `auto`, and the estimators of `lipcore.fitting.estimators`."""
 ROBOT_ESTIMATORS = ("rigid-body", "rigid-body+lip-chain")
 """Estimators with the term `rigid_body`, which take a robot."""
 

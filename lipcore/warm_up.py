@@ -12,12 +12,12 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from lipcore.fit_options import FitOptions
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Samples
+from lipcore.fitting.options import FitOptions
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative, Arm
-from lipcore.model import train
-from lipcore.motion import Motion
-from lipcore.samples import Samples
+from lipcore.training.train import train
 
 COMPILED = ("lip", "lip-chain", "rigid-body", "rigid-body+lip-chain")
 """Estimators with compiled terms. What all have in common comes with each."""

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 import lipcore
-from lipcore.metrics import evaluate
-from lipcore.robots import load_robot
-from lipcore.simulation import Stream, simulate
+from lipcore.data.metrics import evaluate
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
 
 FOLDER = Path(__file__).parent / "panda-sim"
 SPEEDS = (1.0, 2.0, 5.0, 10.0)

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 
 RATE = 1000.0
 BLOCK = 50_000

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from benchmarks.timing import Ask
 from benchmarks.workload import Workload
-from lipcore.motion import Motion
-from lipcore.posterior import ExactPosterior
-from lipcore.robots import Robot, pinocchio
-from lipcore.samples import Array, Samples
-from lipcore.selection import spread_out
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Array, Samples
+from lipcore.posterior.exact import ExactPosterior
+from lipcore.posterior.selection import spread_out
+from lipcore.robots.library import Robot, pinocchio
 
 GPYTORCH_SAID = (
     "GPyTorch: one independent exact GP a joint, as a batch of n: zero mean, RBF with one lengthscale an input "

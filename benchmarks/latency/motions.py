@@ -17,9 +17,9 @@ from benchmarks.latency.results import MotionRow, Results
 from benchmarks.latency.subjects import Subject, in_process
 from benchmarks.latency.targets import p50, single
 from benchmarks.workload import TRAIN_SEED, Workload
-from lipcore.robots import Robot, load_robot
-from lipcore.samples import Samples
-from lipcore.simulation import FAST, Stream, simulate
+from lipcore.data.samples import Samples
+from lipcore.robots.library import Robot, load_robot
+from lipcore.robots.simulation import FAST, Stream, simulate
 
 SLOW, QUICK = Stream(), Stream(speed=FAST)
 MOTIONS: dict[str, tuple[Stream, ...]] = {

@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.latency import baselines
 from benchmarks.timing import Ask
 from benchmarks.workload import BenchError, Workload
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 
 BATCH = 1000
 """Queries of a batch."""

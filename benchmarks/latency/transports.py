@@ -13,7 +13,7 @@ from benchmarks.clients import Address, HttpClient, post
 from benchmarks.latency.subjects import Subject
 from benchmarks.latency.websocket import WebSocket, frame, read_answer, request_frame
 from benchmarks.workload import MODEL, Bed
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.client.stream import StreamClient
 from service.oip.schema import HEADER
 from service.stream.frames import request_bytes

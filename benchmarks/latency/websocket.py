@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 
 from benchmarks.clients import Address, BadAnswerError, connect
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.stream.frames import ANSWER, ASK_STD, ERROR, HAS_STD, NUMBER, REQUEST
 
 _BINARY, _TEXT, _CLOSE, _PING, _PONG = 2, 1, 8, 9, 10

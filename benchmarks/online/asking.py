@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.clients import Address
 from benchmarks.latency.websocket import WebSocket, frame, request_frame
 from benchmarks.timing import Timing, no_collection
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.stream.frames import ANSWER, ERROR, request_bytes
 
 RATE = 500.0

@@ -15,8 +15,8 @@ import numpy as np
 import lipcore
 from benchmarks.clients import HttpClient, post
 from benchmarks.workload import BenchError
-from lipcore.model import TorqueModel
-from lipcore.samples import Array, Samples
+from lipcore.data.samples import Array, Samples
+from lipcore.model.torque_model import TorqueModel
 from service.cli.demo import ServiceProcess
 from service.client import Client
 from service.learning.owner import set_options

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.timing import no_collection
-from lipcore.model import TorqueModel
+from lipcore.model.torque_model import TorqueModel
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 

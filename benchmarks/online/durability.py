@@ -12,8 +12,8 @@ from benchmarks.latency.table import Grid, promises
 from benchmarks.latency.targets import Target
 from benchmarks.online.bed import install, train
 from benchmarks.online.trials import BATCHES, LATE, MODEL, ROWS, TWICE, Tally, Trials, Victim
-from lipcore.robots import load_robot
-from lipcore.simulation import Payload, Stream, simulate
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Payload, Stream, simulate
 from service.learning.schema import LearningOptions
 
 ROBOT, RATE, SPEED = "double-pendulum", 100.0, 5.0

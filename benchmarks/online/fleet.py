@@ -7,11 +7,11 @@ from functools import reduce
 
 import torch
 
-from lipcore.compact.posterior import CompactPosterior
-from lipcore.compact.statistics import Statistics, collect, merge
-from lipcore.model import TorqueModel
-from lipcore.motion import Motion
-from lipcore.samples import Samples
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Samples
+from lipcore.model.torque_model import TorqueModel
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.statistics import Statistics, collect, merge
 
 
 def merged_difference(model: TorqueModel, parts: Sequence[Samples], queries: Motion) -> float:

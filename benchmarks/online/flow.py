@@ -15,7 +15,7 @@ from benchmarks.clients import HttpClient
 from benchmarks.online.asking import Asked, Asker
 from benchmarks.online.bed import Bed
 from benchmarks.online.sending import BATCH_ROWS, Ack, batch_requests, send_all, stream, stream_frames
-from lipcore.samples import Array, Samples
+from lipcore.data.samples import Array, Samples
 from service.client.stream import StreamClient
 
 STREAM = "bench"

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
+from lipcore.data.samples import Array
 from lipcore.kernels.friction import FRICTION_TERMS, friction_features
-from lipcore.model import TorqueModel
+from lipcore.model.torque_model import TorqueModel
 from lipcore.online.batch import Rows
-from lipcore.samples import Array
 
 FEATURES = 500
 

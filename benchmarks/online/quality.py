@@ -16,9 +16,9 @@ from benchmarks.online.flow import STREAM
 from benchmarks.online.fourier import FourierModel
 from benchmarks.online.scene import Scene, rows_of
 from benchmarks.online.sending import BATCH_ROWS, batch_requests, stream
-from lipcore.metrics import evaluate
-from lipcore.model import TorqueModel
-from lipcore.samples import Array, Samples
+from lipcore.data.metrics import evaluate
+from lipcore.data.samples import Array, Samples
+from lipcore.model.torque_model import TorqueModel
 
 REFIT_ROWS = 3000
 """Rows that a refit is given, thinned evenly; it chooses among them those that it stands on."""

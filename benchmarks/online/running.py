@@ -24,8 +24,8 @@ from benchmarks.online.quality import Method, Moment
 from benchmarks.online.results import Results
 from benchmarks.online.scene import Scene, rows_of
 from benchmarks.online.sending import BATCH_ROWS
-from lipcore.model import TorqueModel
-from lipcore.samples import Array, Samples
+from lipcore.data.samples import Array, Samples
+from lipcore.model.torque_model import TorqueModel
 from service.learning.schema import LearningOptions
 
 PARTS = ("flow", "cost", "quality", "fleet")

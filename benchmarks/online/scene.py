@@ -8,11 +8,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.online import spacing
+from lipcore.data import independence
+from lipcore.data.samples import Array, Samples
 from lipcore.online.batch import Rows
-from lipcore.robots import Robot, load_robot
-from lipcore.samples import Array, Samples
-from lipcore.simulation import Payload, Stream, simulate
+from lipcore.robots.library import Robot, load_robot
+from lipcore.robots.simulation import Payload, Stream, simulate
 from lipcore.vocabulary import LEARNT
 
 SINUSOIDS, UNSEEN_SINUSOIDS = 50, 100
@@ -116,4 +116,4 @@ class Scene:
 def rows_of(samples: Samples) -> Rows:
     """Rows to learn from, all of them."""
     code: NDArray[np.uint8] = np.full(len(samples), LEARNT, dtype=np.uint8)
-    return Rows(samples.t, samples.q, samples.dq, samples.ddq, samples.tau, code, spacing.evenly(samples.t))
+    return Rows(samples.t, samples.q, samples.dq, samples.ddq, samples.tau, code, independence.even_weights(samples.t))

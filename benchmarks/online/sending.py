@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import msgspec
 
 from benchmarks.clients import BadAnswerError, HttpClient, post
-from lipcore.samples import Samples
+from lipcore.data.samples import Samples
 from service.client.stream import StreamClient, StreamLearnt
 
 BATCH_ROWS = 100

@@ -21,9 +21,9 @@ from benchmarks.online.scene import rows_of
 from benchmarks.online.sending import Ack, batch_request, send
 from benchmarks.processes import PROC, levels
 from benchmarks.workload import BenchError
-from lipcore.model import TorqueModel
+from lipcore.data.samples import Array, Samples
+from lipcore.model.torque_model import TorqueModel
 from lipcore.online.learner import OnlineModel
-from lipcore.samples import Array, Samples
 from service.cli.demo import ServiceProcess
 from service.client import Client
 

@@ -16,9 +16,9 @@ from benchmarks.reproduce import figures, report, table
 from benchmarks.reproduce.experiment import YARDSTICK, Cell, Experiment
 from benchmarks.reproduce.results import FILE, Results
 from benchmarks.reproduce.running import ReproductionError, run
-from lipcore.estimators import ESTIMATORS
-from lipcore.model import MIN_SAMPLES
-from lipcore.robots import ROBOTS, SimulationUnavailableError
+from lipcore.fitting.estimators import ESTIMATORS
+from lipcore.fitting.task import MIN_SAMPLES
+from lipcore.robots.library import ROBOTS, SimulationUnavailableError
 from service.cli.consoles import print_json
 from service.cli.options import Json
 

@@ -16,13 +16,13 @@ from pydantic import BaseModel, ConfigDict
 
 import lipcore
 from benchmarks.reproduce.memory import peak_mb, reset_peak
-from lipcore.estimators import check_estimator
-from lipcore.fit_options import FitOptions
-from lipcore.metrics import evaluate
-from lipcore.robots import Robot, load_robot
-from lipcore.samples import Array, Samples
-from lipcore.simulation import Stream, inverse_dynamics, simulate
-from lipcore.urdf import RigidBody
+from lipcore.data.metrics import evaluate
+from lipcore.data.samples import Array, Samples
+from lipcore.fitting.estimators import check_estimator
+from lipcore.fitting.options import FitOptions
+from lipcore.robots.library import Robot, load_robot
+from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
+from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import JointType
 
 FIRST_TEST_SEED = 1000
@@ -44,7 +44,7 @@ class Cell(BaseModel):
 
 
 class TestResult(BaseModel):
-    """Figures of one test set, one number a joint; coverage and width one list for each of lipcore.metrics.LEVELS.
+    """Figures of one test set, one number a joint; coverage and width one list for each of data.metrics.LEVELS.
 
     nmse is against the simulator's torque without noise, nmse_noisy against the measured one; torque_std, N·m, is the
     standard deviation of the former.

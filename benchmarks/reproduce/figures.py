@@ -11,8 +11,8 @@ import numpy as np
 
 from benchmarks.reproduce import table
 from benchmarks.reproduce.report import Run
-from lipcore.metrics import RELIABILITY_LEVELS
-from lipcore.samples import Array
+from lipcore.data.metrics import RELIABILITY_LEVELS
+from lipcore.data.samples import Array
 
 COLOURS = {
     "se": "#999999",

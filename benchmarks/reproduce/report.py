@@ -14,8 +14,8 @@ import numpy as np
 from benchmarks.reproduce import table
 from benchmarks.reproduce.experiment import YARDSTICK, CellResult, Experiment
 from benchmarks.reproduce.table import Row, Summary
-from lipcore.samples import Array
-from lipcore.simulation import FUNDAMENTAL, MIDDLE_AMPLITUDE
+from lipcore.data.samples import Array
+from lipcore.robots.simulation import FUNDAMENTAL, MIDDLE_AMPLITUDE
 
 _PACKAGES = ("lipserve", "numpy", "scipy", "torch", "numba", "pin", "example-robot-data", "matplotlib")
 

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.reproduce.experiment import CellResult
-from lipcore.metrics import LEVELS
-from lipcore.samples import Array
+from lipcore.data.metrics import LEVELS
+from lipcore.data.samples import Array
 
 
 class Row(NamedTuple):

@@ -22,7 +22,7 @@ from benchmarks.scale import plan, streams
 from benchmarks.scale.engines import Engines, eventually, ready, stored
 from benchmarks.scale.part import Part
 from benchmarks.scale.replicas import LEARNING, MODEL
-from lipcore.samples import Samples
+from lipcore.data.samples import Samples
 from service.cli.demo import ServiceProcess
 from service.client import Client
 from service.client.stream import StreamClient

@@ -24,7 +24,7 @@ from benchmarks.scale.engines import Engines, eventually, ready
 from benchmarks.scale.part import Part
 from benchmarks.scale.replicas import LEARNING, MODEL
 from benchmarks.workload import BenchError
-from lipcore.samples import Samples
+from lipcore.data.samples import Samples
 from service.cli.demo import ServiceProcess
 from service.client import ApiError, Client
 from service.foundation.states import ACTIVE, SUCCEEDED

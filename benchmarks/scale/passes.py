@@ -21,9 +21,9 @@ from benchmarks.latency.targets import Target
 from benchmarks.scale import streams
 from benchmarks.scale.engines import Engines
 from benchmarks.scale.part import Part
-from lipcore.compact.summing import Summing
-from lipcore.conditioning import SHARD, Told, told
-from lipcore.samples import Samples
+from lipcore.data.samples import Samples
+from lipcore.posterior.summing import Summing
+from lipcore.training.conditioning import SHARD, ShardStatistics, sum_samples
 from service.compute import executors
 from service.compute.executors import Processes
 from service.compute.shards import summed
@@ -48,12 +48,12 @@ class Shard:
     last: int
 
 
-def work(shard: Shard) -> Told:
+def work(shard: Shard) -> ShardStatistics:
     """What the rows of a shard tell of the model."""
     folder, rows = Path(shard.recording), slice(shard.first, shard.last)
     arrays = {name: np.array(np.load(folder / f"{name}.npy", mmap_mode="r")[rows]) for name in NAMES}
     summing, names = _summing(shard.model)
-    return told(summing, Samples(names, **arrays), None)
+    return sum_samples(summing, Samples(names, **arrays), None)
 
 
 @cache

@@ -19,7 +19,7 @@ from benchmarks.online.sending import batch_request, send
 from benchmarks.scale import streams
 from benchmarks.scale.engines import Engines, eventually, ready
 from benchmarks.scale.part import Part
-from lipcore.samples import Samples
+from lipcore.data.samples import Samples
 from service.client import ApiError, Client
 
 NAME = "replicas"

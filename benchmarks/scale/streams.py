@@ -9,9 +9,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from lipcore.robots import Robot, load_robot
-from lipcore.samples import Samples
-from lipcore.simulation import Stream, simulate
+from lipcore.data.samples import Samples
+from lipcore.robots.library import Robot, load_robot
+from lipcore.robots.simulation import Stream, simulate
 
 ROBOT = "panda"
 SPEED, NOISE, VISCOUS, COULOMB = 5.0, 0.05, 0.5, 0.3

@@ -15,9 +15,9 @@ from benchmarks.online.bed import Bed
 from benchmarks.online.scene import rows_of
 from benchmarks.online.sending import batch_request, send
 from benchmarks.soak.connections import BATCH_ROWS, TAUGHT, Log, stream_of
-from lipcore.model import TorqueModel
+from lipcore.data.samples import Array, Samples
+from lipcore.model.torque_model import TorqueModel
 from lipcore.online.learner import OnlineModel
-from lipcore.samples import Array, Samples
 from service.client import Client
 
 _PAGE = 100

@@ -9,7 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 
 from benchmarks.soak.connections import Connection, Expected, Log, Observing, Predicting, Streaming, Uploading
-from lipcore.samples import Samples
+from lipcore.data.samples import Samples
 
 PROCESSES = 2
 

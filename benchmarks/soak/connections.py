@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.clients import Address, HttpClient, post
 from benchmarks.online.sending import Ack, batch_request, send
-from lipcore.samples import Array, Samples
+from lipcore.data.samples import Array, Samples
 from service.client.stream import StreamClient
 
 STEADY, TAUGHT = "steady", "taught"

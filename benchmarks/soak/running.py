@@ -24,8 +24,8 @@ from benchmarks.soak.clients import PROCESSES, Mix, Work
 from benchmarks.soak.connections import BATCH_PERIOD, BATCH_ROWS, STEADY, TAUGHT, Expected, Log
 from benchmarks.soak.memory import MemoryWatch
 from benchmarks.timing import Timing
-from lipcore.model import TorqueModel
-from lipcore.samples import Samples
+from lipcore.data.samples import Samples
+from lipcore.model.torque_model import TorqueModel
 from service.learning.schema import LearningOptions
 
 KINDS = ("predict", "stream", "observe", "upload")

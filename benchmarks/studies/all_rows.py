@@ -4,7 +4,7 @@
 
 A simulated arm with friction that no estimator expresses exactly (a jump at zero speed) is learnt from episodes of 50
 seconds, at several rates and for several lengths. Each fit chooses its rows and its basis as a training job does. Then
-the same basis is told of all rows: each counted by the seconds that it stands for (see `lipcore.online.spacing`), and
+the same basis takes in all rows: each counted by the seconds that it stands for (see `data.independence`), and
 each in full. `worth` is the sum of what the rows count by their time. Judged on unseen trajectories of twice the
 bandwidth: nMSE, and coverage of the 95 % interval, noise included, each the mean over joints and trajectories.
 """
@@ -17,9 +17,9 @@ import torch
 
 import lipcore
 from benchmarks.online.scene import Scene
-from lipcore.conditioning import condition
-from lipcore.metrics import evaluate
-from lipcore.online.spacing import weights
+from lipcore.data.independence import stream_weights
+from lipcore.data.metrics import evaluate
+from lipcore.training.conditioning import condition
 
 GRID = ((10.0, 1), (10.0, 2), (100.0, 1), (100.0, 2), (100.0, 4), (100.0, 20), (1000.0, 2))
 """Hz, and episodes of SECONDS."""
@@ -54,7 +54,7 @@ def main() -> None:
                 samples = lipcore.Samples.concatenate(parts)
                 few = np.linspace(0, len(samples) - 1, min(len(samples), CANDIDATES)).round().astype(np.int64)
                 chosen = lipcore.train(samples.rows(few), scene.arm.joint_types, "lip-chain", OPTIONS)
-                weight = np.concatenate([weights(part.t) for part in parts])
+                weight = np.concatenate([stream_weights(part.t) for part in parts])
                 timed, full = (condition(chosen, samples, each) for each in (weight, None))
                 found = " | ".join(judge(model, unseen) for model in (chosen, timed, full))
                 what = f"{robot}, {speed:g}"

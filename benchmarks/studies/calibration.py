@@ -14,9 +14,9 @@ import numpy as np
 import torch
 
 import lipcore
-from lipcore.robots import Robot, load_robot, pinocchio
-from lipcore.simulation import FAST, Stream, simulate
-from lipcore.urdf import RigidBody
+from lipcore.robots.library import Robot, load_robot, pinocchio
+from lipcore.robots.simulation import FAST, Stream, simulate
+from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import ROBOT_ESTIMATORS
 
 SEEDS, TESTS, SPEEDS, SIZES = (301, 302), 2, (1.0, FAST), (60, 200, 500)

@@ -20,8 +20,8 @@ import torch
 import lipcore
 from lipcore.excitation import Belief, Limits, PlanOptions, plan
 from lipcore.profiles import profile
-from lipcore.robots import Robot, load_robot
-from lipcore.simulation import FAST, Stream, inverse_dynamics, sinusoids
+from lipcore.robots.library import Robot, load_robot
+from lipcore.robots.simulation import FAST, Stream, inverse_dynamics, sinusoids
 
 SEEDS = range(101, 106)
 TESTS = range(9001, 9005)

@@ -15,9 +15,9 @@ import torch
 
 import lipcore
 from benchmarks.online.scene import Scene, rows_of
-from lipcore.metrics import evaluate
+from lipcore.data.independence import stream_weights
+from lipcore.data.metrics import evaluate
 from lipcore.online.learner import OnlineModel
-from lipcore.online.spacing import weights
 
 RATES = (1000.0, 100.0, 50.0, 20.0, 10.0, 5.0)
 OPTIONS = lipcore.FitOptions(max_inducing_outputs=500, starts=1, max_iterations=80)
@@ -43,7 +43,7 @@ def main() -> None:
         base = lipcore.train(scene.history(100, 10), scene.arm.joint_types, "lip-chain", OPTIONS)
         live, change = rows_of(scene.live()), round(scene.change_at * scene.rate)
         for rate in RATES:
-            rows, found = replace(live, weight=weights(live.time, rate=rate)), []
+            rows, found = replace(live, weight=stream_weights(live.time, rate=rate)), []
             online = OnlineModel.start(base, FORGETTING)
             for first in range(0, len(rows), BLOCK):
                 if first == change:

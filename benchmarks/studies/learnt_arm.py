@@ -19,16 +19,17 @@ import torch
 from threadpoolctl import threadpool_limits
 
 import lipcore
-from lipcore import FitOptions, model
-from lipcore.arm.learning import POLISHING, make_problem
+from lipcore import FitOptions
+from lipcore.arm.learning import POLISHING
+from lipcore.arm.posing import make_problem
+from lipcore.data.metrics import evaluate
+from lipcore.data.motion import motion_arrays
+from lipcore.data.samples import Samples
 from lipcore.kernels.geometry import Geometry
-from lipcore.metrics import evaluate
-from lipcore.motion import motion_arrays
-from lipcore.random_arms import random_arm
-from lipcore.robots import Robot, load_robot, pinocchio
-from lipcore.samples import Samples
-from lipcore.selection import spread_out
-from lipcore.simulation import Stream, inverse_dynamics, simulate
+from lipcore.posterior.selection import spread_out
+from lipcore.robots.library import Robot, load_robot, pinocchio, random_arm
+from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
+from lipcore.training import auto, fit
 
 ROWS = (
     ("panda", 1.0, "middle", 500),
@@ -138,7 +139,7 @@ def answer() -> None:
 def main() -> None:
     """Run what is asked for."""
     torch.set_num_threads(1)
-    model.known_geometries = lambda types, gravity: ()  # type: ignore[assignment]
+    fit.known_geometries = auto.known_geometries = lambda types, gravity: ()  # type: ignore[assignment]
     what, numbers = sys.argv[1], [int(each) for each in sys.argv[2:]]
     with threadpool_limits(1):
         if what == "answer":

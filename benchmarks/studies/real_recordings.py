@@ -18,13 +18,13 @@ import torch
 from rosbags.typesys import Stores, get_typestore
 
 import lipcore
-from lipcore.arm.warning import warnings
-from lipcore.estimators import ESTIMATORS
-from lipcore.metrics import evaluate
-from lipcore.parameters import report
-from lipcore.samples import Array, Samples
-from lipcore.signals import differentiate, low_pass
-from lipcore.urdf import RigidBody
+from lipcore.data.metrics import evaluate
+from lipcore.data.samples import Array, Samples
+from lipcore.data.signals import differentiate, low_pass
+from lipcore.fitting.estimators import ESTIMATORS
+from lipcore.model.parameters import report
+from lipcore.model.warnings import warnings
+from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import AUTO
 
 PANDA_RATE, UR10_RATE, SHARE = 30.0, 125.0, 0.7

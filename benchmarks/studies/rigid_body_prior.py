@@ -10,10 +10,10 @@ import torch
 from calibration import randomised
 
 import lipcore
-from lipcore.metrics import evaluate
-from lipcore.robots import load_robot
-from lipcore.simulation import FAST, Stream, inverse_dynamics, simulate
-from lipcore.urdf import RigidBody
+from lipcore.data.metrics import evaluate
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import FAST, Stream, inverse_dynamics, simulate
+from lipcore.robots.urdf import RigidBody
 
 SEEDS, TESTS, STRIDE = range(1, 6), range(1001, 1005), 5
 

@@ -4,9 +4,9 @@ import numpy as np
 import torch
 
 import lipcore
-from lipcore.metrics import evaluate
-from lipcore.robots import load_robot
-from lipcore.simulation import FAST, Stream, simulate
+from lipcore.data.metrics import evaluate
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import FAST, Stream, simulate
 
 SEEDS, TESTS = (11, 12, 13), (2001, 2002)
 TRAINING = {"slow only": (1.0,), "slow and fast": (1.0, FAST)}

@@ -12,30 +12,22 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from lipcore import noise
-from lipcore.arm.problem import Expected, Point, Problem, root_of
-from lipcore.arm.recording import residual_correlation
+from lipcore.arm.posing import make_problem, mode_of, with_samples, with_stribeck
+from lipcore.arm.problem import Point, Problem, root_of
 from lipcore.arm.scales import rescale
-from lipcore.arm.search import Found, Pool, search
-from lipcore.fit_options import FitOptions
-from lipcore.fitting import Cancelled, FitCancelledError, FitProgress, Progress
-from lipcore.kernels.arm_prior import (
-    Alternative,
-    Arm,
-    arm_of_robot,
-    chain,
-    in_chain,
-    unit_anywhere,
-    widths_of,
-)
+from lipcore.arm.search import Pool, SearchResult, search
+from lipcore.data.independence import residual_correlation
+from lipcore.data.samples import Samples
+from lipcore.data.signals import noise_level
+from lipcore.fitting import noise
+from lipcore.fitting.hyperparameters import FitCancelledError, FitProgress
+from lipcore.fitting.task import Task
+from lipcore.kernels.arm_prior import Alternative, Arm
 from lipcore.kernels.compiled.arm import PARAMETERS
-from lipcore.kernels.friction import FRICTION_TERMS, friction_features
+from lipcore.kernels.friction import FRICTION_TERMS
 from lipcore.kernels.geometry import Geometry
-from lipcore.samples import Array, Samples
-from lipcore.selection import spread_out
-from lipcore.signals import noise_level
-from lipcore.urdf import RigidBody
-from lipcore.vocabulary import GeometryMode, JointType
+from lipcore.posterior.selection import spread_out
+from lipcore.vocabulary import GeometryMode
 
 SEARCH_ROWS, ROWS_PER_JOINT = 80, 10
 """Rows that the search looks at: at least the first, and this many a joint."""
@@ -69,69 +61,57 @@ class Learnt:
 
 
 def learn(
-    samples: Samples,
-    joint_types: tuple[JointType, ...],
-    options: FitOptions,
-    gravity: bool = True,
-    robot: RigidBody | None = None,
+    task: Task,
     known: Sequence[Geometry] = (),
-    on_progress: Progress | None = None,
-    cancelled: Cancelled | None = None,
-    stretches: Samples | None = None,
     begin: Sequence[Geometry] = (),
     seed: int = 0,
 ) -> Learnt:
-    """Learn the arm that moved so.
+    """Learn the arm that moved as the samples of a task say.
 
-    gravity: whether torques contain it; robot: a URDF's bodies, which geometry and masses are expected around, as
-    `options.geometry` and `options.prior` say; known: geometries to look at, too, where none is given; stretches:
-    contiguous samples that tell the white noise, where `samples` are thinned; begin: geometries from base to tip that
-    other samples of the same arm have told, which are followed from there, without a search; seed: of the search.
+    task.robot: a URDF's bodies, which geometry and masses are expected around, as `options.geometry` and
+    `options.prior` say; known: geometries that a search looks at, too, where no URDF is given; begin: geometries from
+    base to tip that other samples of the same arm have led to, which are followed from there, without a search; seed:
+    of the search.
 
-    Raise FitCancelledError when `cancelled` answers true, ValueError for samples that no arm can be learnt from.
+    Raise FitCancelledError when `task.cancelled` answers true, ValueError for samples that no arm can be learnt from.
     """
     with threadpool_limits(1):  # matrices are small: more threads would take longer
-        watch = _Watch(on_progress, cancelled, time.monotonic(), options.max_iterations)
-        mode = mode_of(options, robot)
+        samples, options = task.samples, task.options
+        watch = _Watch(task, time.monotonic())
+        mode = mode_of(options, task.robot)
         rows = spread_out(samples.motion(), options.posterior_samples).numpy()
-        problem, order = make_problem(samples.rows(rows), joint_types, options, gravity, robot, samples)
-        found: Found | None = None
+        chosen = samples.rows(rows)
+        problem, order = make_problem(chosen, task.joint_types, options, task.gravity, task.robot, samples)
+        result: SearchResult | None = None
         if mode == "learn" and not begin:
-            few = spread_out(samples.rows(rows).motion(), max(SEARCH_ROWS, ROWS_PER_JOINT * len(joint_types)))
-            types = tuple(joint_types[joint] for joint in order)
-            signals = samples if stretches is None else stretches
-            sensor = noise_level([signals.tau[part][:, order] for part in signals.episodes()])
-            found = search(
-                problem.rows(few.numpy()), types, gravity, sensor, options.search_seconds, seed, known, watch.searching
-            )
-            starts = [(each.geometry, each.sigma) for each in found.points[:POLISHED]]
+            result = _search(task, problem, order, chosen, known, seed, watch)
+            starts = [(each.geometry, each.sigma) for each in result.points[:POLISHED]]
         else:
-            if robot is not None and (mode == "fixed" or not begin):
-                begin = [Geometry.from_robot(robot, gravity)]
+            if task.robot is not None and (mode == "fixed" or not begin):
+                begin = [Geometry.from_robot(task.robot, task.gravity)]
             starts = [(each, noise.start(samples)[order]) for each in begin]
         polished = Pool(problem.recombined(CHECKS))
         for geometry, sigma in starts:
             polished.add(problem.descend(geometry, sigma, POLISHING, watch.stop))
         ends = polished.points
         watch.step("hyperparameters", ends[0].value, 0.85)
-        contiguous = (samples if stretches is None else stretches).rows(slice(0, CORRELATED))
-        every, _ = make_problem(contiguous, joint_types, options, gravity, robot)
-        residual = every.tau - every.features(ends[0].geometry) @ (problem.weights(ends[0]) / every.scale)
-        correlation = residual_correlation(residual, contiguous)
+        contiguous = task.signals.rows(slice(0, CORRELATED))
+        recorded = with_samples(problem, contiguous, order)
+        correlation = residual_correlation(recorded.tau - recorded.mean(ends[0]), contiguous)
         weight = min(1.0, len(samples) / correlation / len(rows))
         problem = replace(problem, counts=np.full(len(rows), weight))
         ends = sorted((problem.at(each.geometry, each.sigma) for each in ends), key=lambda each: each.value)
         best, others, problem, stribeck_nats = _refined(problem, ends, watch)
         watch.step("posterior", best.value, 0.95)
         report: dict[str, float | int | bool | str] = {"geometry": mode, "search_objective": ends[0].value}
-        if found is not None:
-            report |= _search_report(found, ends, others)
+        if result is not None:
+            report |= _search_report(result, ends, others)
         report |= {
             "objective": best.value,
-            "friction_terms": _terms(problem),
+            "friction_terms": problem.friction_terms,
             "stribeck_nats": stribeck_nats,
             "iterations": watch.iteration,
-            "converged": found is None or found.ended == "idle",
+            "converged": result is None or result.ended == "idle",
             "samples_given": len(samples),
             "samples_hyperparameters": len(rows),
             "samples_posterior": len(rows),
@@ -143,83 +123,28 @@ def learn(
         return Learnt(arm, params, rows, weight, report)
 
 
-def mode_of(options: FitOptions, robot: RigidBody | None) -> GeometryMode:
-    """How the geometry is to be come by; raise ValueError where that needs a robot and there is none."""
-    if options.geometry == "auto":
-        return "learn" if robot is None else "calibrate"
-    if robot is None and options.geometry != "learn":
-        raise ValueError(f"geometry is {options.geometry!r}, which needs a robot: a profile such as panda, or a URDF")
-    return options.geometry
-
-
-def make_problem(
+def _search(
+    task: Task,
+    problem: Problem,
+    order: NDArray[np.int64],
     samples: Samples,
-    joint_types: Sequence[JointType],
-    options: FitOptions,
-    gravity: bool,
-    robot: RigidBody | None = None,
-    every: Samples | None = None,
-) -> tuple[Problem, NDArray[np.int64]]:
-    """What samples ask of an arm, base to tip, and the data's joint at each place of the chain.
-
-    every: all samples, which tell how large torques and noise are; `samples` where None.
-    """
-    mode, n, every = mode_of(options, robot), samples.n_joints, samples if every is None else every
-    order = chain(robot, n)
-    tau = in_chain(samples.tau, order)
-    usual = np.sqrt(np.mean(every.tau**2, axis=0))[order]
-    floor, start = noise.floor(every)[order], noise.start(every)[order]
-    motions = np.stack([in_chain(part, order) for part in (samples.q, samples.dq, samples.ddq)], axis=1)
-    speed = np.maximum(np.sqrt(np.mean(every.dq**2, axis=0))[order], 1e-3)
-    # friction's weights of a joint, as large as its torque
-    friction = np.stack([usual / speed, usual, usual], axis=1).reshape(-1) + floor.repeat(len(FRICTION_TERMS))
-    anywhere = unit_anywhere(float(usual.max()), n)
-    body, centre = anywhere, np.zeros((n, PARAMETERS))
-    if robot is not None and mode != "learn":
-        arm = arm_of_robot(robot, gravity, options.prior)
-        masses, rotors = arm.unit[: PARAMETERS * n].reshape(n, -1), arm.unit[PARAMETERS * n :]
-        body, centre = np.concatenate([masses[order].reshape(-1), rotors[order]]), arm.centre
-    types = tuple(joint_types[joint] for joint in order)
-    return (
-        Problem(
-            np.ascontiguousarray(motions),
-            tau,
-            np.ones(len(samples)),
-            _friction(motions[:, 1]),
-            np.concatenate([centre.reshape(-1), np.zeros(n + len(friction))]),
-            np.concatenate([body, friction]),
-            start,
-            floor,
-            _expected(types, gravity, robot, mode),
-        ),
-        order,
-    )
-
-
-def _expected(
-    types: tuple[JointType, ...], gravity: bool, robot: RigidBody | None, mode: GeometryMode
-) -> Expected | None:
-    if mode == "fixed":
-        return None
-    if mode == "calibrate" and robot is not None:
-        around = Geometry.from_robot(robot, gravity)
-        return Expected(widths_of(around), around)
-    n = len(types)
-    any_arm = Geometry(
-        types,
-        np.tile(np.eye(3), (n, 1, 1)),
-        np.zeros((n, 3)),
-        np.tile([0.0, 0.0, 1.0], (n, 1)),
-        np.array([0.0, 0.0, -1.0 if gravity else 0.0]),
-    )
-    return Expected.anything(any_arm)
+    known: Sequence[Geometry],
+    seed: int,
+    watch: _Watch,
+) -> SearchResult:
+    """Search for the geometry on a few of the rows `samples` of a problem."""
+    types = tuple(task.joint_types[joint] for joint in order)
+    few = spread_out(samples.motion(), max(SEARCH_ROWS, ROWS_PER_JOINT * len(types)))
+    sensor = noise_level([task.signals.tau[part][:, order] for part in task.signals.episodes()])
+    seconds = task.options.search_seconds
+    return search(problem.rows(few.numpy()), types, task.gravity, sensor, seconds, seed, known, watch.searching)
 
 
 def _refined(problem: Problem, ends: Sequence[Point], watch: _Watch) -> tuple[Point, list[Point], Problem, float]:
     """Scales, noise and geometry of the best end, with friction's fourth term where the evidence wants it; then what
     becomes of the other ends with the same scales; last how many nats that term gains."""
     best, problem = _in_turn(problem, ends[0], ROUNDS, 0.85, watch)
-    wider = _with_stribeck(problem)
+    wider = with_stribeck(problem)
     start = wider.at(best.geometry, best.sigma)
     gain = rescale(problem, best).value - rescale(wider, start).value
     if gain > STRIBECK_NATS:
@@ -242,25 +167,6 @@ def _in_turn(problem: Problem, point: Point, rounds: int, fraction: float, watch
         point = problem.descend(point.geometry, scaled.sigma, ROUND_STEPS, watch.stop, noise=False)
         watch.step("hyperparameters", point.value, fraction + 0.02 * number)
     return point, problem
-
-
-def _with_stribeck(problem: Problem) -> Problem:
-    """The same with friction's fourth term, whose weights may be as large as a joint's torque, like the Coulomb ones
-    before their scale was fitted."""
-    n = problem.n_joints
-    first, usual = (PARAMETERS + 1) * n, np.sqrt(np.mean(problem.tau**2, axis=0)) + problem.floor
-    scale = np.concatenate([problem.scale[first:].reshape(n, -1), usual[:, None]], axis=1)
-    return replace(
-        problem,
-        friction=_friction(problem.motions[:, 1], stribeck=True),
-        centre=np.concatenate([problem.centre[:first], np.zeros(scale.size)]),
-        scale=np.concatenate([problem.scale[:first], scale.reshape(-1)]),
-    )
-
-
-def _terms(problem: Problem) -> int:
-    """Terms of a joint's friction, f."""
-    return int(problem.friction.shape[2]) // problem.n_joints
 
 
 def _arm(
@@ -286,7 +192,7 @@ def _arm(
         unit,
         np.zeros(0) if expected is None else expected.step(best.geometry),
         np.zeros(0) if expected is None else expected.widths,
-        _terms(problem) > len(FRICTION_TERMS),
+        problem.friction_terms > len(FRICTION_TERMS),
     )
     differing = [each for each in others if _differs(problem, best, each)]
     if not differing:
@@ -321,15 +227,17 @@ def _differs(problem: Problem, best: Point, other: Point) -> bool:
     return bool(np.any(np.sqrt(np.mean((means[0] - means[1]) ** 2, axis=0)) > DIFFERS * stated))
 
 
-def _search_report(found: Found, ends: Sequence[Point], others: Sequence[Point]) -> dict[str, float | int | bool | str]:
+def _search_report(
+    result: SearchResult, ends: Sequence[Point], others: Sequence[Point]
+) -> dict[str, float | int | bool | str]:
     report: dict[str, float | int | bool | str] = {
-        "search_starts": found.starts,
-        "search_hops": found.hops,
-        "search_optima": found.distinct,
-        "search_times_best": found.times_best,
-        "search_explained": found.explained,
-        "search_ended": found.ended,
-        "search_seconds": found.seconds,
+        "search_starts": result.starts,
+        "search_hops": result.hops,
+        "search_optima": result.distinct,
+        "search_times_best": result.times_best,
+        "search_explained": result.explained,
+        "search_ended": result.ended,
+        "search_seconds": result.seconds,
         "search_alternatives": len(others),
     }
     if len(ends) > 1:
@@ -337,36 +245,25 @@ def _search_report(found: Found, ends: Sequence[Point], others: Sequence[Point])
     return report
 
 
-def _friction(dq: Array, stribeck: bool = False) -> Array:
-    """Friction's features of N velocities (N, n), joint by joint: (N, n, f n)."""
-    size, n = dq.shape
-    features = friction_features(torch.from_numpy(np.ascontiguousarray(dq)), stribeck).numpy()  # (f, N, n)
-    out = np.zeros((size, n, n, len(features)))
-    joints = np.arange(n)
-    out[:, joints, joints] = features.transpose(1, 2, 0)
-    return out.reshape(size, n, -1)
-
-
-@dataclass
 class _Watch:
-    """Progress and cancellation."""
+    """Progress and cancellation of a task."""
 
-    on_progress: Progress | None
-    cancelled: Cancelled | None
-    began: float
-    most: int
-    iteration: int = 0
+    def __init__(self, task: Task, began: float) -> None:
+        self.task, self.began, self.iteration = task, began, 0
 
     def step(self, stage: str, objective: float, fraction: float) -> None:
+        """Report a step; raise FitCancelledError where the caller asks to stop."""
         self.iteration += 1
         if self.stop():
             raise FitCancelledError("the fit was cancelled")
-        if self.on_progress is not None:
-            elapsed = time.monotonic() - self.began
-            self.on_progress(FitProgress(stage, self.iteration, self.most, objective, fraction, elapsed))
+        if self.task.on_progress is not None:
+            most, elapsed = self.task.options.max_iterations, time.monotonic() - self.began
+            self.task.on_progress(FitProgress(stage, self.iteration, most, objective, fraction, elapsed))
 
     def searching(self, objective: float, fraction: float) -> None:
+        """Report a step of the search, which takes most of the time."""
         self.step("geometry", objective, 0.8 * min(fraction, 1.0))
 
     def stop(self) -> bool:
-        return self.cancelled is not None and self.cancelled()
+        """Whether the caller asks to stop."""
+        return self.task.cancelled is not None and self.task.cancelled()

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.linalg import LinAlgError
 from scipy.linalg import cho_solve, lapack, solve_triangular
 
+from lipcore.data.samples import Array
 from lipcore.kernels.compiled.arm import PARAMETERS, arm_masses, arm_shapes
 from lipcore.kernels.geometry import Geometry
-from lipcore.samples import Array
 
 ANGLE, LENGTH = 1.0, 0.5
 """Prior widths of a geometry that nothing is known of, rad and m."""
@@ -44,7 +44,7 @@ class Expected:
 
     @classmethod
     def anything(cls, geometry: Geometry) -> Expected:
-        """Nothing is known."""
+        """Nothing is known but the joints: axes point anywhere, and lie within some 0.5 m of the frame before."""
         return cls(np.where(geometry.turns, ANGLE, LENGTH))
 
     def step(self, geometry: Geometry) -> Array:
@@ -52,7 +52,7 @@ class Expected:
         return -geometry.shifts() if self.around is None else geometry.towards(self.around)
 
     def value(self, geometry: Geometry) -> float:
-        """−log of the prior's density, without its constant."""
+        """−log of the prior's density at a geometry, nats, without its constant."""
         return 0.5 * float(np.sum((self.step(geometry) / self.widths) ** 2))
 
 
@@ -74,7 +74,7 @@ class Problem:
     """Samples that a geometry is to explain.
 
     motions: (N, 3, n), q, dq and ddq from base to tip; tau: (N, n); counts: (N,), independent samples that a row stands
-    for; friction: (N, n, f), its features; centre, scale: (k,), μ and s of w; noise: (n,), where its prior lies;
+    for; friction: (N, n, f n), its features; centre, scale: (k,), μ and s of w; noise: (n,), where its prior lies;
     floor: (n,), the smallest admitted; expected: prior of the geometry,
     None where it is fixed.
     """
@@ -94,8 +94,13 @@ class Problem:
         """Number of joints n."""
         return int(self.tau.shape[1])
 
+    @property
+    def friction_terms(self) -> int:
+        """Terms of a joint's friction: f = 3, or 4 with more friction at low speed."""
+        return int(self.friction.shape[2]) // self.n_joints
+
     def rows(self, rows: Array) -> Problem:
-        """The same with some of the samples."""
+        """The same with some of the samples. rows: their indices, or (N,) whether each is kept."""
         kept = {name: getattr(self, name)[rows] for name in ("motions", "tau", "counts", "friction")}
         return replace(self, **kept)
 
@@ -122,7 +127,7 @@ class Problem:
         return np.ascontiguousarray(self.weights(point)[: PARAMETERS * n].reshape(n, PARAMETERS))
 
     def features(self, geometry: Geometry) -> Array:
-        """Features of w, in units of s: (N, n, k)."""
+        """Features Φ of w at a geometry, in units of s: (N, n, k) (eq. 12 of docs/method.md)."""
         size, n = self.tau.shape
         out = np.empty((size, n, len(self.scale)))
         masses = np.empty((size, PARAMETERS * n, n))
@@ -146,7 +151,11 @@ class Problem:
         return out.transpose(0, 2, 1)
 
     def at(self, geometry: Geometry, sigma: Array, features: Array | None = None) -> Point:
-        """The evidence of a geometry and of a noise, (n,); raise LinAlgError where it cannot be computed."""
+        """The evidence of a geometry and of a noise (eq. 18 of docs/method.md), with its priors.
+
+        sigma: (n,) N·m; features: those of `features`, where they are known. Raise LinAlgError where it cannot be
+        computed.
+        """
         features = self.features(geometry) if features is None else features
         scaled, target = self._scaled(features, sigma)
         precision = scaled.T @ scaled
@@ -225,7 +234,10 @@ class Problem:
         return np.concatenate([self.features(point.geometry), self.shapes(point)], axis=2)
 
     def normal(self, point: Point) -> tuple[Array, Array, int]:
-        """Normal equations of (w, θ): precision, right-hand side, and where θ begins."""
+        """Normal equations of (w, θ), undamped (eq. 19 of docs/method.md).
+
+        Return the precision (k + g, k + g), the right-hand side (k + g,), and k, where θ begins.
+        """
         k = len(self.scale)
         both = np.concatenate([point.features, self.shapes(point)], axis=2)
         scaled, _ = self._scaled(both, point.sigma)

@@ -18,9 +18,9 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from lipcore.arm.problem import NOISE_WIDTH, Point, Problem, root_of
+from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import KINDS
 from lipcore.kernels.compiled.arm import PARAMETERS
-from lipcore.samples import Array
 
 WIDTH = 2.0
 """Prior width of each logarithm's parts: a factor of seven either way within one deviation."""
@@ -31,7 +31,7 @@ BODY_KINDS = 3
 
 @dataclass(frozen=True)
 class Scaled:
-    """problem: the same with the deviations found; sigma: (n,) noise std, N·m; value: −log evidence, nats."""
+    """problem: with the deviations of largest evidence; sigma: (n,) noise std, N·m; value: −log evidence, nats."""
 
     problem: Problem
     sigma: Array
@@ -39,7 +39,10 @@ class Scaled:
 
 
 def rescale(problem: Problem, point: Point) -> Scaled:
-    """Maximise the evidence over noise and prior deviations around a point; raise LinAlgError where it has none."""
+    """Maximise the evidence over noise and prior deviations around a point (eq. 20 of docs/method.md).
+
+    Raise LinAlgError where there is no evidence.
+    """
     from scipy.optimize import minimize  # noqa: PLC0415 - serving does without it
 
     n, k = problem.n_joints, len(problem.scale)

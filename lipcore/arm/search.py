@@ -12,8 +12,8 @@ from numpy.linalg import LinAlgError
 
 from lipcore.arm.problem import Point, Problem
 from lipcore.arm.starts import draw, hop
+from lipcore.data.samples import Array
 from lipcore.kernels.geometry import Geometry
-from lipcore.samples import Array
 from lipcore.vocabulary import JointType
 
 SCREENED, STARTS = 400, 20
@@ -35,8 +35,8 @@ FAVOUR = 1.5
 
 
 @dataclass(frozen=True)
-class Found:
-    """What a search found: optima, best first, and how.
+class SearchResult:
+    """Where a search ended: optima, best first, and how.
 
     points: up to KEPT distinct optima; starts, hops: descents; distinct: optima seen that differ by more than SAME;
     times_best: descents that ended in the best; explained: whether its residuals look like the sensor's noise;
@@ -62,11 +62,11 @@ def search(
     seed: int = 0,
     known: Sequence[Geometry] = (),
     step: Callable[[float, float], None] | None = None,
-) -> Found:
+) -> SearchResult:
     """Find the geometry of the best evidence; `problem` holds few rows, some eighty.
 
     sensor_noise: (n,) N·m, what the signals say of their white noise; seconds: time limit; known: geometries to begin
-    from, too; step: told the best value and the fraction of the work after each descent, may raise to end it all.
+    from, too; step: called with the best value and the fraction of the work after each descent, may raise to end it.
     Raise LinAlgError where no start has an evidence.
     """
     rng = np.random.default_rng(seed)
@@ -107,7 +107,7 @@ def search(
         if step is not None:
             step(pool.best, 0.4 + 0.6 * max(quiet / IDLE, (time.monotonic() - began) / seconds))
     best = pool.points[0]
-    return Found(
+    return SearchResult(
         tuple(pool.points),
         starts,
         hops,
@@ -141,7 +141,7 @@ class Pool:
         return len(self.ends) + self.failed
 
     def add(self, point: Point) -> None:
-        """Take in the end of a descent."""
+        """Take in the end of a descent, unless a better one of the same arm is there."""
         self.ends.append(point.value)
         torque = self.checks.mean(point)
         for place, (other, its) in enumerate(zip(self.points, self.torques, strict=True)):

@@ -1,13 +1,17 @@
-"""Arms to begin a search from, and arms near another one."""
+"""Arms to begin a search from: drawn, near another one, or installed here."""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
+from lipcore.data.samples import Array
 from lipcore.kernels.geometry import STANDARD_GRAVITY, Geometry, aligned, rotation_of
-from lipcore.samples import Array
+from lipcore.robots.library import ROBOTS, SimulationUnavailableError, installed_profiles
+from lipcore.robots.urdf import JointMismatchError, RigidBody, UrdfError
 from lipcore.vocabulary import JointType
 
 RIGHT_ANGLED = np.array([[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], np.float64)
@@ -21,7 +25,10 @@ HOPS = 7
 
 
 def draw(rng: np.random.Generator, joint_types: tuple[JointType, ...], gravity: bool) -> Geometry:
-    """A random arm with right angles, its first axis mostly upright, sometimes any way."""
+    """A random arm with right angles, its first axis mostly upright, sometimes any way.
+
+    joint_types: (n,), base to tip; gravity: whether torques contain it.
+    """
     n = len(joint_types)
     rotation, translation = np.empty((n, 3, 3)), np.zeros((n, 3))
     for j in range(n):
@@ -42,7 +49,7 @@ def draw(rng: np.random.Generator, joint_types: tuple[JointType, ...], gravity: 
 
 
 def hop(rng: np.random.Generator, geometry: Geometry) -> Geometry:
-    """Another arm near an optimum: one or two joints turned, mirrored, or drawn anew."""
+    """Another arm near an optimum: one or two joints turned, mirrored, reversed, moved, shaken or drawn anew."""
     rotation, translation, n = geometry.rotation.copy(), geometry.translation.copy(), geometry.n_joints
     for j in rng.choice(n, min(int(rng.integers(1, 3)), n), replace=False):
         axis, kind = geometry.axis[j], rng.integers(HOPS)
@@ -74,3 +81,19 @@ def weight(gravity: bool) -> Array:
 def _unit(rng: np.random.Generator) -> Array:
     vector = rng.standard_normal(3)
     return np.asarray(vector / np.linalg.norm(vector))
+
+
+@lru_cache(maxsize=16)
+def known_geometries(joint_types: tuple[JointType, ...], gravity: bool) -> tuple[Geometry, ...]:
+    """Geometries of the robots of ROBOTS with these joints from base to tip; none where no URDFs are installed.
+
+    joint_types: (n,), from base to tip; gravity: whether torques contain it. A robot that is no serial arm of such
+    joints is left out.
+    """
+    geometries = []
+    for name in installed_profiles():
+        joints = ROBOTS[name].free
+        if len(joints) == len(joint_types):
+            with suppress(JointMismatchError, UrdfError, SimulationUnavailableError):
+                geometries.append(Geometry.from_robot(RigidBody.from_profile(name, joints, joint_types), gravity))
+    return tuple(geometries)

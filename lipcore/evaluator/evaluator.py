@@ -9,11 +9,11 @@ from copy import copy
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.motion import Motion
 from lipcore.evaluator.constants import check, lay_out, linear_prior
 from lipcore.kernels.base import LinearKernel, PairKernel, Params
 from lipcore.kernels.compiled.answer import COVARIANCE, MEAN, STD, answer
 from lipcore.kernels.compiled.panels import ROWS, WIDTH
-from lipcore.motion import Motion
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -44,7 +44,7 @@ class Evaluator:
 
     term: the kernel's nonlinear term, None if it has none. params: hyperparameters of all terms. inducing: S samples,
     None without `term`. outputs: (m,), which of their torques, as sample · n + joint. linear: the linear terms in the
-    order of the anchors. weights: (M,). root: Q, (M, M) lower triangular. std_factor: see `calibration`. floor: (n,)
+    order of the anchors. weights: (M,). root: Q, (M, M) lower triangular. std_factor: calibration. floor: (n,)
     (N·m)², none where None.
 
     Safe from several threads, which answer at the same time: compiled code runs without the GIL and every thread has

@@ -1,4 +1,4 @@
-"""How much of a model's variance a motion would take away, and how that changes with the motion.
+"""What is known of a robot's torques before a motion, and how much of the variance that motion would take away.
 
 The variance of a Gaussian process after more samples depends on where they are, not on the torques that come: it is
 known before the robot moves. With k the covariance that a model's posterior (or a prior) gives to torques at two
@@ -8,27 +8,114 @@ Nothing is approximated: X is a few hundred samples at most, of which each stand
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from lipcore.excitation.belief import Belief
-from lipcore.linalg import cholesky
-from lipcore.motion import Motion
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Array, Samples
+from lipcore.excitation.limits import Limits
+from lipcore.excitation.motions import draw
+from lipcore.fitting.estimators import make_estimator
+from lipcore.fitting.hyperparameters import fit
+from lipcore.fitting.options import FitOptions
+from lipcore.kernels.arm_prior import arm_of_robot
+from lipcore.kernels.base import Params, TorqueKernel
+from lipcore.model.torque_model import TorqueModel
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.linalg import cholesky
+from lipcore.robots.library import Robot
+from lipcore.robots.simulation import inverse_dynamics
+from lipcore.robots.urdf import RigidBody
 
 STEP = 1e-6
 """Of finite differences, rad and its rates. Covariances are smooth over far more, all but friction's sign (0.02)."""
 LEAST = 1e-9
 """Share of the variance that rounding may not go below: a logarithm is taken of it."""
+PRIOR_MOTIONS = 80
+"""Motions whose torques, as the URDF has them, tell a prior's hyperparameters."""
+NOISE_SHARE = 0.01
+"""Standard deviation of the noise that is expected, as a share of a joint's torque spread, where none is given."""
+PRIOR_FIT = FitOptions(
+    hyperparameter_samples=PRIOR_MOTIONS, posterior_samples=PRIOR_MOTIONS, max_iterations=60, starts=1, device="cpu"
+)
+"""Short: where hyperparameters start, all motions would seem hopeless, and nothing be gained by choosing one."""
+
+
+@dataclass(frozen=True)
+class Belief:
+    """Gaussian belief of an n-joint robot's torques: a kernel with its hyperparameters, and what a model has learnt.
+
+    noise_variance: (n,) (N·m)² of a measurement. posterior: None before anything was learnt.
+    """
+
+    kernel: TorqueKernel
+    params: Params
+    noise_variance: Tensor
+    posterior: CompactPosterior | None = None
+
+    @classmethod
+    def of_model(cls, model: TorqueModel) -> Belief:
+        """What a trained model believes. Its calibration factor is left out: it widens all deviations alike."""
+        posterior = replace(model.posterior, std_factor=1.0)
+        return cls(posterior.kernel, posterior.params, posterior.noise_variance, posterior)
+
+    @classmethod
+    def prior(
+        cls,
+        robot: Robot,
+        limits: Limits,
+        noise_std: Array | float | None = None,
+        estimator: str | None = None,
+        bodies: RigidBody | None = None,
+        seed: int = 0,
+    ) -> Belief:
+        """What is believed before any data: an estimator with hyperparameters fitted to what the URDF says.
+
+        The URDF need not be right: it tells how large and how smooth torques are, not what they are.
+
+        noise_std: N·m, of all joints or (n,); NOISE_SHARE of the torque's spread by default. bodies: for estimators
+        of rigid bodies. estimator: `rigid-body` with bodies and `lip-chain` without by default.
+        """
+        estimator = estimator or ("lip-chain" if bodies is None else "rigid-body")
+        motion = draw(limits, PRIOR_MOTIONS, seed)
+        tau = inverse_dynamics(robot, motion.q.numpy(), motion.dq.numpy(), motion.ddq.numpy())
+        std = NOISE_SHARE * tau.std(0) if noise_std is None else np.broadcast_to(noise_std, tau.shape[1:])
+        if not (np.isfinite(std).all() and (std > 0).all()):
+            raise ValueError(f"noise_std is {noise_std}, expected positive numbers, one or one a joint")
+        tau += std * np.random.default_rng(seed).standard_normal(tau.shape)
+        t, apart = np.arange(len(motion), dtype=np.float64), np.arange(len(motion), dtype=np.int64)
+        samples = Samples(robot.joint_names, t, apart, motion.q.numpy(), motion.dq.numpy(), motion.ddq.numpy(), tau)
+        kernel = make_estimator(
+            estimator, robot.joint_types, arm=None if bodies is None else arm_of_robot(bodies, mode="calibrate")
+        ).kernel
+        return cls(kernel, fit(kernel, samples, PRIOR_FIT).params, torch.from_numpy(np.square(std)))
+
+    @property
+    def floor(self) -> Tensor:
+        """Variance that the model's answers never fall below, (n,) (N·m)²."""
+        return torch.zeros_like(self.noise_variance) if self.posterior is None else self.posterior.floor
+
+    def cross(self, motion: Motion) -> Tensor:
+        """Prior covariance of what the model is made of with all torques of N motions, (M, N n); M = 0 for a prior."""
+        if self.posterior is None:
+            return torch.zeros((0, len(motion) * self.kernel.n_joints), dtype=torch.float64)
+        return self.posterior.cross(self.kernel, motion)
+
+    @property
+    def root(self) -> Tensor:
+        """Q, (M, M): Q c, of a cross covariance c, has as its square what the model has learnt of those torques."""
+        return torch.zeros((0, 0), dtype=torch.float64) if self.posterior is None else self.posterior.root
 
 
 @dataclass(frozen=True)
 class Information:
     """What a motion would tell of the torques at R reference motions of an n-joint robot.
 
-    learnt: (M, R n), its square is what the model has learnt of the references; now: (R, n) variance there; floor: (n,)
-    that a variance never falls below.
+    belief: what is known before; learnt: (M, R n), its square is what the model has learnt of the references; now: (R,
+    n) variance there, (N·m)²; floor: (n,) that a variance never falls below.
     """
 
     belief: Belief
@@ -52,27 +139,27 @@ class Information:
         """
         belief = self.belief
         own = belief.kernel.symmetric_gram(belief.params, motion)
-        _, told = self._told(own, self._with_reference(motion), belief.root @ belief.cross(motion), repeats)
-        return self._share(self._after(told))
+        _, explained = self._explained(own, self._with_reference(motion), belief.root @ belief.cross(motion), repeats)
+        return self._share(self._after(explained))
 
     def slope(self, motion: Motion, repeats: float = 1.0) -> tuple[float, Motion]:
         """Mean over joints of log `left`, and its derivatives by position, velocity and acceleration, each (N, n).
 
-        With S = k(X, X) + R, D = k(X, r) and α = S⁻¹ D, what is told of r changes by 2 αᵀ dD − αᵀ dS α.
+        With S = k(X, X) + R, D = k(X, r) and α = S⁻¹ D, what X explains of r changes by 2 αᵀ dD − αᵀ dS α.
         """
         belief, kernel, params = self.belief, self.belief.kernel, self.belief.params
         own, other, cross = kernel.gram(params, motion, motion), self._with_reference(motion), belief.cross(motion)
         learnt = belief.root @ cross
-        solved, told = self._told(own, other, learnt, repeats)
-        after = self._after(told)
-        moves = after == self.now - told  # a variance that has reached its floor stays there
+        solved, explained = self._explained(own, other, learnt, repeats)
+        after = self._after(explained)
+        moves = after == self.now - explained  # a variance that has reached its floor stays there
         weight = -torch.where(moves, 1 / after, 0.0).reshape(-1) / after.numel()
         by_other = 2 * solved * weight
         by_own = -(solved * weight) @ solved.T
         by_cross = belief.root.T @ (-2 * learnt @ by_own - self.learnt @ by_other.T)
         size, n = motion.q.shape
         parts = {"q": motion.q, "dq": motion.dq, "ddq": motion.ddq}
-        found = {name: torch.empty_like(part) for name, part in parts.items()}
+        slopes = {name: torch.empty_like(part) for name, part in parts.items()}
         for name, part in parts.items():
             for joint in range(n):
                 moved = part.clone()
@@ -82,14 +169,14 @@ class Information:
                 total = 2 * (by_own * (kernel.gram(params, near, motion) - own)).sum(1)
                 total += (by_other * (self._with_reference(near) - other)).sum(1)
                 total += (by_cross * (belief.cross(near) - cross)).sum(0)
-                found[name][:, joint] = total.reshape(size, n).sum(1) / STEP
-        return float(self._share(after).log().mean()), Motion(**found)
+                slopes[name][:, joint] = total.reshape(size, n).sum(1) / STEP
+        return float(self._share(after).log().mean()), Motion(**slopes)
 
     def _with_reference(self, motion: Motion) -> Tensor:
         """Prior covariance of the motion's torques with those at the references, (N n, R n)."""
         return self.belief.kernel.gram(self.belief.params, motion, self.reference)
 
-    def _told(self, own: Tensor, other: Tensor, learnt: Tensor, repeats: float) -> tuple[Tensor, Tensor]:
+    def _explained(self, own: Tensor, other: Tensor, learnt: Tensor, repeats: float) -> tuple[Tensor, Tensor]:
         """S⁻¹ D, (N n, R n), and the variance that the motion would take away, (R, n), from prior covariances."""
         noise = (self.belief.noise_variance / repeats).repeat(len(own) // len(self.floor))
         factor = cholesky(own - learnt.T @ learnt + torch.diag(noise))
@@ -97,8 +184,8 @@ class Information:
         solved = torch.linalg.solve_triangular(factor.lower.T, whitened, upper=True)
         return solved, whitened.square().sum(0).reshape(self.now.shape)
 
-    def _after(self, told: Tensor) -> Tensor:
-        return torch.maximum(torch.maximum(self.now - told, self.floor), LEAST * self.now)
+    def _after(self, explained: Tensor) -> Tensor:
+        return torch.maximum(torch.maximum(self.now - explained, self.floor), LEAST * self.now)
 
     def _share(self, after: Tensor) -> Tensor:
         """Geometric mean over the references: what is left of the largest variances alone would tell of extremes."""

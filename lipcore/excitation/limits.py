@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.samples import Array
 from lipcore.profiles import Profile
-from lipcore.robots import Robot
-from lipcore.samples import Array
+from lipcore.robots.library import Robot
 from lipcore.vocabulary import JointType
 
 USUAL_SPEED: dict[str, float] = {"revolute": 1.0, "prismatic": 0.2}
@@ -69,7 +69,7 @@ class Limits:
 
     @classmethod
     def of_robot(cls, robot: Robot) -> Limits:
-        """Those of a URDF, which knows no accelerations."""
+        """Those of a URDF's Pinocchio model, which knows no accelerations; usual ones stand in where one is missing."""
         unknown = np.full(robot.n_joints, np.nan)
         torque = np.asarray(robot.model.effortLimit, dtype=np.float64)
         return cls.known(robot.joint_names, robot.joint_types, robot.lower, robot.upper, robot.speed, unknown, torque)

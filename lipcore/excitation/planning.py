@@ -8,17 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lipcore.excitation.belief import Belief
-from lipcore.excitation.information import Information
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Array
+from lipcore.excitation.information import Belief, Information
 from lipcore.excitation.limits import Limits
-from lipcore.excitation.reference import draw
-from lipcore.excitation.searching import INSTANTS, Goal, search
-from lipcore.excitation.series import Series
-from lipcore.excitation.shape import Shape, harmonics
-from lipcore.excitation.torque import TorqueCheck
-from lipcore.motion import Motion
-from lipcore.robots import Robot
-from lipcore.samples import Array
+from lipcore.excitation.motions import Series, Shape, draw, harmonics
+from lipcore.excitation.searching import INSTANTS, Goal, TorqueCheck, search
+from lipcore.robots.library import Robot
 
 
 @dataclass(frozen=True)
@@ -103,7 +99,7 @@ def plan(
     """Search for the motion that leaves least of the variance; equal arguments give equal motions.
 
     What is minimised is the mean logarithm of the share of variance left, over joints and motions all over the limits.
-    robot: for torque limits. on_progress: told iterations and that share (geometric mean).
+    robot: for torque limits. on_progress: called with iterations and that share (geometric mean).
     Raise ValueError where joints differ or no motion keeps the limits.
     """
     options = options or PlanOptions()
@@ -116,12 +112,12 @@ def plan(
     check = TorqueCheck(robot, limits) if robot is not None and np.isfinite(limits.torque).any() else None
     goal = Goal.build(shape, information, check, options.samples)
     until = began + options.budget_s
-    found = search(goal, options.starts, options.iterations, options.seed, until, on_progress)
-    series = shape.series(found.x)
+    result = search(goal, options.starts, options.iterations, options.seed, until, on_progress)
+    series = shape.series(result.x)
     if check is not None:
         series = check.hold(series)
     torque = np.full(limits.n_joints, np.nan) if check is None else check.used(series)
     used = np.vstack([series.used(limits), torque])
     took = time.monotonic() - began
     left = goal.left(series)
-    return Plan(series, limits, options, information, left, used, found.iterations, took, found.out_of_time)
+    return Plan(series, limits, options, information, left, used, result.iterations, took, result.out_of_time)

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.samples import Array
 from lipcore.kernels.compiled.arm_recursion import PARAMETERS
 from lipcore.kernels.geometry import Geometry
-from lipcore.samples import Array
-from lipcore.urdf import RigidBody
+from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import GeometryMode, Prior
 
 KINDS = (0, 1, 1, 1, 2, 2, 2, 2, 2, 2)

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from lipcore.data.motion import Motion
 from lipcore.kernels.compiled.cross import Array, Cross
 from lipcore.kernels.regressor import Regressor
-from lipcore.motion import Motion
 
 Params = Mapping[str, Tensor]
 """Unconstrained hyperparameters by name: logarithms of positive numbers, logits of shares."""

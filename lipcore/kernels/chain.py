@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from lipcore.data.motion import Motion, check_joint_types
 from lipcore.kernels.base import Params, State
 from lipcore.kernels.compiled.chain import chain_cross, chain_gradient, chain_gram, chain_size
 from lipcore.kernels.compiled.kernel import CompiledKernel, Driver
@@ -25,7 +26,6 @@ from lipcore.kernels.energy import potential_blocks, potential_energy_torque
 from lipcore.kernels.polynomial import BaseKernels, Derivatives, base_kernels, chain_sum
 from lipcore.kernels.weights import PRIOR_STD as WEIGHTS_PRIOR_STD
 from lipcore.kernels.weights import initial_weights, velocity_weights
-from lipcore.motion import Motion, check_joint_types
 from lipcore.vocabulary import JointType
 
 SHARE = 2 / 3

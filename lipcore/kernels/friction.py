@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from lipcore.data.motion import Motion
 from lipcore.kernels.base import LinearKernel, Params
 from lipcore.kernels.compiled.friction import friction_rows
 from lipcore.kernels.regressor import Array, Regressor
-from lipcore.motion import Motion
 
 SIGN_WIDTH = 0.02
 """Velocity over which the Coulomb sign turns over, rad/s (m/s): tanh(dq / width) avoids a jump at standstill."""

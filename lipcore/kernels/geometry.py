@@ -18,10 +18,10 @@ from functools import cached_property
 
 import numpy as np
 
+from lipcore.data.motion import check_joint_types
+from lipcore.data.samples import Array
 from lipcore.kernels.compiled.arm_recursion import ACROSS, AXIS, CONSTANTS, KIND, PLACE, SCREWS, TURN
-from lipcore.motion import check_joint_types
-from lipcore.samples import Array
-from lipcore.urdf import RigidBody
+from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import JointType
 
 STANDARD_GRAVITY = 9.81

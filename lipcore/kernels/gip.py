@@ -13,9 +13,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from lipcore.data.motion import Motion, check_joint_types
 from lipcore.kernels.base import PairKernel, Params, State
 from lipcore.kernels.se import independent_blocks, largest_behind, per_joint, power
-from lipcore.motion import Motion, check_joint_types
 from lipcore.vocabulary import JointType
 
 FACTOR_LOGITS = (0.0, -4.0)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from lipcore.data.motion import Motion, check_joint_types
 from lipcore.kernels.base import Params, State
 from lipcore.kernels.compiled.kernel import CompiledKernel, Driver
 from lipcore.kernels.compiled.lip import lip_cross, lip_gradient, lip_gram, lip_size
@@ -18,7 +19,6 @@ from lipcore.kernels.energy import (
 )
 from lipcore.kernels.polynomial import Derivatives, base_kernels, product
 from lipcore.kernels.weights import PRIOR_STD, initial_weights, velocity_weights
-from lipcore.motion import Motion, check_joint_types
 from lipcore.vocabulary import JointType
 
 

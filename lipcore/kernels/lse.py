@@ -23,9 +23,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from lipcore.data.motion import Motion, check_joint_types
 from lipcore.kernels.base import PairKernel, Params, State
 from lipcore.kernels.se import independent_blocks, per_joint, power, spread
-from lipcore.motion import Motion, check_joint_types
 from lipcore.vocabulary import JointType
 
 

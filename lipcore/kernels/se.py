@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from lipcore.data.motion import Motion
 from lipcore.kernels.base import PairKernel, Params, State
-from lipcore.motion import Motion
 
 SPREAD_SHARE = 0.1
 """Smallest spread credited to a joint, relative to that of the joint that moves most: some joints stand still."""

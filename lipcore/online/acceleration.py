@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 
 MIN_RATE = 50.0
 RATE_SLACK = 0.95
@@ -59,7 +59,7 @@ def window(rate: float) -> int:
 
     h is 0.04 s, at least 2 samples. The slope over ±T passes a motion of frequency f with the gain
     3 (sin x − x cos x)/x³ ≈ 1 − x²/10, x = 2π f T, which at T = 0.04 s is 0.994 at 1 Hz, 0.975 at 2 Hz, 0.903 at 4 Hz,
-    1/√2 at 7.2 Hz and 1/2 at 10 Hz. (The zero-phase filter for recordings, lipcore.signals.CUTOFF, is flatter below and
+    1/√2 at 7.2 Hz and 1/2 at 10 Hz. (The zero-phase filter for recordings, data.signals.CUTOFF, is flatter below and
     down to 1/2 at 4 Hz; a local quadratic as narrow as that would lose 4 % at 1 Hz.) White noise σ on dq comes out as
     σ rate √(3/(h (h+1) (2h+1))) ≈ σ √(3/(2 T³ rate)): 4.8 σ/s at 1 kHz, 13 σ/s at 100 Hz, 16 σ/s at 50 Hz.
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.motion import Motion
-from lipcore.samples import Array
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Array
 from lipcore.vocabulary import CODES, LEARNT
 
 
@@ -17,7 +17,7 @@ from lipcore.vocabulary import CODES, LEARNT
 class Rows:
     """N rows of n joints. time: (N,) event time, s; q, dq, ddq, tau: (N, n), SI; code: (N,) uint8 places in CODES.
 
-    weight: (N,) how many independent samples each counts for (see `spacing`), one where not given.
+    weight: (N,) how many independent samples each counts for (see `data.independence`), one where not given.
     """
 
     time: Array

@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from lipcore.data.samples import Array
 from lipcore.online.record import Record, number
-from lipcore.samples import Array
 
 Kind = Literal["sudden", "drift"]
 
@@ -130,9 +130,9 @@ class ChangeDetector:
     alarm: Change | None = None
 
     def step(self, record: Record, at: float) -> tuple[ChangeDetector, Change | None]:
-        """Take in a record whose last row has event time `at`, s; return the detector and the change that it found.
+        """Take in a record whose last row has event time `at`, s; return the detector and the change that it detects.
 
-        Records of up to about 0.5 s are told apart; longer ones are one bucket each. A record that is late counts as of
+        Records of up to about 0.5 s are kept apart; longer ones are one bucket each. A record that is late counts as of
         now. Raise ValueError for other joints than before.
         """
         if not record.rows:
@@ -151,7 +151,7 @@ class ChangeDetector:
         return replace(following, alarm=change), change
 
     def acknowledged(self) -> ChangeDetector:
-        """The detector that takes what came since the last alarm for the new reference."""
+        """The detector that takes what has arrived since the last alarm for the new reference."""
         if not self.alarm:
             return self
         return ChangeDetector(tuple(b for b in self.buckets if b.start >= self.alarm.at), self.open)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from lipcore.vocabulary import CODES, LEARNT
 
 Codes = NDArray[np.uint8]

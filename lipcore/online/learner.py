@@ -11,11 +11,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lipcore.compact.posterior import CompactPosterior
-from lipcore.compact.statistics import Solution, Statistics, add_to, copied, decay, empty, mirror, solve
-from lipcore.model import TorqueModel
+from lipcore.data.samples import Array
+from lipcore.model.torque_model import TorqueModel
 from lipcore.online.batch import Rows
-from lipcore.samples import Array
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.statistics import Solution, Statistics, add_to, copied, decay, empty, mirror, solve
 
 CHUNK = 500
 """Rows whose features are computed together: they take 28 MB at a thousand variables."""
@@ -29,7 +29,7 @@ class ForgottenError(ValueError):
 
 @dataclass(frozen=True)
 class Regime:
-    """What is known of a robot between two changes: a prior N(centre, I) and the sums of what it has told.
+    """What is known of a robot between two changes: a prior N(centre, I) and the sums of its rows since.
 
     begins: event time, s. centre: (M,) whitened variables. The trained version is in the sums of the first regime: as
     samples that say its mean, which is the centre.
@@ -49,12 +49,12 @@ class OnlineModel:
     """A trained version and what it has learnt since; immutable, every method returns another one.
 
     The posterior is a function of the rows learnt, not of their order: a row of event time t counts its own weight (see
-    `spacing`), times exp(−(reference − t) / forgetting_s) where there is forgetting. What is forgotten leaves its mean
-    behind, with the prior's uncertainty: the version as trained where that is forgotten. A change begins a new regime,
-    whose prior has the mean of what was known before and the variance that a robot never seen has.
+    `data.independence`), times exp(−(reference − t) / forgetting_s) where there is forgetting. What is forgotten leaves
+    its mean behind, with the prior's uncertainty: the version as trained where that is forgotten. A change begins a new
+    regime, whose prior has the mean of what was known before and the variance that a robot never seen has.
 
     base: the version as trained; reference: event time, s, that weights refer to, the latest seen; since: when the
-    version's own samples begin to be forgotten, the first row's time unless said; before: the regime before the last
+    version's own samples begin to be forgotten, the first row's time unless given; before: the regime before the last
     change, which late rows of then still reach.
     """
 
@@ -67,16 +67,20 @@ class OnlineModel:
 
     @classmethod
     def start(cls, base: TorqueModel, forgetting_s: float | None = None, since: float | None = None) -> OnlineModel:
-        """Nothing learnt yet; raise ValueError for a wrong forgetting time, or a model that has learnt already."""
+        """A version as trained, with nothing learnt yet.
+
+        forgetting_s: time constant of forgetting, s, None for never; since: event time, s, from which on the version's
+        own samples are forgotten. Raise ValueError for a wrong forgetting time, or a model that has learnt already.
+        """
         _check(forgetting_s)
         statistics = base.posterior.statistics
         if statistics is None:
             raise ValueError("the model has learnt online already, expected one as trained")
         # (I + A) ŵ = b: samples that say ŵ have A ŵ = b − ŵ, and the prior around ŵ gives the rest
         centre = base.posterior.basis.root.T @ base.posterior.weights
-        said = Statistics(statistics.a, statistics.b - centre, 0.0)
+        sums = Statistics(statistics.a, statistics.b - centre, 0.0)
         reference = -math.inf if since is None else since
-        return cls(base, forgetting_s, since, reference, None, Regime(-math.inf, centre, said))
+        return cls(base, forgetting_s, since, reference, None, Regime(-math.inf, centre, sums))
 
     @property
     def samples(self) -> float:
@@ -93,7 +97,7 @@ class OnlineModel:
         """Learn the rows of code 0, in any order; those from before the regime before this one teach nothing more.
 
         own: whether nobody else has these sums (see `detached`), so that they can be added to where they are: the model
-        that this is called of is not to be used again, the last of many is to be made `whole`. The outcome is the same
+        that this is called of is not to be used again, the last of many is to be `symmetrised`. The outcome is the same
         to the last bit. novel: called for the rows as they are learnt, since their features show whether the basis
         covers them.
         """
@@ -128,14 +132,14 @@ class OnlineModel:
         return replace(self, before=self.now, now=fresh)
 
     def with_forgetting(self, forgetting_s: float | None) -> OnlineModel:
-        """Forget otherwise from here on; raise ValueError for a forgetting time that is none."""
+        """Forget otherwise from here on. forgetting_s: s, None for never; raise ValueError unless above zero."""
         _check(forgetting_s)
         return replace(self, forgetting_s=forgetting_s)
 
     def model(self, floor: Array | None = None) -> TorqueModel:
         """Solve for the model that answers. floor: (n,) (N·m)², which its variances are never below."""
         posterior = self.base.posterior
-        found = CompactPosterior.solved(
+        updated = CompactPosterior.solved(
             posterior.kernel,
             posterior.basis,
             self.now.solve(),
@@ -143,10 +147,10 @@ class OnlineModel:
             posterior.std_factor,
             None if floor is None else torch.from_numpy(np.array(floor, np.float64)),
         )
-        return replace(self.base, posterior=found)
+        return replace(self.base, posterior=updated)
 
-    def whole(self) -> OnlineModel:
-        """Return the same model with its sums complete, once it has learnt with `own`."""
+    def symmetrised(self) -> OnlineModel:
+        """Return the same model with both triangles of its sums, once it has learnt with `own`."""
         for regime in (self.now, self.before):
             if regime is not None:
                 mirror(regime.statistics)
@@ -158,7 +162,7 @@ class OnlineModel:
         model = self if own else self.detached()
         for first in range(0, len(rows), CHUNK):
             model = model._add_chunk(rows.take(slice(first, first + CHUNK)), sign, novel)
-        return model if own else model.whole()
+        return model if own else model.symmetrised()
 
     def _add_chunk(self, rows: Rows, sign: float, novel: Novel | None) -> OnlineModel:
         latest = max(self.reference, float(rows.time.max()))
@@ -166,20 +170,20 @@ class OnlineModel:
         current = rows.time >= model.now.begins
         now, before = model.now, model.before
         if current.any():
-            now = replace(now, statistics=model._told(now.statistics, rows.take(current), sign, novel))
+            now = replace(now, statistics=model._summed(now.statistics, rows.take(current), sign, novel))
         if before is not None and (late := ~current & (rows.time >= before.begins)).any():
-            before = replace(before, statistics=model._told(before.statistics, rows.take(late), sign, novel))
+            before = replace(before, statistics=model._summed(before.statistics, rows.take(late), sign, novel))
             now = replace(now, centre=before.solve().mean)
         return replace(model, now=now, before=before)
 
-    def _told(self, statistics: Statistics, rows: Rows, sign: float, novel: Novel | None) -> Statistics:
-        """These statistics, overwritten, with what rows say, or without it."""
+    def _summed(self, statistics: Statistics, rows: Rows, sign: float, novel: Novel | None) -> Statistics:
+        """These statistics, overwritten, with the rows added (sign 1) or taken back (−1)."""
         posterior, motion = self.base.posterior, rows.motion()
         weights = torch.from_numpy(rows.weight)
         if self.forgetting_s is not None:
             weights = weights * torch.from_numpy(np.exp((rows.time - self.reference) / self.forgetting_s))
         residual = torch.from_numpy(rows.tau) - posterior.kernel.mean(motion)
-        features, open_ = posterior.basis.told(motion)
+        features, open_ = posterior.basis.features_and_uncovered(motion)
         if novel is not None:
             novel((open_ > posterior.noise_variance).any(1).numpy())
         return add_to(statistics, features, posterior.noise_variance + open_, residual, weights, sign)

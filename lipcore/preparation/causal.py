@@ -6,11 +6,11 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from lipcore.data.samples import Array
+from lipcore.data.signals import ORDER
 from lipcore.preparation.filtering import QUANTITIES, Read, Work, settle
 from lipcore.preparation.recipe import PreparationError, Recipe
 from lipcore.preparation.resampling import BLOCK, SAME_RATE
-from lipcore.samples import Array
-from lipcore.signals import ORDER
 
 
 class CausalFilter:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lipcore.data.samples import Array
+from lipcore.data.signals import ORDER, differentiate
 from lipcore.preparation.recipe import Form, PreparationError, Recipe
 from lipcore.preparation.resampling import BLOCK, SAME_RATE
-from lipcore.samples import Array
-from lipcore.signals import ORDER, differentiate
 
 QUANTITIES = ("q", "dq", "ddq", "tau")
 Read = Callable[[str], Array]
@@ -116,7 +116,7 @@ def _edges(rate: float, cutoff: float | None, recipe: Recipe) -> tuple[int, int]
 
 
 class ZeroPhase:
-    """`lipcore.signals.low_pass` for one column after the other: designed once, and holding one copy of a column."""
+    """`data.signals.low_pass` for one column after the other: designed once, and holding one copy of a column."""
 
     def __init__(self, rate: float, cutoff: float) -> None:
         from scipy.signal import butter, sosfilt, sosfilt_zi  # noqa: PLC0415 - half a second

@@ -9,12 +9,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.samples import Array
 from lipcore.preparation import steps as record
 from lipcore.preparation.causal import CausalFilter
 from lipcore.preparation.filtering import QUANTITIES, Read, Work, ZeroPhase, derived, filters, settle, without_delay
 from lipcore.preparation.recipe import PreparationError, Recipe
 from lipcore.preparation.resampling import Clock, between, clock_of, grid, interpolate, thinned
-from lipcore.samples import Array
 
 BRIDGE = 0.3
 """Longest gap, in periods of the cut-off, that is bridged rather than split at where signals are low-passed.

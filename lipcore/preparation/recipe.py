@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args
 
-from lipcore.signals import CUTOFF
+from lipcore.data.signals import CUTOFF
 
 Form = Literal["acausal", "causal"]
 """acausal: without delay, from what came before and after, for recordings; causal: as a live stream can, late."""

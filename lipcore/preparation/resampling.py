@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.samples import Array
 from lipcore.preparation.recipe import PreparationError
-from lipcore.samples import Array
 
 MAX_RATE = 1e6
 """Hz; times that rise faster than this are not in seconds."""

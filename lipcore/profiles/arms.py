@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lipcore.profiles.sheet import FREE, Numbers, Sheet, degrees, numbered, symmetric
+from lipcore.profiles.profile import FREE, Numbers, Sheet, degrees, numbered, symmetric
 
 _FRANKA = (
     "JointState.effort and tau_J are the torque that link-side sensors measure, gravity included. tau_J_d, the "

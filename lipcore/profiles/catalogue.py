@@ -10,13 +10,42 @@ import numpy as np
 
 from lipcore.profiles.arms import ARMS
 from lipcore.profiles.names import is_number, makes
-from lipcore.profiles.others import OTHERS
-from lipcore.profiles.profile import Profile
+from lipcore.profiles.profile import Profile, Sheet, array
 from lipcore.profiles.reading import Limits, read_limits
-from lipcore.profiles.sheet import Sheet, array
-from lipcore.robots import ROBOTS, UnknownRobotError, installed_profiles, profile_urdf
+from lipcore.robots.library import ROBOTS, UnknownRobotError, installed_profiles, profile_urdf
 from lipcore.vocabulary import JointType
 
+_URDF = "URDF of example-robot-data"
+_SAY = "Say what the effort of your recordings is with `effort`."
+_BAXTER = (
+    "The effort that its springs' deflection measures, gravity included. Commanded torque is added to the robot's own "
+    "gravity compensation: upload it as `commanded`."
+)
+_TOY = "A small test rig: what its effort is depends on your drives. " + _SAY
+
+
+def _sheet(name: str, title: str, effort_note: str = _SAY, measured: bool = False) -> Sheet:
+    return Sheet(title, ROBOTS[name].free, "measured" if measured else "unknown", effort_note, _URDF)
+
+
+OTHERS: dict[str, Sheet] = {
+    "baxter-left": _sheet("baxter-left", "Rethink Baxter, left arm", _BAXTER, measured=True),
+    "baxter-right": _sheet("baxter-right", "Rethink Baxter, right arm", _BAXTER, measured=True),
+    "pr2-left": _sheet("pr2-left", "Willow Garage PR2, left arm"),
+    "pr2-right": _sheet("pr2-right", "Willow Garage PR2, right arm"),
+    "talos-left": _sheet("talos-left", "PAL TALOS, left arm without its first joint"),
+    "tiago": _sheet("tiago", "PAL TIAGo, lift and arm"),
+    "tiago-pro-left": _sheet("tiago-pro-left", "PAL TIAGo Pro, left arm"),
+    "tiago-pro-right": _sheet("tiago-pro-right", "PAL TIAGo Pro, right arm"),
+    "double-pendulum": _sheet("double-pendulum", "Double pendulum", _TOY),
+    "asr-twodof": _sheet("asr-twodof", "Two-joint arm of ASR", _TOY),
+    "finger-edu": replace(
+        _sheet("finger-edu", "FingerEdu of the Open Dynamic Robot Initiative", _TOY),
+        source=f"{_URDF} for the ranges; its limits of speed and torque, 1000, are placeholders and left out",
+        placeholders=True,
+    ),
+}
+"""Arms that example-robot-data alone describes: there is a profile where that package is installed."""
 SHEETS: dict[str, Sheet] = ARMS | OTHERS
 REVOLUTE: tuple[JointType, ...] = ("revolute",)
 
@@ -50,13 +79,13 @@ def recognise(joint_names: Sequence[str]) -> tuple[str, ...]:
     have numbers, which every robot has.
     """
     mentioned = frozenset().union(*map(makes, joint_names))
-    found = []
+    fitting = []
     for each in profiles():
-        whole = any(len(reading) == each.n_joints for reading in each.readings(joint_names, bool(mentioned)))
+        all_there = any(len(reading) == each.n_joints for reading in each.readings(joint_names, bool(mentioned)))
         telling = mentioned or not all(is_number(name) for name in each.joint_names)
-        if whole and telling and mentioned <= each.makes:
-            found.append(each)
-    return tuple(each.name for each in sorted(found, key=lambda each: -each.n_joints))
+        if all_there and telling and mentioned <= each.makes:
+            fitting.append(each)
+    return tuple(each.name for each in sorted(fitting, key=lambda each: -each.n_joints))
 
 
 @lru_cache(maxsize=128)

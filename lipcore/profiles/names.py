@@ -41,7 +41,7 @@ def makes(text: str) -> frozenset[str]:
 
 def words(name: str) -> Words:
     """A name as words, those that say nothing left out."""
-    return tuple(word for word in (found.lower() for found in _WORD.findall(name)) if word not in _EMPTY)
+    return tuple(word for word in (each.lower() for each in _WORD.findall(name)) if word not in _EMPTY)
 
 
 def is_number(name: str) -> bool:
@@ -80,24 +80,27 @@ def _forms(aliases: tuple[tuple[str, ...], ...]) -> list[frozenset[Words]]:
 def _by_words(split: Sequence[Words], aliases: Sequence[Sequence[str]]) -> list[Assignment]:
     """Names that end in an alias, those with one prefix together; aliases that are a number only are left out."""
     forms = _forms(tuple(map(tuple, aliases)))
-    found: defaultdict[Words, defaultdict[int, set[int]]] = defaultdict(lambda: defaultdict(set))
+    places_by_prefix: defaultdict[Words, defaultdict[int, set[int]]] = defaultdict(lambda: defaultdict(set))
     for place, name in enumerate(split):
         for joint, each in enumerate(forms):
             for form in each:
                 if name[-len(form) :] == form:
-                    found[name[: -len(form)]][joint].add(place)
-    groups = ({joint: min(places) for joint, places in group.items() if len(places) == 1} for group in found.values())
+                    places_by_prefix[name[: -len(form)]][joint].add(place)
+    groups = (
+        {joint: min(places) for joint, places in group.items() if len(places) == 1}
+        for group in places_by_prefix.values()
+    )
     return _distinct(group for group in groups if group)
 
 
 def _by_number(split: Sequence[Words], n_joints: int) -> list[Assignment]:
     """Names that are numbers behind one prefix, counted from 1, or from 0 where there is a 0."""
-    found: defaultdict[Words, list[tuple[int, int]]] = defaultdict(list)
+    numbers_by_prefix: defaultdict[Words, list[tuple[int, int]]] = defaultdict(list)
     for place, name in enumerate(split):
         if name and name[-1].isdigit() and len(name[-1]) < 4:
-            found[name[:-1]].append((int(name[-1]), place))
+            numbers_by_prefix[name[:-1]].append((int(name[-1]), place))
     groups = []
-    for group in found.values():
+    for group in numbers_by_prefix.values():
         first = 0 if any(number == 0 for number, _ in group) else 1
         numbered = {number - first: place for number, place in group}
         # a number too many or twice, or other names in the majority, say that another robot is meant
@@ -108,11 +111,11 @@ def _by_number(split: Sequence[Words], n_joints: int) -> list[Assignment]:
 
 def _distinct(groups: Iterator[Assignment] | Sequence[Assignment]) -> list[Assignment]:
     """Groups without those that another one holds."""
-    found: list[Assignment] = []
+    distinct: list[Assignment] = []
     holders: defaultdict[tuple[int, int], list[Assignment]] = defaultdict(list)
     for group in sorted(groups, key=len, reverse=True):
         if not any(group.items() <= larger.items() for larger in holders[next(iter(group.items()))]):
-            found.append(group)
+            distinct.append(group)
             for item in group.items():
                 holders[item].append(group)
-    return found
+    return distinct

@@ -3,14 +3,66 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
-from lipcore.motion import Array
+from lipcore.data.motion import Array
 from lipcore.profiles.names import Assignment, assignments, is_number, makes
 from lipcore.vocabulary import EffortMeaning, JointType
+
+FREE = (-np.inf, np.inf)
+"""Range of a joint that turns without end."""
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Limits as a maker publishes them, one a joint, in rad, rad/s, rad/s², N·m; None: not published."""
+
+    ranges: tuple[tuple[float, float], ...]
+    speed: tuple[float, ...]
+    torque: tuple[float, ...] | None
+    acceleration: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A robot as the catalogue writes it down, before its URDF is looked for.
+
+    joints: names as its own URDF or driver has them, from base to tip; aliases: (n) other names, none by default;
+    numbers: None takes those of the installed URDF, and without one there is no profile; source: of the numbers;
+    placeholders: whether that URDF's limits of speed and torque mean nothing.
+    """
+
+    title: str
+    joints: tuple[str, ...]
+    effort: EffortMeaning
+    effort_note: str
+    source: str
+    numbers: Numbers | None = None
+    aliases: tuple[tuple[str, ...], ...] = ()
+    placeholders: bool = False
+
+
+def degrees(*values: float) -> tuple[float, ...]:
+    """Degrees in radians."""
+    return tuple(np.radians(values).tolist())
+
+
+def symmetric(*degrees_each: float) -> tuple[tuple[float, float], ...]:
+    """Ranges of ± so many degrees, in radians."""
+    return tuple((-limit, limit) for limit in degrees(*degrees_each))
+
+
+def numbered(count: int, *patterns: str) -> tuple[tuple[str, ...], ...]:
+    """The names of joints 1..count in each of the patterns."""
+    return tuple(tuple(pattern.format(joint) for pattern in patterns) for joint in range(1, count + 1))
+
+
+def array(values: Sequence[float] | None, n_joints: int) -> Array:
+    """Values as an array (n,), NaN where there are none."""
+    return np.full(n_joints, np.nan) if values is None else np.array(values, dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,7 +72,7 @@ class Profile:
     lower, upper: (n,) rad or m, infinite where the joint turns without end; speed, acceleration: (n,) rad/s, rad/s² or
     m/s, m/s²; torque: (n,) N·m or N. Each is NaN where it is not known. torque_constants: (n,) N·m/A of motor currents.
     joint_aliases: (n) other names of each joint; urdf: its text, None where none is at hand; source: of the numbers;
-    whole: whether data of this robot hold every joint, as those of an uploaded URDF with its fingers need not.
+    complete: whether data of this robot hold every joint, as those of an uploaded URDF with its fingers need not.
     """
 
     name: str
@@ -38,7 +90,7 @@ class Profile:
     joint_aliases: tuple[tuple[str, ...], ...]
     urdf: str | None = field(repr=False)
     source: str
-    whole: bool = True
+    complete: bool = True
 
     def __post_init__(self) -> None:
         n = len(self.joint_names)
@@ -71,9 +123,9 @@ class Profile:
 
     def match(self, names: Sequence[str]) -> tuple[int | None, ...]:
         """Which joint each of the names means, None where none or not one alone: (N,)."""
-        found = self.readings(names)
-        largest = max(map(len, found), default=0)
-        best = [each for each in found if len(each) == largest]
+        readings = self.readings(names)
+        largest = max(map(len, readings), default=0)
+        best = [each for each in readings if len(each) == largest]
         if len(best) != 1 or 2 * largest <= min(self.n_joints, len(names)):
             return (None,) * len(names)
         joint_at = {place: joint for joint, place in best[0].items()}
@@ -82,11 +134,11 @@ class Profile:
     def order_of(self, names: Sequence[str]) -> list[int] | None:
         """Places of this robot's joints among the names, from base to tip; other names, as of grippers, are left out.
 
-        None where a joint is missing, or where more than one name could be it. Not `whole`: those that are there.
+        None where a joint is missing, or where more than one name could be it. Not `complete`: those that are there.
         """
         matched = self.match(names)
         places = {joint: place for place, joint in enumerate(matched) if joint is not None}
-        if not places or (self.whole and len(places) < self.n_joints):
+        if not places or (self.complete and len(places) < self.n_joints):
             return None
         return [places[joint] for joint in sorted(places)]
 
@@ -99,34 +151,6 @@ class Profile:
         if len(matched) < len(names) or (len(names) < self.n_joints and all(map(is_number, names))):
             return None
         return tuple(self.joint_names[joint] for joint in matched)
-
-    def for_joints(self, names: Sequence[str]) -> Profile:
-        """Return a profile with one joint for each of the names, in their order and so called.
-
-        A name that is none of this robot's joints gets a revolute joint of which nothing is known. `urdf` stays that of
-        the whole robot.
-        """
-        matched = self.match(names)
-        pick = np.array([self.n_joints if joint is None else joint for joint in matched], dtype=np.int64)
-
-        def picked(values: Array) -> Array:
-            found: Array = np.append(values, np.nan)[pick]
-            return found
-
-        return replace(
-            self,
-            joint_names=tuple(names),
-            joint_types=tuple("revolute" if joint is None else self.joint_types[joint] for joint in matched),
-            joint_aliases=tuple(
-                () if joint is None else (self.joint_names[joint], *self.joint_aliases[joint]) for joint in matched
-            ),
-            lower=picked(self.lower),
-            upper=picked(self.upper),
-            speed=picked(self.speed),
-            acceleration=picked(self.acceleration),
-            torque=picked(self.torque),
-            torque_constants=None if self.torque_constants is None else picked(self.torque_constants),
-        )
 
     def why_no_urdf(self) -> str:
         """A sentence that says why rigid bodies cannot be built by this name."""

@@ -9,9 +9,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from lipcore.motion import Array
+from lipcore.data.motion import Array
 from lipcore.profiles.profile import Profile
-from lipcore.urdf import MOVABLE, UrdfError, describe
+from lipcore.robots.urdf import MOVABLE, UrdfError, describe
 from lipcore.vocabulary import JointType
 
 NOTE = "A URDF does not say what the effort field means: say it with `effort`."
@@ -19,7 +19,10 @@ NOTE = "A URDF does not say what the effort field means: say it with `effort`."
 
 @dataclass(frozen=True)
 class Limits:
-    """Of joints in the order they were asked for, (n,) each: infinite where a joint turns freely, NaN where unknown."""
+    """Types and limits of joints in the order they were asked for, (n,) each, SI units.
+
+    lower, upper: position; speed; torque. Infinite where a joint turns freely, NaN where unknown.
+    """
 
     types: tuple[JointType, ...]
     lower: Array
@@ -53,7 +56,7 @@ def from_urdf(text: str, name: str) -> Profile:
         joint_aliases=((),) * n_joints,
         urdf=text,
         source="its URDF",
-        whole=False,
+        complete=False,
     )
 
 
@@ -64,17 +67,17 @@ def _from_base(text: str) -> list[str]:
         below[_link(joint, "parent")].append((joint.get("name", ""), _link(joint, "child")))
     moved = {child for each in below.values() for _, child in each}
     waiting = [each for link in below if link not in moved for each in below[link]][::-1]
-    found = []
+    names = []
     while waiting:
         name, child = waiting.pop()
-        found.append(name)
+        names.append(name)
         waiting.extend(reversed(below.get(child, [])))
-    return found
+    return names
 
 
 def _link(joint: ElementTree.Element, which: str) -> str:
-    found = joint.find(which)
-    return "" if found is None else found.get("link", "")
+    element = joint.find(which)
+    return "" if element is None else element.get("link", "")
 
 
 def _root(text: str) -> ElementTree.Element:
@@ -90,15 +93,15 @@ def read_limits(text: str, joints: Sequence[str]) -> Limits:
 
     A limit of speed or effort that is not above 0 is none, nor is a range that holds no interval.
     """
-    found = {joint.get("name", ""): joint for joint in _root(text).findall("joint")}
+    elements = {joint.get("name", ""): joint for joint in _root(text).findall("joint")}
     types: list[JointType] = []
     rows = []
     for name in joints:
-        if name not in found or found[name].get("type") not in MOVABLE:
+        if name not in elements or elements[name].get("type") not in MOVABLE:
             raise UrdfError(f"the URDF has no joint {name!r} that moves")
-        kind = found[name].get("type", "")
+        kind = elements[name].get("type", "")
         types.append(MOVABLE[kind])
-        limit = found[name].find("limit")
+        limit = elements[name].find("limit")
         given: Mapping[str, str] = {} if limit is None else limit.attrib
         lower, upper, speed, torque = (_number(name, given, key) for key in ("lower", "upper", "velocity", "effort"))
         if kind == "continuous":

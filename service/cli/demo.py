@@ -17,9 +17,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from lipcore.robots import Robot, SimulationUnavailableError, load_robot
-from lipcore.samples import Samples
-from lipcore.simulation import FAST, Stream, simulate
+from lipcore.data.samples import Samples
+from lipcore.robots.library import Robot, SimulationUnavailableError, load_robot
+from lipcore.robots.simulation import FAST, Stream, simulate
 from service.cli.consoles import out
 from service.cli.plotting import draw_torque
 from service.cli.simulate import write_recording

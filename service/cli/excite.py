@@ -15,15 +15,16 @@ from rich.console import Console
 from rich.table import Table
 
 import lipcore
-from lipcore import TorqueModel, persistence
-from lipcore.estimators import ESTIMATORS
+from lipcore import TorqueModel
+from lipcore.data.samples import Array
 from lipcore.excitation import Belief, Limits, Plan, PlanOptions, plan
-from lipcore.linalg import NotPositiveDefiniteError
-from lipcore.manifest import DEFAULT_LIMITS, MANIFEST, ROBOT, TENSORS, ModelFormatError
+from lipcore.files import persistence
+from lipcore.files.manifest import DEFAULT_LIMITS, MANIFEST, ROBOT, TENSORS, ModelFormatError
+from lipcore.fitting.estimators import ESTIMATORS
+from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.profiles import names
-from lipcore.robots import Robot, SimulationUnavailableError
-from lipcore.samples import Array
-from lipcore.simulation import FAST, Stream, sinusoids
+from lipcore.robots.library import Robot, SimulationUnavailableError
+from lipcore.robots.simulation import FAST, Stream, sinusoids
 from lipcore.vocabulary import JointType
 from service.cli import plotting
 from service.cli.consoles import err, print_json

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from lipcore import profiles
 from lipcore.excitation import Limits
-from lipcore.model import TorqueModel
+from lipcore.model.torque_model import TorqueModel
 from lipcore.profiles import Profile
-from lipcore.robots import ROBOTS, Robot, SimulationUnavailableError, load_robot
-from lipcore.urdf import RigidBody
+from lipcore.robots.library import ROBOTS, Robot, SimulationUnavailableError, load_robot
+from lipcore.robots.urdf import RigidBody
 
 MAX_URDF_BYTES = 16 * 1024 * 1024
 

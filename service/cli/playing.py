@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from lipcore.robots import SimulationUnavailableError, load_robot
-from lipcore.samples import Array
-from lipcore.simulation import FAST, Payload, Stream, simulate
+from lipcore.data.samples import Array
+from lipcore.robots.library import SimulationUnavailableError, load_robot
+from lipcore.robots.simulation import FAST, Payload, Stream, simulate
 from lipcore.vocabulary import TorqueConvention
 from service.cli.consoles import CommandError
 from service.client.stream import StreamClient, StreamError

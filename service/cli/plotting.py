@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from lipcore.data.samples import Samples
 from lipcore.excitation import Plan
-from lipcore.samples import Samples
 from service.client import Prediction
 
 HEADINGS = ("position, rad (m)", "speed, per s", "acceleration, per s²")

@@ -8,9 +8,9 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from lipcore.robots import ROBOTS, SimulationUnavailableError, load_robot
-from lipcore.samples import Samples
-from lipcore.simulation import FAST, Payload, Stream, simulate
+from lipcore.data.samples import Samples
+from lipcore.robots.library import ROBOTS, SimulationUnavailableError, load_robot
+from lipcore.robots.simulation import FAST, Payload, Stream, simulate
 from service.cli.consoles import print_json, say
 from service.cli.options import Json
 

@@ -14,9 +14,9 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session, undefer
 
 import lipcore
-from lipcore import persistence
-from lipcore.online import state
-from lipcore.probing import probe
+from lipcore.files import persistence
+from lipcore.files.probing import probe
+from lipcore.online import transfer as state
 from service.cli.consoles import err, print_json, say
 from service.cli.options import Json
 from service.foundation.errors import DamagedDataError

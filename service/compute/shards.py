@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
 from typing import Any, Protocol, Self, TypeVar
 
-from lipcore.fitting import FitCancelledError
+from lipcore.fitting.hyperparameters import FitCancelledError
 from service.compute.executors import lost
 
 logger = logging.getLogger(__name__)

@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 
 from fastapi import Query
 
+from lipcore.data.signals import CUTOFF
 from lipcore.preparation.recipe import Filtering, Form, Recipe
-from lipcore.signals import CUTOFF
 from lipcore.vocabulary import TorqueConvention
 from service.datasets.asking import MEDIA_TYPES, SUFFIXES
 from service.foundation.errors import invalid_request

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 from safetensors import safe_open
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 
 MOST_POINTS = 2000
 """Most points of a column."""

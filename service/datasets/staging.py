@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.samples import Array
 from lipcore.preparation.plan import plan
 from lipcore.preparation.recipe import PreparationError, Recipe
-from lipcore.samples import Array
 from service.foundation.errors import invalid_data
 from service.storage.disk import Disk
 

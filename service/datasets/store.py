@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from sqlalchemy import select
 from sqlalchemy.exc import SQLAlchemyError
 
+from lipcore.data.samples import Samples
 from lipcore.profiles import Profile
-from lipcore.samples import Samples
 from lipcore.vocabulary import JointType
 from service.datasets.mapping.reading import read
 from service.datasets.options import UploadOptions

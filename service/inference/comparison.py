@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection
 from math import isfinite
 
-from lipcore import paired
-from lipcore.metrics import evaluate
-from lipcore.paired import Answer, Comparison, Difference
-from lipcore.samples import Array, Samples
+from lipcore.data import paired
+from lipcore.data.metrics import evaluate
+from lipcore.data.paired import Answer, Comparison, Difference
+from lipcore.data.samples import Array, Samples
 from service.foundation.errors import invalid_request
 from service.inference.comparison_schema import (
     CompareRequest,

@@ -7,9 +7,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from lipcore.metrics import LEVELS, RELIABILITY_LEVELS
-from lipcore.metrics import evaluate as compare
-from lipcore.samples import Array, Samples
+from lipcore.data.metrics import LEVELS, RELIABILITY_LEVELS
+from lipcore.data.metrics import evaluate as compare
+from lipcore.data.samples import Array, Samples
 from service.datasets import store
 from service.foundation.errors import InvalidRequestError, invalid_request
 from service.inference.schema import EvaluateRequest, EvaluateResponse, Interval, Reliability, Stretches

@@ -12,10 +12,10 @@ import torch
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from lipcore import dynamics
-from lipcore.functionals import Estimate
-from lipcore.model import TorqueModel
-from lipcore.motion import Motion
+from lipcore.data.motion import Motion
+from lipcore.model import dynamics
+from lipcore.model.functionals import Estimate
+from lipcore.model.torque_model import TorqueModel
 from lipcore.vocabulary import ComponentName, TorqueConvention
 from service.foundation.errors import invalid_request
 from service.inference.schema import PredictRequest

@@ -8,9 +8,9 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore import dynamics
-from lipcore.motion import Motion
-from lipcore.samples import Array, Samples
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Array, Samples
+from lipcore.model import dynamics
 from service.foundation.errors import invalid_request
 from service.inference import evaluating
 from service.inference.comparison_schema import TraceComponent, TraceComponentValues, TraceRequest, TraceResponse

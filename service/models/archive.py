@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, NamedTuple
 
-from lipcore.manifest import MANIFEST, ROBOT, TENSORS
+from lipcore.files.manifest import MANIFEST, ROBOT, TENSORS
 
 EXPORT, CHECKSUMS = "export.json", "checksums.json"
 MEMBERS = (EXPORT, CHECKSUMS, MANIFEST, TENSORS, ROBOT)

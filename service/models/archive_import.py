@@ -10,11 +10,11 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from lipcore import persistence, strict_json
-from lipcore.arm.warning import warnings
-from lipcore.manifest import MANIFEST, ROBOT, TENSORS, Limits, ModelFormatError, read_manifest_bytes
-from lipcore.parameters import report
-from lipcore.probing import probe
+from lipcore.files import persistence, strict_json
+from lipcore.files.manifest import MANIFEST, ROBOT, TENSORS, Limits, ModelFormatError, read_manifest_bytes
+from lipcore.files.probing import probe
+from lipcore.model.parameters import report
+from lipcore.model.warnings import warnings
 from service.foundation.errors import InvalidDataError, invalid_data, problem
 from service.foundation.settings import Settings
 from service.models import archive, registry

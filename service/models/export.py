@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lipcore import persistence
-from lipcore.arm.urdf_writer import urdf_of_parameters
-from lipcore.manifest import MANIFEST, TENSORS, ModelFormatError
+from lipcore.files import persistence
+from lipcore.files.manifest import MANIFEST, TENSORS, ModelFormatError
+from lipcore.files.urdf_writer import urdf_of_parameters
 from service.foundation.errors import InvalidRequestError, UnreadableVersionError, invalid_request, not_found, problem
 from service.models import archive, registry
 from service.models.archive import CHECKSUMS, EXPORT, Part

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from lipcore import metrics
-from lipcore.manifest import FORMAT_VERSION
-from lipcore.model import TorqueModel
-from lipcore.samples import Samples
+from lipcore.data import metrics
+from lipcore.data.samples import Samples
+from lipcore.files.manifest import FORMAT_VERSION
+from lipcore.model.torque_model import TorqueModel
 from service import __version__
 from service.storage.database import DatasetRow
 

@@ -15,8 +15,8 @@ import numpy as np
 from fastapi import Depends
 
 import lipcore
-from lipcore.model import TorqueModel
-from lipcore.online.revision import Revision
+from lipcore.model.torque_model import TorqueModel
+from lipcore.online.transfer import Revision
 from service.foundation.errors import NotFoundError, UnreadableVersionError, not_found
 from service.foundation.fields import of_app
 from service.foundation.states import PartState

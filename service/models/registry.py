@@ -11,7 +11,7 @@ from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
 import lipcore
-from lipcore.persistence import checksums, read_manifest
+from lipcore.files.persistence import checksums, read_manifest
 from service.foundation.errors import not_found
 from service.foundation.settings import shipped_models
 from service.models import moves

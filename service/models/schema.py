@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
-from lipcore.splits import Kind, Split
+from lipcore.data.splits import Kind, Split
 from lipcore.vocabulary import JointType, TorqueConvention
 
 ModelName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from anyio import to_thread
 
-from lipcore.model import TorqueModel
+from lipcore.model.torque_model import TorqueModel
 from service.foundation.errors import RevisionNotReachedError, problem
 from service.models.moves import SERVING
 from service.models.registry import Serving

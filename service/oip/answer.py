@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lipcore.model import TorqueModel
+from lipcore.model.torque_model import TorqueModel
 from service.foundation.errors import invalid_request
 from service.foundation.settings import Settings
 from service.inference.predicting import Query, check_answer

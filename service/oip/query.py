@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.dynamics import available
-from lipcore.model import TorqueModel
+from lipcore.model.dynamics import available
+from lipcore.model.torque_model import TorqueModel
 from lipcore.vocabulary import COMPONENTS, ComponentName
 from service.foundation.errors import invalid_request
 from service.foundation.settings import Settings

@@ -9,7 +9,7 @@ from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Request, Response
 from starlette.types import Scope
 
-from lipcore.model import TorqueModel
+from lipcore.model.torque_model import TorqueModel
 from service import __version__
 from service.foundation.errors import NotFoundError, NotReadyError, UnreadableVersionError, problem, sentence
 from service.models import registry

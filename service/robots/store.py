@@ -11,12 +11,12 @@ from sqlalchemy import select
 from sqlalchemy.orm import undefer
 
 from lipcore import profiles
-from lipcore.motion import Array
+from lipcore.data.motion import Array
 from lipcore.profiles import Profile
 from lipcore.profiles.names import is_number
 from lipcore.profiles.reading import read_limits
-from lipcore.robots import ROBOTS, UnknownRobotError, profile_urdf
-from lipcore.urdf import MOVABLE, RigidBody, UrdfError, describe
+from lipcore.robots.library import ROBOTS, UnknownRobotError, profile_urdf
+from lipcore.robots.urdf import MOVABLE, RigidBody, UrdfError, describe
 from service.foundation.errors import (
     ConflictError,
     InvalidDataError,

@@ -21,7 +21,7 @@ from service.stream.frames import NUMBER, REQUEST
 from service.web.storage_errors import translated
 
 if TYPE_CHECKING:
-    from lipcore.samples import Array
+    from lipcore.data.samples import Array
 
 logger = logging.getLogger(__name__)
 

@@ -36,7 +36,7 @@ from service.web.observability.meters import StreamMeter
 from service.web.server.stream_protocol import StreamProtocol
 
 if TYPE_CHECKING:
-    from lipcore.samples import Array
+    from lipcore.data.samples import Array
 
 
 class FrameReader:

@@ -12,8 +12,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from lipcore.samples import Array
-from lipcore.splits import GUARD_S, Mask, Numbers, Parts, Split, SplitError, choose, split
+from lipcore.data.samples import Array
+from lipcore.data.splits import GUARD_S, Mask, Numbers, Parts, Split, SplitError, choose, split
 from service.foundation.errors import invalid_request
 from service.models.schema import HeldOutSet, Holdout, HoldoutLineage
 from service.storage.database import DatasetRow

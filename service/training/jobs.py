@@ -8,9 +8,9 @@ from typing import Any
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from lipcore.estimators import UnknownEstimatorError, check_estimator
-from lipcore.fit_options import FitOptions
-from lipcore.robots import ROBOTS, SimulationUnavailableError
+from lipcore.fitting.estimators import UnknownEstimatorError, check_estimator
+from lipcore.fitting.options import FitOptions
+from lipcore.robots.library import ROBOTS, SimulationUnavailableError
 from service.datasets import store
 from service.foundation.errors import BusyError, ConflictError, InvalidRequestError, invalid_request, not_found, problem
 from service.foundation.settings import Settings

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from sqlalchemy import select
 
+from lipcore.data import independence
+from lipcore.data.samples import Array, Samples
 from lipcore.kernels.geometry import Geometry
-from lipcore.online import spacing
-from lipcore.samples import Array, Samples
-from lipcore.urdf import RigidBody
+from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import TorqueConvention
 from service.foundation.settings import Settings
 from service.journal import log
@@ -107,7 +107,7 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
         span = {"first": float(samples.t.min()), "last": float(samples.t.max())}
         log_lineage |= {"rows": len(samples), **span}
         ages = refresh_data.age_weights(samples.t, within)
-        counted = spacing.recorded(samples.t, samples.episode)
+        counted = independence.recording_weights(samples.t, samples.episode)
         weighted = samples, counted if ages is None else counted * ages
     return Material(
         *_candidates(table, logged.samples),

@@ -10,7 +10,7 @@ from contextvars import copy_context
 from types import TracebackType
 from typing import Any, Self
 
-from lipcore.fitting import FitProgress
+from lipcore.fitting.hyperparameters import FitProgress
 from service.storage.database import Database, JobRow, now
 
 SEARCH = "hyperparameters"

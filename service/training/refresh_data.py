@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
+from lipcore.data.samples import Array, Samples
 from lipcore.online.batch import Rows
-from lipcore.samples import Array, Samples
 from service.journal import log
 from service.journal.log import decode
 from service.storage.database import Database, DatasetRow, EventRow

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lipcore.conditioning import SHARD
-from lipcore.online import spacing
-from lipcore.samples import Samples
-from lipcore.splits import Mask, Numbers
+from lipcore.data import independence
+from lipcore.data.samples import Samples
+from lipcore.data.splits import Mask, Numbers
+from lipcore.training.conditioning import SHARD
 from service.storage.database import DatasetRow
 from service.storage.files import Files
 from service.storage.sample_file import Reader
@@ -85,7 +85,7 @@ class Part:
         if not self.timed:
             return self.factor * len(self)
         clock = self.clock()
-        weights = spacing.recorded(clock.t, clock.episode)
+        weights = independence.recording_weights(clock.t, clock.episode)
         return self.factor * float(weights.sum() if self.chosen is None else weights[self.chosen].sum())
 
     def shards(self) -> Iterator[Shard]:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from lipcore.fit_options import MOST_SECONDS, FitOptions, GeometryOption, Standing
+from lipcore.fitting.options import MOST_SECONDS, FitOptions, GeometryOption, Standing
 from lipcore.vocabulary import AUTO, CHOICES, DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS, JointType
 from service.foundation.states import JobState
 from service.models.schema import Holdout, ModelName

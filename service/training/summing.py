@@ -18,14 +18,14 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from lipcore import persistence
-from lipcore.compact.statistics import empty
-from lipcore.compact.summing import Summing
-from lipcore.conditioning import Told, conditioned, told
-from lipcore.fit_options import FitOptions
-from lipcore.model import TorqueModel
-from lipcore.online import spacing
-from lipcore.samples import Array, Samples
+from lipcore.data import independence
+from lipcore.data.samples import Array, Samples
+from lipcore.files import persistence
+from lipcore.fitting.options import FitOptions
+from lipcore.model.torque_model import TorqueModel
+from lipcore.posterior.statistics import empty
+from lipcore.posterior.summing import Summing
+from lipcore.training.conditioning import ShardStatistics, sum_samples, with_statistics
 from service.compute.executors import placed, sent, shard_executor
 from service.compute.shards import summed
 from service.foundation.settings import Settings
@@ -63,27 +63,27 @@ def all_rows(
     Raise FitCancelledError when `cancelled` says so.
     """
     gpu = options.device == "cuda"
-    total: Told | None = None
+    total: ShardStatistics | None = None
     shards = table.shards()
     if shards:
         progress(0.0)
         context = Context(sent(settings), packed(model), model.joint_names, "cuda" if gpu else "cpu")
         with shard_executor(settings, gpu) as executor:
-            work = partial(shard_told, context)
+            work = partial(shard_statistics, context)
             done = partial(_report, progress, len(table) / material.rows, len(shards))
             total = summed(executor, work, shards, cancelled, done=done)
     if material.logged is not None:
-        logged = told(Summing.of(model.posterior), *material.logged, cancelled)
+        logged = sum_samples(Summing.of(model.posterior), *material.logged, cancelled)
         total = logged if total is None else total + logged
     assert total is not None  # a job has samples
-    return conditioned(model, total, material.rows)
+    return with_statistics(model, total, material.rows)
 
 
-def shard_told(context: Context, shard: Shard) -> Told:
+def shard_statistics(context: Context, shard: Shard) -> ShardStatistics:
     """What the rows of one shard tell: done by a worker."""
     summing = _cached(_SUMMING, _name(context), 2, lambda: _summing(context))
     samples, weights = read(placed(context.settings), context.joint_names, shard)
-    return told(summing, samples, weights)
+    return sum_samples(summing, samples, weights)
 
 
 def read(settings: Settings, joint_names: tuple[str, ...], shard: Shard) -> tuple[Samples, Array]:
@@ -99,7 +99,7 @@ def read(settings: Settings, joint_names: tuple[str, ...], shard: Shard) -> tupl
     values = {name: reader.array(name, first, last) for name in ("t", "episode")}
     weights = np.full(shard.last - shard.first, shard.factor)
     if shard.timed:
-        weights *= spacing.recorded(values["t"], values["episode"])[rows]
+        weights *= independence.recording_weights(values["t"], values["episode"])[rows]
     values = {name: each[rows] for name, each in values.items()}
     values |= {name: reader.array(name, shard.first, shard.last) for name in ("q", "dq", "ddq", "tau")}
     samples = Samples(joint_names=joint_names, **values)

@@ -12,8 +12,10 @@ from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
 import lipcore
-from lipcore.conditioning import wanted
-from lipcore.model import TorqueModel, fitted
+from lipcore.fitting.task import Task
+from lipcore.model.torque_model import TorqueModel
+from lipcore.training.conditioning import should_condition
+from lipcore.training.train import fit_model
 from service.compute.executors import ClusterUnavailableError
 from service.foundation.errors import ServiceError, StorageFullError, StorageUnavailableError
 from service.foundation.settings import Settings
@@ -134,24 +136,23 @@ def _fit(settings: Settings, claim: Claim, material: Material, pulse: Pulse) -> 
     options = lipcore.FitOptions(**request["options"])
     table = material.table.weighed(options.posterior_samples)
     # the version that serves has learnt all rows of a refresh, not only the few that a fit chooses
-    every = request.get("refresh") is not None or wanted(options, material.rows, table.independent_rows())
+    every = request.get("refresh") is not None or should_condition(options, material.rows, table.independent_rows())
     if every:
         pulse.plan(material.rows)
     if not every or material.rows <= CANDIDATES:  # else it is the pass that takes long
         pulse.remaining = Remaining(min(options.hyperparameter_samples, count), min(options.posterior_samples, count))
     pulse.stage("hyperparameters")
-    trained = fitted(
+    task = Task(
         material.samples,
         request["joint_types"],
-        request["estimator"],
         options,
-        torque_convention=material.torque_convention,
-        on_progress=pulse.progress,
-        cancelled=pulse.cancelled,
-        robot=material.robot,
-        stretches=material.stretches,
-        geometries=material.geometries,
+        material.torque_convention,
+        material.robot,
+        material.stretches,
+        pulse.progress,
+        pulse.cancelled,
     )
+    trained = fit_model(task, request["estimator"], material.geometries)
     trained = replace(trained, fit={**trained.fit, "samples_given": material.rows})
     if not every:
         return trained

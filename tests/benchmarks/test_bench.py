@@ -30,7 +30,7 @@ from benchmarks.latency.targets import targets
 from benchmarks.latency.websocket import read_answer, request_frame
 from benchmarks.timing import Timing, measure, median
 from benchmarks.workload import BenchError, Source
-from lipcore.simulation import Stream
+from lipcore.robots.simulation import Stream
 from service.stream.frames import ANSWER, ERROR, REQUEST
 from tests.service.data import QUICK
 

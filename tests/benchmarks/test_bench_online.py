@@ -28,7 +28,7 @@ from benchmarks.online.scene import Scene, rows_of
 from benchmarks.online.sending import Ack, batch_requests, stream
 from benchmarks.timing import Timing
 from lipcore import TorqueModel
-from lipcore.robots import pinocchio
+from lipcore.robots.library import pinocchio
 from tests.service.data import QUICK
 
 PENDULUM = Scene(robot="double-pendulum", seconds=2.0, change_at=1.0, payload=0.2, viscous=0.05, coulomb=0.02)

@@ -15,7 +15,7 @@ from benchmarks.scale import engines, passes, plan, replicas, running, streams, 
 from benchmarks.scale.part import Results
 from benchmarks.scale.peaks import KINDS, Peaks
 from benchmarks.workload import BenchError
-from lipcore.conditioning import SHARD, conditioned
+from lipcore.training.conditioning import SHARD, with_statistics
 from service.compute.executors import Inline
 from service.compute.shards import summed
 from service.foundation.settings import shipped_models
@@ -65,7 +65,7 @@ def test_shards_of_a_pass_tell_what_all_rows_do(tmp_path):
     model = lipcore.load(shipped_models() / passes.MODEL)
     samples = streams.stream(2 * half, 20)
     at_once = passes.work(shards[0])
-    one, other = (conditioned(model, each, 2 * half) for each in (told, at_once))
+    one, other = (with_statistics(model, each, 2 * half) for each in (told, at_once))
     query = samples.q[:5], samples.dq[:5], samples.ddq[:5]
     np.testing.assert_allclose(one.predict(*query).tau, other.predict(*query).tau, rtol=1e-8, atol=1e-8)
     assert not np.array_equal(one.predict(*query).tau, model.predict(*query).tau)

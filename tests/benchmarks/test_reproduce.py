@@ -19,9 +19,9 @@ from benchmarks.reproduce import figures, report, table
 from benchmarks.reproduce.command import ERRORS, app
 from benchmarks.reproduce.experiment import Cell, Experiment, run_cell
 from benchmarks.reproduce.results import Results, ResultsError
-from lipcore.fit_options import FitOptions
-from lipcore.robots import ROBOTS, load_robot
-from lipcore.simulation import Stream, simulate
+from lipcore.fitting.options import FitOptions
+from lipcore.robots.library import ROBOTS, load_robot
+from lipcore.robots.simulation import Stream, simulate
 
 ESTIMATORS = ("se", "rigid-body", "lip-chain")
 JOINTS = ("joint1", "joint2")

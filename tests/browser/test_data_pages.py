@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from lipcore.estimators import ESTIMATORS
+from lipcore.fitting.estimators import ESTIMATORS
 from lipcore.vocabulary import ROBOT_ESTIMATORS
 from tests.browser.accessibility import audit
 from tests.browser.conftest import Dashboard

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from lipcore.samples import Samples
+from lipcore.data.samples import Samples
 from service.client.stream import StreamClient
 from tests.browser.accessibility import audit
 from tests.browser.conftest import Dashboard

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from lipcore.fitting import FitCancelledError
+from lipcore.fitting.hyperparameters import FitCancelledError
 from service.compute.executors import ClusterUnavailableError, Processes, lost, sent, shard_executor
 from service.compute.shards import summed
 from service.foundation.settings import Settings

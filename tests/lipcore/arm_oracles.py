@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 from torch.func import grad, jvp
 
+from lipcore.data.samples import Samples
 from lipcore.kernels.geometry import Geometry
-from lipcore.robots import Robot
-from lipcore.samples import Samples
-from lipcore.simulation import Stream, simulate
+from lipcore.robots.library import Robot
+from lipcore.robots.simulation import Stream, simulate
 from tests.lipcore.arms import random_bodies, random_geometry
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lipcore.kernels.geometry import Geometry, rotation_of
-from lipcore.urdf import RigidBody
+from lipcore.robots.urdf import RigidBody
 
 
 def random_geometry(kinds: str, seed: int, gravity: bool = True) -> Geometry:

@@ -11,13 +11,13 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from lipcore.compact.statistics import collect, merge
-from lipcore.model import TorqueModel
-from lipcore.online import state
+from lipcore.data.samples import Samples
+from lipcore.model.torque_model import TorqueModel
+from lipcore.online import transfer
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
-from lipcore.online.revision import Revision
-from lipcore.samples import Samples
+from lipcore.online.transfer import Revision
+from lipcore.posterior.statistics import collect, merge
 from lipcore.vocabulary import CODES
 
 Check = Callable[[TorqueModel, Rows], None]
@@ -96,11 +96,11 @@ def check_streams_merge(model: TorqueModel, rows: Rows) -> None:
 
 def check_prediction_changes_nothing(model: TorqueModel, rows: Rows) -> None:
     online = OnlineModel.start(model).learn(rows)
-    before = state.dump(online)
+    before = transfer.dump(online)
     answering = online.model()
     first = answering.predict(rows.q, rows.dq, rows.ddq)
     second = answering.predict(rows.q, rows.dq, rows.ddq)
-    assert state.dump(online) == before
+    assert transfer.dump(online) == before
     assert np.array_equal(first.tau, second.tau)
     assert np.array_equal(first.tau_std, second.tau_std)
     same_answers(online.model(), answering, rows)
@@ -108,10 +108,10 @@ def check_prediction_changes_nothing(model: TorqueModel, rows: Rows) -> None:
 
 def check_learning_leaves_what_it_started_from_alone(model: TorqueModel, rows: Rows) -> None:
     start = OnlineModel.start(model)
-    before = state.dump(start)
+    before = transfer.dump(start)
     start.learn(rows)
     start.learn(rows.take(slice(0, 5))).change(float(rows.time[10])).learn(rows)
-    assert state.dump(start) == before
+    assert transfer.dump(start) == before
 
 
 def check_memory_is_constant(model: TorqueModel, rows: Rows) -> None:
@@ -119,7 +119,7 @@ def check_memory_is_constant(model: TorqueModel, rows: Rows) -> None:
     sizes = set()
     for _ in range(3):
         online = online.learn(rows)
-        sizes.add(len(state.dump(online)))
+        sizes.add(len(transfer.dump(online)))
     assert len(sizes) == 1
     assert online.samples == 3 * len(rows)
 
@@ -127,8 +127,8 @@ def check_memory_is_constant(model: TorqueModel, rows: Rows) -> None:
 def check_state_survives_bytes(model: TorqueModel, rows: Rows) -> None:
     online = OnlineModel.start(model, 30.0).learn(rows.take(slice(0, 60))).change(float(rows.time[60]))
     online = online.learn(rows.take(slice(60, None)))
-    read = state.load(model, state.dump(online))
-    assert state.dump(read) == state.dump(online)
+    read = transfer.load(model, transfer.dump(online))
+    assert transfer.dump(read) == transfer.dump(online)
     same_answers(read.model(), online.model(), rows)
     late = rows.take(slice(0, 5))
     same_answers(read.learn(late).model(), online.learn(late).model(), rows)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.func import jacrev
 
-from lipcore.motion import Motion
+from lipcore.data.motion import Motion
 
 Instant = tuple[Tensor, Tensor, Tensor]
 """(q, v, a) of one sample, each (n,)."""

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from torch import Tensor
 
+from lipcore.data.motion import Motion
 from lipcore.kernels.base import PairKernel, Params, State
 from lipcore.kernels.chain import ChainKernel
 from lipcore.kernels.lip import LipKernel
-from lipcore.motion import Motion
 from tests.lipcore.oracles import Energy, chain_energies, lip_energies
 
 Shapes = dict[str, tuple[int, ...]]

@@ -11,7 +11,7 @@ import pytest
 
 from lipcore import FitOptions, Samples, load, save, train
 from lipcore.arm import search
-from lipcore.linalg import NotPositiveDefiniteError
+from lipcore.posterior.linalg import NotPositiveDefiniteError
 from tests.lipcore.arm_oracles import arm, recorded
 
 OPTIONS = FitOptions(device="cpu", search_seconds=0.3, posterior_samples=60)

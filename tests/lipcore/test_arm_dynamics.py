@@ -8,14 +8,14 @@ import pytest
 import torch
 from torch.func import jacrev
 
+from lipcore.data.motion import Motion
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Arm, arm_of_robot
 from lipcore.kernels.compiled.arm import arm_energies, arm_features, arm_masses, arm_shapes, arm_torques
 from lipcore.kernels.geometry import Geometry
-from lipcore.motion import Motion
-from lipcore.robots import load_robot
-from lipcore.simulation import inverse_dynamics
-from lipcore.urdf import RigidBody
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import inverse_dynamics
+from lipcore.robots.urdf import RigidBody
 from tests.lipcore.arm_oracles import arm, energies, lagrangian_torque, motions, tensor
 
 ROBOTS = ("double-pendulum", "panda", "kinova", "tiago")

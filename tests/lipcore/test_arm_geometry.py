@@ -8,9 +8,9 @@ import pytest
 
 from lipcore.kernels.compiled.arm import arm_masses
 from lipcore.kernels.geometry import Geometry, aligned, rotation_of, skew, turn_of
-from lipcore.robots import Robot, load_robot
-from lipcore.simulation import inverse_dynamics
-from lipcore.urdf import RigidBody
+from lipcore.robots.library import Robot, load_robot
+from lipcore.robots.simulation import inverse_dynamics
+from lipcore.robots.urdf import RigidBody
 from tests.lipcore.arm_oracles import arm, as_robot, motions
 from tests.lipcore.arms import random_geometry
 

@@ -9,13 +9,12 @@ import pinocchio as pin
 import pytest
 
 from lipcore import FitOptions, Samples, TorqueModel, train
-from lipcore.arm.linearisation import linearisation_error
 from lipcore.kernels.arm import ArmKernel
+from lipcore.model.warnings import linearisation_error
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
-from lipcore.random_arms import random_arm
-from lipcore.robots import Robot
-from lipcore.simulation import Stream, inverse_dynamics, simulate
+from lipcore.robots.library import Robot, random_arm
+from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
 
 OPTIONS = FitOptions(search_seconds=10.0, statistics="chosen", device="cpu")
 ROBOT = random_arm(4, joints=3)

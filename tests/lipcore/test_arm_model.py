@@ -13,21 +13,23 @@ import torch
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
-from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, dynamics, load, persistence, save, train
-from lipcore.compact.compress import linear
-from lipcore.compact.statistics import collect, merge
-from lipcore.estimators import make_estimator
+from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, load, save, train
+from lipcore.data.metrics import evaluate
+from lipcore.data.motion import Motion
+from lipcore.files import persistence
+from lipcore.fitting.estimators import make_estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative, Arm
 from lipcore.kernels.friction import friction_features
-from lipcore.metrics import evaluate
-from lipcore.motion import Motion
+from lipcore.model import dynamics
+from lipcore.model.parameters import inertial_parameters, report, weight_posterior
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
-from lipcore.parameters import inertial_parameters, report, weight_posterior
-from lipcore.robots import load_robot
-from lipcore.simulation import Stream, simulate
-from lipcore.urdf import RigidBody
+from lipcore.posterior.compression import linear
+from lipcore.posterior.statistics import collect, merge
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.urdf import RigidBody
 from tests.lipcore.arm_oracles import arm, as_robot, motions, recorded
 from tests.lipcore.arms import random_bodies
 

@@ -9,14 +9,14 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from lipcore import FitOptions, Samples
-from lipcore.arm.learning import make_problem
+from lipcore.arm.posing import make_problem
 from lipcore.arm.problem import NOISE_WIDTH, Expected, Point, Problem, root_of
-from lipcore.arm.recording import residual_correlation
 from lipcore.arm.scales import _Evidence, rescale
+from lipcore.data.independence import residual_correlation
 from lipcore.kernels.geometry import Geometry
-from lipcore.robots import load_robot
-from lipcore.simulation import inverse_dynamics
-from lipcore.urdf import RigidBody
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import inverse_dynamics
+from lipcore.robots.urdf import RigidBody
 from tests.lipcore.arm_oracles import arm, recorded
 
 KINDS = "RPR"

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lipcore import ModelFormatError, copy_model, persistence
-from lipcore.arm.report import bodies_of, read_geometry
-from lipcore.manifest import read_manifest_bytes
+from lipcore import ModelFormatError, copy_model
+from lipcore.files import persistence
+from lipcore.files.arm import bodies_of, read_geometry
+from lipcore.files.manifest import read_manifest_bytes
 from tests.lipcore.arms import parameters, random_bodies, random_geometry
 
 ORDER = [2, 0, 1]

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 
 from lipcore import FitOptions, Samples, TorqueModel, train
-from lipcore.arm.learning import learn, make_problem
+from lipcore.arm.learning import learn
+from lipcore.arm.posing import make_problem
 from lipcore.arm.problem import Problem
-from lipcore.arm.search import Found, search
-from lipcore.fitting import FitCancelledError, FitProgress
+from lipcore.arm.search import SearchResult, search
+from lipcore.data.metrics import evaluate
+from lipcore.data.signals import noise_level
+from lipcore.fitting.hyperparameters import FitCancelledError, FitProgress
+from lipcore.fitting.task import Task
 from lipcore.kernels.geometry import Geometry
-from lipcore.metrics import evaluate
-from lipcore.robots import Robot
-from lipcore.signals import noise_level
+from lipcore.robots.library import Robot
 from tests.lipcore.arm_oracles import as_robot, recorded
 from tests.lipcore.arms import random_bodies, random_geometry
 
@@ -46,7 +48,7 @@ def rows(given: Case, size: int = 80) -> Problem:
     return make_problem(few, given.robot.joint_types, OPTIONS, bool(given.geometry.gravity.any()))[0]
 
 
-def found_in(problem: Problem, given: Case, seconds: float = 5.0, known: tuple[Geometry, ...] = ()) -> Found:
+def found_in(problem: Problem, given: Case, seconds: float = 5.0, known: tuple[Geometry, ...] = ()) -> SearchResult:
     gravity = bool(given.geometry.gravity.any())
     sensor = noise_level([given.samples.tau])
     return search(problem, given.robot.joint_types, gravity, sensor, seconds, 0, known)
@@ -143,4 +145,4 @@ def test_a_search_can_be_cancelled(calls: int) -> None:
     given = case("RPR")
     asked = iter(range(10**9))
     with pytest.raises(FitCancelledError, match="cancelled"):
-        learn(given.samples, given.robot.joint_types, OPTIONS, cancelled=lambda: next(asked) >= calls)
+        learn(Task(given.samples, given.robot.joint_types, OPTIONS, cancelled=lambda: next(asked) >= calls))

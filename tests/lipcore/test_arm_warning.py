@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from lipcore import FitOptions, ModelFormatError, TorqueModel, load, save, train
-from lipcore.arm.warning import warnings
-from lipcore.estimators import make_estimator
+from lipcore.fitting.estimators import make_estimator
 from lipcore.kernels.arm_prior import Alternative
-from lipcore.parameters import report
-from lipcore.random_arms import random_arm
-from lipcore.simulation import Stream, simulate
+from lipcore.model.parameters import report
+from lipcore.model.warnings import warnings
+from lipcore.robots.library import random_arm
+from lipcore.robots.simulation import Stream, simulate
 
 ROBOT = random_arm(4, joints=3)
 SHARE, MORE = 0.27, 1.5

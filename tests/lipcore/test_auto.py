@@ -8,20 +8,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lipcore.auto import contest
-from lipcore.auto.unseen import LEAST_ROWS, hold_out
-from lipcore.estimators import MissingRobotError, check_estimator
-from lipcore.fit_options import FitOptions
-from lipcore.fitting import FitCancelledError
-from lipcore.linalg import NotPositiveDefiniteError
-from lipcore.manifest import ModelFormatError, read_manifest_bytes
-from lipcore.model import train
-from lipcore.persistence import load, manifest_bytes, save
-from lipcore.robots import load_robot
-from lipcore.samples import Samples
-from lipcore.simulation import Stream, simulate
-from lipcore.splits import SplitError
-from lipcore.urdf import RigidBody
+from lipcore.data.samples import Samples
+from lipcore.data.splits import SplitError
+from lipcore.files.manifest import ModelFormatError, read_manifest_bytes
+from lipcore.files.persistence import load, manifest_bytes, save
+from lipcore.fitting.estimators import MissingRobotError, check_estimator
+from lipcore.fitting.hyperparameters import FitCancelledError
+from lipcore.fitting.options import FitOptions
+from lipcore.posterior.linalg import NotPositiveDefiniteError
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.urdf import RigidBody
+from lipcore.training import auto
+from lipcore.training.held_out import LEAST_ROWS, hold_out
+from lipcore.training.train import train
 
 ARM = "finger-edu"
 TYPES = ("revolute",) * 3
@@ -133,7 +133,7 @@ def test_one_that_fails_is_in_the_table_and_the_others_go_on(monkeypatch):
     def fails(self, samples, place, before=None, search=True):
         raise NotPositiveDefiniteError("nothing can be\nlearnt")
 
-    monkeypatch.setattr(contest.Work, "learn", fails)
+    monkeypatch.setattr(auto.Work, "learn", fails)
     model = train(recorded(), TYPES, options=OPTIONS)
     assert model.selection["chosen"] == model.estimator.name == "lip-chain"
     assert model.selection["reason"] == "no other could be trained"
@@ -143,7 +143,7 @@ def test_one_that_fails_is_in_the_table_and_the_others_go_on(monkeypatch):
     assert rows["rigid-body+lip-chain"]["error"] is not None
     assert rows["lip-chain"]["error"] is None
 
-    monkeypatch.setattr(contest, "fitted", lambda *given: (_ for _ in ()).throw(ValueError("neither")))
+    monkeypatch.setattr(auto, "fit_estimator", lambda *given: (_ for _ in ()).throw(ValueError("neither")))
     with pytest.raises(NotPositiveDefiniteError, match="nothing can be"):
         train(recorded(), TYPES, options=OPTIONS)
 
@@ -182,20 +182,20 @@ def test_it_can_be_cancelled(at_work):
 
 def test_the_search_is_taken_up_again_where_the_chain_leads(monkeypatch):
     searches = []
-    learn = contest.learn
+    learn = auto.learn
 
     def counted(*given):
         searches.append(given[-1])  # the seed
         return learn(*given)
 
-    monkeypatch.setattr(contest, "learn", counted)
-    monkeypatch.setattr(contest.Contest, "_chain_leads", lambda self: True)
+    monkeypatch.setattr(auto, "learn", counted)
+    monkeypatch.setattr(auto.Contest, "_chain_leads", lambda self: True)
     train(recorded(), TYPES, options=OPTIONS)
     assert searches[:2] == [0, 1]
 
 
 def test_both_together_stand_on_all_samples_around_the_arm_that_was_learnt(monkeypatch, tmp_path):
-    monkeypatch.setattr(contest.Contest, "verdict", lambda self: ("rigid-body+lip-chain", "it was told to"))
+    monkeypatch.setattr(auto.Contest, "verdict", lambda self: ("rigid-body+lip-chain", "it was told to"))
     model = train(recorded(), TYPES, options=replace(OPTIONS, posterior_samples=300))
     assert model.selection["chosen"] == model.estimator.name == "rigid-body+lip-chain"
     assert model.fit["samples_given"] == len(recorded())

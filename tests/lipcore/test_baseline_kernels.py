@@ -14,15 +14,15 @@ from hypothesis.extra.numpy import arrays
 from torch import Tensor
 
 from lipcore import FitOptions, train
-from lipcore.estimators import make_estimator
-from lipcore.evidence import negative_log_evidence
+from lipcore.data.motion import Motion
+from lipcore.fitting.estimators import make_estimator
 from lipcore.kernels.base import PairKernel, State
 from lipcore.kernels.gip import GeometricallyInspiredKernel
 from lipcore.kernels.lse import LagrangianSEKernel
 from lipcore.kernels.se import SquaredExponentialKernel
-from lipcore.motion import Motion
-from lipcore.robots import load_robot
-from lipcore.simulation import Stream, simulate
+from lipcore.posterior.exact import negative_log_evidence
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
 from tests.lipcore.oracles import Energy, instant, scale_of, torque_terms
 
 BASELINES = ["se", "gip", "lse"]

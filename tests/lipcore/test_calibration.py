@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from lipcore import FitOptions, Samples, TorqueModel, dynamics, load, model, save, train
-from lipcore.calibration import FUNCTION_STD_FACTOR, NO_CALIBRATION, Calibration, calibrate
-from lipcore.estimators import ESTIMATORS
-from lipcore.parameters import friction_coefficients, inertial_parameters, weight_posterior
-from lipcore.robots import load_robot
-from lipcore.simulation import Stream, simulate
-from lipcore.urdf import RigidBody
+from lipcore import FitOptions, Samples, TorqueModel, load, save, train
+from lipcore.fitting.estimators import ESTIMATORS, FUNCTION_STD_FACTOR, NO_CALIBRATION, Calibration, calibrate
+from lipcore.model import dynamics
+from lipcore.model.parameters import friction_coefficients, inertial_parameters, weight_posterior
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.urdf import RigidBody
+from lipcore.training import fit
 
 FACTOR = 1.75
 SAME = 1e-6
@@ -35,7 +36,7 @@ def plain(request: pytest.FixtureRequest, samples: Samples) -> TorqueModel:
     if request.param == "rigid-body":
         robot = RigidBody.from_profile("double-pendulum", samples.joint_names, ("revolute",) * 2)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(model, "calibrate", lambda name: NO_CALIBRATION)
+        patch.setattr(fit, "calibrate", lambda name: NO_CALIBRATION)
         return train(samples, ("revolute",) * 2, request.param, OPTIONS, robot=robot)
 
 

@@ -8,12 +8,12 @@ import torch
 from hypothesis import given
 
 from lipcore import FitOptions, train
+from lipcore.data.metrics import evaluate
+from lipcore.data.motion import Motion
 from lipcore.kernels.base import State
 from lipcore.kernels.chain import ChainKernel
-from lipcore.metrics import evaluate
-from lipcore.motion import Motion
-from lipcore.robots import Robot, pinocchio
-from lipcore.simulation import Stream, simulate
+from lipcore.robots.library import Robot, pinocchio
+from lipcore.robots.simulation import Stream, simulate
 from tests.lipcore.agreement import RELATIVE, opposite, worst_block_error, worst_energy_error
 from tests.lipcore.oracles import chain_base_kernel
 from tests.lipcore.problems import Problem, chain_shapes, problems, random_problem

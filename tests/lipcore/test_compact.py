@@ -9,19 +9,20 @@ import numpy as np
 import pytest
 import torch
 
-from lipcore import FitOptions, Samples, TorqueModel, dynamics, train
-from lipcore.compact.basis import Basis
-from lipcore.compact.compress import Deviation, compress
-from lipcore.compact.posterior import CompactPosterior
-from lipcore.compact.statistics import collect
-from lipcore.estimators import ESTIMATORS
-from lipcore.linalg import NotPositiveDefiniteError
-from lipcore.motion import Motion
-from lipcore.parameters import weight_posterior
-from lipcore.posterior import ExactPosterior
-from lipcore.robots import load_robot
-from lipcore.simulation import Stream, simulate
-from lipcore.urdf import RigidBody
+from lipcore import FitOptions, Samples, TorqueModel, train
+from lipcore.data.motion import Motion
+from lipcore.fitting.estimators import ESTIMATORS
+from lipcore.model import dynamics
+from lipcore.model.parameters import weight_posterior
+from lipcore.posterior.basis import Basis
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.compression import Deviation, compress
+from lipcore.posterior.exact import ExactPosterior
+from lipcore.posterior.linalg import NotPositiveDefiniteError
+from lipcore.posterior.statistics import collect
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import ROBOT_ESTIMATORS
 
 ROBOT = "double-pendulum"

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from lipcore.data.motion import Motion
 from lipcore.kernels.compiled.lanes import LANES
-from lipcore.motion import Motion
 from tests.lipcore.agreement import opposite
 from tests.lipcore.oracles import shares_of
 from tests.lipcore.problems import KERNELS, Problem, TorchForm, random_problem

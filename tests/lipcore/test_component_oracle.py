@@ -14,13 +14,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from lipcore import TorqueModel, dynamics
-from lipcore.compact.basis import Basis
-from lipcore.compact.statistics import collect
-from lipcore.estimators import make_estimator
+from lipcore import TorqueModel
+from lipcore.data.motion import Motion
+from lipcore.fitting.estimators import make_estimator
 from lipcore.kernels.friction import SIGN_WIDTH
-from lipcore.model import restore, training_range
-from lipcore.motion import Motion
+from lipcore.model import dynamics
+from lipcore.model.torque_model import training_range
+from lipcore.posterior.basis import Basis
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.statistics import collect
 from tests.lipcore.oracles import (
     Energy,
     Instant,
@@ -62,8 +64,10 @@ def case(request: pytest.FixtureRequest) -> Case:
     kernel, outputs = make_estimator(request.param, TYPES).kernel, torch.arange(SAMPLES * N)
     basis = Basis.build(kernel, params, motion, outputs)
     statistics = collect(basis, torch.exp(2 * params["noise.log_std"]), motion, tau)
-    parts = motion, outputs, statistics, training_range(motion), {}
-    model = restore(request.param, JOINT_NAMES, TYPES, "gravity_included", {}, {}, params, *parts)
+    estimator = make_estimator(request.param, TYPES)
+    posterior = CompactPosterior.restore(estimator.kernel, params, motion, outputs, statistics)
+    span = training_range(motion)
+    model = TorqueModel(estimator, JOINT_NAMES, TYPES, "gravity_included", {}, {}, posterior, span, {})
     energies = ENERGIES[request.param](TYPES, params)
     data = samples(motion)
     noise = np.tile(np.exp(2 * params["noise.log_std"].numpy()), SAMPLES)

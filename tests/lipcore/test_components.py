@@ -10,12 +10,13 @@ import pytest
 import torch
 from torch.func import jacrev
 
-from lipcore import FitOptions, Samples, TorqueModel, dynamics, train
+from lipcore import FitOptions, Samples, TorqueModel, train
+from lipcore.data.motion import Motion
 from lipcore.kernels.base import SumKernel
-from lipcore.motion import Motion
-from lipcore.robots import Robot, load_robot
-from lipcore.simulation import Stream, simulate
-from lipcore.urdf import RigidBody
+from lipcore.model import dynamics
+from lipcore.robots.library import Robot, load_robot
+from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.urdf import RigidBody
 
 
 class Setting(NamedTuple):

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 import lipcore
-from lipcore import noise
-from lipcore.compact.statistics import collect, empty, merge
-from lipcore.compact.summing import Summing, Total
-from lipcore.conditioning import condition, conditioned, told, wanted
-from lipcore.fit_options import FitOptions
-from lipcore.online import spacing
+from lipcore.data import independence
+from lipcore.fitting import noise
+from lipcore.fitting.options import FitOptions
+from lipcore.posterior.statistics import collect, empty, merge
+from lipcore.posterior.summing import Summing, Total
+from lipcore.training.conditioning import condition, should_condition, sum_samples, with_statistics
 from tests.service.data import QUICK, stream
 
 TWO = ["revolute"] * 2
@@ -90,11 +90,11 @@ def test_the_form_of_other_devices_sums_alike(few, samples):
 
 def test_parts_are_added_to_the_whole(few, samples):
     summing = Summing.of(few.posterior)
-    parts = told(summing, samples.rows(slice(0, 90))) + told(summing, samples.rows(slice(90, 200)))
-    whole = told(summing, samples)
+    parts = sum_samples(summing, samples.rows(slice(0, 90))) + sum_samples(summing, samples.rows(slice(90, 200)))
+    whole = sum_samples(summing, samples)
     np.testing.assert_allclose(parts.a, whole.a, rtol=1e-9, atol=1e-9 * np.abs(whole.a).max())
     assert (parts.weight, parts.low.tolist(), parts.high.tolist()) == (200.0, whole.low.tolist(), whole.high.tolist())
-    model = conditioned(few, parts, 200)
+    model = with_statistics(few, parts, 200)
     assert model.training_range["dq"]["max"] == samples.dq.max(0).tolist()
     assert model.fit["samples_posterior"] == 200
 
@@ -120,7 +120,7 @@ def chosen(samples, options):
 
 
 def condition_timed(samples, options):
-    return condition(chosen(samples, options), samples, spacing.recorded(samples.t, samples.episode))
+    return condition(chosen(samples, options), samples, independence.recording_weights(samples.t, samples.episode))
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def condition_timed(samples, options):
     ],
 )
 def test_when_all_samples_are_wanted(statistics, count, worth, expected):
-    assert wanted(FitOptions(statistics=statistics), count, worth) is expected
+    assert should_condition(FitOptions(statistics=statistics), count, worth) is expected
 
 
 def test_options_know_their_words():
@@ -161,8 +161,8 @@ def test_thinned_samples_do_not_tell_the_noise():
 def test_rows_of_a_recording_count_for_their_time(rate):
     time = np.r_[np.arange(50) / rate, 5 + np.arange(50) / rate, 9.0]
     episode = np.r_[np.zeros(50), np.ones(50), 2].astype(np.int64)
-    found = spacing.recorded(time, episode)
+    found = independence.recording_weights(time, episode)
     np.testing.assert_allclose(found, np.r_[np.full(100, min(1.0, 10 / rate)), 1.0], rtol=1e-9)
     # a piece with one more row at both ends knows what the whole knows
-    np.testing.assert_array_equal(spacing.recorded(time[29:72], episode[29:72])[1:-1], found[30:71])
-    assert len(spacing.recorded(np.empty(0), np.empty(0, np.int64))) == 0
+    np.testing.assert_array_equal(independence.recording_weights(time[29:72], episode[29:72])[1:-1], found[30:71])
+    assert len(independence.recording_weights(np.empty(0), np.empty(0, np.int64))) == 0

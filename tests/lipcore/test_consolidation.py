@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lipcore import FitOptions, ModelFormatError, TorqueModel, load, save, train
-from lipcore.model import restore
+from lipcore.files.probing import probe
 from lipcore.online.batch import Rows
-from lipcore.online.consolidation import consolidate
 from lipcore.online.learner import OnlineModel
-from lipcore.probing import probe
-from lipcore.robots import load_robot
-from lipcore.simulation import Stream, simulate
+from lipcore.online.transfer import consolidate
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
 from tests.lipcore.online_checks import as_rows
 
 FLOOR = np.array([0.5, 0.0])
@@ -91,19 +92,8 @@ def test_probe_finds_answers_that_are_none(base: TorqueModel) -> None:
     params["noise.log_std"] += 400.0
     statistics = posterior.statistics
     assert statistics is not None
-    broken = restore(
-        base.estimator.name,
-        base.joint_names,
-        base.joint_types,
-        base.torque_convention,
-        base.options,
-        base.fit,
-        params,
-        posterior.basis.inducing,
-        posterior.basis.outputs,
-        statistics,
-        base.training_range,
-        base.compact,
-    )
+    inducing, outputs = posterior.basis.inducing, posterior.basis.outputs
+    restored = CompactPosterior.restore(base.estimator.kernel, params, inducing, outputs, statistics)
+    broken = replace(base, posterior=restored)
     with pytest.raises(ModelFormatError, match="noise_std of a probe"):
         probe(broken)

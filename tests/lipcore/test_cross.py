@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from lipcore.data.motion import Motion
 from lipcore.kernels.compiled.lanes import LANES
-from lipcore.motion import Motion
 from tests.lipcore.oracles import instant, scale_of, torque_terms
 from tests.lipcore.problems import KERNELS, Problem, random_problem
 

@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from lipcore import FitOptions, Samples, TorqueModel, train
-from lipcore.estimators import ESTIMATORS, UnknownEstimatorError, make_estimator
-from lipcore.evidence import negative_log_evidence
+from lipcore.data.metrics import evaluate
+from lipcore.fitting.estimators import ESTIMATORS, UnknownEstimatorError, make_estimator
 from lipcore.kernels.arm_prior import Arm, arm_of_robot
-from lipcore.metrics import evaluate
-from lipcore.robots import load_robot
-from lipcore.simulation import Stream, simulate
-from lipcore.urdf import RigidBody
+from lipcore.posterior.exact import negative_log_evidence
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import AUTO, CHOICES, DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS
 
 ROBOT = "double-pendulum"

@@ -9,10 +9,10 @@ import pytest
 import torch
 from scipy.stats import multivariate_normal
 
-from lipcore.evidence import negative_log_evidence
 from lipcore.kernels.base import Params, SumKernel, TorqueKernel
 from lipcore.kernels.friction import FrictionKernel
-from lipcore.linalg import NotPositiveDefiniteError
+from lipcore.posterior.exact import negative_log_evidence
+from lipcore.posterior.linalg import NotPositiveDefiniteError
 from tests.lipcore.problems import KERNELS, Problem, TorchForm, random_problem
 
 SAMPLES = 9

@@ -9,17 +9,15 @@ import pytest
 import torch
 
 import lipcore
+from lipcore.data.motion import Motion
 from lipcore.excitation import Belief, Limits, PlanOptions, plan
 from lipcore.excitation.information import Information
-from lipcore.excitation.reference import draw
-from lipcore.excitation.searching import Goal, search
-from lipcore.excitation.shape import Shape
-from lipcore.excitation.torque import MARGIN, TorqueCheck
-from lipcore.motion import Motion
-from lipcore.posterior import ExactPosterior
-from lipcore.robots import load_robot
-from lipcore.simulation import Stream, inverse_dynamics, simulate
-from lipcore.urdf import RigidBody
+from lipcore.excitation.motions import Shape, draw
+from lipcore.excitation.searching import MARGIN, Goal, TorqueCheck, search
+from lipcore.posterior.exact import ExactPosterior
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
+from lipcore.robots.urdf import RigidBody
 
 NOISE = 0.05
 QUICK = lipcore.FitOptions(hyperparameter_samples=20, posterior_samples=40, max_iterations=4, starts=1, device="cpu")

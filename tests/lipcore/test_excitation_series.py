@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lipcore.excitation import Limits, Series
-from lipcore.excitation.series import overshoot
-from lipcore.excitation.shape import Shape
+from lipcore.excitation.motions import Shape, overshoot
 
 ROUNDING = 1e-9
 

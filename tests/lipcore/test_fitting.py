@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 import torch
 
-from lipcore import evidence, fitting
-from lipcore.estimators import make_estimator
-from lipcore.fit_options import FitOptions
-from lipcore.fitting import Fit, FitCancelledError, FitProgress, fit
-from lipcore.linalg import NotPositiveDefiniteError
-from lipcore.metrics import evaluate
-from lipcore.model import train
-from lipcore.robots import load_robot
-from lipcore.samples import Samples
-from lipcore.signals import low_pass
-from lipcore.simulation import Stream, simulate
+from lipcore.data.metrics import evaluate
+from lipcore.data.samples import Samples
+from lipcore.data.signals import low_pass
+from lipcore.fitting import hyperparameters as fitting
+from lipcore.fitting.estimators import make_estimator
+from lipcore.fitting.hyperparameters import Fit, FitCancelledError, FitProgress, fit
+from lipcore.fitting.options import FitOptions
+from lipcore.posterior import exact as evidence
+from lipcore.posterior.linalg import NotPositiveDefiniteError
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
+from lipcore.training.train import train
 
 SMALL = FitOptions(hyperparameter_samples=25, posterior_samples=60, max_iterations=12, starts=1, device="cpu")
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from lipcore.data.motion import Motion
 from lipcore.kernels.friction import SIGN_WIDTH, STRIBECK_SPEED, FrictionKernel, friction_features
-from lipcore.motion import Motion
 from tests.lipcore.problems import random_problem
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from lipcore.linalg import NotPositiveDefiniteError, cholesky
+from lipcore.posterior.linalg import NotPositiveDefiniteError, cholesky
 
 
 def well_conditioned(size: int) -> torch.Tensor:

@@ -7,8 +7,8 @@ import pytest
 import torch
 from hypothesis import given
 
+from lipcore.data.motion import Motion
 from lipcore.kernels.lip import LipKernel, shares
-from lipcore.motion import Motion
 from tests.lipcore.agreement import RELATIVE, opposite, worst_block_error, worst_energy_error
 from tests.lipcore.oracles import base_kernel, shares_of
 from tests.lipcore.problems import Problem, lip_shapes, problems, random_problem

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from lipcore.metrics import LEVELS, RELIABILITY_LEVELS, evaluate
+from lipcore.data.metrics import LEVELS, RELIABILITY_LEVELS, evaluate
 
 Z95 = 1.959963984540054
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from lipcore import FitOptions, Samples, TorqueModel, train
-from lipcore.estimators import ESTIMATORS, UnknownEstimatorError
-from lipcore.robots import load_robot
-from lipcore.simulation import Stream, simulate
+from lipcore.fitting.estimators import ESTIMATORS, UnknownEstimatorError
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
 
 JOINT_TYPES = ("revolute", "revolute")
 OPTIONS = FitOptions(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lipcore.motion import Motion, check_joint_types
+from lipcore.data.motion import Motion, check_joint_types
 
 
 def test_one_instant_and_many_are_accepted() -> None:

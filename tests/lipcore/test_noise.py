@@ -10,14 +10,13 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from lipcore import noise
-from lipcore.evidence import negative_log_evidence
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Samples
+from lipcore.fitting import noise
 from lipcore.kernels.base import SumKernel
 from lipcore.kernels.friction import FrictionKernel
-from lipcore.linalg import NotPositiveDefiniteError
-from lipcore.motion import Motion
-from lipcore.posterior import noisy_gram
-from lipcore.samples import Samples
+from lipcore.posterior.exact import negative_log_evidence, noisy_gram
+from lipcore.posterior.linalg import NotPositiveDefiniteError
 from tests.lipcore.problems import random_problem
 
 JOINTS = ("revolute", "prismatic", "revolute")

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lipcore.online.acceleration import MIN_RATE, RateError, derive, rate_of, window
-from lipcore.robots import load_robot
-from lipcore.simulation import Stream, inverse_dynamics, simulate
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
 
 EPOCH = 1.8e9
 """Unix time, whose floats step by 2.4e-7 s."""

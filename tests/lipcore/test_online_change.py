@@ -14,8 +14,8 @@ from scipy.signal import lfilter
 from lipcore.online.change import Change, ChangeDetector, friction_share, suspect
 from lipcore.online.gates import is_contact
 from lipcore.online.record import Record
-from lipcore.robots import Robot, load_robot
-from lipcore.simulation import Payload, Stream, inverse_dynamics, simulate
+from lipcore.robots.library import Robot, load_robot
+from lipcore.robots.simulation import Payload, Stream, inverse_dynamics, simulate
 
 Scale = Callable[[np.ndarray], np.ndarray]
 NAMES = tuple(f"j{k + 1}" for k in range(7))

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from lipcore import FitOptions, TorqueModel, train
-from lipcore.estimators import ESTIMATORS
+from lipcore.fitting.estimators import ESTIMATORS
 from lipcore.online.batch import Rows
-from lipcore.robots import load_robot
-from lipcore.simulation import Stream, simulate
-from lipcore.urdf import RigidBody
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import ROBOT_ESTIMATORS
 from tests.lipcore.online_checks import CHECKS, Check, as_rows
 

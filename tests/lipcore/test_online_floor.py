@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lipcore.online.floor import error_floor
-from lipcore.online.record import Record
-from lipcore.robots import load_robot
-from lipcore.simulation import Payload, Stream, inverse_dynamics, simulate
+from lipcore.online.record import Record, error_floor
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Payload, Stream, inverse_dynamics, simulate
 
 NOISE = np.array([0.05, 2.0])
 

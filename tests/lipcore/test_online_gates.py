@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lipcore.data.samples import Samples
 from lipcore.online.gates import LARGEST_TORQUE, Limits, Patience, check_rows, is_contact, time_span
-from lipcore.robots import Robot, load_robot
-from lipcore.samples import Samples
-from lipcore.simulation import Payload, Stream, inverse_dynamics, simulate
+from lipcore.robots.library import Robot, load_robot
+from lipcore.robots.simulation import Payload, Stream, inverse_dynamics, simulate
 from lipcore.vocabulary import CODES
 
 LIMITS = Limits(12.6, 50.0, 2000.0, None, 1.0, 1e-3)

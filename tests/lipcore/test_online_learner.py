@@ -9,16 +9,16 @@ import pytest
 import torch
 
 from lipcore import FitOptions, TorqueModel, save, train
-from lipcore.compact.posterior import CompactPosterior
-from lipcore.motion import Motion
-from lipcore.online import state
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Samples
+from lipcore.online import transfer
 from lipcore.online.batch import Rows
 from lipcore.online.learner import ForgottenError, OnlineModel, uncovered
-from lipcore.online.revision import Revision
-from lipcore.posterior import ExactPosterior
-from lipcore.robots import load_robot
-from lipcore.samples import Samples
-from lipcore.simulation import Payload, Stream, simulate
+from lipcore.online.transfer import Revision
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.exact import ExactPosterior
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Payload, Stream, simulate
 from lipcore.vocabulary import LEARNT
 from tests.lipcore.online_checks import EXACT, as_rows, same_answers
 
@@ -232,16 +232,16 @@ def test_what_has_learnt_is_neither_a_start_nor_a_version(base: TorqueModel, row
 
 
 def test_state_of_another_version_or_damaged_is_refused(base: TorqueModel, rows: Rows) -> None:
-    payload = state.dump(OnlineModel.start(base).learn(rows))
+    payload = transfer.dump(OnlineModel.start(base).learn(rows))
     known = base.posterior.statistics
     assert known is not None
     told = replace(known, b=known.b + 1)
     other = replace(base, posterior=replace(base.posterior, weights=base.posterior.weights + 1, statistics=told))
     with pytest.raises(ValueError, match="another version"):
-        state.load(other, payload)
+        transfer.load(other, payload)
     for broken in (b"", payload[:-10], b"x" * 100, payload[:8] + b"[" + payload[9:]):
         with pytest.raises(ValueError, match=r"no state|expected|another"):
-            state.load(base, broken)
+            transfer.load(base, broken)
 
 
 def test_revision_of_another_basis_is_refused(base: TorqueModel, rows: Rows) -> None:
@@ -264,12 +264,12 @@ def test_rows_of_differing_shapes_are_refused(rows: Rows) -> None:
 def test_adding_in_place_gives_the_same_bits(base: TorqueModel, rows: Rows, forgetting: float | None) -> None:
     parts = [rows.take(slice(0, 40)), rows.take(slice(40, 41)), rows.take(slice(41, None))]
     usual = OnlineModel.start(base, forgetting, since=float(rows.time.min()))
-    untouched = state.dump(usual)
+    untouched = transfer.dump(usual)
     own = usual.detached()
     for part in parts:
         usual, own = usual.learn(part), own.learn(part, own=True)
     usual, own = usual.change(5000.0), own.change(5000.0)
     usual, own = usual.unlearn(parts[1]), own.unlearn(parts[1], own=True)
-    assert state.dump(own.whole()) == state.dump(usual)
-    assert state.dump(OnlineModel.start(base, forgetting, since=float(rows.time.min()))) == untouched
+    assert transfer.dump(own.symmetrised()) == transfer.dump(usual)
+    assert transfer.dump(OnlineModel.start(base, forgetting, since=float(rows.time.min()))) == untouched
     assert torch.equal(usual.now.statistics.a, usual.now.statistics.a.T)

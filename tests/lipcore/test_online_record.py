@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lipcore.metrics import evaluate
+from lipcore.data.metrics import evaluate
 from lipcore.online.record import Record
 
 Rows = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]

@@ -7,53 +7,53 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lipcore.online.spacing import INDEPENDENT_HZ, evenly, weights
+from lipcore.data.independence import INDEPENDENT_HZ, even_weights, stream_weights
 
 
 @pytest.mark.parametrize("rate", [100.0, 250.0, 1000.0])
 def test_a_second_of_a_fast_stream_counts_the_same_at_every_rate(rate: float) -> None:
     time = 1e9 + np.arange(int(4 * rate)) / rate
-    assert weights(time).sum() == pytest.approx(4 * INDEPENDENT_HZ, rel=1e-3)
-    assert weights(time[1:], time[0]).sum() == pytest.approx((4 - 1 / rate) * INDEPENDENT_HZ, rel=1e-3)
+    assert stream_weights(time).sum() == pytest.approx(4 * INDEPENDENT_HZ, rel=1e-3)
+    assert stream_weights(time[1:], time[0]).sum() == pytest.approx((4 - 1 / rate) * INDEPENDENT_HZ, rel=1e-3)
 
 
 def test_rows_of_a_slow_stream_count_in_full() -> None:
-    assert (weights(np.arange(5) / INDEPENDENT_HZ) > 1 - 1e-12).all()
-    assert (weights(np.arange(5) / 2.0) == 1).all()
-    assert (weights(np.array([3.0])) == 1).all()
-    assert (weights(np.array([3.0]), 2.0) == 1).all()
+    assert (stream_weights(np.arange(5) / INDEPENDENT_HZ) > 1 - 1e-12).all()
+    assert (stream_weights(np.arange(5) / 2.0) == 1).all()
+    assert (stream_weights(np.array([3.0])) == 1).all()
+    assert (stream_weights(np.array([3.0]), 2.0) == 1).all()
 
 
 def test_a_wrong_time_does_not_change_what_evenly_spaced_rows_count_for() -> None:
     time = 5.0 + np.arange(20) / 500
     expected = np.full(20, INDEPENDENT_HZ / 500)
-    np.testing.assert_allclose(evenly(time), expected)
+    np.testing.assert_allclose(even_weights(time), expected)
     for wrong in (np.nan, 4.0, 1e9, time[6]):
-        np.testing.assert_allclose(evenly(np.where(np.arange(20) == 7, wrong, time)), expected, rtol=1e-9)
-    assert (evenly(np.array([3.0])) == 1).all()
-    assert (evenly(np.arange(5.0)) == 1).all()
+        np.testing.assert_allclose(even_weights(np.where(np.arange(20) == 7, wrong, time)), expected, rtol=1e-9)
+    assert (even_weights(np.array([3.0])) == 1).all()
+    assert (even_weights(np.arange(5.0)) == 1).all()
 
 
 def test_rows_that_were_bunched_count_for_the_time_they_took() -> None:
     """Ten frames that wait for each other and arrive together stand for the ten milliseconds since the last ones."""
     even = np.arange(1, 201) / 1000
     bunched = np.repeat(even[9::10], 10) + np.tile(np.arange(10), 20) * 1e-6
-    assert weights(bunched, 0.0).sum() == pytest.approx(weights(even, 0.0).sum(), rel=1e-2)
+    assert stream_weights(bunched, 0.0).sum() == pytest.approx(stream_weights(even, 0.0).sum(), rel=1e-2)
 
 
 def test_rows_without_times_share_those_since_the_batch_before() -> None:
-    together = weights(np.full(100, 7.0), 6.9)
+    together = stream_weights(np.full(100, 7.0), 6.9)
     assert (together == together[0]).all()
     assert together.sum() == pytest.approx(0.1 * INDEPENDENT_HZ)
-    assert (weights(np.full(100, 7.0)) == 1).all()
+    assert (stream_weights(np.full(100, 7.0)) == 1).all()
 
 
 def test_time_that_goes_backwards_counts_nothing() -> None:
-    assert weights(np.array([3.0]), 4.0)[0] == 0
-    assert len(weights(np.empty(0))) == 0
+    assert stream_weights(np.array([3.0]), 4.0)[0] == 0
+    assert len(stream_weights(np.empty(0))) == 0
 
 
 @given(st.permutations(range(8)))
 def test_weights_belong_to_rows_and_not_to_places(order: list[int]) -> None:
     time = np.cumsum([0.001, 0.002, 0.001, 0.05, 0.003, 0.001, 0.001, 0.01])
-    np.testing.assert_allclose(weights(time[order], 0.0), weights(time, 0.0)[order])
+    np.testing.assert_allclose(stream_weights(time[order], 0.0), stream_weights(time, 0.0)[order])

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from lipcore.metrics import evaluate
-from lipcore.paired import MAX_BLOCKS, MIN_BLOCKS, Answer, blocks, compare, difference
-from lipcore.samples import Samples
+from lipcore.data.metrics import evaluate
+from lipcore.data.paired import MAX_BLOCKS, MIN_BLOCKS, Answer, blocks, compare, difference
+from lipcore.data.samples import Samples
 
 
 def recording(t, tau, episode=None):

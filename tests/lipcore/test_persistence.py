@@ -14,9 +14,10 @@ import torch
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
-from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, copy_model, load, persistence, save, train
-from lipcore.robots import load_robot
-from lipcore.simulation import Stream, simulate
+from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, copy_model, load, save, train
+from lipcore.files import persistence
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
 
 
 @pytest.fixture(scope="module")

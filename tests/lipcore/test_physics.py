@@ -9,11 +9,12 @@ import pinocchio as pin
 import pytest
 import torch
 
-from lipcore import FitOptions, Samples, TorqueModel, dynamics, train
-from lipcore.metrics import evaluate
-from lipcore.motion import Motion
-from lipcore.robots import Robot, load_robot
-from lipcore.simulation import Stream, simulate
+from lipcore import FitOptions, Samples, TorqueModel, train
+from lipcore.data.metrics import evaluate
+from lipcore.data.motion import Motion
+from lipcore.model import dynamics
+from lipcore.robots.library import Robot, load_robot
+from lipcore.robots.simulation import Stream, simulate
 
 
 class Case(NamedTuple):

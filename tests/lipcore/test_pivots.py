@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lipcore.compact.pivots import PREFERENCE, pivots
+from lipcore.posterior.selection import PREFERENCE, pivots
 
 
 def gram_of(rows: int, rank: int, seed: int) -> torch.Tensor:

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
+from lipcore.data.motion import Motion
 from lipcore.kernels.base import SumKernel
 from lipcore.kernels.friction import FrictionKernel
-from lipcore.motion import Motion
-from lipcore.posterior import ExactPosterior, noisy_gram
+from lipcore.posterior.exact import ExactPosterior, noisy_gram
 from tests.lipcore.problems import KERNELS, Problem, random_problem
 
 JOINTS = ("revolute", "prismatic", "revolute")
@@ -96,7 +96,7 @@ def test_terms_of_the_kernel_share_out_the_mean(setting: Setting) -> None:
 
 def test_predictions_do_not_depend_on_the_chunk_size(setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = setting.posterior.predict(setting.query)
-    monkeypatch.setattr("lipcore.posterior.QUERIES_PER_CHUNK", 3)
+    monkeypatch.setattr("lipcore.posterior.exact.QUERIES_PER_CHUNK", 3)
     parts = setting.posterior.predict(setting.query)
     assert torch.allclose(parts.mean, whole.mean, rtol=1e-10, atol=1e-12)
     assert torch.allclose(parts.covariance, whole.covariance, rtol=1e-9, atol=1e-11)

@@ -14,8 +14,8 @@ from lipcore.profiles import from_urdf, names, profile, profiles, recognise
 from lipcore.profiles.arms import ARMS
 from lipcore.profiles.catalogue import SHEETS
 from lipcore.profiles.names import MAKES, words
-from lipcore.robots import ROBOTS, UnknownRobotError, load_robot, profile_urdf
-from lipcore.urdf import RigidBody, UrdfError
+from lipcore.robots.library import ROBOTS, UnknownRobotError, load_robot, profile_urdf
+from lipcore.robots.urdf import RigidBody, UrdfError
 from tests.lipcore.test_urdf import joint, link, robot
 
 ALL = tuple(SHEETS)
@@ -188,16 +188,6 @@ def test_some_joints_of_a_robot_are_matched_but_no_whole() -> None:
     assert panda.called(("joint4", "joint2")) is None
 
 
-def test_a_profile_for_the_joints_of_data() -> None:
-    found = profile("panda").for_joints(("fer_joint6", "wheel", "fer_joint1", "fer_joint2", "fer_joint7"))
-    assert found.joint_names == ("fer_joint6", "wheel", "fer_joint1", "fer_joint2", "fer_joint7")
-    assert found.joint_aliases[0] == ("panda_joint6", "fer_joint6")
-    for name in ("lower", "upper", "speed", "acceleration", "torque"):
-        values, whole = getattr(found, name), getattr(profile("panda"), name)
-        assert np.isnan(values[1])
-        assert values[[0, 2, 3, 4]].tolist() == whole[[5, 0, 1, 6]].tolist()
-
-
 @pytest.mark.parametrize("name", ALL)
 def test_the_own_names_of_a_robot_are_recognised_unless_they_are_numbers(name: str) -> None:
     found = recognise(profile(name).joint_names)
@@ -226,7 +216,6 @@ def test_any_names_are_taken(joints: list[str]) -> None:
         order = found.order_of(joints)
         assert order is None or len(set(order)) == found.n_joints
         assert len(found.match(joints)) == len(joints)
-        assert found.for_joints(joints).n_joints == len(joints)
 
 
 def test_of_too_many_names_only_equal_ones_are_found() -> None:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from lipcore import FitOptions, Samples, train
-from lipcore.metrics import Metrics, evaluate
-from lipcore.signals import differentiate, low_pass
+from lipcore.data.metrics import Metrics, evaluate
+from lipcore.data.signals import differentiate, low_pass
 
 DATA = Path(__file__).parents[3] / "shared/data"
 PANDA, SCHUNK = DATA / "panda_exciting_trajectory.db3", DATA / "schunk_liu_althoff.npz"

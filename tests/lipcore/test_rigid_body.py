@@ -13,23 +13,16 @@ import pytest
 import torch
 
 from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, copy_model, load, save, train
-from lipcore.estimators import make_estimator
+from lipcore.data.metrics import evaluate
+from lipcore.data.motion import Motion
+from lipcore.fitting.estimators import make_estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import arm_of_robot
-from lipcore.metrics import evaluate
-from lipcore.motion import Motion
-from lipcore.parameters import (
-    friction_coefficients,
-    inertial_parameters,
-    is_plausible,
-    nearest_plausible,
-    precision,
-    pseudo_inertia,
-    weight_posterior,
-)
-from lipcore.robots import load_robot, profile_urdf
-from lipcore.simulation import Stream, simulate
-from lipcore.urdf import JointMismatchError, RigidBody
+from lipcore.model.parameters import friction_coefficients, inertial_parameters, precision, weight_posterior
+from lipcore.model.plausible import is_plausible, nearest_plausible, pseudo_inertia
+from lipcore.robots.library import load_robot, profile_urdf
+from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.urdf import JointMismatchError, RigidBody
 
 VISCOUS, COULOMB = 0.5, 0.3
 BODIES = 70

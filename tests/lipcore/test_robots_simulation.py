@@ -8,8 +8,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from lipcore.robots import ROBOTS, Robot, UnknownRobotError, load_robot
-from lipcore.simulation import Payload, Stream, simulate
+from lipcore.robots.library import ROBOTS, Robot, UnknownRobotError, load_robot
+from lipcore.robots.simulation import Payload, Stream, simulate
 
 JOINTS = {
     "panda": (7, "panda_joint1", "panda_joint7"),

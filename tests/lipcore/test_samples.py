@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lipcore.samples import Samples
+from lipcore.data.samples import Samples
 
 
 def table(rows: int = 6, episode: tuple[int, ...] | None = None, names: tuple[str, ...] = ("a", "b")) -> Samples:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from lipcore.motion import Motion
-from lipcore.selection import spread_out
+from lipcore.data.motion import Motion
+from lipcore.posterior.selection import spread_out
 
 
 def random_motion(size: int, seed: int = 0) -> Motion:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lipcore.signals import differentiate, low_pass, noise_level
+from lipcore.data.signals import differentiate, low_pass, noise_level
 
 RATE = 100.0
 SECONDS = 20

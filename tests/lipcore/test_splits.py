@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lipcore.samples import Samples
-from lipcore.splits import GUARD_S, Split, SplitError, choose, split, taken
+from lipcore.data.samples import Samples
+from lipcore.data.splits import GUARD_S, Split, SplitError, choose, split, taken
 
 KINDS = ("episodes", "last", "blocks")
 

@@ -11,18 +11,18 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from lipcore import fitting
-from lipcore.estimators import make_estimator
-from lipcore.fit_options import FitOptions
-from lipcore.fitting import FitCancelledError, fit
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Samples
+from lipcore.fitting import hyperparameters as fitting
+from lipcore.fitting.estimators import make_estimator
+from lipcore.fitting.hyperparameters import FitCancelledError, fit
+from lipcore.fitting.options import FitOptions
 from lipcore.kernels.base import SumKernel
 from lipcore.kernels.chain import ChainKernel
 from lipcore.kernels.friction import FrictionKernel
-from lipcore.linalg import NotPositiveDefiniteError
-from lipcore.motion import Motion
-from lipcore.robots import load_robot
-from lipcore.samples import Samples
-from lipcore.simulation import Stream, simulate
+from lipcore.posterior.linalg import NotPositiveDefiniteError
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
 
 OPTIONS = FitOptions(hyperparameter_samples=40, posterior_samples=60, max_iterations=20, device="cpu")
 

@@ -11,21 +11,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lipcore.compact.basis import Basis
-from lipcore.compact.statistics import (
-    Statistics,
-    collect,
-    decay,
-    empty,
-    merge,
-    solve,
-    subtract,
-    update,
-)
+from lipcore.data.motion import Motion
 from lipcore.kernels.base import SumKernel
 from lipcore.kernels.friction import FrictionKernel
-from lipcore.linalg import NotPositiveDefiniteError
-from lipcore.motion import Motion
+from lipcore.posterior.basis import Basis
+from lipcore.posterior.linalg import NotPositiveDefiniteError
+from lipcore.posterior.statistics import Statistics, collect, decay, empty, merge, solve, subtract, update
 from tests.lipcore.problems import random_problem
 
 TYPES = ("revolute", "prismatic", "revolute")

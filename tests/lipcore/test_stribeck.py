@@ -11,14 +11,14 @@ import torch
 
 from lipcore import FitOptions, Samples, TorqueModel, load, save, train
 from lipcore.arm import learning
-from lipcore.arm.storing import arm_tensors, read_arm
+from lipcore.data.motion import Motion
+from lipcore.files.arm import arm_tensors, read_arm
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative
-from lipcore.motion import Motion
+from lipcore.model.parameters import friction_coefficients
 from lipcore.online.learner import OnlineModel
-from lipcore.parameters import friction_coefficients
-from lipcore.random_arms import random_arm
-from lipcore.simulation import Stream, simulate
+from lipcore.robots.library import random_arm
+from lipcore.robots.simulation import Stream, simulate
 from tests.lipcore.test_arm_model import errors, rows_of
 
 ROBOT = random_arm(1, joints=3)

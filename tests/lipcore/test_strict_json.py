@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lipcore.strict_json import MAX_DEPTH, StrictJsonError, quote, read
+from lipcore.files.strict_json import MAX_DEPTH, StrictJsonError, quote, read
 
 VALUES = st.recursive(
     st.none()

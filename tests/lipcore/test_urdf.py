@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from lipcore import FitOptions
-from lipcore.estimators import MissingRobotError, UnknownEstimatorError, check_estimator, make_estimator
+from lipcore.fitting.estimators import MissingRobotError, UnknownEstimatorError, check_estimator, make_estimator
 from lipcore.kernels.arm_prior import arm_of_robot
-from lipcore.robots import ROBOTS, UnknownRobotError, load_robot, profile_urdf
-from lipcore.urdf import MAX_LINKS, JointMismatchError, RigidBody, UrdfError, describe
+from lipcore.robots.library import ROBOTS, UnknownRobotError, load_robot, profile_urdf
+from lipcore.robots.urdf import MAX_LINKS, JointMismatchError, RigidBody, UrdfError, describe
 
 TWO = ("revolute", "revolute")
 

@@ -10,13 +10,13 @@ import pinocchio as pin
 import pytest
 
 from lipcore import FitOptions, train
-from lipcore.arm.urdf_writer import ArmJoints, rpy, urdf_of_parameters, urdf_text
+from lipcore.files.persistence import encode
+from lipcore.files.urdf_writer import ArmJoints, rpy, urdf_of_parameters, urdf_text
 from lipcore.kernels.compiled.arm import arm_torques
 from lipcore.kernels.geometry import Geometry, rotation_of
-from lipcore.persistence import encode
-from lipcore.robots import load_robot
-from lipcore.simulation import Stream, simulate
-from lipcore.urdf import RigidBody, describe
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.urdf import RigidBody, describe
 from tests.lipcore.arms import parameters, parameters_of, random_bodies, random_geometry
 
 

@@ -9,9 +9,9 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 
 from lipcore import FitOptions, train
-from lipcore.energies import kinetic_energy
-from lipcore.motion import Motion
-from lipcore.samples import Samples
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Samples
+from lipcore.model.functionals import kinetic_energy
 from lipcore.warm_up import COMPILED, warm_up
 
 

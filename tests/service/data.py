@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from lipcore.robots import load_robot
-from lipcore.samples import Samples
-from lipcore.simulation import Stream, simulate
+from lipcore.data.samples import Samples
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
 from service.foundation.states import ACTIVE
 from service.learning.learners import Learners
 from service.models.loaded import LoadedModels

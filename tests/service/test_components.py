@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from lipcore import dynamics
+from lipcore.data.motion import Motion
 from lipcore.kernels.se import SquaredExponentialKernel
-from lipcore.motion import Motion
+from lipcore.model import dynamics
 from service.client import ApiError, Client
 from service.foundation.settings import Settings
 from service.inference import predicting

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lipcore
-from lipcore.metrics import evaluate
+from lipcore.data.metrics import evaluate
 from service.models import registry
 from tests.service.data import arrays, error, npz, post, service_of, stream, upload
 

@@ -8,8 +8,8 @@ from typer.testing import CliRunner
 
 import lipcore
 from lipcore.profiles import profile
-from lipcore.robots import load_robot, profile_urdf
-from lipcore.simulation import Stream, inverse_dynamics, simulate
+from lipcore.robots.library import load_robot, profile_urdf
+from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
 from service.cli import excite as command
 from service.cli.excite import fetch, find_model
 from service.cli.excite_robot import find

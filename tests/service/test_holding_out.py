@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import lipcore
-from lipcore.metrics import evaluate
-from lipcore.samples import Samples
+from lipcore.data.metrics import evaluate
+from lipcore.data.samples import Samples
 from service.models import registry
 from service.storage.database import DatasetRow, JobRow
 from service.training.material import recorded

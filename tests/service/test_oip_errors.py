@@ -9,7 +9,7 @@ import pytest
 import torch
 from fastapi.testclient import TestClient
 
-from lipcore import dynamics
+from lipcore.model import dynamics
 from service.oip import answer as answering
 from service.oip import query
 from tests.service.data import ADDRESS, error, service_of

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from lipcore import dynamics
-from lipcore.model import TorqueModel
-from lipcore.motion import Motion
+from lipcore.data.motion import Motion
+from lipcore.model import dynamics
+from lipcore.model.torque_model import TorqueModel
 from service.oip import answer as answering
 from service.oip import query as querying
 from service.oip import wire

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lipcore
-from lipcore.robots import ROBOTS, load_robot, profile_urdf
+from lipcore.robots.library import ROBOTS, load_robot, profile_urdf
 from service.client import ApiError, Client
 from service.foundation.errors import InvalidRequestError
 from service.models import registry

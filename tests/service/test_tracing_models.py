@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lipcore import dynamics
+from lipcore.data.motion import Motion
 from lipcore.kernels.se import SquaredExponentialKernel
-from lipcore.motion import Motion
+from lipcore.model import dynamics
 from tests.service.data import arrays, error, npz, post, service_of, stream, train, upload
 
 PARTS = ["inertial", "coriolis", "gravity", "friction"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lipcore.robots import load_robot
+from lipcore.robots.library import load_robot
 from tests.service.data import DEADLINE, ENDLESS, QUICK, eventually, job, queue, running, stream, train, upload
 
 QUERY = {"q": [0.3, -0.2], "dq": [0.1, 0.4], "ddq": [1.0, -0.5]}

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.datasets.formats.table import SAME_LENGTH
 from service.foundation.errors import invalid_data
 

@@ -14,7 +14,7 @@ from typing import IO
 import pyarrow as pa
 import pyarrow.csv as pacsv
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.datasets.formats.columns import MISSING, NUMBER, NumberColumn, StampColumn
 from service.datasets.formats.table import Table, checked_names, first_line, left_out, stacked
 from service.datasets.options import ReadOptions

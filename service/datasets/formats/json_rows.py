@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.datasets.formats.table import SAME_LENGTH, block_rows, checked_names, left_out
 from service.foundation.errors import InvalidDataError, invalid_data
 from service.foundation.settings import Settings

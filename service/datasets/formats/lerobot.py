@@ -13,7 +13,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.datasets.formats.json_rows import decode
 from service.datasets.formats.parquet import ParquetSource
 from service.datasets.formats.table import Table, checked_names, first_line

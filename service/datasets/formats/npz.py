@@ -14,7 +14,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.lib import format as npy
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.datasets.formats.table import Table, block_rows, checked_names, first_line, left_out
 from service.datasets.formats.zips import ERRORS, measure, open_zip
 from service.datasets.options import ReadOptions

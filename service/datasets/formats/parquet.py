@@ -15,7 +15,7 @@ from typing import IO
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.datasets.formats.columns import Node, plan
 from service.datasets.formats.table import Table, block_rows, checked_names, first_line, left_out, stacked
 from service.datasets.options import ReadOptions

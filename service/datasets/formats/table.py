@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.foundation.errors import invalid_data
 from service.foundation.settings import Settings
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.datasets.mapping.vocabulary import TURN
 from service.foundation.errors import InvalidDataError, invalid_data
 

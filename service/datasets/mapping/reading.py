@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.samples import Array
 from lipcore.profiles import Profile
-from lipcore.samples import Array
 from lipcore.vocabulary import TorqueConvention
 from service.datasets.formats.table import Table
 from service.datasets.mapping import checks

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lipcore.data.samples import Array
 from lipcore.kernels.friction import FRICTION_TERMS, SIGN_WIDTH
-from lipcore.samples import Array
 from service.datasets.report.fit import OWN, Fit, friction_terms, own_features
 from service.datasets.report.signals import Limits
 from service.datasets.report.timing import Rows, spread

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lipcore.data.samples import Array
 from lipcore.kernels.friction import SIGN_WIDTH
-from lipcore.samples import Array
 from service.datasets.report.timing import Rows
 
 OWN = 5

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.datasets.report.fit import Fit
 from service.datasets.report.timing import Rows
 from service.datasets.schema import Lag

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from lipcore.data.samples import Array
 from lipcore.preparation.recipe import Recipe
 from lipcore.profiles import Profile
-from lipcore.samples import Array
 from service.datasets.report.advice import advice, in_words, warnings
 from service.datasets.report.excitation import SELDOM, joint_excitation, weights
 from service.datasets.report.fit import make_fit

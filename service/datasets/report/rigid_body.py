@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
 
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Array
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.friction import FRICTION_TERMS, SIGN_WIDTH
-from lipcore.motion import Motion
-from lipcore.robots import SimulationUnavailableError
-from lipcore.samples import Array
-from lipcore.urdf import PARAMETERS, RigidBody
+from lipcore.robots.library import SimulationUnavailableError
+from lipcore.robots.urdf import PARAMETERS, RigidBody
 from service.datasets.report.signals import Limits
 from service.datasets.schema import WholeExcitation
 

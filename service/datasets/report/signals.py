@@ -7,9 +7,9 @@ from math import comb
 
 import numpy as np
 
+from lipcore.data.samples import Array
+from lipcore.data.signals import DIFFERENCE_ORDERS
 from lipcore.profiles import Profile
-from lipcore.samples import Array
-from lipcore.signals import DIFFERENCE_ORDERS
 from lipcore.vocabulary import JointType
 from service.datasets.report.timing import Rows
 from service.datasets.schema import JointLimits, JointSaturation

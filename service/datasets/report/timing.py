@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.datasets.schema import Gap, Timing
 from service.datasets.staging import EPISODE, TIME, Staged
 

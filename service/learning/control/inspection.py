@@ -10,9 +10,9 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
 from lipcore.online.record import Record
-from lipcore.samples import Array
 from lipcore.vocabulary import CODES
 from service.foundation.errors import NotFoundError, not_found
 from service.journal import log

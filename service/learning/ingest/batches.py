@@ -11,7 +11,7 @@ import numpy as np
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from lipcore.model import TorqueModel
+from lipcore.model.torque_model import TorqueModel
 from service.foundation.errors import ConflictError, invalid_request
 from service.foundation.settings import Settings
 from service.journal import log

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from sqlalchemy import select
 from sqlalchemy.orm import Session, undefer
 
+from lipcore.data.samples import Array
 from lipcore.online import acceleration
 from lipcore.online.acceleration import JITTER, RateError, derive
 from lipcore.online.batch import Rows
-from lipcore.samples import Array
 from lipcore.vocabulary import CODES
 from service.foundation.errors import invalid_request
 from service.journal.log import decode

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from lipcore.online import spacing
+from lipcore.data import independence
+from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
 from lipcore.online.gates import check_rows
-from lipcore.samples import Array
 from service.foundation.errors import ConflictError
 from service.journal import log
 from service.learning.ingest import screening
@@ -84,7 +84,7 @@ def observe_frames(intake: Intake, frames: Frames) -> FramesResult:
         bounds = screening.limits(model, options, intake.settings)
         q, dq, ddq, tau = numbers = [np.ascontiguousarray(getattr(frames, name)[new]) for name in NUMBERS]
         # frames are dated by the service as they arrive, so that their times need no check
-        weights = spacing.weights(frames.time[new], None if before is None else before.last)
+        weights = independence.stream_weights(frames.time[new], None if before is None else before.last)
         rows = Rows(frames.time[new], q, dq, ddq, tau, check_rows(None, q, dq, ddq, tau, bounds), weights)
         screened = screening.answered(rows, frames.mean[new], frames.std[new], model)
         sequences = frames.sequences[new]

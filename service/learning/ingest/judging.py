@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
 from lipcore.online.change import RATIO, Change, ChangeDetector, friction_share
 from lipcore.online.gates import Patience, is_contact
 from lipcore.online.record import Record
-from lipcore.samples import Array
 from lipcore.vocabulary import CODES, LEARNT
 from service.learning.ingest.screening import Screened
 from service.learning.schema import LearningOptions

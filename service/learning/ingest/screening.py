@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
-from lipcore.model import TorqueModel
-from lipcore.online import spacing
+from lipcore.data import independence
+from lipcore.data.samples import Array
+from lipcore.model.torque_model import TorqueModel
 from lipcore.online.batch import Rows
 from lipcore.online.gates import Limits, check_rows, time_span
-from lipcore.samples import Array
 from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.settings import Settings
 from service.learning.ingest import derivation
@@ -180,7 +180,10 @@ def dated(measured: Measured, clock: Clock, bounds: Limits, previous: float | No
         codes[clock.leaps(t, usable, offset, gap) & (codes != LIMIT)] = TIME_JUMP
     ddq = np.full_like(measured.q, np.nan) if measured.ddq is None else measured.ddq
     time = clock.event_time(t, offset, len(measured))
-    weights = spacing.weights(time, previous) if t is None or len(measured) == 1 else spacing.evenly(t)
+    if t is None or len(measured) == 1:
+        weights = independence.stream_weights(time, previous)
+    else:
+        weights = independence.even_weights(t)
     rows = Rows(time, measured.q, measured.dq, ddq, measured.tau, codes, weights)
     return Dated(rows, offset, span(t, codes))
 

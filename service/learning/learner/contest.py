@@ -19,10 +19,10 @@ from typing import Any, Literal
 import numpy as np
 from scipy.special import stdtrit
 
+from lipcore.data.paired import BLOCK_S, MAX_BLOCKS, Answer, Difference, of_blocks, surprise
+from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
 from lipcore.online.record import Record
-from lipcore.paired import BLOCK_S, MAX_BLOCKS, Answer, Difference, of_blocks, surprise
-from lipcore.samples import Array
 from service.foundation.settings import Settings
 from service.learning.learner.follower import Follower
 from service.learning.learner.publication import Contested

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy.exc import DBAPIError
 
-from lipcore.arm.linearisation import linearisation_error
-from lipcore.model import TorqueModel
-from lipcore.online import state
+from lipcore.data.samples import Array
+from lipcore.model.torque_model import TorqueModel
+from lipcore.model.warnings import linearisation_error
+from lipcore.online import transfer as state
 from lipcore.online.learner import OnlineModel
-from lipcore.online.revision import Revision
-from lipcore.samples import Array
+from lipcore.online.transfer import Revision
 from service.foundation.errors import StorageFullError
 from service.foundation.settings import Settings
 from service.journal import log, snapshots

@@ -5,11 +5,10 @@ from __future__ import annotations
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from lipcore.model import TorqueModel
-from lipcore.online.consolidation import consolidate
-from lipcore.online.floor import error_floor
-from lipcore.online.record import Record
-from lipcore.samples import Array
+from lipcore.data.samples import Array
+from lipcore.model.torque_model import TorqueModel
+from lipcore.online.record import Record, error_floor
+from lipcore.online.transfer import consolidate
 from service.journal import log, snapshots
 from service.learning.learner.restore import Restored, restore
 from service.models.served import Learnt

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from lipcore.online.revision import Revision
+from lipcore.online.transfer import Revision
 from service.storage.files import Files, new_id
 
 NAMES = tuple(each.name for each in fields(Revision))

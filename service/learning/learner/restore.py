@@ -24,8 +24,8 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from lipcore.model import TorqueModel
-from lipcore.online import state
+from lipcore.model.torque_model import TorqueModel
+from lipcore.online import transfer as state
 from lipcore.online.batch import Rows
 from lipcore.online.learner import ForgottenError, Novel, OnlineModel
 from service.journal import log, snapshots
@@ -145,7 +145,7 @@ def advance(
     else:
         rows = {each.event.number: each.rows for each in arrivals}
         online = _learn(database, known, online, part, rows, novel)
-    online = online.whole() if teaches else online
+    online = online.symmetrised() if teaches else online
     return replace(known, online=online, number=part.end, without=_active(replace(known, number=part.end)))
 
 
@@ -238,7 +238,7 @@ def _without_later(database: Database, known: Restored) -> Restored:
     online = known.online.detached()
     for taking in takings:
         online = _take(database, known, online, taking, newest + 1)
-    return replace(known, online=online.whole(), without={}) if takings else known
+    return replace(known, online=online.symmetrised(), without={}) if takings else known
 
 
 def _has_newer(database: Database, known: Restored, at_most: int | None) -> bool:

@@ -10,9 +10,9 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
 from lipcore.online.learner import uncovered
-from lipcore.samples import Array
 from lipcore.vocabulary import CODES, LEARNT
 from service.learning.ingest.derivation import EDGE
 from service.learning.ingest.intake import Judged

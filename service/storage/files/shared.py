@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, TypeVar
 
-from lipcore.manifest import MANIFEST
+from lipcore.files.manifest import MANIFEST
 from service.storage.files.local import remove
 from service.storage.files.objects import Found, Objects
 

@@ -20,10 +20,10 @@ from typing import TypeVar
 import numpy as np
 from sqlalchemy import select
 
-from lipcore import persistence
-from lipcore.manifest import ModelFormatError
-from lipcore.model import TorqueModel
-from lipcore.samples import Samples
+from lipcore.data.samples import Samples
+from lipcore.files import persistence
+from lipcore.files.manifest import ModelFormatError
+from lipcore.model.torque_model import TorqueModel
 from service.foundation.errors import DamagedDataError
 from service.foundation.settings import Settings
 from service.storage import sample_file

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import lipcore
-from lipcore import persistence
-from lipcore.urdf import RigidBody
+from lipcore.files import persistence
+from lipcore.robots.urdf import RigidBody
 from tests.service.archives.packing import MANIFEST, exported, pack, refused, send, unpack, vouched, with_json
 from tests.service.data import QUICK, stream
 

@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from lipcore.robots import ROBOTS
-from lipcore.simulation import Payload
+from lipcore.robots.library import ROBOTS
+from lipcore.robots.simulation import Payload
 from service import __version__
 from service.cli.main import Commands
 from service.datasets.formats.opening import open_table

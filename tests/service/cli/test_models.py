@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lipcore.urdf import describe
+from lipcore.robots.urdf import describe
 from tests.service.models.arms import JOINTS, WARNING
 
 

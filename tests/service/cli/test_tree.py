@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from lipcore.estimators import ESTIMATORS
-from lipcore.robots import ROBOTS
+from lipcore.fitting.estimators import ESTIMATORS
+from lipcore.robots.library import ROBOTS
 from lipcore.vocabulary import AUTO, CHOICES
 from service.cli import consoles, options
 from service.cli.consoles import plain

@@ -38,7 +38,7 @@ def version(parameters) -> Version:
 
 @pytest.fixture(scope="module")
 def robot():
-    from lipcore.urdf import RigidBody
+    from lipcore.robots.urdf import RigidBody
 
     return RigidBody.from_profile("panda", REVERSED, panda().joint_types)
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import lipcore
-from lipcore.conditioning import SHARD, condition
-from lipcore.online import spacing
-from lipcore.samples import Samples
+from lipcore.data import independence
+from lipcore.data.samples import Samples
+from lipcore.training.conditioning import SHARD, condition
 from service.compute.executors import Inline, shard_executor
 from service.compute.shards import summed
 from service.foundation.settings import Settings
@@ -19,7 +19,7 @@ from service.storage.database import DatasetRow
 from service.storage.files import Files, new_id
 from service.storage.sample_file import Reader
 from service.training.rows import CANDIDATES, STRETCHES, Part, Table, opened
-from service.training.summing import Context, packed, read, shard_told
+from service.training.summing import Context, packed, read, shard_statistics
 from tests.service.data import QUICK, stream
 
 ROWS = SHARD + 700
@@ -97,7 +97,7 @@ def test_shards_weigh_rows_as_the_whole_does(settings, parts):
         read_back = [read(settings, tuple(part.row.joint_names), each) for each in shards]
         samples, mask = recording(), slice(None) if part.chosen is None else part.chosen
         weights = np.concatenate([weights for _, weights in read_back])
-        np.testing.assert_array_equal(weights, spacing.recorded(samples.t, samples.episode)[mask])
+        np.testing.assert_array_equal(weights, independence.recording_weights(samples.t, samples.episode)[mask])
         np.testing.assert_array_equal(np.concatenate([each.tau for each, _ in read_back]), samples.tau[mask])
         assert part.independent_rows() == pytest.approx(weights.sum())
 
@@ -120,7 +120,7 @@ def test_the_pass_is_the_same_in_processes_and_here(settings, parts, model):
     """To the last bit; and what the plain way finds, to rounding."""
     table = Table([masked(parts[0]), parts[0]])
     context = Context(settings, packed(model), model.joint_names, "cpu")
-    work, shards = partial(shard_told, context), table.shards()
+    work, shards = partial(shard_statistics, context), table.shards()
     here = summed(Inline(), work, shards, lambda: False)
     with shard_executor(settings) as executor:
         there = summed(executor, work, shards, lambda: False)
@@ -128,7 +128,7 @@ def test_the_pass_is_the_same_in_processes_and_here(settings, parts, model):
     assert here.b.tobytes() == there.b.tobytes()
 
     samples = recording()
-    weights = spacing.recorded(samples.t, samples.episode)
+    weights = independence.recording_weights(samples.t, samples.episode)
     mask = table.parts[0].chosen
     both = Samples.concatenate([samples.rows(mask), samples])
     plain = condition(model, both, np.concatenate([weights[mask], weights])).posterior.statistics

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from lipcore.samples import Samples
+from lipcore.data.samples import Samples
 from service.foundation.states import ACTIVE
 from tests.service.data import eventually, job, post, queue, stream
 from tests.service.server import Server

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lipcore.fitting import FitCancelledError
+from lipcore.fitting.hyperparameters import FitCancelledError
 from service.compute.executors import Inline, shard_executor
 from service.compute.shards import AHEAD, ShardFailedError, summed
 from service.foundation.settings import Settings

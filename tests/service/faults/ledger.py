@@ -13,7 +13,7 @@ import httpx
 import numpy as np
 
 import lipcore
-from lipcore.online import spacing
+from lipcore.data import independence
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.vocabulary import LEARNT
@@ -134,7 +134,7 @@ class Ledger:
         places = np.concatenate([np.arange(s * ROWS, (s + 1) * ROWS) for s in teach] or [np.arange(0)])
         numbers = [getattr(taught, name)[:last] for name in ("q", "dq", "ddq", "tau")]
         code = np.full(last, LEARNT, np.uint8)
-        every = Rows(times[:last], *numbers, code, spacing.evenly(times[:last]))
+        every = Rows(times[:last], *numbers, code, independence.even_weights(times[:last]))
         model = OnlineModel.start(base).learn(every.take(places)).model()
         return model.predict(*(np.array(QUERIES[name]) for name in ("q", "dq", "ddq")))
 

@@ -67,7 +67,7 @@ JOBS = [
     *_around_commit("job queued", actions.train, "service.training.jobs:create"),
     Point("job queued: before it is handed on", actions.train, Fault("service.training.queue:JobQueue.submit"), "all"),
     *_both("job claimed", actions.train, Fault(COMMIT, "after", "service.training.worker:_claim")),
-    *_both("job at work: fit begun", actions.train, Fault("lipcore.fitting:fit", "before", WORK)),
+    *_both("job at work: fit begun", actions.train, Fault("lipcore.fitting.hyperparameters:fit", "before", WORK)),
     *_both("job at work: fit ended", actions.train, Fault("service.training.worker:_fit", "after")),
     *_both("version: half of its files", actions.train, Fault(FSYNC, "before", WORK)),
     *_both("version: files complete, no row", actions.train, Fault(RENAME, "after", WORK)),
@@ -77,7 +77,7 @@ JOBS = [
     Point(
         "job at work: its process stands still",
         actions.train,
-        Fault("lipcore.fitting:fit", "before", WORK, victim="frozen"),
+        Fault("lipcore.fitting.hyperparameters:fit", "before", WORK, victim="frozen"),
         "all",
     ),
     *_around_commit("job cancelled while it runs", actions.cancel, "service.training.jobs:cancel"),

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from lipcore.persistence import MANIFEST, TENSORS
+from lipcore.files.persistence import MANIFEST, TENSORS
 from service.app import create_app
 from service.foundation.settings import Settings
 from service.storage.database.sqlite import FILE

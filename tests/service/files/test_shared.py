@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import lipcore
+from lipcore.files import persistence
 from service.foundation.errors import DamagedDataError
 from service.foundation.settings import Settings
 from service.storage import sample_file
@@ -121,7 +122,7 @@ def test_snapshots_are_those_that_were_stored(one, other):
 
 def test_a_version_answers_from_a_copy_as_from_its_files(one, other, publish, trained):
     manifest = publish(one)
-    model = other.load_version("mv_one", lipcore.persistence.checksums(manifest))
+    model = other.load_version("mv_one", persistence.checksums(manifest))
     q = np.full((1, 2), 0.3)
     assert np.array_equal(model.predict(q, q, q).tau, lipcore.load(trained).predict(q, q, q).tau)
 
@@ -145,9 +146,9 @@ def test_a_version_without_its_manifest_is_none(one, other, publish):
 def test_a_damaged_copy_of_a_version_is_fetched_again(one, other, name, publish):
     manifest = publish(one)
     spoil(other.version_folder("mv_one") / name)
-    assert other.load_version("mv_one", lipcore.persistence.checksums(manifest)).n_joints == 2
+    assert other.load_version("mv_one", persistence.checksums(manifest)).n_joints == 2
     (other.version_folder("mv_one") / name).unlink()
-    assert other.load_version("mv_one", lipcore.persistence.checksums(manifest)).n_joints == 2
+    assert other.load_version("mv_one", persistence.checksums(manifest)).n_joints == 2
 
 
 @ANY_STORE
@@ -166,7 +167,7 @@ def test_a_damaged_object_is_never_read(one, other, tmp_path, publish):
     with pytest.raises(DamagedDataError, match="Upload it again"):
         other.samples_file("ds_one", digest)
     with pytest.raises(lipcore.ModelFormatError, match="sha256"):
-        other.load_version("mv_one", lipcore.persistence.checksums(manifest))
+        other.load_version("mv_one", persistence.checksums(manifest))
 
 
 @ANY_STORE
@@ -262,19 +263,19 @@ def test_copies_in_use_stay_whatever_their_size(host, publish):
 
 def test_threads_that_fetch_at_once_all_read_it_whole(one, other, publish):
     digest, manifest = put(one, stream(samples=200)), publish(one)
-    sums = lipcore.persistence.checksums(manifest)
+    sums = persistence.checksums(manifest)
     with ThreadPoolExecutor(8) as pool:
         found = [pool.submit(other.samples_file, "ds_one", digest) for _ in range(8)]
-        loaded = [pool.submit(other.read_version, "mv_one", lipcore.persistence.read_files) for _ in range(8)]
+        loaded = [pool.submit(other.read_version, "mv_one", persistence.read_files) for _ in range(8)]
     assert len({each.result() for each in found}) == 1
     for each in loaded:
-        lipcore.persistence.check(each.result(), sums)
+        persistence.check(each.result(), sums)
     assert not list(other._place._drafts.iterdir())
 
 
 def _read(home, url, digest):
     files = Files(home, url)
-    names = sorted(lipcore.persistence.read_files(files.version_folder("mv_one")))
+    names = sorted(persistence.read_files(files.version_folder("mv_one")))
     return sample_file.sha256(files.samples_file("ds_one", digest)), names
 
 

@@ -10,7 +10,7 @@ from sqlalchemy import select
 from typer.testing import CliRunner
 
 from lipcore import ModelFormatError
-from lipcore.online import state
+from lipcore.online import transfer
 from service import cli
 from service.cli.verify import verify_home
 from service.foundation.errors import DamagedDataError
@@ -80,7 +80,7 @@ def test_version_that_is_whole_but_another_one_is_not_loaded(arm, name):
 
 def snapshot(arm, number):
     known = restore(arm.database, arm.files, ARM, 1, arm.base, number)
-    return snapshots.save(arm.database, arm.files, ARM, 1, number, state.dump(known.online), most=20)
+    return snapshots.save(arm.database, arm.files, ARM, 1, number, transfer.dump(known.online), most=20)
 
 
 def test_damaged_snapshot_gives_way_to_the_one_before(arm, caplog):

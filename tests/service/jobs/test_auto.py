@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from lipcore.fitting import FitProgress
+from lipcore.fitting.hyperparameters import FitProgress
 from service.training.pulse import LEAST_FRACTION, Remaining
 from tests.service.data import QUICK, ended, job, queue, stream, train, upload
 

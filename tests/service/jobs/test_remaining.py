@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lipcore.fitting import FitProgress
+from lipcore.fitting.hyperparameters import FitProgress
 from service.training.pulse import POSTERIOR_ITERATIONS, Remaining
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lipcore.samples import Samples
+from lipcore.data.samples import Samples
 from tests.service.data import stream
 
 ROWS = 50

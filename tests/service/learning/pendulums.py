@@ -13,12 +13,12 @@ import torch
 
 import lipcore
 from lipcore import FitOptions, Samples, TorqueModel
-from lipcore.compact.posterior import CompactPosterior
-from lipcore.compact.statistics import collect, merge
-from lipcore.online import state
+from lipcore.online import transfer
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.online.record import Record
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.statistics import collect, merge
 from service.foundation.settings import Settings
 from service.journal import log, snapshots
 from service.journal.log import NewBatch
@@ -108,7 +108,7 @@ class Arm:
         """Store the state after an event, the last one unless said; return the number of the event that it is of."""
         known = self.restored(at_most=at_most)
         assert known.settled
-        payload, most = state.dump(known.online), self.settings.max_snapshots
+        payload, most = transfer.dump(known.online), self.settings.max_snapshots
         assert snapshots.save(self.database, self.files, self.model, 1, known.number, payload, most=most) is not None
         return known.number
 

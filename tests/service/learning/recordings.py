@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lipcore
+from lipcore.data.independence import INDEPENDENT_HZ
+from lipcore.data.samples import Samples
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
-from lipcore.online.spacing import INDEPENDENT_HZ
-from lipcore.samples import Samples
 from lipcore.vocabulary import CODES
 from service.journal import log
 from tests.service.data import stream

@@ -13,10 +13,10 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import norm
 
-from lipcore.metrics import evaluate
-from lipcore.model import TorquePrediction
+from lipcore.data.metrics import evaluate
+from lipcore.data.paired import MAX_BLOCKS, Answer, surprise
+from lipcore.model.torque_model import TorquePrediction
 from lipcore.online.batch import Rows
-from lipcore.paired import MAX_BLOCKS, Answer, surprise
 from service.foundation.settings import Settings
 from service.learning.learner.contest import (
     MIN_BLOCKS,

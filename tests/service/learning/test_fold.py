@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from sqlalchemy import delete
 
 import lipcore
-from lipcore.online import state
-from lipcore.online.revision import Revision
+from lipcore.online import transfer
+from lipcore.online.transfer import Revision
 from service.journal import log, snapshots
 from service.learning.learner import course, learnt
 from service.learning.learner.course import RewoundError
@@ -100,13 +100,13 @@ class Story:
                 return known
             known, pages = following, pages and pages - 1
             if known.settled:
-                assert state.dump(known.online) == state.dump(fold.after(known.number)), known.number
+                assert transfer.dump(known.online) == transfer.dump(fold.after(known.number)), known.number
         return known
 
     def store(self, known) -> None:
         """Store a snapshot."""
         if known.settled and known.number > self.start:
-            payload = state.dump(known.online)
+            payload = transfer.dump(known.online)
             snapshots.save(self.arm.database, self.arm.files, ARM, self.version, known.number, payload, most=4)
 
 
@@ -134,7 +134,7 @@ def tell(pieces, page_rows: int, start: int) -> None:
         with story.arm.database.transaction() as session:
             session.execute(delete(SnapshotRow))
         first = story.followed(story.begun(), None, fold)
-        assert state.dump(known.online) == state.dump(late.online) == state.dump(first.online)
+        assert transfer.dump(known.online) == transfer.dump(late.online) == transfer.dump(first.online)
         story.arm.database.close()
 
 
@@ -168,7 +168,7 @@ def make(home: Path, page_rows: int, connection) -> None:
     floor = learnt.floor(database, ARM, 1, known.number, 2)
     revision = Revision.of(known.online.model(floor))
     arrays = [getattr(revision, each.name) for each in fields(revision)]
-    made = [state.dump(known.online), *(np.ascontiguousarray(each).tobytes() for each in arrays)]
+    made = [transfer.dump(known.online), *(np.ascontiguousarray(each).tobytes() for each in arrays)]
     connection.send([hashlib.sha256(each).hexdigest() for each in made])
     database.close()
 
@@ -186,7 +186,7 @@ def test_two_processes_reach_the_same_bits(home):
     first, second = (_made(home, page_rows) for page_rows in (500, 1))
     assert first == second
     known = arm.restored(at_most=7)
-    payload = state.dump(known.online)
+    payload = transfer.dump(known.online)
     assert snapshots.save(arm.database, arm.files, ARM, 1, known.number, payload, most=4) is not None
     assert _made(home, 500)[0] == first[0]
     arm.database.close()

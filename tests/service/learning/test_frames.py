@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lipcore.data.independence import INDEPENDENT_HZ, stream_weights
 from lipcore.online.record import Record
-from lipcore.online.spacing import INDEPENDENT_HZ, weights
 from service.foundation.errors import BusyError, ConflictError
 from service.journal import log, retention
 from service.learning.ingest.frames import Frames, FramesResult
@@ -197,7 +197,7 @@ def _weights(school, pupil):
 def test_frames_count_for_the_time_since_the_frame_before(school, pupil, observe):
     observe(range(10))
     (first,) = logged(school, pupil)
-    np.testing.assert_array_equal(first.weight, weights(first.time))
+    np.testing.assert_array_equal(first.weight, stream_weights(first.time))
     observe(range(10, 20), time=first.time[-1] + 0.02 + 1e-3 * np.arange(10))
     second = logged(school, pupil)[1]
     expected = INDEPENDENT_HZ * np.array([0.02, *[1e-3] * 9])

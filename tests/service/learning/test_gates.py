@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lipcore
-from lipcore.urdf import RigidBody
+from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import CODES
 from service.foundation.settings import Settings
 from service.learning.ingest.screening import limits

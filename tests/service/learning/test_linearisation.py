@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 import lipcore
-from lipcore.arm.linearisation import linearisation_error
-from lipcore.random_arms import random_arm
-from lipcore.simulation import Stream, simulate
+from lipcore.model.warnings import linearisation_error
+from lipcore.robots.library import random_arm
+from lipcore.robots.simulation import Stream, simulate
 from service.models import registry
 from tests.service.data import DEADLINE, ended, eventually, train, upload
 from tests.service.learning.lessons import Pupil, answered

@@ -11,7 +11,7 @@ import pytest
 
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
-from lipcore.online.revision import Revision
+from lipcore.online.transfer import Revision
 from service.learning.learner import learnt, publication
 from service.learning.learner.learnt import LearntVersions
 from service.learning.learner.publication import Published

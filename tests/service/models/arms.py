@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from lipcore import persistence
-from lipcore.manifest import MANIFEST, read_manifest_bytes
-from lipcore.robots import load_robot
-from lipcore.urdf import RigidBody
+from lipcore.files import persistence
+from lipcore.files.manifest import MANIFEST, read_manifest_bytes
+from lipcore.robots.library import load_robot
+from lipcore.robots.urdf import RigidBody
 from service.foundation.settings import Settings, shipped_models
 from service.models import registry
 from service.storage.database import Database

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lipcore.paired import Answer, Comparison, Difference, compare
+from lipcore.data.paired import Answer, Comparison, Difference, compare
 from service.inference.comparison import _verdict
 from tests.service.data import arrays, error, npz, post, stream, upload
 from tests.service.models.versions import publish, trained, worse

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lipcore.kernels.geometry import Geometry
-from lipcore.urdf import RigidBody
+from lipcore.robots.urdf import RigidBody
 from service.client import ApiError
 from tests.service.client.conftest import over
 from tests.service.data import service_of

@@ -7,7 +7,7 @@ import pinocchio
 import pytest
 
 from lipcore.preparation.recipe import Recipe
-from lipcore.robots import load_robot
+from lipcore.robots.library import load_robot
 from service.datasets.report.excitation import collinearity, reversals
 from service.datasets.schema import DatasetReport
 from tests.service.recordings.report_data import profile_of, report_on, swing

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lipcore.data.signals import low_pass, noise_level
 from lipcore.preparation.recipe import Recipe
-from lipcore.signals import low_pass, noise_level
 from service.datasets.report.making import make_report
 from service.datasets.schema import DatasetReport
 from service.datasets.staging import prepare

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lipcore.signals import noise_level
+from lipcore.data.signals import noise_level
 from service.datasets.preview import extremes, make_preview
 from service.datasets.report.signals import noise_or_share, white_noise
 from service.datasets.report.timing import bounds, number_parts, thin

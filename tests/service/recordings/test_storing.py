@@ -14,7 +14,7 @@ from sqlalchemy import select
 
 from benchmarks.ingest import recording
 from benchmarks.ingest import running as ingest
-from lipcore.robots import load_robot
+from lipcore.robots.library import load_robot
 from service.storage import sample_file
 from service.storage.database import JobRow
 from tests.service.data import arrays, error, npz, post, queue, service_of, stream

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.datasets.formats.bags import mcap, rosbag1, sqlite
 from service.datasets.formats.bags.container import Bag, Channel, JoinedBags
 from service.datasets.formats.bags.states import (

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.samples import Array
+from lipcore.data.samples import Array
 from service.datasets.formats.bags.container import Channel
 from service.datasets.formats.bags.layout import Layout, Types, lay_out, parse, well_known
 from service.foundation.errors import InvalidDataError, invalid_data, readable

@@ -1,0 +1,84 @@
+"""A table of samples: what is recorded, simulated, uploaded and learnt from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from itertools import pairwise
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lipcore.data.motion import Motion
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Samples:
+    """N samples of n joints, SI units, joint order as in `joint_names`.
+
+    q, dq, ddq, tau: (N, n); t: (N,) seconds; episode: (N,) integers, constant over one contiguous recording.
+    """
+
+    joint_names: tuple[str, ...]
+    t: Array
+    episode: NDArray[np.int64]
+    q: Array
+    dq: Array
+    ddq: Array
+    tau: Array
+
+    def __post_init__(self) -> None:
+        shape = (len(self.t), len(self.joint_names))
+        for name in ("q", "dq", "ddq", "tau"):
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name} has shape {getattr(self, name).shape}, expected {shape}")
+        if self.episode.shape != (shape[0],):
+            raise ValueError(f"episode has shape {self.episode.shape}, expected {(shape[0],)}")
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints n."""
+        return len(self.joint_names)
+
+    def rows(self, index: slice | NDArray[np.int64] | NDArray[np.bool_]) -> Samples:
+        """Return the chosen rows. index: a slice, indices, or (N,) whether each is chosen."""
+        return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "joint_names"})
+
+    def episodes(self) -> list[slice]:
+        """Contiguous runs of equal `episode`, in order of rows."""
+        edges = np.flatnonzero(np.diff(self.episode)) + 1
+        bounds = [0, *edges.tolist(), len(self)]
+        return [slice(a, b) for a, b in pairwise(bounds) if b > a]
+
+    def motion(self, device: torch.device | str = "cpu") -> Motion:
+        """Position, velocity and acceleration as tensors, (N, n) each; raise ValueError where one is not finite."""
+        return Motion.from_arrays(self.q, self.dq, self.ddq, device)
+
+    def torque(self, device: torch.device | str = "cpu") -> Tensor:
+        """Measured torque as a tensor, (N, n)."""
+        return torch.from_numpy(self.tau.copy()).to(device)
+
+    @staticmethod
+    def concatenate(parts: list[Samples]) -> Samples:
+        """Rows of all parts in order; episodes are renumbered so that parts never share one."""
+        if not parts:
+            raise ValueError("no samples to concatenate")
+        if empty := [index for index, part in enumerate(parts) if len(part) == 0]:
+            raise ValueError(f"part {empty[0]} has no samples")
+        names = parts[0].joint_names
+        for part in parts[1:]:
+            if part.joint_names != names:
+                raise ValueError(f"joint names differ: {list(part.joint_names)}, expected {list(names)}")
+        episodes, used = [], 0
+        for part in parts:
+            numbered = np.unique(part.episode, return_inverse=True)[1].astype(np.int64) + used
+            episodes.append(numbered)
+            used = int(numbered.max()) + 1
+        stack = {k: np.concatenate([getattr(p, k) for p in parts]) for k in ("t", "q", "dq", "ddq", "tau")}
+        return Samples(joint_names=names, episode=np.concatenate(episodes), **stack)

@@ -1,0 +1,203 @@
+"""Motions within limits: Fourier series at rest at both ends, any vector of numbers as one, and references.
+
+Swevers et al. (1997): a period of a finite Fourier series can be repeated, and what it does between two instants is
+known from enough of them: the maximum of a trigonometric polynomial of degree K is at most 1 / cos(π K / m) times its
+largest magnitude at m > 2 K even instants of a period (Ehlich & Zeller, 1964).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Array
+from lipcore.excitation.limits import Limits
+
+DENSE = 64
+"""Instants for each harmonic that peaks are looked for at: the bound then lies 0.12 % above them."""
+INSTANTS = 12
+"""Instants for each harmonic that limits are watched at while searching."""
+LEAST_HARMONICS, MOST_HARMONICS = 5, 60
+SHARPNESS = 40
+"""Exponent of the norm that stands for the largest share of a limit: large is near, but its slope jumps."""
+SPREAD = 1 / 3
+"""Standard deviation of speed and acceleration, as a share of their limits."""
+SECONDS = 50.0
+"""Length of the random motions."""
+PER_MOTION = 5
+"""Instants that are taken of each of them."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """One period of q(t) = offset + Σ_k sine_k / (kω) sin kωt − cosine_k / (kω) cos kωt with ω = 2π / seconds.
+
+    offset: (n,); sine, cosine: (K, n), amplitudes of the velocity in rad/s (m/s). At rest at both ends where
+    Σ sine_k = 0 and Σ k cosine_k = 0.
+    """
+
+    seconds: float
+    offset: Array
+    sine: Array
+    cosine: Array
+
+    @property
+    def harmonics(self) -> int:
+        """Number of harmonics K."""
+        return len(self.sine)
+
+    def at(self, t: Array) -> tuple[Array, Array, Array]:
+        """Position, velocity and acceleration at times t (N,): each (N, n)."""
+        omega = frequencies(self.seconds, self.harmonics)
+        sin, cos = np.sin(np.outer(t, omega)), np.cos(np.outer(t, omega))
+        q = self.offset + sin @ (self.sine / omega[:, None]) - cos @ (self.cosine / omega[:, None])
+        dq = cos @ self.sine + sin @ self.cosine
+        ddq = -sin @ (self.sine * omega[:, None]) + cos @ (self.cosine * omega[:, None])
+        return q, dq, ddq
+
+    def scaled(self, middle: Array, factor: Array | float) -> Series:
+        """The motion shrunk towards `middle`, (n,), by a factor for all or for each joint."""
+        return replace(
+            self,
+            offset=middle + factor * (self.offset - middle),
+            sine=factor * self.sine,
+            cosine=factor * self.cosine,
+        )
+
+    def used(self, limits: Limits) -> Array:
+        """Upper bound on the share of the limits that is used at any time: (3, n) of position, speed, acceleration."""
+        m = DENSE * self.harmonics
+        q, dq, ddq = self.at(np.arange(m) / m * self.seconds)
+        peaks = [np.abs(q - limits.middle).max(0), np.abs(dq).max(0), np.abs(ddq).max(0)]
+        shares = np.array(peaks) / np.array([limits.half, limits.speed, limits.acceleration])
+        return np.asarray(shares * overshoot(self.harmonics, m))
+
+
+def frequencies(seconds: float, harmonics: int) -> Array:
+    """kω for k = 1 … K, rad/s, with ω = 2π / seconds: (K,)."""
+    return np.asarray(2 * np.pi / seconds * np.arange(1, harmonics + 1), dtype=np.float64)
+
+
+def overshoot(harmonics: int, instants: int) -> float:
+    """Most that a trigonometric polynomial exceeds its largest magnitude at so many even instants, as a factor.
+
+    harmonics: its degree K; 1 / cos(π K / m) (Ehlich & Zeller, 1964).
+    """
+    return float(1 / np.cos(np.pi * harmonics / instants))
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Maps a matrix x (2 K + 1, n) to a motion of n joints that keeps its limits, differentiably.
+
+    Row 0 shifts the middle, the next K are sine and the last K cosine amplitudes, each in units of what the limits
+    allow to that harmonic alone. Two projections bring both ends to rest; each joint is then shrunk towards its middle
+    as far as the limits ask for: by (1 + g^p)^(1/p), g the p-norm of all shares of its limits.
+
+    amplitude: (K, n) velocity of each unit; at_rest: (2, K, n) unit directions that are projected out; watched:
+    (3, m, 2 K + 1) shares of limits up to `unit` (3, n).
+    """
+
+    limits: Limits
+    seconds: float
+    amplitude: Tensor
+    at_rest: Tensor
+    omega: Tensor
+
+    @classmethod
+    def build(cls, limits: Limits, seconds: float, harmonics: int) -> Shape:
+        """For a motion of so many seconds and harmonics K; raise ValueError for fewer than two harmonics."""
+        if harmonics < 2:
+            raise ValueError(f"harmonics is {harmonics}, expected at least 2: one cannot start and end at rest")
+        omega = frequencies(seconds, harmonics)[:, None]
+        reach = np.minimum.reduce([limits.half * omega, limits.speed + 0 * omega, limits.acceleration / omega])
+        direction = np.stack([reach, reach * omega])
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        return cls(limits, seconds, *(torch.from_numpy(part) for part in (reach, direction, omega[:, 0])))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Shape of x."""
+        harmonics, n = self.amplitude.shape
+        return 2 * harmonics + 1, n
+
+    def coefficients(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Shift from the middle (n,), sine and cosine amplitudes (K, n) within the limits. x: (2 K + 1, n)."""
+        harmonics, half = len(self.omega), torch.from_numpy(self.limits.half)
+        waves = x[1:].reshape(2, harmonics, -1)
+        waves = waves - self.at_rest * (self.at_rest * waves).sum(1, keepdim=True)
+        shift, sine, cosine = x[0] * half, *(waves * self.amplitude)
+        m = INSTANTS * harmonics
+        motion = self._motion(shift, sine, cosine, torch.arange(m, dtype=torch.float64) / m * self.seconds)
+        speed, acceleration = (torch.from_numpy(part) for part in (self.limits.speed, self.limits.acceleration))
+        unit = torch.stack([half, speed, acceleration])[:, None] / overshoot(harmonics, m)
+        shares = (torch.stack(motion) / unit).abs().reshape(-1, len(half))
+        # every joint by the largest share first: powers overflow otherwise
+        largest = shares.detach().amax(0).clamp_min(1.0)
+        powers = (shares / largest).pow(SHARPNESS).sum(0) + largest.pow(-SHARPNESS)
+        shrink = largest * powers.pow(1 / SHARPNESS)
+        return shift / shrink, sine / shrink, cosine / shrink
+
+    def motion(self, x: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Position, velocity and acceleration at times t (N,), each (N, n), differentiable in x."""
+        q, dq, ddq = self._motion(*self.coefficients(x), t)
+        return torch.from_numpy(self.limits.middle) + q, dq, ddq
+
+    def series(self, x: Array) -> Series:
+        """The motion of x (2 K + 1, n) as a series, held to the limits by their strict bound."""
+        shift, sine, cosine = (part.numpy() for part in self.coefficients(torch.from_numpy(x)))
+        series = Series(self.seconds, self.limits.middle + shift, sine, cosine)
+        return series.scaled(self.limits.middle, 1 / np.maximum(1.0, series.used(self.limits).max(0)))
+
+    def random(self, rng: np.random.Generator) -> Array:
+        """A start for a search, (2 K + 1, n): harmonics of random strength and phase, faster ones weaker."""
+        rows, n = self.size
+        x = rng.standard_normal((rows, n))
+        x[0] *= 0.3
+        # so that some starts are mostly slow and far, others fast and short
+        fall = rng.uniform(0.0, 1.0, n)
+        harmonics = np.arange(1, len(self.omega) + 1)[:, None]
+        x[1:] *= np.tile(harmonics**-fall, (2, 1))
+        return np.asarray(x)
+
+    def _motion(self, shift: Tensor, sine: Tensor, cosine: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        omega = self.omega[:, None]
+        phase = t[:, None] * self.omega
+        sin, cos = torch.sin(phase), torch.cos(phase)
+        q = shift + sin @ (sine / omega) - cos @ (cosine / omega)
+        return q, cos @ sine + sin @ cosine, -sin @ (sine * omega) + cos @ (cosine * omega)
+
+
+def harmonics(limits: Limits, seconds: float) -> int:
+    """How many harmonics K a motion of so many seconds gets.
+
+    Up to the frequency at which the acceleration limit takes over from the speed limit.
+    """
+    fastest = float(np.max(limits.acceleration / limits.speed)) / (2 * np.pi)
+    return int(np.clip(np.ceil(fastest * seconds), LEAST_HARMONICS, MOST_HARMONICS))
+
+
+def draw(limits: Limits, count: int, seed: int) -> Motion:
+    """`count` instants of motion: one half from anywhere, the other half from random motions within the limits.
+
+    Anywhere: positions evenly over the range, speeds and accelerations Gaussian and cut off at the limits. That is more
+    than tasks ask for: joints seldom are at the ends of their ranges and fast at the same time. Random motions, some
+    slow and far, some fast and short, leave corners out that a task may ask for. Against one half alone, plans for both
+    did better at what neither half holds.
+    """
+    rng = np.random.default_rng(seed)
+    some = count - count // 2
+    q = rng.uniform(limits.lower, limits.upper, (some, limits.n_joints))
+    dq, ddq = (
+        np.clip(SPREAD * rng.standard_normal(q.shape), -1, 1) * limit for limit in (limits.speed, limits.acceleration)
+    )
+    shape, parts = Shape.build(limits, SECONDS, harmonics(limits, SECONDS)), [np.stack([q, dq, ddq])]
+    while some < count:
+        instants = rng.uniform(0, SECONDS, min(PER_MOTION, count - some))
+        parts.append(np.stack(shape.series(shape.random(rng)).at(instants)))
+        some += len(instants)
+    return Motion.from_arrays(*np.concatenate(parts, axis=1))

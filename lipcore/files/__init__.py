@@ -1,0 +1,1 @@
+"""A model as files: written, and read from strangers."""

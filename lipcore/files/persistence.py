@@ -1,0 +1,336 @@
+"""A model on disk: `manifest.json`, which a person can read, `model.safetensors`, and `robot.urdf` where there is one.
+
+None of them can hold code, and whatever they hold is checked: what is loaded may come from a stranger.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors.torch import save as save_tensors
+from torch import Tensor
+
+from lipcore.data.motion import Motion
+from lipcore.files.arm import arm_tensors, is_of_arm, read_arm, read_mode
+from lipcore.files.manifest import (
+    DEFAULT_LIMITS,
+    FORMAT,
+    FORMAT_VERSION,
+    MANIFEST,
+    ROBOT,
+    TENSORS,
+    Limits,
+    ModelFormatError,
+    read_manifest_bytes,
+)
+from lipcore.files.tensors import FLOOR, INDUCING, OUTPUTS, PARAMS, A, B, read_tensors
+from lipcore.fitting.estimators import Calibration, make_estimator
+from lipcore.kernels.arm_prior import Arm
+from lipcore.model.parameters import report
+from lipcore.model.torque_model import TorqueModel
+from lipcore.model.warnings import warnings
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.linalg import pack_symmetric, unpack_symmetric
+from lipcore.posterior.statistics import Statistics
+from lipcore.robots.urdf import RigidBody
+from lipcore.vocabulary import ROBOT_ESTIMATORS
+
+SAME = 1e-6
+"""Relative difference of the noise in the manifest and in the tensors that another processor may make."""
+
+
+def save(model: TorqueModel, folder: Path, lineage: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Write the model as a new folder, all of it or nothing, and return its manifest.
+
+    lineage: where the model comes from, stored as given. Raise FileExistsError where the folder exists, ValueError for
+    a model that has learnt online: see `lipcore.online.transfer`.
+    """
+    manifest, files = encode(model, lineage)
+    write(folder, files)
+    return manifest
+
+
+def encode(model: TorqueModel, lineage: Mapping[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """The manifest of a model and its files by name: `manifest.json`, `model.safetensors`, `robot.urdf`.
+
+    lineage: where the model comes from, stored as given. Raise ValueError as `save` does.
+    """
+    basis, statistics = model.posterior.basis, model.posterior.statistics
+    if statistics is None:
+        raise ValueError("the model has learnt online since it was trained, expected one as trained")
+    tensors = {f"{PARAMS}{name}": value for name, value in model.posterior.params.items()}
+    tensors |= {name: getattr(basis.inducing, name.rpartition("/")[2]) for name in INDUCING}
+    tensors |= {OUTPUTS: basis.outputs, A: pack_symmetric(statistics.a), B: statistics.b}
+    if bool((model.posterior.floor > 0).any()):
+        tensors[FLOOR] = model.posterior.floor
+    if model.arm is not None:
+        tensors |= arm_tensors(model.arm)
+    parameters = report(model.posterior, model.estimator, model.joint_names)
+    payload = save_tensors({name: value.contiguous() for name, value in tensors.items()})
+    manifest = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "estimator": model.estimator.name,
+        "joint_names": list(model.joint_names),
+        "joint_types": list(model.joint_types),
+        "torque_convention": model.torque_convention,
+        "noise_std": model.noise_std.tolist(),
+        "options": model.options,
+        "fit": model.fit,
+        "compact": {**model.compact, "data_samples": round(statistics.samples)},
+        "calibration": asdict(model.calibration),
+        "parameters": parameters,
+        "warnings": warnings(model, parameters),
+        "hyperparameters": {name: value.tolist() for name, value in model.posterior.params.items()},
+        "training_range": model.training_range,
+        "lineage": dict(lineage or {}),
+        "tensors": {"file": TENSORS, "bytes": len(payload), "sha256": sha256(payload)},
+    }
+    if model.selection is not None:
+        manifest["selection"] = model.selection
+    files = {TENSORS: payload}
+    if model.robot is not None:
+        files[ROBOT] = model.robot.urdf.encode()
+        manifest["robot"] = {
+            "name": model.robot.name,
+            "joints": list(model.robot.urdf_joints),
+            "matched": model.robot.matched,
+            "prior": model.options["prior"],
+            "file": ROBOT,
+            "bytes": len(files[ROBOT]),
+            "sha256": sha256(files[ROBOT]),
+        }
+    files[MANIFEST] = manifest_bytes(manifest)
+    read_manifest_bytes(files[MANIFEST])  # nothing is written that would be refused when it is read
+    return manifest, files
+
+
+def decode(files: Mapping[str, bytes], limits: Limits = DEFAULT_LIMITS) -> TorqueModel:
+    """The model that these files hold; raise ModelFormatError for anything that `encode` does not make.
+
+    What it costs in time and memory is bounded by the limits, which are checked before anything is computed.
+    """
+    manifest = _manifest(files, limits)
+    n = len(manifest["joint_names"])
+    tensors = read_tensors(_verified(files, TENSORS, manifest["tensors"]), n, limits)
+    robot = _robot(files, manifest, limits)
+    try:
+        return _restore(manifest, tensors, robot)
+    except ModelFormatError:
+        raise
+    except Exception as error:  # whatever numerics make of numbers that no training has made
+        raise ModelFormatError(f"the tensors do not make a valid model: {_text(error)}", TENSORS) from error
+
+
+def load(folder: Path, checksums: Mapping[str, str] | None = None, limits: Limits = DEFAULT_LIMITS) -> TorqueModel:
+    """Load a model that `save` wrote; raise ModelFormatError for anything else.
+
+    checksums: sha256 of each file by name, as kept elsewhere, which the files then have to match.
+    """
+    files = read_files(folder, limits)
+    if checksums is not None:
+        check(files, checksums)
+    try:
+        return decode(files, limits)
+    except ModelFormatError as error:
+        raise ModelFormatError(f"{folder} does not hold a valid model: {error}", error.file) from error
+
+
+def copy_model(source: Path, folder: Path) -> dict[str, Any]:
+    """Copy a saved model to a new folder, all of it or nothing, and return its manifest; raise ModelFormatError."""
+    files = read_files(source)
+    manifest = _manifest(files, DEFAULT_LIMITS)
+    _verified(files, TENSORS, manifest["tensors"])
+    if "robot" in manifest:
+        _verified(files, ROBOT, manifest["robot"])
+    write(folder, {**files, MANIFEST: manifest_bytes(manifest)})
+    return manifest
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """Read and check a model's manifest; raise ModelFormatError."""
+    return read_manifest_bytes(_read(folder / MANIFEST, DEFAULT_LIMITS.manifest_bytes))
+
+
+def read_files(folder: Path, limits: Limits = DEFAULT_LIMITS) -> dict[str, bytes]:
+    """The files of a saved model by name, as they are; raise ModelFormatError where one is missing."""
+    files = {MANIFEST: _read(folder / MANIFEST, limits.manifest_bytes)}
+    files[TENSORS] = _read(folder / TENSORS)
+    if "robot" in _manifest(files, limits):
+        files[ROBOT] = _read(folder / ROBOT, limits.robot_bytes)
+    return files
+
+
+def check(files: Mapping[str, bytes], checksums: Mapping[str, str]) -> None:
+    """Compare files by name with the sha256 that is known of each.
+
+    Raise ModelFormatError naming the file that is missing, one too many, or damaged.
+    """
+    for name in sorted(files.keys() | checksums.keys()):
+        if name not in files or name not in checksums:
+            raise ModelFormatError(f"{name} is {'missing' if name in checksums else 'one file too many'}", name)
+        if sha256(files[name]) != checksums[name]:
+            raise ModelFormatError(f"{name} does not have the sha256 that was kept of it: it is damaged", name)
+
+
+def checksums(manifest: Mapping[str, Any]) -> dict[str, str]:
+    """sha256 of each file of the model with this manifest, by name."""
+    sums = {MANIFEST: sha256(manifest_bytes(manifest)), TENSORS: str(manifest["tensors"]["sha256"])}
+    return {**sums, ROBOT: str(manifest["robot"]["sha256"])} if "robot" in manifest else sums
+
+
+def manifest_bytes(manifest: Mapping[str, Any]) -> bytes:
+    """The file of a manifest: equal manifests give equal bytes."""
+    return json.dumps(manifest, indent=2, allow_nan=False).encode() + b"\n"
+
+
+def sha256(content: bytes) -> str:
+    """Hash of a file, in hexadecimal digits."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def write(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write files as a new folder that outlives a power cut, all of it or nothing.
+
+    Raise FileExistsError where the folder exists.
+    """
+    if folder.exists():
+        raise FileExistsError(f"{folder} exists: a saved model is never overwritten")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    # its name tells whose draft it is, where nobody comes to remove it
+    draft = Path(tempfile.mkdtemp(prefix=f".draft-{folder.name}-", dir=folder.parent))
+    try:
+        for name, content in files.items():
+            _write(draft / name, content)
+        draft.chmod(0o755)
+        _sync(draft)
+        os.rename(draft, folder)
+        _sync(folder.parent)
+    except BaseException:
+        shutil.rmtree(draft, ignore_errors=True)
+        raise
+
+
+def _manifest(files: Mapping[str, bytes], limits: Limits) -> dict[str, Any]:
+    if MANIFEST not in files:
+        raise ModelFormatError(f"{MANIFEST} is missing")
+    return read_manifest_bytes(files[MANIFEST], limits)
+
+
+def _verified(files: Mapping[str, bytes], name: str, entry: Mapping[str, Any]) -> bytes:
+    """A file that is as its manifest says."""
+    if name not in files:
+        raise ModelFormatError(f"{name} is missing", name)
+    content = files[name]
+    if len(content) != entry["bytes"] or sha256(content) != entry["sha256"]:
+        raise ModelFormatError(f"{name} does not match the sha256 and the size of its manifest", name)
+    return content
+
+
+def _robot(files: Mapping[str, bytes], manifest: Mapping[str, Any], limits: Limits) -> RigidBody | None:
+    if "robot" not in manifest:
+        return None
+    entry = manifest["robot"]
+    content = _verified(files, ROBOT, entry)
+    if len(content) > limits.robot_bytes:
+        raise ModelFormatError(f"{ROBOT} has {len(content)} bytes, expected at most {limits.robot_bytes}", ROBOT)
+    try:
+        robot = RigidBody.from_urdf(
+            content.decode(), manifest["joint_names"], manifest["joint_types"], entry["joints"], entry["name"]
+        )
+    except Exception as error:  # Pinocchio raises what its parser does
+        raise ModelFormatError(f"{ROBOT} is not the robot of this model: {_text(error)}", ROBOT) from error
+    return replace(robot, matched=entry["matched"])
+
+
+def _restore(manifest: Mapping[str, Any], tensors: dict[str, Tensor], robot: RigidBody | None) -> TorqueModel:
+    params = {name.removeprefix(PARAMS): value for name, value in tensors.items() if name.startswith(PARAMS)}
+    compact = dict(manifest["compact"])
+    statistics = Statistics(unpack_symmetric(A, tensors[A]), tensors[B], float(compact.pop("data_samples")))
+    arm = _arm(manifest, tensors) if manifest["estimator"] in ROBOT_ESTIMATORS else None
+    if arm is None and (strange := next(filter(is_of_arm, tensors), None)) is not None:
+        raise ModelFormatError(f"{TENSORS} has the tensor {strange!r}, but the estimator has no rigid bodies", TENSORS)
+    options, calibration = manifest["options"], Calibration(**manifest["calibration"])
+    estimator = make_estimator(manifest["estimator"], manifest["joint_types"], bool(options.get("tied", True)), arm)
+    posterior = CompactPosterior.restore(
+        estimator.kernel,
+        params,
+        Motion(*(tensors[name] for name in INDUCING)),
+        tensors[OUTPUTS],
+        statistics,
+        float(manifest["fit"].get("jitter", 0.0)),
+        calibration.function_std_factor,
+    )
+    if FLOOR in tensors:
+        posterior = replace(posterior, floor=tensors[FLOOR])
+    model = TorqueModel(
+        estimator=estimator,
+        joint_names=tuple(manifest["joint_names"]),
+        joint_types=tuple(manifest["joint_types"]),
+        torque_convention=manifest["torque_convention"],
+        options=options,
+        fit=manifest["fit"],
+        posterior=posterior,
+        training_range=manifest["training_range"],
+        compact=compact,
+        robot=robot,
+        calibration=calibration,
+        selection=manifest.get("selection"),
+    )
+    stated = manifest.get("hyperparameters")
+    if stated is not None and stated != {name: value.tolist() for name, value in params.items()}:
+        raise ModelFormatError("hyperparameters are not those of the tensors")
+    if not np.allclose(model.noise_std, manifest["noise_std"], rtol=SAME, atol=0):
+        raise ModelFormatError(f"noise_std is not that of the tensors, {model.noise_std.tolist()}")
+    return model
+
+
+def _arm(manifest: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Arm:
+    try:
+        mode = read_mode(manifest["fit"].get("geometry"))
+    except ValueError as error:
+        raise ModelFormatError(str(error)) from None
+    try:
+        return read_arm(tensors, manifest["joint_types"], mode)
+    except ValueError as error:
+        raise ModelFormatError(str(error), TENSORS) from None
+
+
+def _text(error: Exception) -> str:
+    return (str(error).strip() or type(error).__name__)[:300]
+
+
+def _read(path: Path, most: int | None = None) -> bytes:
+    """A file of a saved model; raise ModelFormatError, also for more than `most` bytes."""
+    try:
+        with path.open("rb") as file:
+            content = file.read(-1 if most is None else most + 1)
+    except OSError as error:
+        raise ModelFormatError(f"{path} cannot be read: {error}", path.name) from error
+    if most is not None and len(content) > most:
+        raise ModelFormatError(f"{path} has more than {most} bytes", path.name)
+    return content
+
+
+def _write(path: Path, content: bytes) -> None:
+    with path.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _sync(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

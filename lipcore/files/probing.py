@@ -1,0 +1,48 @@
+"""Asking a model whose numbers are not known to be those of a fit, before anybody relies on it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lipcore.data.samples import Array
+from lipcore.files.checks import LARGEST
+from lipcore.files.manifest import TENSORS, ModelFormatError
+from lipcore.model.torque_model import TorqueModel
+
+INDUCING = 20
+"""Inducing samples that it is asked at: there its answers are furthest from the prior's."""
+
+
+def probe(model: TorqueModel) -> None:
+    """Ask a model where it should know and where it cannot; raise ModelFormatError for an answer that is none.
+
+    The motions are rest, the ends and the middle of its training range, and some of its inducing samples. They are
+    asked in both ways that there are, as a batch and one at a time.
+    """
+    motion = _motions(model)
+    with np.errstate(all="ignore"):  # what overflows is found in the answers
+        answer = model.predict(motion[0], motion[1], motion[2], covariance=True)
+        single = [model.answer(np.ascontiguousarray(motion[:, row])) for row in range(motion.shape[1])]
+    parts = {
+        "tau": answer.tau,
+        "tau_std": answer.tau_std,
+        "noise_std": answer.noise_std,
+        "covariance": answer.covariance,
+        "tau of a single query": np.array([tau for tau, _ in single]),
+        "tau_std of a single query": np.array([std for _, std in single], dtype=np.float64),
+    }
+    for name, values in parts.items():
+        if values is None or not np.isfinite(values).all() or np.abs(values).max() > LARGEST:
+            raise ModelFormatError(f"{name} of a probe is not finite or beyond ±{LARGEST:g}", TENSORS)
+        if "std" in name and (values < 0).any():
+            raise ModelFormatError(f"{name} of a probe is below zero", TENSORS)
+
+
+def _motions(model: TorqueModel) -> Array:
+    """Motions to ask at, (3, K, n)."""
+    ranges = [model.training_range[name] for name in ("q", "dq", "ddq")]
+    low, high = (np.array([each[end] for each in ranges]) for end in ("min", "max"))
+    inducing = model.posterior.basis.inducing
+    seen = np.stack([part[:INDUCING].numpy() for part in (inducing.q, inducing.dq, inducing.ddq)])
+    fixed = np.stack([np.zeros_like(low), low, high, 0.5 * (low + high)], axis=1)
+    return np.concatenate([fixed, seen], axis=1)

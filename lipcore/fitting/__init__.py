@@ -1,0 +1,1 @@
+"""Fitting: the torque priors to choose from, their options, their hyperparameters and the noise."""

@@ -1,0 +1,104 @@
+"""The measurement noise of each joint: where a fit starts, how far it may fall, and what all samples say of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Array, Samples
+from lipcore.data.signals import noise_level
+from lipcore.kernels.base import Params, TorqueKernel
+from lipcore.posterior.linalg import cholesky
+
+START_SHARE = 0.01
+"""Smallest noise std that a fit starts from, relative to the joint's torque spread: what no model explains is noise
+too, and filtered torques look free of noise though they are not. Data that deserve less are fitted with less."""
+FLOOR_JOINT = 1e-4
+FLOOR_ROBOT = 1e-5
+"""Smallest noise std admitted, relative to the joint's torque spread and to the largest root mean square of all joints:
+below the second, a Gram matrix in float64 can no longer be factored faithfully."""
+PRIOR_STD = 1.0
+"""Width of the prior on the logarithm: a small data set cannot tell noise from misfit."""
+LARGEST_STEP = 0.7
+NEWTON_STEPS, SMALLEST_STEP = 8, 0.01
+WIDENINGS = 3
+STRETCHES = 25
+"""Contiguous parts of the samples that are left out one after another."""
+TOLERATED = 1.15
+"""Squared error over expected variance that chance explains."""
+SAMPLES = 250
+"""Samples that tell the noise: its estimate is then good to about five per cent."""
+
+
+def start(samples: Samples, stretches: Samples | None = None) -> Array:
+    """Noise std that a fit starts from, (n,) N·m: the white noise of the signals, or a share of their spread.
+
+    stretches: contiguous samples, where `samples` are thinned: their differences would tell of motion.
+    """
+    signals = samples if stretches is None else stretches
+    level = noise_level([signals.tau[part] for part in signals.episodes()])
+    return np.asarray(np.maximum.reduce([level, START_SHARE * samples.tau.std(axis=0), floor(samples)]))
+
+
+def floor(samples: Samples) -> Array:
+    """Smallest noise std admitted for these samples, (n,) N·m."""
+    largest = float(np.sqrt(np.mean(samples.tau**2, axis=0)).max())
+    return np.asarray(np.maximum(FLOOR_JOINT * samples.tau.std(axis=0), FLOOR_ROBOT * max(largest, 1e-6)))
+
+
+def refine(
+    kernel: TorqueKernel, params: Params, motion: Motion, tau: Tensor, centre: Tensor, lowest: Tensor
+) -> dict[str, Tensor]:
+    """What up to SAMPLES samples say of the noise, all else held: two steps, returned as new hyperparameters.
+
+    First the penalised evidence is maximised over the noise by Newton steps on log σ_j. With K = k(X, X) + R and
+    α = K⁻¹y, its slope is σ_j²(Σα² − tr K⁻¹) over joint j; σ_j² tr K⁻¹ is the number of samples left to tell the noise,
+    after those that the function uses up.
+
+    Then contiguous stretches are left out one after another and predicted by the rest. Errors larger than the model
+    expects, as where filtered noise lasts over several samples and was taken for the function, raise the noise.
+
+    centre, lowest: (n,) log std of the prior's centre and of the floor. Raise NotPositiveDefiniteError as a fit does.
+    """
+    n, gram = kernel.n_joints, kernel.symmetric_gram(params, motion)
+    y = (tau - kernel.mean(motion)).reshape(-1)
+    log_std = params["noise.log_std"]
+    for _ in range(NEWTON_STEPS):
+        inverse, alpha = _inverse(gram, log_std, y)
+        variance = torch.exp(2 * log_std)
+        free = variance * inverse.diagonal().reshape(-1, n).sum(0)
+        explained = variance * alpha.reshape(-1, n).square().sum(0)
+        slope = explained - free - (log_std - centre) / PRIOR_STD**2
+        step = (slope / (2 * free + 1 / PRIOR_STD**2)).clamp(-LARGEST_STEP, LARGEST_STEP)
+        before, log_std = log_std, torch.maximum(log_std + step, lowest)
+        if bool(((log_std - before).abs() < SMALLEST_STEP).all()):
+            break
+    for _ in range(WIDENINGS):
+        excess = _left_out(*_inverse(gram, log_std, y), n)
+        if bool((excess <= TOLERATED).all()):
+            break
+        log_std = log_std + torch.where(excess > TOLERATED, 0.5 * torch.log(excess), 0.0).clamp_max(LARGEST_STEP)
+    return {**params, "noise.log_std": log_std}
+
+
+def _inverse(gram: Tensor, log_std: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """K⁻¹ and α = K⁻¹y."""
+    noisy = gram.clone()
+    noisy.diagonal().add_(torch.exp(2 * log_std).repeat(len(y) // len(log_std)))
+    factor = cholesky(noisy)
+    return torch.cholesky_inverse(factor.lower), factor.solve(y)
+
+
+def _left_out(inverse: Tensor, alpha: Tensor, n: int) -> Tensor:
+    """Mean squared error over predicted variance of each joint, stretch by stretch predicted from all others: (n,).
+
+    Leaving out block B, the error is [K⁻¹]_BB⁻¹ α_B and its covariance [K⁻¹]_BB⁻¹ (Rasmussen & Williams, eq. 5.12).
+    """
+    ratios = []
+    for block in torch.arange(len(alpha), device=alpha.device).reshape(-1, n).tensor_split(STRETCHES):
+        rows = block.reshape(-1)
+        covariance = torch.linalg.inv(inverse[rows][:, rows])
+        ratios.append(((covariance @ alpha[rows]).square() / covariance.diagonal()).reshape(-1, n))
+    return torch.cat(ratios).mean(0)

@@ -1,0 +1,242 @@
+"""What a torque model says beyond torque: inertia, Coriolis, gravity and friction torques, energies, forward dynamics.
+
+Rigid-body torque is M(q) ddq + c(q, dq) + g(q): affine in ddq, at standstill and without acceleration gravity alone.
+So every part is a sum or difference of torques at a few motions, with an exact posterior (`functionals`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lipcore.data.motion import Motion
+from lipcore.fitting.estimators import Estimator
+from lipcore.kernels.base import SumKernel, TorqueKernel
+from lipcore.model.functionals import (
+    EnergyKernel,
+    Estimate,
+    combine_torques,
+    kinetic_energy,
+    potential_energy,
+    prior_mean,
+    with_anchors,
+)
+from lipcore.model.torque_model import TorqueModel
+from lipcore.posterior.exact import Posterior
+from lipcore.vocabulary import COMPONENTS, ComponentName
+
+_ALWAYS: tuple[ComponentName, ...] = ("friction",)
+_TORQUES: dict[ComponentName, dict[str, float]] = {
+    "gravity": {"rest": 1.0},
+    "coriolis": {"moving": 1.0, "rest": -1.0},
+    "inertial": {"accelerating": 1.0, "rest": -1.0},
+}
+"""Components as sums of torques at standstill, moving without acceleration, and accelerating from standstill."""
+
+
+class UnavailableComponentError(ValueError):
+    """A component that does not exist or that the model's estimator cannot offer."""
+
+
+class IndefiniteInertiaError(ValueError):
+    """The learnt inertia matrix cannot be inverted: the query is far from the training data. index: of the query."""
+
+    def __init__(self, index: int) -> None:
+        super().__init__(
+            f"the learnt inertia matrix at query {index} is not positive definite, expected a posture that the "
+            "training data tell the inertia of"
+        )
+        self.index = index
+
+
+@dataclass(frozen=True)
+class Energies:
+    """Posterior means of kinetic and potential energy in J, each (N,). The potential is known up to a constant."""
+
+    kinetic: Tensor
+    potential: Tensor
+
+
+def available(estimator: Estimator) -> tuple[ComponentName, ...]:
+    """Components that an estimator can offer: all where its torque comes from energies, else friction only."""
+    terms = _dynamics_terms(estimator)
+    return COMPONENTS if terms and len(_energy_terms(estimator)) == len(terms) else _ALWAYS
+
+
+def components(
+    model: TorqueModel, motion: Motion, names: Sequence[str], tau: Tensor | None = None
+) -> dict[str, Estimate]:
+    """Posterior of components at N queries, by name; friction is in `friction` and `forward_dynamics` alone.
+
+    - `inertia_matrix` (N, n, n): M(q), kg·m² where both joints are revolute;
+    - `inertial`, `coriolis`, `gravity`, `friction` (N, n): M(q) ddq, c(q, dq), g(q), f(dq); the torque is their sum;
+    - `kinetic_energy` (N,) J: ½ dqᵀ M(q) dq;
+    - `potential_energy` (N,) J: V(q) − V(q₀), q₀ the `reference_posture`, and its uncertainty that of the difference;
+    - `forward_dynamics` (N, n) rad/s²: see `forward_dynamics`, which `tau` (N, n) N·m is for.
+
+    Raise UnavailableComponentError for a name that is unknown or not on offer; ValueError for a wrong number of joints,
+    or where `tau` is missing, of another shape or given in vain; IndefiniteInertiaError.
+    """
+    asked = _check(model, motion, names, tau)
+    posterior, terms = model.posterior, _dynamics_terms(model.estimator)
+    estimates: dict[str, Estimate] = {}
+    torques = [name for name in asked if name in _TORQUES or name == "inertia_matrix"]
+    if torques:
+        estimates |= _torque_parts(posterior, SumKernel(*terms), motion, torques)
+    if "friction" in asked:
+        friction = model.estimator.terms["friction"]
+        estimates["friction"] = combine_torques(
+            posterior, friction, [motion], torch.eye(model.n_joints, dtype=torch.float64)
+        )
+    energetic = _energy_terms(model.estimator)
+    if "kinetic_energy" in asked:
+        estimates["kinetic_energy"] = kinetic_energy(posterior, energetic, motion)
+    if "potential_energy" in asked:
+        estimates["potential_energy"] = potential_energy(posterior, energetic, motion, reference_posture(model))
+    if "forward_dynamics" in asked and tau is not None:
+        estimates["forward_dynamics"] = forward_dynamics(model, motion, tau)
+    return {name: estimates[name] for name in asked}
+
+
+def reference_posture(model: TorqueModel) -> Tensor:
+    """Where potential energy counts from, (n,): the middle of each joint's range in the training samples."""
+    q = model.training_range["q"]
+    return 0.5 * torch.tensor([q["min"], q["max"]], dtype=torch.float64).sum(0)
+
+
+def forward_dynamics(model: TorqueModel, motion: Motion, tau: Tensor) -> Estimate:
+    """Acceleration under torque tau (N, n) N·m: ddq = M(q)⁻¹ (tau − c − g − f), (N, n) rad/s²; motion.ddq is not read.
+
+    Uncertainty to first order: an error ε of the whole torque at (q, dq, ddq) moves ddq by −M⁻¹ ε, M's own error
+    included. It holds while the uncertainty of M is small against M. Raise IndefiniteInertiaError where M is not
+    positive definite.
+    """
+    posterior, zero = model.posterior, torch.zeros_like(motion.q)
+    inertia = inertia_matrix(posterior, SumKernel(*_dynamics_terms(model.estimator)), motion.q)
+    lower, info = torch.linalg.cholesky_ex(0.5 * (inertia + inertia.mT))
+    if info.any():
+        raise IndefiniteInertiaError(int(info.nonzero()[0]))
+    bias = posterior.mean(Motion(motion.q, motion.dq, zero))
+    ddq = torch.cholesky_solve((tau - bias)[:, :, None], lower)[:, :, 0]
+    covariance = posterior.predict(Motion(motion.q, motion.dq, ddq)).covariance
+    half = torch.cholesky_solve(covariance, lower)  # M⁻¹ Σ
+    variance = torch.cholesky_solve(half.mT, lower).diagonal(dim1=1, dim2=2)
+    return Estimate(ddq, variance.clamp_min(0.0).sqrt())
+
+
+def inertia_matrix(posterior: Posterior, dynamics: TorqueKernel, q: Tensor) -> Tensor:
+    """Posterior mean of M(q), (N, n, n), kg·m² where both joints are revolute.
+
+    dynamics: the kernel's terms but friction; q: (N, n) rad or m. Column j is the torque per unit acceleration of joint
+    j, f(q, 0, e_j) − f(q, 0, 0): exact, since torque is affine in ddq.
+    """
+    n = q.shape[1]
+    zero = torch.zeros_like(q)
+    rest = posterior.mean(Motion(q, zero, zero), dynamics)
+    pushes = [_push(q, joint) for joint in range(n)]
+    return torch.stack([posterior.mean(push, dynamics) - rest for push in pushes], dim=2)
+
+
+def gravity(posterior: Posterior, dynamics: TorqueKernel, q: Tensor) -> Tensor:
+    """Posterior mean of the gravity torque g(q) = f(q, 0, 0), (N, n) N·m: the torque at standstill, friction excluded.
+
+    dynamics: the kernel's terms but friction; q: (N, n) rad or m.
+    """
+    zero = torch.zeros_like(q)
+    return posterior.mean(Motion(q, zero, zero), dynamics)
+
+
+def energies(posterior: Posterior, dynamics: EnergyKernel, query: Motion) -> Energies:
+    """Posterior means of kinetic and potential energy at N queries, learnt without a label on either.
+
+    dynamics: the term that the energies are of.
+    """
+    kinetic, potential = prior_mean([dynamics], query) + posterior.weights @ with_anchors(posterior, [dynamics], query)
+    return Energies(kinetic, potential)
+
+
+def _torque_parts(
+    posterior: Posterior, kernel: TorqueKernel, motion: Motion, names: Sequence[ComponentName]
+) -> dict[str, Estimate]:
+    """The components of `_TORQUES` and the inertia matrix, from one joint posterior."""
+    n, zero = motion.n_joints, torch.zeros_like(motion.q)
+    moves = {"rest": Motion(motion.q, zero, zero)}
+    if "coriolis" in names:
+        moves["moving"] = Motion(motion.q, motion.dq, zero)
+    if "inertial" in names:
+        moves["accelerating"] = Motion(motion.q, zero, motion.ddq)
+    if "inertia_matrix" in names:
+        moves |= {f"push {joint}": _push(motion.q, joint) for joint in range(n)}
+    at = {move: index for index, move in enumerate(moves)}
+    blocks = [_inertia_rows(at, n) if name == "inertia_matrix" else _vector_rows(name, at, n) for name in names]
+    every = combine_torques(posterior, kernel, list(moves.values()), torch.cat(blocks).reshape(-1, len(moves) * n))
+    sizes = [len(block) for block in blocks]
+    parts = zip(names, torch.split(every.mean, sizes, dim=1), torch.split(every.std, sizes, dim=1), strict=True)
+    return {
+        name: Estimate(_symmetric(mean, n), _symmetric(std, n)) if name == "inertia_matrix" else Estimate(mean, std)
+        for name, mean, std in parts
+    }
+
+
+def _vector_rows(name: ComponentName, at: dict[str, int], n: int) -> Tensor:
+    """Coefficients (n, S, n) of a component of `_TORQUES`."""
+    rows = torch.zeros((n, len(at), n), dtype=torch.float64)
+    for move, sign in _TORQUES[name].items():
+        rows[:, at[move]] = sign * torch.eye(n, dtype=torch.float64)
+    return rows
+
+
+def _inertia_rows(at: dict[str, int], n: int) -> Tensor:
+    """Coefficients (n (n+1) / 2, S, n) of ½ (M_ij + M_ji) for i ≤ j; column j of M is f(q, 0, e_j) − f(q, 0, 0)."""
+    i, j = torch.triu_indices(n, n)
+    entry, first_push, rest = torch.arange(len(i)), at["push 0"], at["rest"]
+    rows = torch.zeros((len(i), len(at), n), dtype=torch.float64)
+    for row, column in ((i, j), (j, i)):
+        rows[entry, first_push + column, row] += 0.5
+        rows[entry, rest, row] -= 0.5
+    return rows
+
+
+def _symmetric(upper: Tensor, n: int) -> Tensor:
+    """Entries i ≤ j, (N, n (n+1) / 2), as symmetric matrices (N, n, n)."""
+    i, j = torch.triu_indices(n, n)
+    full = torch.empty((len(upper), n, n), dtype=upper.dtype)
+    full[:, i, j] = full[:, j, i] = upper
+    return full
+
+
+def _push(q: Tensor, joint: int) -> Motion:
+    """Unit acceleration of one joint from standstill."""
+    zero = torch.zeros_like(q)
+    push = zero.clone()
+    push[:, joint] = 1.0
+    return Motion(q, zero, push)
+
+
+def _dynamics_terms(estimator: Estimator) -> list[TorqueKernel]:
+    return [term for name, term in estimator.terms.items() if name != "friction"]
+
+
+def _energy_terms(estimator: Estimator) -> list[EnergyKernel]:
+    return [term for term in _dynamics_terms(estimator) if isinstance(term, EnergyKernel)]
+
+
+def _check(model: TorqueModel, motion: Motion, names: Sequence[str], tau: Tensor | None) -> list[ComponentName]:
+    offered = available(model.estimator)
+    for name in names:
+        if name not in offered:
+            raise UnavailableComponentError(
+                f"component is {name!r}, expected one that estimator {model.estimator.name!r} offers: "
+                f"{', '.join(offered)}"
+            )
+    if motion.n_joints != model.n_joints:
+        raise ValueError(f"motion has {motion.n_joints} joints, expected {model.n_joints}")
+    if ("forward_dynamics" in names) != (tau is not None):
+        expected = "a torque for forward_dynamics" if tau is None else "None without forward_dynamics"
+        raise ValueError(f"tau is {'None' if tau is None else 'given'}, expected {expected}")
+    if tau is not None and tau.shape != motion.q.shape:
+        raise ValueError(f"tau has shape {tuple(tau.shape)}, expected {tuple(motion.q.shape)} as q has")
+    return [name for name in COMPONENTS if name in names]

@@ -1,0 +1,146 @@
+"""Posteriors of what is jointly Gaussian with torques: their sums and differences, and the energies behind them.
+
+Energies are learnt without a label on either (eq. 2 of docs/method.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from lipcore.data.motion import Motion
+from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.base import Params, State, TorqueKernel, row_chunks
+from lipcore.kernels.chain import ChainKernel
+from lipcore.kernels.lip import LipKernel
+from lipcore.posterior.exact import Posterior
+
+EnergyKernel = LipKernel | ChainKernel | ArmKernel
+"""Priors of torques that come from priors of the energies."""
+KINETIC, POTENTIAL = 0, 1
+COLUMNS_PER_CHUNK = 512
+"""Right-hand sides whitened together: enough for fast matrix products, few enough to stay within tens of MB."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Posterior mean and standard deviation of a quantity at N queries, both (N, ...), noise excluded."""
+
+    mean: Tensor
+    std: Tensor
+
+
+def condition(posterior: Posterior, prior_mean: Tensor, prior_variance: Tensor, cross: Tensor) -> Estimate:
+    """Posterior of K quantities from their covariance with the posterior's anchors (see `Posterior`).
+
+    prior_mean, prior_variance: (K,); cross: (M, K).
+    """
+    explained = posterior.whiten(cross).square().sum(0)
+    std = (prior_variance - explained).clamp_min(0.0).sqrt()  # rounding may end below zero where all is known
+    return Estimate(prior_mean + posterior.weights @ cross, posterior.std_factor * std)
+
+
+def combine_torques(
+    posterior: Posterior, kernel: TorqueKernel, motions: Sequence[Motion], coefficients: Tensor
+) -> Estimate:
+    """Posterior of F linear combinations of a kernel's torques at S motions a query, (N, F).
+
+    The joint posterior of all S n torques is used: what they share cancels in a difference, in its uncertainty too.
+    motions: S motions of N queries each; coefficients: (F, S n), motion by motion.
+    """
+    n, size, count = kernel.n_joints, len(motions), len(motions[0])
+    stacked = [torch.stack([getattr(m, name) for m in motions], dim=1) for name in ("q", "dq", "ddq")]  # (N, S, n)
+    step = max(1, COLUMNS_PER_CHUNK // (size * n))
+    means, stds = [], []
+    for start in range(0, count, step):
+        stack = Motion(*(part[start : start + step].reshape(-1, n) for part in stacked))
+        queries = len(stack) // size
+        cross = posterior.cross(kernel, stack)  # (M, queries S n)
+        cross = cross.reshape(-1, size * n) @ coefficients.T
+        grams = [kernel.symmetric_gram(posterior.params, stack[k * size : (k + 1) * size]) for k in range(queries)]
+        variance = torch.stack([(coefficients @ gram * coefficients).sum(1) for gram in grams])
+        mean = kernel.mean(stack).reshape(queries, -1) @ coefficients.T
+        estimate = condition(
+            posterior, mean.reshape(-1), variance.reshape(-1), cross.reshape(len(posterior.weights), -1)
+        )
+        means.append(estimate.mean.reshape(queries, -1))
+        stds.append(estimate.std.reshape(queries, -1))
+    return Estimate(torch.cat(means), torch.cat(stds))
+
+
+def kinetic_energy(posterior: Posterior, kernels: Sequence[EnergyKernel], query: Motion) -> Estimate:
+    """Posterior of the kinetic energy at N queries, summed over the kernels: (N,) J (eq. 2 of docs/method.md)."""
+    mean = prior_mean(kernels, query)[KINETIC]
+    variance = covariance(posterior.params, kernels, query, query)[KINETIC]
+    return condition(posterior, mean, variance, with_anchors(posterior, kernels, query)[KINETIC])
+
+
+def potential_energy(
+    posterior: Posterior, kernels: Sequence[EnergyKernel], query: Motion, reference: Tensor
+) -> Estimate:
+    """Posterior of V(q) − V(reference) at N queries, summed over the kernels: (N,) J. reference: (n,).
+
+    Torques do not tell the constant of V: only a difference has a useful uncertainty.
+    """
+    params, zero = posterior.params, torch.zeros_like(reference)[None]
+    origin = Motion(reference[None], zero, zero)
+    variance = (
+        covariance(params, kernels, query, query)
+        - 2 * covariance(params, kernels, query, origin)
+        + covariance(params, kernels, origin, origin)
+    )
+    mean = prior_mean(kernels, query) - prior_mean(kernels, origin)
+    cross = with_anchors(posterior, kernels, query) - with_anchors(posterior, kernels, origin)
+    return condition(posterior, mean[POTENTIAL], variance[POTENTIAL], cross[POTENTIAL])
+
+
+def prior_mean(kernels: Sequence[EnergyKernel], query: Motion) -> Tensor:
+    """Prior means of the kinetic and the potential energy at N queries, summed over the kernels: (2, N) J."""
+    total = torch.zeros((2, len(query)), dtype=torch.float64)
+    for kernel in kernels:
+        if isinstance(kernel, ArmKernel) and (weights := kernel.prior_weights()) is not None:
+            total += (kernel.energy_features(query) @ weights).T
+    return total
+
+
+def covariance(params: Params, kernels: Sequence[EnergyKernel], x: Motion, y: Motion) -> Tensor:
+    """Prior covariance of each energy at sample k of x with the same energy at sample k of y: (2, N) J².
+
+    x, y: N samples each; y may be a single one, which then is that of every k.
+    """
+    total = torch.zeros((2, len(x)), dtype=torch.float64)
+    for kernel in kernels:
+        if isinstance(kernel, ArmKernel):
+            scaled = kernel.energy_features(x) @ kernel.covariance(params)
+            total += (scaled * kernel.energy_features(y)).sum(2).T
+        else:
+            total += kernel.energy_covariance(params, State.paired(x), State.paired(y))
+    return total
+
+
+def with_anchors(posterior: Posterior, kernels: Sequence[EnergyKernel], query: Motion) -> Tensor:
+    """Prior covariance of both energies at N queries with the M anchors of the posterior: (2, M, N) (eq. 2)."""
+    total = torch.zeros((2, len(posterior.weights), len(query)), dtype=torch.float64)
+    for kernel in kernels:
+        if isinstance(kernel, ArmKernel):
+            scaled = kernel.energy_features(query) @ kernel.covariance(posterior.params)  # (N, 2, p)
+            parts = [posterior.with_weights(kernel, scaled[:, energy].T) for energy in (KINETIC, POTENTIAL)]
+        else:
+            anchors = posterior.with_torques(kernel, partial(_with_torques, kernel, posterior.params, query))
+            parts = list(anchors.reshape(len(anchors), 2, -1).unbind(1))
+        total += torch.stack(parts)
+    return total
+
+
+def _with_torques(kernel: LipKernel | ChainKernel, params: Params, query: Motion, motion: Motion) -> Tensor:
+    """Covariance of all torques of S samples with both energies at N queries: (S n, 2 N)."""
+    n, size, columns = kernel.n_joints, len(motion), State.columns(motion)
+    out = torch.empty((size, n, 2, len(query)), dtype=torch.float64)
+    for rows in row_chunks(len(query), size):
+        cross = kernel.energies(params, State.rows(query[rows]), columns)  # (2, n, rows, S)
+        out[..., rows] = cross.permute(3, 1, 0, 2)
+    return out.reshape(size * n, -1)

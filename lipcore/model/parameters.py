@@ -1,0 +1,257 @@
+"""Physical parameters that a model has learnt, with uncertainty: friction coefficients and inertial parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lipcore.data.samples import Array
+from lipcore.fitting.estimators import Estimator
+from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.base import LinearKernel
+from lipcore.kernels.friction import FrictionKernel, friction_terms
+from lipcore.kernels.geometry import Geometry
+from lipcore.model.plausible import is_plausible, nearest_plausible
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.compression import checks
+from lipcore.posterior.exact import Posterior
+from lipcore.robots.urdf import PARAMETERS
+
+STEPS = ("turn 1", "turn 2", "shift 1", "shift 2")
+"""Names of a joint's numbers of geometry: about, and along, the two vectors across its axis."""
+UNDETERMINED = 0.5
+"""Torque does not tell what is still as uncertain as this share of what was expected beforehand."""
+LEAST_VARIANCE = 1e-12
+"""Smallest posterior variance relative to the prior's that rounding leaves meaningful."""
+
+
+@dataclass(frozen=True)
+class WeightPosterior:
+    """Gaussian posterior of the weights of one linear term. mean: (p,); covariance: (p, p); scale: (p,) prior std."""
+
+    mean: Array
+    covariance: Array
+    scale: Array
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations, (p,)."""
+        return np.sqrt(np.maximum(self.covariance.diagonal(), 0.0))
+
+
+@dataclass(frozen=True)
+class Friction:
+    """Coefficients per joint and their standard deviations, each (n,).
+
+    viscous: N·m·s/rad (N·s/m); coulomb, offset: N·m (N); stribeck: N·m (N), of friction that slow joints have besides,
+    None where that is no part of the model.
+    """
+
+    viscous: Array
+    viscous_std: Array
+    coulomb: Array
+    coulomb_std: Array
+    offset: Array
+    offset_std: Array
+    stribeck: Array | None = None
+    stribeck_std: Array | None = None
+
+
+@dataclass(frozen=True)
+class InertialParameters:
+    """Ten parameters of each of n bodies, (n, 10): mass kg, first moment (3) kg·m, inertia (6) kg·m².
+
+    The inertia, xx, xy, yy, xz, yz, zz, is about the frame of the joint that moves the body. mean, std: of the
+    posterior; many are known from torques only in combinations, which std shows. scale: standard deviations
+    beforehand. plausible: the physically possible
+    parameters nearest to the mean in the posterior's metric; mean_is_plausible: whether the mean is possible itself.
+    geometry: that the plausible parameters are meant for; deviation: (n,) N·m, root mean square by which their torque
+    misses the model's where the robot has been.
+    """
+
+    mean: Array
+    std: Array
+    scale: Array
+    plausible: Array
+    mean_is_plausible: bool
+    geometry: Geometry
+    deviation: Array
+
+
+def weight_posterior(posterior: Posterior, term: LinearKernel) -> WeightPosterior:
+    """Posterior N(E w + cᵀα, Λ − |L⁻¹c|²) of a linear term's p weights, whose prior is N(μ, Λ).
+
+    term: one of the posterior's kernel. The covariance carries the posterior's calibration.
+    """
+    prior = term.covariance(posterior.params).detach()
+    cross = posterior.with_weights(term, prior)  # (M, p)
+    white = posterior.whiten(cross)
+    mean = cross.T @ posterior.weights
+    if (centre := term.prior_weights()) is not None:
+        mean = mean + centre.to(mean.device)
+    covariance = posterior.std_factor**2 * (prior - white.T @ white)
+    return WeightPosterior(_numpy(mean), _numpy(0.5 * (covariance + covariance.T)), _numpy(prior.diagonal().sqrt()))
+
+
+def friction_coefficients(posterior: Posterior, estimator: Estimator) -> Friction:
+    """Friction of each joint with standard deviations, the weights of the friction term.
+
+    Raise ValueError for an estimator without friction.
+    """
+    term = estimator.terms.get("friction")
+    if not isinstance(term, FrictionKernel):
+        raise ValueError(f"estimator {estimator.name!r} has no friction term")
+    weights = weight_posterior(posterior, term)
+    shape = (term.n_joints, len(term.terms))
+    mean, std = weights.mean.reshape(shape).T, weights.std.reshape(shape).T
+    named = dict(zip(term.terms, mean, strict=True))
+    named |= {f"{name}_std": value for name, value in zip(term.terms, std, strict=True)}
+    return Friction(**named)
+
+
+def inertial_parameters(posterior: CompactPosterior, estimator: Estimator) -> InertialParameters:
+    """Inertial parameters of each of n bodies, with the plausible ones nearest to them.
+
+    Raise ValueError for an estimator without rigid bodies.
+    """
+    term = _arm_kernel(estimator)
+    weights, size = weight_posterior(posterior, term), PARAMETERS * term.n_joints
+    mean, std, scale = (part[:size].reshape(-1, PARAMETERS) for part in (weights.mean, weights.std, weights.scale))
+    geometry = term.geometry(weights.mean)
+    if all(is_plausible(body) for body in mean):
+        return InertialParameters(mean, std, scale, mean, True, geometry, np.zeros(term.n_joints))
+    # masses for the geometry that the arm is linearised at, where the torque is exactly linear in them; or masses and
+    # geometry together, to first order in the latter
+    start = term.arm.centre[term.arm.place]
+    alone = weights.mean.copy()
+    metric = precision(posterior, term)
+    part, steps = slice(0, size), term.steps
+    alone[steps] = 0.0
+    moved = np.linalg.solve(metric[part, part], metric[part, steps] @ (weights.mean / weights.scale)[steps])
+    given = weights.mean[part] + moved * weights.scale[part]
+    alone[part] = nearest_plausible(given, weights.scale[part], metric[part, part], term.n_joints, start)
+    options = [alone]
+    if term.arm.steps:
+        options.append(nearest_plausible(weights.mean, weights.scale, metric, term.n_joints, start))
+    asked = checks(posterior.basis.inducing, 0)
+    torque = posterior.predict(asked, term).mean.numpy()
+    errors = [np.sqrt(np.mean((term.torque(option, asked) - torque) ** 2, axis=0)) for option in options]
+    best = int(np.argmin([np.mean(error / np.maximum(torque.std(0), 1e-12)) for error in errors]))
+    plausible = options[best][:size].reshape(-1, PARAMETERS)
+    return InertialParameters(mean, std, scale, plausible, False, term.geometry(options[best]), errors[best])
+
+
+def precision(posterior: CompactPosterior, term: LinearKernel) -> Array:
+    """Posterior precision of a term's weights, all others at their mean, in units of their prior deviations: (p, p).
+
+    From the statistics, I + A, where there are any: a covariance has lost what is known to more than eight digits.
+    """
+    rows = posterior.basis.rows(term)
+    if posterior.statistics is not None:
+        return _numpy(posterior.statistics.a[rows, rows]) + np.eye(rows.stop - rows.start)
+    weights = weight_posterior(posterior, term)
+    scaled = weights.covariance / np.outer(weights.scale, weights.scale)
+    values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
+    return np.asarray((vectors / np.maximum(values, LEAST_VARIANCE)) @ vectors.T)
+
+
+def report(posterior: CompactPosterior, estimator: Estimator, joint_names: Sequence[str]) -> dict[str, Any]:
+    """All parameters of an estimator as plain numbers, for a manifest.
+
+    Friction, and of an arm inertia, rotor and geometry. joint_names: (n,), in the order of the data. `files.arm` reads
+    it.
+    """
+    friction = friction_coefficients(posterior, estimator)
+    out: dict[str, Any] = {
+        "friction": {
+            name: {"mean": getattr(friction, name).tolist(), "std": getattr(friction, f"{name}_std").tolist()}
+            for name in friction_terms(friction.stribeck is not None)
+        }
+    }
+    if "rigid_body" in estimator.terms:
+        inertia = inertial_parameters(posterior, estimator)
+        out["inertia"] = {
+            "mean_is_plausible": inertia.mean_is_plausible,
+            "plausible_deviation": inertia.deviation.tolist(),
+            "bodies": [
+                {
+                    "joint": name,
+                    "mean": _body(inertia.mean[j]),
+                    "std": _body(inertia.std[j]),
+                    "plausible": _body(inertia.plausible[j]),
+                    "undetermined": _open(inertia.std[j], inertia.scale[j]),
+                }
+                for j, name in enumerate(joint_names)
+            ],
+        }
+        out |= _of_arm(posterior, _arm_kernel(estimator), joint_names, inertia.geometry)
+    return out
+
+
+def _of_arm(posterior: Posterior, term: ArmKernel, joint_names: Sequence[str], plausible: Geometry) -> dict[str, Any]:
+    """Rotor inertias and the geometry as the posterior has it; plausible: that of the plausible bodies."""
+    weights, arm = weight_posterior(posterior, term), term.arm
+    n = term.n_joints
+    rotors = slice(PARAMETERS * n, (PARAMETERS + 1) * n)
+    geometry, step_std = term.geometry(weights.mean), weights.std[term.steps]
+    joints, at = [], 0
+    for place, count in enumerate(geometry.screws):
+        std = step_std[at : at + count] if arm.steps else np.zeros(0)
+        usual = arm.widths[at : at + count]
+        at += count
+        joints.append(
+            {
+                "joint": joint_names[arm.order[place]],
+                "type": geometry.joint_types[place],
+                "rotation": geometry.rotation[place].tolist(),
+                "translation": geometry.translation[place].tolist(),
+                "axis": geometry.axis[place].tolist(),
+                "across": geometry.across[place].tolist(),
+                "plausible": {
+                    "rotation": plausible.rotation[place].tolist(),
+                    "translation": plausible.translation[place].tolist(),
+                },
+                "turn_std": std[:2].tolist(),
+                "shift_std": std[2:].tolist(),
+                "undetermined": [
+                    name for name, one, other in zip(STEPS, std, usual, strict=False) if one > UNDETERMINED * other
+                ],
+            }
+        )
+    return {
+        "rotor": {"mean": weights.mean[rotors].tolist(), "std": weights.std[rotors].tolist()},
+        "geometry": {
+            "mode": arm.mode,
+            "gravity": geometry.gravity.tolist(),
+            "order": arm.order.tolist(),
+            "joints": joints,
+        },
+    }
+
+
+def _arm_kernel(estimator: Estimator) -> ArmKernel:
+    term = estimator.terms.get("rigid_body")
+    if not isinstance(term, ArmKernel):
+        raise ValueError(f"estimator {estimator.name!r} has no rigid bodies")
+    return term
+
+
+def _open(std: Array, scale: Array) -> list[str]:
+    """Which of a body's parameters the samples leave as they were expected."""
+    left = std > UNDETERMINED * scale
+    parts = {"mass": left[0], "first_moment": left[1:4].any(), "inertia": left[4:].any()}
+    return [name for name, is_open in parts.items() if is_open]
+
+
+def _body(values: Array) -> dict[str, Any]:
+    return {"mass": float(values[0]), "first_moment": values[1:4].tolist(), "inertia": values[4:].tolist()}
+
+
+def _numpy(values: Tensor) -> Array:
+    out: Array = values.to(torch.float64).cpu().numpy()
+    return out

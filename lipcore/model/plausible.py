@@ -1,0 +1,96 @@
+"""Bodies that can exist: which ten parameters are plausible, and the plausible ones nearest to an estimate."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lipcore.data.samples import Array
+from lipcore.robots.urdf import PARAMETERS
+
+LEAST_MASS = 1e-4
+"""Smallest mass of a plausible body, as a share of the arm's."""
+LEAST_EXTENT, RADIUS = 1e-3, 0.05
+"""Smallest spread of a plausible body's mass along each axis, m: no real body is a point; radius of a usual one, m."""
+BARRIERS = tuple(10.0**power for power in range(3, -4, -1))
+"""Weights of the barrier: the last leaves at most 4 n times as much of the squared distance to gain."""
+NEWTON_STEPS, SHORTEST = 30, 1e-8
+
+
+def pseudo_inertia(body: Array) -> Array:
+    """The pseudo-inertia [[Σ, h], [hᵀ, m]] of ten parameters, (4, 4): positive definite for every real body."""
+    mass, moment = body[0], body[1:4]
+    xx, xy, yy, xz, yz, zz = body[4:]
+    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    out = np.empty((4, 4))
+    out[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+    out[:3, 3] = out[3, :3] = moment
+    out[3, 3] = mass
+    return out
+
+
+def is_plausible(body: Array) -> bool:
+    """Whether ten parameters belong to a body that can exist: its pseudo-inertia is positive definite."""
+    return bool(np.linalg.eigvalsh(pseudo_inertia(body))[0] > 0)
+
+
+def nearest_plausible(mean: Array, scale: Array, metric: Array, n: int, start: Array | None = None) -> Array:
+    """Weights (p,) nearest to a mean (p,) whose first 10 n are plausible bodies.
+
+    metric: (p, p), of weights in units of `scale` (p,). A convex problem: ½ |w − μ|² in that metric, subject to each
+    body's pseudo-inertia being at least that of a tiny real one. Newton's method along the central path of a barrier,
+    −t Σ log det, as in Boyd & Vandenberghe, § 11.
+    start: (n, 10), a plausible guess; balls where it is none.
+    """
+    size = PARAMETERS * n
+    given = np.zeros((n, PARAMETERS)) if start is None else start
+    total = max(float(mean[:size:PARAMETERS].sum()), float(given[:, 0].sum()), 1e-3)
+    least = LEAST_MASS * total * np.diag([LEAST_EXTENT**2, LEAST_EXTENT**2, LEAST_EXTENT**2, 1.0])
+    centre = mean / scale
+    basis = np.array([pseudo_inertia(unit) for unit in np.eye(PARAMETERS)])
+
+    def matrices(point: Array) -> Array:
+        bodies = (point * scale)[:size].reshape(n, PARAMETERS)
+        return np.asarray(np.einsum("nk,kij->nij", bodies, basis) - least)
+
+    def value(point: Array, barrier: float) -> float:
+        signs, logs = np.linalg.slogdet(matrices(point))
+        if (signs <= 0).any() or (np.linalg.eigvalsh(matrices(point))[:, 0] <= 0).any():
+            return np.inf
+        off = point - centre
+        return float(0.5 * off @ metric @ off - barrier * logs.sum())
+
+    point = centre.copy()
+    point[:size] = np.concatenate([_real(body, total / n, least) for body in given]) / scale[:size]
+    for barrier in BARRIERS:
+        for _ in range(NEWTON_STEPS):
+            inverse = np.linalg.inv(matrices(point))
+            turned = np.einsum("nij,kjl->nkil", inverse, basis)  # P⁻¹ E_k
+            slope = np.einsum("nkii->nk", turned).reshape(-1) * scale[:size]
+            bend = np.einsum("nkij,nlji->nkl", turned, turned)
+            gradient = metric @ (point - centre)
+            gradient[:size] -= barrier * slope
+            hessian = metric.copy()
+            for body in range(n):
+                part = slice(PARAMETERS * body, PARAMETERS * (body + 1))
+                hessian[part, part] += barrier * bend[body] * np.outer(scale[part], scale[part])
+            try:
+                step = -np.linalg.solve(hessian, gradient)
+            except np.linalg.LinAlgError:  # at the boundary, but for rounding: the point is plausible all the same
+                break
+            slack, length, now = float(-gradient @ step), 1.0, value(point, barrier)
+            while length > SHORTEST and value(point + length * step, barrier) > now - 0.1 * length * slack:
+                length *= 0.5
+            if length <= SHORTEST:
+                break
+            point = point + length * step
+            if slack < 1e-3 * barrier:
+                break
+    return np.asarray(point * scale)
+
+
+def _real(body: Array, usual_mass: float, least: Array) -> Array:
+    """A body, or a ball of the usual mass where it is none that can exist."""
+    if np.linalg.eigvalsh(pseudo_inertia(body) - 2 * least)[0] > 0:
+        return body
+    ball = 0.4 * usual_mass * RADIUS**2
+    return np.array([usual_mass, 0, 0, 0, ball, 0, ball, 0, 0, ball])

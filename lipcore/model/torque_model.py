@@ -1,0 +1,128 @@
+"""A trained torque model: immutable, asked for torques with their uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from numpy.typing import ArrayLike
+
+from lipcore.data.motion import Motion, motion_arrays
+from lipcore.data.samples import Array
+from lipcore.evaluator import Evaluator
+from lipcore.fitting.estimators import NO_CALIBRATION, Calibration, Estimator
+from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.arm_prior import Arm
+from lipcore.model.selection import Selection
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.robots.urdf import RigidBody
+from lipcore.vocabulary import JointType, TorqueConvention
+
+
+@dataclass(frozen=True)
+class TorquePrediction:
+    """Answer for N queries of n joints, N·m.
+
+    tau: (N, n) mean; tau_std: (N, n) standard deviation of the function; noise_std: (n,) of the measurement; an
+    interval for measurements needs both. covariance: (N, n, n) of the function between joints, where asked for.
+    """
+
+    tau: Array
+    tau_std: Array
+    noise_std: Array
+    covariance: Array | None = None
+
+
+TrainingRange = dict[str, dict[str, list[float]]]
+"""Smallest (`min`) and largest (`max`) q, dq and ddq of the samples behind a posterior, per joint."""
+
+
+def training_range(motion: Motion) -> TrainingRange:
+    """Smallest and largest q, dq and ddq of N instants, SI units."""
+    return {
+        name: {"min": values.min(0).values.tolist(), "max": values.max(0).values.tolist()}
+        for name, values in (("q", motion.q), ("dq", motion.dq), ("ddq", motion.ddq))
+    }
+
+
+@dataclass(frozen=True)
+class TorqueModel:
+    """Fitted inverse dynamics of one robot: immutable, safe to share between threads.
+
+    joint_names, joint_types: (n,), in the order of the data; torque_convention: what its torques hold; options: those
+    of the fit; fit: what the fit reported, compact: how near the compact posterior comes to the exact one, both for the
+    manifest; training_range: of the samples behind the posterior; robot: the rigid bodies of an estimator that has
+    them; calibration: how the posterior's deviations are corrected; selection: how `auto` has chosen the estimator,
+    None where it was named.
+    """
+
+    estimator: Estimator
+    joint_names: tuple[str, ...]
+    joint_types: tuple[JointType, ...]
+    torque_convention: TorqueConvention
+    options: dict[str, int | float | bool | str]
+    fit: dict[str, float | int | bool | str]
+    posterior: CompactPosterior
+    training_range: TrainingRange
+    compact: dict[str, float | int | bool]
+    robot: RigidBody | None = None
+    calibration: Calibration = NO_CALIBRATION
+    selection: Selection | None = None
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints n."""
+        return len(self.joint_names)
+
+    @property
+    def arm(self) -> Arm | None:
+        """What is known of the rigid bodies, of an estimator that has them."""
+        term = self.estimator.terms.get("rigid_body")
+        return term.arm if isinstance(term, ArmKernel) else None
+
+    @property
+    def noise_std(self) -> Array:
+        """Standard deviation of the measured torque around the function, (n,) N·m, jitter included."""
+        std: Array = self.posterior.noise_variance.sqrt().numpy()
+        return std
+
+    def predict(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike, covariance: bool = False) -> TorquePrediction:
+        """Torque with uncertainty for arrays of shape (n,) or (N, n), SI units.
+
+        covariance: whether that between the joints is asked for, too.
+        Raise ValueError for a wrong number of joints, differing shapes or a value that is not finite.
+        """
+        query = motion_arrays(q, dq, ddq)
+        joints = query[0].shape[1]
+        if joints != self.n_joints:
+            raise ValueError(f"q has {joints} joints, expected {self.n_joints}: {', '.join(self.joint_names)}")
+        tau, std, between = self.evaluator.many(*query, covariance)
+        return TorquePrediction(tau, std, self.noise_std, between)
+
+    def answer(self, motion: Array, std: bool = True) -> tuple[Array, Array | None]:
+        """Torque at one instant, and its standard deviation where asked for: both (n,) N·m. For control loops.
+
+        motion: q, dq and ddq as a float64 array (3, n). Neither shape nor finiteness is checked; what is not finite
+        ends in what is not finite.
+        """
+        return self.evaluator.one(motion, std)
+
+    def warm_up(self) -> None:
+        """Do all that the first answer would otherwise wait for."""
+        self.evaluator.warm_up()
+
+    @cached_property
+    def evaluator(self) -> Evaluator:
+        """The compiled form of the posterior, which answers queries."""
+        posterior, basis = self.posterior, self.posterior.basis
+        return Evaluator(
+            basis.term,
+            posterior.params,
+            None if basis.term is None else basis.inducing,
+            basis.outputs.numpy(),
+            basis.linear,
+            posterior.weights.numpy(),
+            posterior.root.numpy(),
+            posterior.std_factor,
+            posterior.floor.numpy(),
+        )

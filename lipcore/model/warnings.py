@@ -1,0 +1,134 @@
+"""What to be careful with of a learnt arm: what its recording leaves open, how its fit ended, how linear it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Array
+from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.compiled.arm import PARAMETERS
+from lipcore.model.parameters import weight_posterior
+from lipcore.model.torque_model import TorqueModel
+from lipcore.posterior.compression import checks
+
+QUERIES = 40
+"""Motions that are looked at: half of the basis' own, half recombined from them."""
+ALWAYS_OPEN = 2
+"""Numbers of a geometry that no torque depends on: its turn about gravity, and a place along the first axis."""
+TOGETHER = 0.7
+"""Independent motions, as a share of the joints, below which joints count as moving together."""
+FARTHER = 2.0
+"""How much farther, or faster, a joint moves than it did where alternative arms are compared."""
+LISTED = 8
+"""Joints that are named in a sentence, at most."""
+COUNTS = {2: "Two", 3: "Three", 4: "Four"}
+
+
+def linearisation_error(model: TorqueModel) -> Array | None:
+    """Error of taking an arm's torque as linear, in units of what is stated, root mean square over motions: (n,).
+
+    With weights w, linear around ŵ = (π̂, r, 0), and Φ their features (alternative arms left out), it is
+
+        Y(θ + δθ) π + r ∘ ddq − Φ w    over    √(tau_std² + noise_std²)    at    w = ŵ + (I − C Λ⁻¹) (μ − ŵ)
+
+    where μ and C are posterior mean and covariance, Λ the prior's: the step towards μ as far as samples determine it.
+    Along what they leave open μ may lie anywhere, for no torque depends on it. The motions are those that the basis
+    keeps. None for a model without an arm, or with a geometry that is fixed: it is linear.
+    """
+    term = model.estimator.terms.get("rigid_body")
+    if not isinstance(term, ArmKernel) or not term.arm.steps:
+        return None
+    arm, posterior, n = term.arm, model.posterior, term.n_joints
+    motion = checks(posterior.basis.inducing, 0, QUERIES)
+    known, used = weight_posterior(posterior, term), term.steps.stop
+    centre = known.mean.copy()
+    centre[: PARAMETERS * n], centre[term.steps] = arm.parameters[arm.place].reshape(-1), 0.0
+    step = known.mean - centre
+    weights = centre + step - known.covariance @ (step / known.scale**2) / posterior.std_factor**2
+    linear = term.features(motion).numpy()[:, :, :used] @ weights[:used]
+    answer = posterior.predict(motion)
+    stated = answer.covariance.diagonal(dim1=1, dim2=2).clamp_min(0.0) + posterior.noise_variance
+    error = term.torque(weights, motion) - linear
+    return np.asarray(np.sqrt(np.mean(error**2 / stated.numpy(), axis=0)))
+
+
+def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
+    """Sentences about a model's arm, the gravest first; of a model without one, about the motion of its recording.
+
+    parameters: the report of `lipcore.model.parameters.report`.
+    """
+    arm, fit = model.arm, model.fit
+    moved = float(fit.get("motion_dimensions", model.n_joints))
+    together = (
+        f"Its joints moved together, like {moved:.1f} independent ones of {model.n_joints}: torque of other motion may "
+        "be off by more than tau_std says. A recording in which each moves by itself tells more."
+    )
+    if arm is None:
+        return [together] if moved < TOGETHER * model.n_joints else []
+    out = []
+    if len(arm.alternatives) > 1:
+        out.append(_alternatives(model))
+    if fit.get("search_ended") == "time":
+        limit = float(model.options.get("search_seconds", 0.0))
+        out.append(f"The search for the geometry ended at its time limit, {limit:g} s: a longer one may tell more.")
+    if fit.get("search_explained") is False:
+        more = "" if "energy" in model.estimator.terms else " Compare with rigid-body+lip-chain."
+        out.append(
+            f"Rigid bodies leave more of the torque than the sensor's noise: it holds more than they explain.{more}"
+        )
+    joints = parameters.get("geometry", {}).get("joints", ())
+    names = {each["joint"]: each["undetermined"] for each in joints if each["undetermined"]}
+    count = sum(map(len, names.values()))
+    if count > ALWAYS_OPEN:
+        listed = "; ".join([f"{joint}: {', '.join(each)}" for joint, each in names.items()][:LISTED])
+        listed += "; …" if len(names) > LISTED else ""
+        stand = "are the URDF's" if arm.mode == "calibrate" else "are only a guess"
+        out.append(f"The recording does not tell {count} numbers of the geometry, which {stand} ({listed}).")
+    if (count > ALWAYS_OPEN or arm.alternatives) and moved < TOGETHER * model.n_joints:
+        out.append(together)
+    return out
+
+
+def _alternatives(model: TorqueModel) -> str:
+    """How likely the alternative arms are, and which joint has to move farther or faster to tell them apart.
+
+    Their spread is the standard deviation of their mixture, root mean square over the basis' motions with one joint
+    FARTHER from the middle of its range, or that much faster; the joint is the one where it is largest for the noise.
+    """
+    term = model.estimator.terms["rigid_body"]
+    assert isinstance(term, ArmKernel)
+    motion, tried = model.posterior.basis.inducing, []
+    low, high = (np.array(model.training_range["q"][end]) for end in ("min", "max"))
+    fastest = np.abs([model.training_range["dq"][end] for end in ("min", "max")]).max(0)
+    for joint, name in enumerate(model.joint_names):
+        length = "m" if model.joint_types[joint] == "prismatic" else "rad"
+        q, dq, ddq = (each.clone() for each in (motion.q, motion.dq, motion.ddq))
+        middle = 0.5 * (low[joint] + high[joint])
+        q[:, joint] = middle + FARTHER * (q[:, joint] - middle)
+        dq[:, joint] *= FARTHER
+        ddq[:, joint] *= FARTHER**2
+        where = f"{name} leaves {low[joint]:.2g} to {high[joint]:.2g} {length}"
+        tried.append((_spread(term, replace(motion, q=q)), where))
+        where = f"{name} is faster than {fastest[joint]:.2g} {length}/s"
+        tried.append((_spread(term, replace(motion, dq=dq, ddq=ddq)), where))
+    spread, where = max(tried, key=lambda each: float((each[0] / model.noise_std).max()))
+    most = int((spread / model.noise_std).argmax())
+    unit = "N" if model.joint_types[most] == "prismatic" else "N·m"
+    shares = sorted((each.probability for each in term.arm.alternatives), reverse=True)
+    percent = " and ".join(", ".join(f"{share:.0%}" for share in shares).rsplit(", ", 1))
+    return (
+        f"{COUNTS.get(len(shares), str(len(shares)))} arms explain the recording about as well ({percent}); their "
+        f"difference is in tau_std. A recording in which {where} would tell: at twice that they differ by "
+        f"{spread[most]:.2g} {unit} in {model.joint_names[most]}."
+    )
+
+
+def _spread(term: ArmKernel, motion: Motion) -> Array:
+    """Standard deviation of the mixture of alternative arms, root mean square over motions: (n,)."""
+    features = term.features(motion).numpy()[:, :, term.steps.stop :]
+    return np.asarray(np.sqrt(np.mean(np.square(features).sum(2), axis=0)))

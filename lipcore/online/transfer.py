@@ -1,0 +1,140 @@
+"""What a model has learnt online, as it leaves the process: a model to save, arrays to answer with, a snapshot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+from torch import Tensor
+
+from lipcore.data.samples import Array
+from lipcore.model.torque_model import TorqueModel
+from lipcore.online.learner import OnlineModel, Regime
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.linalg import pack_symmetric, unpack_symmetric
+from lipcore.posterior.statistics import Statistics
+
+REGIMES = ("now", "before")
+ABSENT = float("nan")
+"""Stands for None among numbers."""
+
+
+def consolidate(online: OnlineModel, floor: Array | None = None) -> TorqueModel:
+    """The model that answers as `online.model(floor)` does, to the last bit, and that can be saved.
+
+    The posterior of a regime is that of the sums A and b with the prior N(centre, I): its mean (I + A)⁻¹ (centre + b)
+    is also that of the sums A and centre + b with the prior of a trained model, N(0, I). What it no longer holds is
+    which part was trained and which learnt: it neither unlearns nor forgets the rows of before.
+    """
+    base, now = online.base.posterior, online.now
+    trained = base.statistics
+    # a change of the robot leaves nothing of the training samples but their mean
+    samples = online.samples + (trained.samples if trained is not None and online.before is None else 0.0)
+    posterior = CompactPosterior.build(
+        base.kernel,
+        base.basis,
+        Statistics(now.statistics.a, now.centre + now.statistics.b, max(samples, 0.0)),
+        base.noise_variance,
+        base.std_factor,
+    )
+    if floor is not None:
+        posterior = replace(posterior, floor=torch.from_numpy(floor.copy()))
+    return replace(online.base, posterior=posterior)
+
+
+@dataclass(frozen=True)
+class Revision:
+    """Answers of one basis after some learning.
+
+    weights: (M,); root: (M, M), see `CompactPosterior`; packed: both as the evaluator lays them out; floor: (n,).
+    """
+
+    weights: Array
+    root: Array
+    packed: Array
+    floor: Array
+
+    @classmethod
+    def of(cls, model: TorqueModel) -> Revision:
+        """The arrays of a model that has learnt."""
+        posterior = model.posterior
+        arrays = posterior.weights.numpy(), posterior.root.numpy(), model.evaluator.packed, posterior.floor.numpy()
+        return cls(*(np.ascontiguousarray(each) for each in arrays))
+
+    def apply(self, base: TorqueModel) -> TorqueModel:
+        """Return the model of the same basis that answers so; raise ValueError where shapes do not fit.
+
+        No linear algebra, and nothing is copied: the arrays may be memory-mapped, copy-on-write because torch takes
+        writable memory only. They must not change any more.
+        """
+        for name, like in (("weights", base.posterior.weights), ("root", base.posterior.root)):
+            if getattr(self, name).shape != tuple(like.shape):
+                raise ValueError(f"{name} has shape {getattr(self, name).shape}, expected {tuple(like.shape)}")
+        weights, root, floor = (torch.from_numpy(each) for each in (self.weights, self.root, self.floor))
+        posterior = replace(base.posterior, weights=weights, root=root, floor=floor, statistics=None)
+        model = replace(base, posterior=posterior)
+        # the cached property, filled without laying anything out again
+        model.__dict__["evaluator"] = base.evaluator.revised(self.packed, self.floor)
+        return model
+
+
+def dump(online: OnlineModel) -> bytes:
+    """All of an online model but the version as trained, as the bytes of a safetensors file.
+
+    Its size does not grow with what was learnt.
+    """
+    numbers = [ABSENT if each is None else each for each in (online.forgetting_s, online.since, online.reference)]
+    tensors = {"numbers": torch.tensor(numbers, dtype=torch.float64), "base": _trained(online.base)}
+    for name in REGIMES:
+        regime = getattr(online, name)
+        if regime is not None:
+            tensors |= {f"{name}/{part}": value for part, value in _parts(regime).items()}
+    return save_tensors({name: value.clone().contiguous() for name, value in tensors.items()})
+
+
+def load(base: TorqueModel, payload: bytes) -> OnlineModel:
+    """The online model that `dump` wrote. base: the version as trained that it was started from.
+
+    Raise ValueError for bytes that are no such state, or one of another version.
+    """
+    try:
+        tensors = load_tensors(payload)
+        # weights: written by earlier releases; they are solved for, and to the last bit with as many threads only
+        same = any(torch.equal(tensors["base"], each) for each in (_trained(base), base.posterior.weights))
+        forgetting_s, since, reference = tensors["numbers"].tolist()
+        regimes = {name: _regime(tensors, name) for name in REGIMES if f"{name}/numbers" in tensors}
+    except (KeyError, SafetensorError, RuntimeError, TypeError) as error:
+        raise ValueError(f"these bytes are no state of an online model: {error}") from error
+    if not same:
+        raise ValueError("the state is of another version")
+    size = len(base.posterior.basis)
+    for name, regime in regimes.items():
+        if regime.centre.shape != (size,) or regime.statistics.a.shape != (size, size):
+            raise ValueError(f"{name} has {len(regime.centre)} variables, expected {size}")
+    return OnlineModel(base, _number(forgetting_s), _number(since), reference, regimes.get("before"), regimes["now"])
+
+
+def _trained(base: TorqueModel) -> Tensor:
+    """What tells a version from another: read from its files, so that it is the same in every process."""
+    statistics = base.posterior.statistics
+    return base.posterior.weights if statistics is None else statistics.b
+
+
+def _parts(regime: Regime) -> dict[str, Tensor]:
+    sums = regime.statistics
+    numbers = torch.tensor([regime.begins, sums.samples], dtype=torch.float64)
+    return {"numbers": numbers, "centre": regime.centre, "a": pack_symmetric(sums.a), "b": sums.b}
+
+
+def _regime(tensors: dict[str, Tensor], name: str) -> Regime:
+    begins, samples = tensors[f"{name}/numbers"].tolist()
+    statistics = Statistics(unpack_symmetric(f"{name}/a", tensors[f"{name}/a"]), tensors[f"{name}/b"], samples)
+    return Regime(begins, tensors[f"{name}/centre"], statistics)
+
+
+def _number(value: float) -> float | None:
+    return None if value != value else value  # noqa: PLR0124 - NaN alone differs from itself

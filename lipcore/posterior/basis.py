@@ -1,0 +1,126 @@
+"""The functions that a compact posterior is written in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lipcore.data.motion import Motion
+from lipcore.kernels.base import LinearKernel, PairKernel, Params, SumKernel, TorqueKernel
+from lipcore.kernels.compiled.cross import Cross
+from lipcore.posterior.linalg import cholesky
+
+
+@dataclass(frozen=True)
+class Basis:
+    """m torques of the nonlinear term, chosen among those of S inducing samples, and all weights of the linear terms.
+
+    These M = m + p variables u have the prior covariance B Bᵀ, and φ(x) = B⁻¹ cov(u, f(x)): in their whitened form they
+    are independent with variance one, and the torque is φᵀ w plus a remainder of variance k(x, x) − φᵀφ.
+
+    term: the nonlinear term, None for an estimator without one; linear: the linear terms; inducing: S samples;
+    outputs: (m,) places of the chosen torques among the S n, sample by sample; root: B, (M, M) lower triangular.
+    """
+
+    term: PairKernel | None
+    linear: tuple[LinearKernel, ...]
+    params: Params
+    inducing: Motion
+    outputs: Tensor
+    root: Tensor
+
+    @classmethod
+    def build(cls, kernel: TorqueKernel, params: Params, inducing: Motion, outputs: Tensor) -> Basis:
+        """Basis of a kernel's terms.
+
+        params: hyperparameters; inducing: S samples, whose torques `outputs` (m,) counts as sample · n + joint. Raise
+        ValueError where outputs and terms do not fit together.
+        """
+        term, linear = split(kernel)
+        places = len(inducing) * kernel.n_joints
+        if outputs.dim() != 1 or len(set(outputs.tolist())) != len(outputs) or (term is None and len(outputs)):
+            raise ValueError(f"outputs has shape {tuple(outputs.shape)}, expected distinct places of torques")
+        if len(outputs) and not (int(outputs.min()) >= 0 and int(outputs.max()) < places):
+            raise ValueError(f"outputs reaches from {outputs.min()} to {outputs.max()}, expected 0 to {places - 1}")
+        roots = [cholesky(each.covariance(params).detach()).lower for each in linear]
+        if term is not None:
+            gram = term.symmetric_gram(params, inducing)
+            roots.insert(0, cholesky(gram[outputs][:, outputs]).lower)
+        root: Tensor = torch.block_diag(*roots)  # type: ignore[no-untyped-call]
+        return cls(term, linear, params, inducing, outputs, root)
+
+    def __len__(self) -> int:
+        return len(self.root)
+
+    def rows(self, linear: LinearKernel) -> slice:
+        """Places of a linear term's weights among the variables."""
+        start = len(self.outputs)
+        for each in self.linear:
+            size = each.covariance(self.params).shape[0]
+            if each is linear:
+                return slice(start, start + size)
+            start += size
+        raise ValueError("the linear term is none of this basis")
+
+    def covariance(self, query: Motion) -> Tensor:
+        """cov(u, f(x)) for the torques of N queries, before whitening: (M, N n)."""
+        parts = []
+        if self.term is not None:
+            parts.append(self.term.gram(self.params, self.inducing, query)[self.outputs])
+        parts += [each.covariance(self.params) @ _rows(each, query).T for each in self.linear]
+        return torch.cat(parts)
+
+    def features(self, query: Motion) -> Tensor:
+        """φ(x) = B⁻¹ cov(u, f(x)) for the torques of N queries (eq. 24 of docs/method.md): (M, N n)."""
+        solved: Tensor = torch.linalg.solve_triangular(self.root, self.covariance(query), upper=False)
+        return solved
+
+    def uncovered(self, query: Motion, features: Tensor) -> Tensor:
+        """Variance k(x, x) − φᵀφ that the basis leaves open at N queries, (N, n). features: φ(x), (M, N n)."""
+        if self.term is None:
+            return torch.zeros_like(query.q)
+        return self._open(self.term.variance(self.params, query).diagonal(dim1=1, dim2=2), features)
+
+    def features_and_uncovered(self, query: Motion) -> tuple[Tensor, Tensor]:
+        """`features` (M, N n) and `uncovered` (N, n) of N queries, for few of them at a time: compiled, on the CPU."""
+        if self._cross is None:
+            features = self.features(query)
+            return features, self.uncovered(query, features)
+        n, size = query.n_joints, self._cross.size
+        blocks = torch.empty((len(query), size + 1, n, n), dtype=torch.float64)
+        motions = np.stack([query.q.numpy(), query.dq.numpy(), query.ddq.numpy()], axis=1)
+        self._cross.fill_many(motions, blocks.numpy())
+        gram = blocks[:, :size].permute(1, 2, 0, 3).reshape(size * n, len(query) * n)[self.outputs]
+        parts = [gram, *(each.covariance(self.params) @ _rows(each, query).T for each in self.linear)]
+        features = torch.linalg.solve_triangular(self.root, torch.cat(parts), upper=False)
+        return features, self._open(blocks[:, size].diagonal(dim1=1, dim2=2), features)
+
+    @cached_property
+    def _cross(self) -> Cross | None:
+        return None if self.term is None else self.term.cross(self.params, self.inducing)
+
+    def _open(self, prior: Tensor, features: Tensor) -> Tensor:
+        # the linear terms' own features leave nothing open
+        explained = features[: len(self.outputs)].square().sum(0).reshape(prior.shape)
+        return (prior - explained).clamp_min(0.0)
+
+
+def split(kernel: TorqueKernel) -> tuple[PairKernel | None, tuple[LinearKernel, ...]]:
+    """The nonlinear term of a kernel, if it has one, and its linear terms; raise ValueError for any other kernel."""
+    terms: Sequence[TorqueKernel] = kernel.terms if isinstance(kernel, SumKernel) else (kernel,)
+    nonlinear = [each for each in terms if isinstance(each, PairKernel)]
+    linear = tuple(each for each in terms if isinstance(each, LinearKernel))
+    if len(nonlinear) > 1 or len(nonlinear) + len(linear) < len(terms):
+        names = ", ".join(type(each).__name__ for each in terms)
+        raise ValueError(f"the kernel's terms are {names}, expected at most one pair kernel beside linear ones")
+    return (nonlinear[0] if nonlinear else None), linear
+
+
+def _rows(kernel: LinearKernel, query: Motion) -> Tensor:
+    features = kernel.features(query)
+    return features.reshape(-1, features.shape[-1])

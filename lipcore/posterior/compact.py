@@ -1,0 +1,142 @@
+"""The compact posterior: a Gaussian over M basis functions, made of sums over samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from lipcore.data.motion import Motion
+from lipcore.kernels.base import LinearKernel, Params, TorqueKernel
+from lipcore.posterior.basis import Basis
+from lipcore.posterior.exact import Posterior, Prediction
+from lipcore.posterior.statistics import Solution, Statistics, solve
+
+
+@dataclass(frozen=True)
+class CompactPosterior(Posterior):
+    """Posterior whose anchors are the M variables of a basis (DESIGN §4).
+
+    The whitened variables have the posterior N(ŵ, Σ), from statistics alone N((I + A)⁻¹ b, (I + A)⁻¹). With
+    c = cov(u, f(x)) = B φ(x):
+
+        mean       E f(x) + φᵀ ŵ                = E f(x) + cᵀ α,     α = B⁻ᵀ ŵ
+        variance   k(x, x) − φᵀφ + φᵀ Σ φ       = k(x, x) − |Q c|²,  QᵀQ = B⁻ᵀ (I − Σ) B⁻¹
+
+    where φ does not reach, the variance is the prior's. root: Q, (M, M) lower triangular; noise_variance: (n,) R;
+    floor: (n,) (N·m)², which the variance of a torque is never below, whatever the samples say; zero but for models
+    that learn online (see `online.record.error_floor`). statistics: what it was made from; None where that is more than
+    one sum.
+    """
+
+    basis: Basis
+    noise_variance: Tensor
+    root: Tensor
+    floor: Tensor
+    statistics: Statistics | None = None
+
+    @classmethod
+    def build(
+        cls,
+        kernel: TorqueKernel,
+        basis: Basis,
+        statistics: Statistics,
+        noise_variance: Tensor,
+        std_factor: float = 1.0,
+    ) -> CompactPosterior:
+        """Posterior of statistics (eq. 24 of docs/method.md).
+
+        noise_variance: (n,) (N·m)²; std_factor: calibration. Raise NotPositiveDefiniteError for statistics that no
+        samples have.
+        """
+        posterior = cls.solved(kernel, basis, solve(statistics), noise_variance, std_factor)
+        return replace(posterior, statistics=statistics)
+
+    @classmethod
+    def restore(
+        cls,
+        kernel: TorqueKernel,
+        params: Params,
+        inducing: Motion,
+        outputs: Tensor,
+        statistics: Statistics,
+        jitter: float = 0.0,
+        std_factor: float = 1.0,
+    ) -> CompactPosterior:
+        """Rebuild a posterior from what a file holds: hyperparameters, inducing outputs (see `Basis`) and statistics.
+
+        jitter: (N·m)², what the fit has added to the noise's variance.
+        Raise ValueError naming what is missing, unknown or of the wrong shape.
+        """
+        expected = {**kernel.shapes(), "noise.log_std": torch.Size([kernel.n_joints])}
+        for name in expected.keys() | params.keys():
+            shape = tuple(params[name].shape) if name in params else None
+            right = tuple(expected[name]) if name in expected else None
+            if shape != right:
+                raise ValueError(f"hyperparameter {name!r} has shape {shape}, expected {right}")
+        basis = Basis.build(kernel, params, inducing, outputs)
+        size = len(basis)
+        if statistics.a.shape != (size, size) or statistics.b.shape != (size,):
+            raise ValueError(
+                f"statistics have shapes {tuple(statistics.a.shape)} and {tuple(statistics.b.shape)}, "
+                f"expected {(size, size)} and {(size,)}"
+            )
+        noise_variance = torch.exp(2 * params["noise.log_std"]) + jitter
+        return cls.build(kernel, basis, statistics, noise_variance, std_factor)
+
+    @classmethod
+    def solved(
+        cls,
+        kernel: TorqueKernel,
+        basis: Basis,
+        solution: Solution,
+        noise_variance: Tensor,
+        std_factor: float = 1.0,
+        floor: Tensor | None = None,
+    ) -> CompactPosterior:
+        """Posterior of the torques, given that of the whitened variables.
+
+        noise_variance: (n,) (N·m)²; floor: (n,) (N·m)², none where None.
+        """
+        weights = torch.linalg.solve_triangular(basis.root.T, solution.mean[:, None], upper=True)[:, 0]
+        # and not from QᵀQ itself: B⁻¹ is badly conditioned
+        root = torch.linalg.solve_triangular(basis.root, solution.learnt, upper=False, left=False)
+        floor = torch.zeros_like(noise_variance) if floor is None else floor
+        return cls(kernel, basis.params, std_factor, weights, basis, noise_variance, root, floor)
+
+    def predict(self, query: Motion, component: TorqueKernel | None = None) -> Prediction:
+        """Posterior mean and n×n covariance of the torques at each of N queries, or of one term of the kernel.
+
+        The floor is one of the whole torque: no term's share of it is known.
+        """
+        prediction = super().predict(query, component)
+        if component is not None:
+            return prediction
+        short = (self.floor - prediction.covariance.diagonal(dim1=1, dim2=2)).clamp_min(0.0)
+        return Prediction(prediction.mean, prediction.covariance + torch.diag_embed(short))
+
+    def whiten(self, cross: Tensor) -> Tensor:
+        """Q c, (M, K). cross: covariance of the variables with K quantities, (M, K)."""
+        return self.root @ cross
+
+    def with_torques(self, term: TorqueKernel, covariance: Callable[[Motion], Tensor]) -> Tensor:
+        """Covariance of the variables with K quantities of the nonlinear term, zero for linear weights: (M, K).
+
+        covariance: that of the term's torques at N motions with the quantities, (N n, K). Raise ValueError for another
+        term.
+        """
+        if term is not self.basis.term:
+            raise ValueError("the term is none of this posterior")
+        inducing = covariance(self.basis.inducing)[self.basis.outputs]
+        return torch.cat([inducing, inducing.new_zeros((len(self.basis) - len(inducing), inducing.shape[1]))])
+
+    def with_weights(self, term: LinearKernel, covariance: Tensor) -> Tensor:
+        """Covariance of the variables with K quantities of a linear term, zero for all other variables: (M, K).
+
+        covariance: cov(w, s), (p, K).
+        """
+        out = covariance.new_zeros((len(self.basis), covariance.shape[1]))
+        out[self.basis.rows(term)] = covariance
+        return out

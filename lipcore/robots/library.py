@@ -1,0 +1,219 @@
+"""Arms as Pinocchio models: those of example-robot-data, with every other joint locked, and random ones.
+
+The URDFs come with the package `example-robot-data` (extra `sim`). Random arms, for tests and benchmarks, have
+any axes, any offsets and plausible masses.
+"""
+
+from __future__ import annotations
+
+import importlib
+import site
+import sys
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lipcore.data.samples import Array
+from lipcore.vocabulary import JointType
+
+
+class SimulationUnavailableError(RuntimeError):
+    """The packages that simulation needs are not installed."""
+
+
+class UnknownRobotError(ValueError):
+    """No robot of that name can be simulated."""
+
+
+@dataclass(frozen=True)
+class RobotSource:
+    """A URDF below example-robot-data's `robots` folder and the joints that stay free, from base to tip."""
+
+    urdf: str
+    free: tuple[str, ...]
+
+
+def _numbered(pattern: str, *numbers: int) -> tuple[str, ...]:
+    return tuple(pattern.format(number) for number in numbers)
+
+
+_UR = tuple(f"{j}_joint" for j in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"))
+# the gripper's jaw is the last joint of the chain; Pinocchio cannot lock it, since a link has the same name
+_SO = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+_PR2 = ("shoulder_pan", "shoulder_lift", "upper_arm_roll", "elbow_flex", "forearm_roll", "wrist_flex", "wrist_roll")
+
+ROBOTS: dict[str, RobotSource] = {
+    "panda": RobotSource("panda_description/urdf/panda.urdf", _numbered("panda_joint{}", *range(1, 8))),
+    "ur3": RobotSource("ur_description/urdf/ur3_robot.urdf", _UR),
+    "ur5": RobotSource("ur_description/urdf/ur5_robot.urdf", _UR),
+    "ur10": RobotSource("ur_description/urdf/ur10_robot.urdf", _UR),
+    "xarm7": RobotSource("xarm_description/urdf/xarm7.urdf", _numbered("joint{}", *range(1, 8))),
+    "kinova": RobotSource("kinova_description/robots/kinova.urdf", _numbered("j2s6s200_joint_{}", *range(1, 7))),
+    "z1": RobotSource("z1_description/urdf/z1.urdf", _numbered("joint{}", *range(1, 7))),
+    "so100": RobotSource("so_arm_description/urdf/so100.urdf", _SO),
+    "so101": RobotSource("so_arm_description/urdf/so101.urdf", _SO),
+    "baxter-left": RobotSource(
+        "baxter_description/urdf/baxter.urdf", tuple(f"left_{j}" for j in ("s0", "s1", "e0", "e1", "w0", "w1", "w2"))
+    ),
+    "baxter-right": RobotSource(
+        "baxter_description/urdf/baxter.urdf", tuple(f"right_{j}" for j in ("s0", "s1", "e0", "e1", "w0", "w1", "w2"))
+    ),
+    "pr2-left": RobotSource("pr2_description/urdf/pr2.urdf", tuple(f"l_{j}_joint" for j in _PR2)),
+    "pr2-right": RobotSource("pr2_description/urdf/pr2.urdf", tuple(f"r_{j}_joint" for j in _PR2)),
+    "talos-left": RobotSource("talos_data/robots/talos_left_arm.urdf", _numbered("arm_left_{}_joint", *range(2, 8))),
+    "tiago": RobotSource(
+        "tiago_description/robots/tiago_no_hand.urdf",
+        ("torso_lift_joint", *_numbered("arm_{}_joint", *range(1, 8))),
+    ),
+    "tiago-pro-left": RobotSource(
+        "tiago_pro_description/robots/tiago_pro.urdf", _numbered("arm_left_{}_joint", *range(1, 8))
+    ),
+    "tiago-pro-right": RobotSource(
+        "tiago_pro_description/robots/tiago_pro.urdf", _numbered("arm_right_{}_joint", *range(1, 8))
+    ),
+    "double-pendulum": RobotSource("double_pendulum_description/urdf/double_pendulum.urdf", ("joint1", "joint2")),
+    "asr-twodof": RobotSource("asr_twodof_description/urdf/TwoDofs.urdf", ("J1", "J2")),
+    "finger-edu": RobotSource(
+        "finger_edu_description/robots/finger_edu.urdf",
+        ("finger_base_to_upper_joint", "finger_upper_to_middle_joint", "finger_middle_to_lower_joint"),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A serial arm by name: its Pinocchio model and what the simulator needs to know of its joints.
+
+    lower, upper: (n,) position limits in rad or m; speed: (n,) velocity limits in rad/s or m/s.
+    """
+
+    name: str
+    model: Any
+    joint_names: tuple[str, ...]
+    joint_types: tuple[JointType, ...]
+    lower: Array
+    upper: Array
+    speed: Array
+
+    @property
+    def n_joints(self) -> int:
+        """Number of free joints n."""
+        return len(self.joint_names)
+
+    def configuration(self, q: Array) -> Array:
+        """Pinocchio's configuration of joint positions q (n,): unbounded joints take (cos, sin)."""
+        out = np.empty(self.model.nq)
+        for at, size, place in self._places:
+            angle = q[place]
+            out[at : at + size] = angle if size == 1 else (np.cos(angle), np.sin(angle))
+        return out
+
+    @cached_property
+    def _places(self) -> list[tuple[int, int, int]]:
+        """Of each joint: where its configuration starts, how long that is, where its position is."""
+        model = self.model  # looked at once: asking Pinocchio takes longer than the dynamics of a sample
+        return [(model.idx_qs[joint], model.joints[joint].nq, model.idx_vs[joint]) for joint in range(1, model.njoints)]
+
+
+def pinocchio() -> Any:
+    """The pinocchio module; raise SimulationUnavailableError with the remedy where it is missing."""
+    try:
+        return importlib.import_module("pinocchio")
+    except ImportError as error:
+        raise SimulationUnavailableError(
+            "rigid-body dynamics need Pinocchio: pip install pin; a minimal system may also lack its OpenMP runtime, "
+            f"libgomp1 ({error})"
+        ) from error
+
+
+def load_robot(name: str) -> Robot:
+    """Load a robot by name; raise UnknownRobotError or SimulationUnavailableError."""
+    if name not in ROBOTS:
+        raise UnknownRobotError(f"robot is {name!r}, expected one of {', '.join(ROBOTS)}")
+    pin, source = pinocchio(), ROBOTS[name]
+    full = pin.buildModelFromUrdf(str(_robots_folder() / source.urdf))
+    locked = [full.getJointId(joint) for joint in list(full.names)[1:] if joint not in source.free]
+    model = pin.buildReducedModel(full, locked, pin.neutral(full)) if locked else full
+    names = tuple(model.names)[1:]
+    if names != source.free:
+        raise UnknownRobotError(f"robot {name!r} has the joints {names}, expected {source.free}")
+    types: list[JointType] = []
+    limits = []
+    for index in range(1, model.njoints):
+        joint = model.joints[index]
+        types.append("prismatic" if joint.shortname().startswith("JointModelP") else "revolute")
+        at = model.idx_qs[index]
+        low, high = model.lowerPositionLimit[at], model.upperPositionLimit[at]
+        # unbounded joints carry limits of (cos, sin), and some URDFs none at all
+        limits.append((low, high) if joint.nq == 1 and high > low else (-np.pi, np.pi))
+    lower, upper = np.array(limits).T
+    speed = np.where(model.velocityLimit > 0, model.velocityLimit, np.inf)
+    return Robot(name, model, names, tuple(types), lower, upper, speed)
+
+
+def installed_profiles() -> tuple[str, ...]:
+    """Names of the robots whose URDFs are installed here."""
+    try:
+        folder = _robots_folder()
+    except SimulationUnavailableError:
+        return ()
+    return tuple(name for name, source in ROBOTS.items() if (folder / source.urdf).is_file())
+
+
+def profile_urdf(name: str) -> str:
+    """The URDF of a robot of ROBOTS as text; raise UnknownRobotError or SimulationUnavailableError."""
+    if name not in ROBOTS:
+        raise UnknownRobotError(f"robot is {name!r}, expected one of {', '.join(ROBOTS)}")
+    return (_robots_folder() / ROBOTS[name].urdf).read_text()
+
+
+def _robots_folder() -> Path:
+    roots = [*site.getsitepackages(), site.getusersitepackages(), *sys.path]
+    for root in roots:
+        folder = Path(root) / "cmeel.prefix/share/example-robot-data/robots"
+        if folder.is_dir():
+            return folder
+    raise SimulationUnavailableError("robots by name need example-robot-data: pip install 'lipserve[sim]'")
+
+
+JOINTS = (3, 8)
+"""Fewest and most joints."""
+TILTED, TILT = 1 / 3, 0.5
+"""Share of arms whose first axis is not upright, and how far it leans, rad."""
+OFFSET, CENTRE = 0.2, 0.1
+"""Spread of a joint's place in the frame before, and of a body's centre of mass, m."""
+HEAVIEST, LIGHTER = 8.0, 0.7
+"""Mass of the first body, kg, and of each next one as a share of that before."""
+BULK = 0.06
+"""Spread of a body's mass about its centre, m."""
+REACH, SLIDE, SPEED = 2.5, 0.4, 2.5
+"""Limits of position, rad and m, and of velocity, rad/s and m/s."""
+
+
+def random_arm(seed: int, joints: int | None = None, prismatic: int | None = None) -> Robot:
+    """A random arm; joints: n, 3 to 8 where None; prismatic: which joint slides, none where None.
+
+    Equal arguments give equal arms.
+    """
+    pin, rng = pinocchio(), np.random.default_rng(seed)
+    n = int(rng.integers(JOINTS[0], JOINTS[1] + 1)) if joints is None else joints
+    types: list[JointType] = ["prismatic" if j == prismatic else "revolute" for j in range(n)]
+    model, last = pin.Model(), 0
+    for j, kind in enumerate(types):
+        turn = pin.exp3(2 * rng.standard_normal(3))
+        if j == 0:
+            turn = pin.exp3(TILT * rng.standard_normal(3)) if rng.uniform() < TILTED else np.eye(3)
+        place = OFFSET * rng.standard_normal(3) if j else np.zeros(3)
+        joint = pin.JointModelPZ() if kind == "prismatic" else pin.JointModelRZ()
+        last = model.addJoint(last, joint, pin.SE3(turn, place), f"joint{j + 1}")
+        mass = HEAVIEST * LIGHTER**j * rng.uniform(0.5, 1.5)
+        spread = BULK * rng.standard_normal((3, 3))
+        moments = mass * (spread @ spread.T + 0.002 * np.eye(3))  # of a real body: ∫ r rᵀ dm is positive definite
+        inertia = np.trace(moments) * np.eye(3) - moments
+        body = pin.Inertia(mass, CENTRE * rng.standard_normal(3), inertia)
+        model.appendBodyToJoint(last, body, pin.SE3.Identity())
+    upper = np.where(np.array(types) == "prismatic", SLIDE, REACH)
+    return Robot(f"random-{seed}", model, tuple(model.names)[1:], tuple(types), -upper, upper, np.full(n, SPEED))

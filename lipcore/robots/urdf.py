@@ -1,0 +1,302 @@
+"""Rigid bodies of a URDF, arranged as the joints of the data are.
+
+A URDF comes from strangers: it is read as text, never as a path, meshes are not opened, and what could run away while
+it is parsed (document types, deep nesting, loops, endless chains) is refused before Pinocchio sees it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+from xml.parsers import expat
+
+import numpy as np
+
+from lipcore.data.motion import check_joint_types
+from lipcore.data.samples import Array
+from lipcore.robots.library import ROBOTS, UnknownRobotError, pinocchio, profile_urdf
+from lipcore.vocabulary import JointType
+
+Matching = Literal["name", "order", "list"]
+"""How the data's joints were matched with the URDF's: by name, by order (profiles only), by an explicit list."""
+
+MOVABLE: dict[str, JointType] = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+MIN_LENGTH, DEFAULT_LENGTH = 0.01, 0.3
+"""Below the first, m, the placements say nothing about the links' size, and the second stands in."""
+MAX_DEPTH = 32
+MAX_LINKS = 500
+"""Links of a URDF: parsers and Pinocchio recurse from link to link, and a long enough chain would exhaust the stack."""
+PARAMETERS = 10
+"""Inertial parameters of a body: mass, first moment (3), inertia (xx, xy, yy, xz, yz, zz) about its joint's frame."""
+
+
+class UrdfError(ValueError):
+    """The text is no URDF that can be used; the message says why."""
+
+
+class JointMismatchError(ValueError):
+    """The joints of the URDF are not those of the data; the message names both."""
+
+
+@dataclass(frozen=True)
+class UrdfJoint:
+    """A joint as the URDF has it. kind: its `type` there; mimics: the joint that it follows."""
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    mimics: str | None = None
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a URDF says of itself. joints: those that move, mimicking ones left out, in the order of the text."""
+
+    name: str
+    joints: tuple[UrdfJoint, ...]
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints that move."""
+        return tuple(joint.name for joint in self.joints)
+
+
+@dataclass(frozen=True)
+class RigidBody:
+    """A serial arm with a fixed base, n moving bodies, everything in the order of the data's joints.
+
+    urdf: its text; urdf_joints: the URDF's name of each joint of the data; matched: how these were matched; model:
+    Pinocchio's, every other joint locked at neutral.
+    """
+
+    name: str
+    urdf: str
+    joint_names: tuple[str, ...]
+    joint_types: tuple[JointType, ...]
+    urdf_joints: tuple[str, ...]
+    matched: Matching
+    model: Any = field(repr=False, compare=False)
+
+    @classmethod
+    def from_urdf(
+        cls,
+        urdf: str,
+        joint_names: Sequence[str],
+        joint_types: Sequence[str],
+        joints: Sequence[str] | None = None,
+        name: str | None = None,
+    ) -> RigidBody:
+        """Build from a URDF's text for data with these joints; `joints` names the URDF's joints in the data's order.
+
+        Without `joints` the names have to be equal. Raise UrdfError, JointMismatchError, or ValueError for a type.
+        """
+        urdf_joints = tuple(joint_names if joints is None else joints)
+        return cls._build(urdf, joint_names, joint_types, urdf_joints, name, "name" if joints is None else "list")
+
+    @classmethod
+    def from_profile(cls, profile: str, joint_names: Sequence[str], joint_types: Sequence[str]) -> RigidBody:
+        """Build a robot of ROBOTS; its joints are matched by name, or by order where the data have other names.
+
+        Raise UnknownRobotError, SimulationUnavailableError without example-robot-data, JointMismatchError.
+        """
+        if profile not in ROBOTS:
+            raise UnknownRobotError(f"robot is {profile!r}, expected one of {', '.join(ROBOTS)}")
+        free, given = ROBOTS[profile].free, tuple(joint_names)
+        by_name = set(given) == set(free)
+        # names that fit in part, or at other places, say that another robot or another order is meant
+        if not by_name and (
+            len(given) != len(free) or any(a != b and a in free for a, b in zip(given, free, strict=True))
+        ):
+            raise _mismatch(profile, free, given)
+        urdf_joints = given if by_name else free
+        urdf = profile_urdf(profile)
+        return cls._build(urdf, given, joint_types, urdf_joints, profile, "name" if by_name else "order")
+
+    @classmethod
+    def _build(
+        cls,
+        urdf: str,
+        joint_names: Sequence[str],
+        joint_types: Sequence[str],
+        urdf_joints: tuple[str, ...],
+        name: str | None,
+        matched: Matching,
+    ) -> RigidBody:
+        types, names = check_joint_types(joint_types), tuple(joint_names)
+        text_name, everything = _scan(urdf)
+        movable = {joint.name: joint for joint in everything if joint.kind in MOVABLE}
+        robot, chosen = name or text_name, set(urdf_joints)
+        if len(urdf_joints) != len(names) or len(chosen) != len(names) or not movable.keys() >= chosen:
+            listed = f"; `joints` lists {', '.join(urdf_joints)}" if matched == "list" else ""
+            raise _mismatch(robot, tuple(movable), names, listed)
+        if len(types) != len(names):
+            raise ValueError(f"joint_types has {len(types)} entries, expected {len(names)}, one a joint")
+        for data_name, kind, joint in zip(names, types, (movable[joint] for joint in urdf_joints), strict=True):
+            if MOVABLE[joint.kind] != kind:
+                raise JointMismatchError(
+                    f"joint {data_name!r} is {kind} in the data, but {joint.name!r} of robot {robot!r} is {joint.kind}"
+                )
+        _check_mimicry(everything, urdf_joints)
+        model = _reduce(_parse(urdf), urdf_joints)
+        return cls(robot, urdf, names, types, urdf_joints, matched, model)
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints n."""
+        return len(self.joint_names)
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the URDF's text."""
+        return hashlib.sha256(self.urdf.encode()).hexdigest()
+
+    @property
+    def order(self) -> tuple[int, ...]:
+        """Place of each joint of the data in Pinocchio's chain, which runs from base to tip: (n,)."""
+        place = {name: index for index, name in enumerate(tuple(self.model.names)[1:])}
+        return tuple(place[name] for name in self.urdf_joints)
+
+    def parameters(self) -> Array:
+        """The URDF's inertial parameters of the body that each joint moves, fixed and locked links merged: (n, 10)."""
+        chain = [inertia.toDynamicParameters() for inertia in tuple(self.model.inertias)[1:]]
+        return np.array(chain)[list(self.order)]
+
+    def length(self) -> float:
+        """Characteristic length, m: the mean distance from one joint to the next."""
+        steps = [float(np.linalg.norm(place.translation)) for place in tuple(self.model.jointPlacements)[2:]]
+        mean = float(np.mean(steps)) if steps else 0.0
+        return mean if mean > MIN_LENGTH else DEFAULT_LENGTH
+
+
+def describe(urdf: str) -> Description:
+    """Read what a URDF holds and check that Pinocchio takes it; raise UrdfError."""
+    name, everything = _scan(urdf)
+    joints = tuple(joint for joint in everything if joint.kind in MOVABLE and joint.mimics is None)
+    if not joints:
+        raise UrdfError("the URDF has no joint that moves, expected revolute, continuous or prismatic joints")
+    _parse(urdf)
+    return Description(name, joints)
+
+
+def _mismatch(robot: str, movable: Sequence[str], data: Sequence[str], listed: str = "") -> JointMismatchError:
+    listed_joints, given = ", ".join(movable) or "none", ", ".join(data)
+    return JointMismatchError(f"robot {robot!r} has the movable joints {listed_joints}; the data have {given}{listed}")
+
+
+def _scan(urdf: str) -> tuple[str, tuple[UrdfJoint, ...]]:
+    """The robot's name and its joints, from one pass that refuses what must not reach a recursive parser."""
+    scanner = _Scanner()
+    parser = expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = scanner.start, scanner.end
+    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = scanner.refuse_declaration
+    try:
+        parser.Parse(urdf, True)
+    except expat.ExpatError as error:
+        raise UrdfError(f"the URDF is not well-formed XML: {error}") from None
+    except UnicodeEncodeError as error:
+        raise UrdfError(f"the URDF is not text: {error}") from None
+    if scanner.links > MAX_LINKS:
+        raise UrdfError(f"the URDF has {scanner.links} links, expected at most {MAX_LINKS}")
+    joints = [
+        UrdfJoint(entry["name"], entry["type"], entry["parent"], entry["child"], entry.get("mimic"))
+        for entry in ({"name": "", "type": "", "parent": "", "child": ""} | joint for joint in scanner.joints)
+    ]
+    moved: dict[str, str] = {}
+    for joint in joints:
+        if joint.child in moved:
+            raise UrdfError(
+                f"link {joint.child!r} is the child of two joints, {moved[joint.child]!r} and {joint.name!r}: a closed "
+                "loop cannot be used, expected a tree"
+            )
+        moved[joint.child] = joint.name
+    for joint in joints:
+        if joint.kind not in MOVABLE and joint.kind != "fixed":
+            raise UrdfError(
+                f"joint {joint.name!r} is of type {joint.kind!r}: expected a fixed base and joints of type "
+                f"{', '.join(MOVABLE)} or fixed"
+            )
+    return scanner.robot, tuple(joints)
+
+
+class _Scanner:
+    """Handlers of expat that collect the joints directly below the root element `robot`."""
+
+    def __init__(self) -> None:
+        self.depth = self.links = 0
+        self.robot = ""
+        self.joints: list[dict[str, str]] = []
+        self._inside = False
+
+    def start(self, tag: str, attributes: dict[str, str]) -> None:
+        self.depth += 1
+        if self.depth > MAX_DEPTH:
+            raise UrdfError(f"the URDF nests elements more than {MAX_DEPTH} deep")
+        if self.depth == 1:
+            if tag != "robot":
+                raise UrdfError(f"the root element is <{tag[:40]}>, expected <robot>")
+            self.robot = attributes.get("name", "")[:200]
+        elif self.depth == 2:
+            self._inside = tag == "joint"
+            self.links += tag == "link"
+            if self._inside:
+                self.joints.append({name: attributes.get(name, "") for name in ("name", "type")})
+        elif self.depth == 3 and self._inside and tag in ("parent", "child", "mimic"):
+            self.joints[-1][tag] = attributes.get("joint" if tag == "mimic" else "link", "")
+
+    def end(self, tag: str) -> None:
+        self.depth -= 1
+
+    def refuse_declaration(self, *_: Any) -> None:
+        raise UrdfError("the URDF declares a document type or an entity (<!DOCTYPE>, <!ENTITY>), which is not accepted")
+
+
+def _check_mimicry(joints: Sequence[UrdfJoint], free: Sequence[str]) -> None:
+    for joint in joints:
+        if joint.mimics is not None and joint.name in free:
+            raise UrdfError(f"joint {joint.name!r} mimics {joint.mimics!r}: it does not move on its own")
+        if joint.mimics is not None and joint.mimics in free:
+            raise UrdfError(
+                f"joint {joint.name!r} mimics {joint.mimics!r} of the data: a coupled joint cannot be locked"
+            )
+
+
+def _parse(urdf: str) -> Any:
+    pin = pinocchio()
+    try:
+        model = pin.buildModelFromXML(urdf)
+    except (ValueError, RuntimeError) as error:
+        raise UrdfError(
+            f"Pinocchio cannot read the URDF: {str(error).strip()[:300]} Usual reasons: a link that a joint names is "
+            "missing, there are two roots, a name is used twice, or a revolute or prismatic joint has no <limit>"
+        ) from None
+    for name, inertia in zip(tuple(model.names), tuple(model.inertias), strict=True):
+        values = inertia.toDynamicParameters()
+        if not np.isfinite(values).all() or values[0] < 0:
+            raise UrdfError(f"the body that joint {name!r} moves has mass {values[0]:g} kg or an inertia out of range")
+    return model
+
+
+def _reduce(full: Any, free: Sequence[str]) -> Any:
+    """Lock every joint but `free`, which have to form one chain from base to tip."""
+    pin = pinocchio()
+    locked = [full.getJointId(name) for name in tuple(full.names)[1:] if name not in free]
+    try:
+        model = pin.buildReducedModel(full, locked, pin.neutral(full)) if locked else full
+    except (ValueError, RuntimeError) as error:
+        raise UrdfError(f"Pinocchio cannot lock the other joints of the URDF: {str(error).strip()[:300]}") from None
+    names = tuple(model.names)
+    if sorted(names[1:]) != sorted(free):
+        raise UrdfError(
+            f"locking left the joints {', '.join(names[1:])}, expected {', '.join(free)}: is a name used twice?"
+        )
+    for index in range(1, model.njoints):
+        parent = model.parents[index]
+        if parent != index - 1:
+            raise UrdfError(
+                f"the joints branch: {names[index]!r} follows {names[parent] if parent else 'the base'!r}, not "
+                f"{names[index - 1]!r}; expected one serial chain from base to tip"
+            )
+    return model

@@ -1,0 +1,1 @@
+"""Training: samples in, a model out; `auto` chooses the estimator."""

@@ -1,0 +1,66 @@
+"""Samples in, a model out: the choice of the estimator, its fit, and the pass over all samples."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lipcore.data.independence import recording_weights
+from lipcore.data.motion import check_joint_types
+from lipcore.data.samples import Samples
+from lipcore.fitting.estimators import check_estimator
+from lipcore.fitting.hyperparameters import Cancelled, Progress
+from lipcore.fitting.options import FitOptions
+from lipcore.fitting.task import Task
+from lipcore.kernels.geometry import Geometry
+from lipcore.model.torque_model import TorqueModel
+from lipcore.robots.urdf import RigidBody
+from lipcore.training import conditioning
+from lipcore.training.auto import choose
+from lipcore.training.fit import fit_estimator
+from lipcore.vocabulary import AUTO, DEFAULT_ESTIMATOR, TorqueConvention
+
+
+def train(
+    samples: Samples,
+    joint_types: Sequence[str],
+    estimator: str = DEFAULT_ESTIMATOR,
+    options: FitOptions | None = None,
+    torque_convention: TorqueConvention = "gravity_included",
+    on_progress: Progress | None = None,
+    cancelled: Cancelled | None = None,
+    robot: RigidBody | None = None,
+) -> TorqueModel:
+    """Train a model on samples of n joints.
+
+    joint_types: (n,), `revolute` or `prismatic`; estimator: one of `lipcore.fitting.estimators.ESTIMATORS`, or `auto`,
+    which chooses (`lipcore.training.auto`); torque_convention: what `samples.tau` holds; on_progress, cancelled: see
+    `lipcore.fitting.hyperparameters.fit`; robot: for estimators of rigid bodies, built for the joints of the samples.
+    Raise ValueError for bad arguments, FitCancelledError, or NotPositiveDefiniteError.
+    """
+    task = Task(
+        samples,
+        check_joint_types(joint_types),
+        options or FitOptions(),
+        torque_convention,
+        robot,
+        on_progress=on_progress,
+        cancelled=cancelled,
+    )
+    model = fit_model(task, estimator)
+    weights = recording_weights(samples.t, samples.episode)
+    weights = np.minimum(weights, 1.0 / float(model.fit.get("row_correlation", 1.0)))  # errors that last count once
+    if not conditioning.should_condition(task.options, len(samples), float(weights.sum())):
+        return model
+    return conditioning.condition(model, samples, weights, cancelled)
+
+
+def fit_model(task: Task, estimator: str = DEFAULT_ESTIMATOR, geometries: Sequence[Geometry] = ()) -> TorqueModel:
+    """Train as `train` does, on the chosen samples alone: where there are too many for memory, on a thinned table.
+
+    estimator: as in `train`; geometries: base to tip, that a search for one looks at first, as of an earlier version;
+    `auto` begins anew. Raise as `train` does.
+    """
+    check_estimator(estimator, task.joint_types, task.robot, task.options)
+    return choose(task) if estimator == AUTO else fit_estimator(task, estimator, geometries=geometries)
