@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from statistics import NormalDist
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lipcore.data.samples import Array
+if TYPE_CHECKING:
+    from lipcore.data.samples import Array
 
 LEVELS = (0.5, 0.8, 0.95, 0.99)
 """Probabilities of the intervals whose coverage and width are always given."""

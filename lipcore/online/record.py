@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lipcore.data.metrics import negative_log_density, quantile
-from lipcore.data.samples import Array
+
+if TYPE_CHECKING:
+    from lipcore.data.samples import Array
 
 LEVEL = 0.95
 """Probability of the interval that `inside` counts."""
