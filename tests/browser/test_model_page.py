@@ -85,7 +85,7 @@ def test_lineage_leads_to_the_data_and_the_job(visitor: Visitor, dashboard: Dash
         "href", f"#/data/{dashboard.dataset['id']}"
     )
     expect(page.get_by_role("columnheader", name="Trained on (flatters): nMSE")).to_be_visible()
-    expect(page.get_by_role("link", name=re.compile("^job_"))).to_be_visible()
+    expect(page.get_by_role("link", name="a training job")).to_have_attribute("href", re.compile("^#/jobs/job_"))
     assert audit(page) == []
 
 

@@ -83,7 +83,7 @@ export async function render(view, { id }, { signal, title }) {
     result,
     card("State", state, bar, figures),
     curve,
-    h("div", { class: "grid wide" }, card("What was asked for", wanted), card("What happened", past)),
+    h("div", { class: "grid wide" }, card("Request", wanted), card("History", past)),
   );
   take(job);
   named(names, signal).then(() => refresh(wanted, asked(job, names)));
@@ -130,7 +130,7 @@ async function named(names, signal) {
   );
 }
 
-const TRIGGERS = { asked: "as asked for", novelty: "as too much motion was novel", linearisation: "as learning moved its arm too far" };
+const TRIGGERS = { asked: "on request", novelty: "as too much motion was novel", linearisation: "as learning moved its arm too far" };
 
 function asked(job, names) {
   const sets = job.datasets.map((id, index) => [index ? ", " : "", link(names.get(id), `#/data/${id}`)]);
@@ -141,11 +141,11 @@ function asked(job, names) {
     ["Data sets", sets.length ? sets : "–"],
     ["Held out", heldOut(job.holdout)],
     ...(job.refresh ? [["Refresh of", `version ${job.refresh.version}, ${TRIGGERS[job.refresh.trigger]}`]] : []),
-    ...(job.retry_of ? [["Repeats", link(job.retry_of, `#/jobs/${job.retry_of}`)]] : []),
-    ["Asked for", when(job.created_at)],
+    ...(job.retry_of ? [["Repeats", link("an earlier job", `#/jobs/${job.retry_of}`)]] : []),
+    ["Queued", when(job.created_at)],
     ["Started", job.started_at ? when(job.started_at) : "not yet"],
     ["Attempts", count(job.attempts)],
     ["Id", h("code", {}, job.id)],
-    ...(job.request_id ? [["Request", h("code", {}, job.request_id)]] : []),
+    ...(job.request_id ? [["Request id", h("code", {}, job.request_id)]] : []),
   ]);
 }

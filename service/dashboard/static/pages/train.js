@@ -71,10 +71,10 @@ export async function render(view, { query }, { signal, title }) {
   const form = h(
     "form",
     { onsubmit: submit },
-    card("What to learn from", choice.element),
-    card("What to make", nameField, estimators, withRobot),
-    card("How to judge it", holdout.element),
-    card("How to fit it", h("p", { class: "hint" }, "The defaults suit most recordings."), advanced.element),
+    card("Data sets", choice.element),
+    card("Model", nameField, estimators, withRobot),
+    card("Held-out part", holdout.element),
+    card("Fit", h("p", { class: "hint" }, "The defaults suit most recordings."), advanced.element),
     problems,
     h("div", { class: "actions" }, start),
   );

@@ -50,7 +50,7 @@ function versionTable({ name, where, model, version }, aliases, reload, look) {
         each.version === version.version ? h("span", { class: "muted" }, "shown here") : null,
       ],
     },
-    { label: "Do", cell: actions },
+    { label: "Actions", cell: actions },
     { label: "Estimator", cell: (each) => each.estimator },
     { label: "Made", cell: (each) => when(each.created_at) },
   ];
@@ -76,7 +76,7 @@ function aliasTable({ name, where }, aliases, reload) {
   const columns = [
     { label: "Alias", cell: (each) => `${each.alias} → ${each.version}` },
     {
-      label: "Do",
+      label: "Actions",
       cell: (each) => h("div", { class: "actions" }, each.previous === null ? null : named(back(each), each), each.alias === "serving" ? null : named(remove(each), each)),
     },
     { label: "Before", cell: (each) => (each.previous === null ? "–" : `version ${each.previous}`) },

@@ -45,7 +45,7 @@ export function holdoutChoice() {
       {},
       h("legend", {}, "Hold out"),
       h("p", { class: "hint" }, "The held-out part is not learnt from; the version is judged on it."),
-      h("div", { class: "grid" }, field("What", kind), fields.share, fields.blocks, fields.seed, fields.guard),
+      h("div", { class: "grid" }, field("Which part", kind), fields.share, fields.blocks, fields.seed, fields.guard),
       about,
     ),
     value: () => {
