@@ -3,12 +3,12 @@
 The floors, from the top; what stands higher imports what stands lower, never the other way (import-linter, in
 pyproject.toml, checks it):
 
-    training, files, online, excitation, warm_up      on one floor; none of them knows another:
+    warm_up                                 above all: trains one of each, so that all is compiled
+    training, files, online, excitation     on one floor; none of them knows another:
         training     samples in, a model out; `auto` chooses the estimator
         files        a model as files: manifest, tensors, URDF, checked when read
         online       learning from a live stream: gates, records, changes, what is learnt and taken back
         excitation   the motion that tells a model most
-        warm_up      compiles ahead of the first answer
     arm          the rigid arm learnt from torque alone: geometry, masses, friction (sections 6 and 7)
     model        a trained model: torque, dynamics, energies, parameters, warnings (section 9)
     evaluator    the compiled form of a posterior, which answers queries

@@ -24,8 +24,8 @@ HERE = Path(__file__).resolve().parent
 CHECKOUT = HERE.parents[1] / "docs"
 INDEX = "README.md"
 ORDER = (
+    "first-model.md",
     "concepts.md",
-    "tutorial.md",
     "own-robot.md",
     "control-loop.md",
     "safety.md",
@@ -41,6 +41,7 @@ ORDER = (
     "errors.md",
     "reference/api.md",
     "reference/cli.md",
+    "reference/metrics.md",
     "reproduction/results.md",
 )
 """Pages beside the index, as the guide lists them. What is not listed here is not a page."""

@@ -160,10 +160,10 @@ def promoted(visitor: Visitor, dashboard: Dashboard, dataset: str) -> None:
     def serving() -> int:
         return dashboard.client.get("/v1/models/my-arm").json()["serving_version"]
 
-    page.get_by_role("button", name="Let it answer: version 1").click()
+    page.get_by_role("button", name="Serve: version 1").click()
     page.get_by_role("dialog").get_by_role("button", name="Cancel").click()
     assert serving() == 2
-    page.get_by_role("button", name="Let it answer: version 1").click()
+    page.get_by_role("button", name="Serve: version 1").click()
     page.get_by_role("dialog").get_by_role("button", name="Serve version 1").click()
     expect(page.get_by_text("Version 1 of my-arm answers from now on.")).to_be_visible()
     assert serving() == 1
@@ -175,7 +175,7 @@ def promoted(visitor: Visitor, dashboard: Dashboard, dataset: str) -> None:
     expect(page.get_by_text("blocks; ±")).to_be_visible()
     assert audit(page) == []
     visitor.shot("versions", 1300)
-    page.get_by_role("button", name="Let it answer: version 1").click()
+    page.get_by_role("button", name="Serve: version 1").click()
     page.get_by_role("dialog").get_by_role("button", name="Serve version 1").click()
     visitor.until(lambda: serving() == 1)
     assert follow is not None

@@ -18,7 +18,7 @@ def test_every_page_can_be_read_on_a_phone_in_both_themes(windows: Visit, dashbo
         *("#/models", *(f"{model}?tab={tab}" for tab in TABS), "#/live", f"#/live/{dashboard.model}"),
     ]
     problems = []
-    for route in [*routes, "/guide", "/guide/tutorial"]:
+    for route in [*routes, "/guide", "/guide/first-model"]:
         page = visitor.open(route)
         if (wider := visitor.overflow()) > 0:
             problems.append(f"{route}: {wider} px wider than the screen")

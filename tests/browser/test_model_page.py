@@ -60,7 +60,7 @@ def test_without_a_recording_of_its_robot_a_page_says_what_to_do(visitor: Visito
     expect(page.get_by_text("has the joints of this model (panda_joint1")).to_be_visible()
     expect(page.get_by_role("link", name="Upload a recording")).to_be_visible()
     page.get_by_role("tab", name="Parts and friction").click()
-    expect(page.get_by_role("table").filter(has_text="Coulomb")).to_contain_text("panda_joint7")
+    expect(page.get_by_role("table").filter(has_text="Coulomb")).to_contain_text("joint7")
     assert audit(page) == []
 
 
@@ -68,7 +68,7 @@ def test_an_alias_is_made_moved_by_name_and_removed(visitor: Visitor, dashboard:
     page = visitor.open(f"#/models/{model}?tab=versions")
     page.get_by_text("Make or move an alias").click()
     page.get_by_label("Alias", exact=True).fill("production")
-    page.get_by_role("button", name="Point it there").click()
+    page.get_by_role("button", name="Set alias").click()
     expect(page.get_by_role("row").filter(has_text="production → 1")).to_be_visible()
     assert dashboard.client.get(f"/v1/models/{model}").json()["aliases"] == {"production": 1}
     expect(page.get_by_role("button", name="Delete")).to_have_count(0)
@@ -85,7 +85,7 @@ def test_lineage_leads_to_the_data_and_the_job(visitor: Visitor, dashboard: Dash
         "href", f"#/data/{dashboard.dataset['id']}"
     )
     expect(page.get_by_role("columnheader", name="Trained on (flatters): nMSE")).to_be_visible()
-    expect(page.get_by_role("link", name=re.compile("^job_"))).to_be_visible()
+    expect(page.get_by_role("link", name="a training job")).to_have_attribute("href", re.compile("^#/jobs/job_"))
     assert audit(page) == []
 
 
@@ -96,7 +96,7 @@ def test_a_motion_outside_the_training_is_said_to_be_a_guess(visitor: Visitor, m
     page.get_by_label("dq of joint2", exact=True).fill("40")
     page.get_by_role("button", name="Ask", exact=True).click()
     expect(page.get_by_text("dq outside")).to_be_visible()
-    expect(page.get_by_text("Do not command this torque unseen")).to_be_visible()
+    expect(page.get_by_text("Do not send this torque to a robot unchecked")).to_be_visible()
     assert audit(page) == []
 
 

@@ -57,7 +57,7 @@ def test_a_page_that_there_is_not_is_said_so(guide):
 
 @pytest.mark.parametrize(
     "name",
-    ["pages.py", "../pages.py", "..%2fpages.py", "%2e%2e%2fpages.py", "tutorial.md", "demo.png%00", "/etc/passwd", ""],
+    ["pages.py", "../pages.py", "..%2fpages.py", "%2e%2e%2fpages.py", "concepts.md", "demo.png%00", "/etc/passwd", ""],
 )
 def test_no_other_file_is_served(guide, name):
     assert guide.get(f"/guide/files/{name}").status_code == 404

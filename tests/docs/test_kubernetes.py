@@ -1,4 +1,4 @@
-"""The objects of docs/kubernetes.md fit each other, and name settings, commands and paths that there are."""
+"""The objects of docs/examples/kubernetes.yaml fit each other, and name settings, commands and paths that there are."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from distributed.cli.dask_scheduler import main as dask_scheduler
 
 from service.app import create_app
 from service.foundation.settings import Settings
-from tests.docs.blocks import ROOT, blocks
+from tests.docs.blocks import ROOT
 from tests.docs.test_commands import parse
 
-PAGE = ROOT / "docs/kubernetes.md"
-TEXTS = [block.text for block in blocks(PAGE) if block.language == "yaml"]
-OBJECTS = [each for text in TEXTS if text.startswith("apiVersion") for each in yaml.safe_load_all(text)]
-PIECES = [yaml.safe_load(text) for text in TEXTS if not text.startswith("apiVersion")]
-"""What another Deployment has instead."""
+EXAMPLES = ROOT / "docs/examples"
+OBJECTS = list(yaml.safe_load_all((EXAMPLES / "kubernetes.yaml").read_text("utf-8")))
+GPU = yaml.safe_load((EXAMPLES / "kubernetes-gpu.yaml").read_text("utf-8"))
+"""What a Deployment of workers with a GPU has instead."""
 
 
 def of_kind(kind: str) -> dict[str, dict]:
@@ -50,7 +49,7 @@ def test_settings_are_those_that_there_are(monkeypatch):
 
 
 def test_commands_are_those_that_there_are():
-    pieces = [each["command"] for piece in PIECES for each in piece["spec"]["template"]["spec"]["containers"]]
+    pieces = [each["command"] for each in GPU["spec"]["template"]["spec"]["containers"]]
     for command in [*(container(name)["command"] for name in DEPLOYMENTS), *pieces]:
         if command[0] == "dask":
             dask_scheduler.make_parser(click.Context(dask_scheduler)).parse_args(command[2:])

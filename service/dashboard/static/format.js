@@ -22,6 +22,11 @@ export function count(x) {
   return known(x) ? Math.round(x).toLocaleString("en").replaceAll(",", "\u202f") : NONE;
 }
 
+/** 1 episode, 2 episodes. */
+export function counted(x, what, plural = `${what}s`) {
+  return `${count(x)} ${x === 1 ? what : plural}`;
+}
+
 /** A share as 94.5 %. */
 export function percent(x, digits = 1) {
   return known(x) ? `${(100 * x).toFixed(digits)}\u00a0%` : NONE;
@@ -45,7 +50,7 @@ export function ago(time) {
   if (passed < 90) return `${Math.round(passed)} s ago`;
   if (passed < 5400) return `${Math.round(passed / 60)} min ago`;
   if (passed < 129600) return `${Math.round(passed / 3600)} h ago`;
-  return `${Math.round(passed / 86400)} days ago`;
+  return `${counted(Math.round(passed / 86400), "day")} ago`;
 }
 
 /** A time (ISO 8601, or Unix seconds) in the reader's own zone. */

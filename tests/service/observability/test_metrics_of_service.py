@@ -15,7 +15,7 @@ from service.training.metrics import DURATION, FINISHED, JOBS, Work
 from tests.service.data import QUICK, service_of, stream, upload
 from tests.service.observability.test_request_ids import QUERY
 
-DOCUMENT = Path(__file__).parents[3] / "docs/monitoring.md"
+DOCUMENT = Path(__file__).parents[3] / "docs/reference/metrics.md"
 FEW = {**QUICK, "posterior_samples": 40}
 """Options of a fit as small as the strict service wants it."""
 PREDICT = "/v1/models/{model}/predict"

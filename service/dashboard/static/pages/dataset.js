@@ -11,7 +11,7 @@ export async function render(view, { id }, { signal, title }) {
   const dataset = await get(path`/v1/datasets/${id}`, {}, signal);
   title(dataset.name);
   const remove = button("Delete", async () => {
-    const question = `Delete “${dataset.name}” (${dataset.id})? Its samples are gone then. Models trained on it stay, but can no longer be judged on it.`;
+    const question = `Delete “${dataset.name}” (${dataset.id})? Its samples will be gone. Models trained on it stay, but can no longer be judged on it.`;
     if (!(await confirm(question, "Delete"))) return;
     await del(path`/v1/datasets/${id}`);
     notice(`${dataset.name} is deleted.`);

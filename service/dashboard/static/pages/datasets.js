@@ -2,7 +2,7 @@
 
 import { get } from "../api.js";
 import { h, refresh, replace } from "../dom.js";
-import { ago, count, number, seconds, when } from "../format.js";
+import { ago, count, counted, number, seconds, when } from "../format.js";
 import { badge, button, card, empty, heading, link, notice, table } from "../ui.js";
 import { robots } from "./data/robots.js";
 import { uploader } from "./data/upload.js";
@@ -48,8 +48,8 @@ function listed(datasets) {
 }
 
 function findings(report) {
-  if (report.warnings.length) return badge(report.warnings.length === 1 ? "1 warning" : `${report.warnings.length} warnings`, "warn");
-  return report.advice.length ? badge(report.advice.length === 1 ? "1 hint" : `${report.advice.length} hints`, "plain") : badge("nothing found", "good");
+  if (report.warnings.length) return badge(counted(report.warnings.length, "warning"), "warn");
+  return report.advice.length ? badge(counted(report.advice.length, "hint"), "plain") : badge("nothing found", "good");
 }
 
 function nothing() {

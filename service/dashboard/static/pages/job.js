@@ -33,7 +33,7 @@ export async function render(view, { id }, { signal, title }) {
   let trouble = "";
 
   const cancel = button("Cancel training", async () => {
-    if (!(await confirm(`Stop the training of ${job.model}? What it has fitted so far is not kept.`, "Stop training"))) return;
+    if (!(await confirm(`Stop the training of ${job.model}? Nothing of it is kept.`, "Stop training"))) return;
     take(await post(path`/v1/jobs/${id}/cancel`, undefined, signal));
   }, { kind: "danger" });
   const retry = button("Try it again", async () => {
@@ -72,7 +72,7 @@ export async function render(view, { id }, { signal, title }) {
   const hush = () => {
     const silent = job.state === "running" && Date.now() - heard > 1000 * QUIET_S;
     quiet.hidden = !(trouble || silent) || !ACTIVE.has(job.state);
-    const text = `${trouble || "The job has not said anything for a while."} What is shown is as of ${when(heard / 1000)}. Trying again.`;
+    const text = `${trouble || "The job has sent nothing for a while."} What is shown is as of ${when(heard / 1000)}. Trying again.`;
     if (!quiet.hidden && quiet.textContent !== text) quiet.textContent = text;
   };
 
@@ -83,7 +83,7 @@ export async function render(view, { id }, { signal, title }) {
     result,
     card("State", state, bar, figures),
     curve,
-    h("div", { class: "grid wide" }, card("What was asked for", wanted), card("What happened", past)),
+    h("div", { class: "grid wide" }, card("Request", wanted), card("History", past)),
   );
   take(job);
   named(names, signal).then(() => refresh(wanted, asked(job, names)));
@@ -112,11 +112,11 @@ function live(job, active) {
 
 function said(job, id) {
   const many = Objective.points(id);
-  const meaning = "The lower, the better the model explains the samples it is fitted to. It does not say how well it predicts others.";
+  const meaning = "The lower, the better the model explains the samples it is fitted to. It does not tell how well it predicts other motion.";
   if (!many) return `${meaning} The curve begins with the first iteration.`;
   const first = Objective.first(id);
-  const missing = first > 1 ? ` It begins at iteration ${first}, where this page began to look.` : "";
-  const whole = job.progress.iteration > many ? " The service tells how far it is about twice a second: iterations in between have no point." : "";
+  const missing = first > 1 ? ` It begins at iteration ${first}, when this page was opened.` : "";
+  const whole = job.progress.iteration > many ? " Points come about twice a second, so some iterations have none." : "";
   return `${meaning}${missing}${whole}`;
 }
 
@@ -130,7 +130,7 @@ async function named(names, signal) {
   );
 }
 
-const TRIGGERS = { asked: "as asked for", novelty: "as much was novel", linearisation: "as its arm had moved" };
+const TRIGGERS = { asked: "on request", novelty: "as too much motion was novel", linearisation: "as learning moved its arm too far" };
 
 function asked(job, names) {
   const sets = job.datasets.map((id, index) => [index ? ", " : "", link(names.get(id), `#/data/${id}`)]);
@@ -141,11 +141,11 @@ function asked(job, names) {
     ["Data sets", sets.length ? sets : "–"],
     ["Held out", heldOut(job.holdout)],
     ...(job.refresh ? [["Refresh of", `version ${job.refresh.version}, ${TRIGGERS[job.refresh.trigger]}`]] : []),
-    ...(job.retry_of ? [["Repeats", link(job.retry_of, `#/jobs/${job.retry_of}`)]] : []),
-    ["Asked for", when(job.created_at)],
+    ...(job.retry_of ? [["Repeats", link("an earlier job", `#/jobs/${job.retry_of}`)]] : []),
+    ["Queued", when(job.created_at)],
     ["Started", job.started_at ? when(job.started_at) : "not yet"],
     ["Attempts", count(job.attempts)],
     ["Id", h("code", {}, job.id)],
-    ...(job.request_id ? [["Request", h("code", {}, job.request_id)]] : []),
+    ...(job.request_id ? [["Request id", h("code", {}, job.request_id)]] : []),
   ]);
 }

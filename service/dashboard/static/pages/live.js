@@ -2,6 +2,7 @@
 
 import { pages } from "../api.js";
 import { h, refresh, replace } from "../dom.js";
+import { count, counted } from "../format.js";
 import { empty, heading, link, offer, select } from "../ui.js";
 import { alarms } from "./live/alarms.js";
 import { follow } from "./live/connection.js";
@@ -23,7 +24,7 @@ export async function render(view, { name }, { signal, title }) {
   title(name ? `${name} live` : "Live");
   const models = (await pages("/v1/models", MOST_MODELS, {}, signal)).map((model) => model.name);
   if (!models.length) {
-    const said = "There is no model yet that could be followed. Upload a recording of your robot, then train a model on it.";
+    const said = "There is no model to follow yet. Upload a recording of your robot, then train a model on it.";
     replace(view, heading("Live"), empty(said, link("Upload a recording", "#/data", "primary")));
     return;
   }
@@ -31,7 +32,7 @@ export async function render(view, { name }, { signal, title }) {
     replace(
       view,
       heading("Live"),
-      h("p", {}, "Follow a model while it answers and learns: torque as measured and as predicted, what was kept out of learning, and how fast answers are."),
+      h("p", {}, "Follow a model while it answers and learns: measured and predicted torque, rows kept out of learning, and answer times."),
       h("ul", {}, models.map((each) => h("li", {}, link(each, address(each))))),
     );
     return;
@@ -158,11 +159,11 @@ function said(page, seen, name) {
 function about({ rows, lost, pausedAt }, age) {
   const rate = rows.rate();
   const texts = [
-    `Stream ${rows.chosen}, the last ${WINDOW_S} s of rows. `,
+    `Stream ${rows.chosen}, the last ${WINDOW_S} s. `,
     age > STALE_S ? `The newest row came ${Math.round(age)} s ago. ` : null,
-    rate ? `Of ${Math.round(rate.came)} rows a second, all counted, ${Math.round(rate.shown)} are sent to this page: where some were kept out of learning, these. ` : null,
-    pausedAt === null ? null : `Plots stand still since ${new Date(pausedAt).toLocaleTimeString("en-GB")}. `,
-    lost ? `${lost} events were lost because this page read too slowly. ` : null,
+    rate ? `${counted(Math.round(rate.came), "row")} come in each second. This page shows ${count(Math.round(rate.shown))} of them, those kept out of learning first. ` : null,
+    pausedAt === null ? null : `Plots are paused since ${new Date(pausedAt).toLocaleTimeString("en-GB")}. `,
+    lost ? `This page was too slow and missed ${counted(lost, "event")}. ` : null,
   ];
   return h("p", {}, texts);
 }

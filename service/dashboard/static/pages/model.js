@@ -102,11 +102,11 @@ function header(state, reload) {
     const { version, model: { serving_version: serving, aliases } } = state;
     const shown = version.version;
     const names = Object.entries(aliases).map(([alias, number]) => `${alias} → ${number}`);
-    promote.textContent = `Let version ${shown} answer`;
+    promote.textContent = `Serve version ${shown}`;
     refresh(actions, shown === serving ? badge("serving") : promote, follow, train);
     refresh(about, facts([
       ["Answers now", `version ${serving}`],
-      ["You look at", `version ${shown}, ${version.estimator}, made ${when(version.created_at)}`],
+      ["Shown here", `version ${shown}, ${version.estimator}, made ${when(version.created_at)}`],
       ...(names.length ? [["Aliases", names.join(", ")]] : []),
     ]), warned(version.warnings));
   };

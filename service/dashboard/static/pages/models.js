@@ -13,7 +13,7 @@ export async function render(view, _params, { signal, title }) {
   const models = await pages("/v1/models", MOST, {}, signal);
   const train = link("Train a model", "#/train", "primary");
   if (!models.length) {
-    const said = "There is no model yet. Upload a recording of your robot, then train a model on it: that takes minutes.";
+    const said = "There is no model yet. Upload a recording of your robot, then train a model on it: this takes minutes.";
     replace(view, heading("Models"), empty(said, link("Upload a recording", "#/data", "primary"), link("Train a model", "#/train")));
     return;
   }

@@ -18,7 +18,7 @@ export async function render(view, { query }, { signal, title }) {
   ]);
   const known = new Map(models.map((each) => [each.name, each]));
   const robot = robotSelect({ none: "none: learn where the axes lie from the torque", withUrdf: true });
-  const withRobot = h("div", {}, field("Robot", robot.select, "Not needed. Where one is chosen, its URDF is where learning begins; its joints are matched with those of the data by name."), robot.note, robot.add);
+  const withRobot = h("div", {}, field("Robot", robot.select, "Optional. With a robot, learning begins at its URDF; joints are matched by name."), robot.note, robot.add);
   const offerRobot = (taken) => {
     withRobot.hidden = !taken;
     robot.select.disabled = !taken;
@@ -71,10 +71,10 @@ export async function render(view, { query }, { signal, title }) {
   const form = h(
     "form",
     { onsubmit: submit },
-    card("What to learn from", choice.element),
-    card("What to make", nameField, estimators, withRobot),
-    card("How to judge it", holdout.element),
-    card("How to fit it", h("p", { class: "hint" }, "The defaults suit most recordings."), advanced.element),
+    card("Data sets", choice.element),
+    card("Model", nameField, estimators, withRobot),
+    card("Held-out part", holdout.element),
+    card("Fit", h("p", { class: "hint" }, "The defaults suit most recordings."), advanced.element),
     problems,
     h("div", { class: "actions" }, start),
   );
@@ -108,7 +108,7 @@ function modelName(known, given) {
     const model = known.get(input.value.trim());
     const has = model?.latest_version === 1 ? "version 1" : `versions up to ${model?.latest_version}`;
     about.textContent = model
-      ? `${model.name} has ${has}. A new one is made: it answers from then on, unless another was chosen to serve.`
+      ? `${model.name} has ${has}. The new version will answer, unless another was chosen to serve.`
       : "";
   };
   input.addEventListener("input", say);

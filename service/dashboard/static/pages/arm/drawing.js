@@ -11,7 +11,7 @@ const SMALLEST = 7, LARGEST = 24; // of a mass, px
 
 /** What both pages say beside the drawing. */
 export const CANNOT = "Torque cannot tell an arm from its mirror image, nor where a frame lies along its axis.";
-export const LEGEND = "Coloured segments are joint axes, grey lines run from frame to frame, balls are masses at their centres. A disc across an axis is one standard deviation of where the axis lies, the thin segments one of how it points, both seen from the frame before. Pale discs and hollow balls: torque does not tell.";
+export const LEGEND = "Coloured segments are joint axes, grey lines links, balls masses at their centres. A disc across an axis is one standard deviation of its place, the thin segments are one of its direction, both relative to the joint before. Pale discs and hollow balls: torque does not tell.";
 
 /** Whether the browser can draw in 3-D. */
 export function drawable() {
@@ -21,7 +21,7 @@ export function drawable() {
 /** Draw the arm of a version into an element; at(q) is where to begin. Returns {draw(q)}, which moves it. */
 export async function drawing(element, { joint_names: names, parameters, training_range: range }, q, { height = 460, signal }) {
   const arm = new Arm(names, parameters, range);
-  const label = `The arm in 3-D, ${names.length} joints from base to tip: ${arm.names.join(", ")}. The tables hold the same in numbers.`;
+  const label = `The arm in 3-D, ${names.length} joints from base to tip: ${arm.names.join(", ")}. The tables hold the same numbers.`;
   let last = q;
   const layout = (shown) => ({ ...arm.layout(shown), height });
   const first = arm.at(last);

@@ -1,6 +1,6 @@
 // The arm that a version has learnt in numbers: where its joints lie, what they carry, and what torque does not tell.
 
-import { number } from "../../format.js";
+import { number, shortNames } from "../../format.js";
 import { table } from "../../ui.js";
 import { centres, frames } from "./kinematics.js";
 
@@ -8,10 +8,11 @@ const DEGREES = 180 / Math.PI;
 
 /** Joints from base to tip, with all positions at zero, in the base's frame. */
 export function jointTable({ joint_names: names, parameters: { geometry } }) {
+  const short = shortNames(names);
   const zero = frames(geometry, names.map(() => 0));
   const stds = (values, factor) => values.map((each) => number(each * factor, 2)).join(", ") || "–";
   const columns = [
-    { label: "Joint", cell: (place) => names[geometry.order[place]] },
+    { label: "Joint", cell: (place) => short[geometry.order[place]] },
     { label: "Type", cell: (place) => geometry.joints[place].type },
     { label: "Axis", numeric: true, cell: (place) => vector(zero[place].axis) },
     { label: "Place, m", numeric: true, cell: (place) => vector(zero[place].origin) },
@@ -19,20 +20,21 @@ export function jointTable({ joint_names: names, parameters: { geometry } }) {
     { label: "± shift, mm", numeric: true, cell: (place) => stds(geometry.joints[place].shift_std, 1000) },
     { label: "Torque does not tell", cell: (place) => geometry.joints[place].undetermined.join(", ") || "–" },
   ];
-  return table(columns, geometry.joints.map((_joint, place) => place), { caption: "Where the joints lie, base to tip, all at zero, in the base’s frame; ± one standard deviation about and along two directions across the axis" });
+  return table(columns, geometry.joints.map((_joint, place) => place), { caption: "Where the joints lie, base to tip, with all positions at zero, in the base’s frame; ± one standard deviation, about and along two directions across the axis" });
 }
 
 /** What the joints carry: masses with their centres, rotors and friction, base to tip. */
 export function massTable({ joint_names: names, joint_types: types, parameters }) {
   const { geometry, inertia, rotor, friction } = parameters;
   const centre = centres(inertia);
+  const short = shortNames(names);
   const pair = ({ mean, std }, joint) => `${number(mean[joint])} ± ${number(std[joint], 2)}`;
   const sliding = types.includes("prismatic") ? "; of sliding joints kg, N·s/m and N" : "";
   const columns = [
-    { label: "Joint", cell: (joint) => names[joint] },
+    { label: "Joint", cell: (joint) => short[joint] },
     { label: "Mass, kg", numeric: true, cell: (joint) => `${number(inertia.bodies[joint].plausible.mass)} ± ${number(inertia.bodies[joint].std.mass, 2)}` },
     { label: "Centre of mass, m", numeric: true, cell: (joint) => vector(centre[joint]) },
-    { label: "± of it, mm", numeric: true, cell: (joint) => spread(inertia.bodies[joint], centre[joint]).map((each) => number(1000 * each, 2)).join(", ") },
+    { label: "± of the centre, mm", numeric: true, cell: (joint) => spread(inertia.bodies[joint], centre[joint]).map((each) => number(1000 * each, 2)).join(", ") },
     ...(rotor ? [{ label: "Rotor, kg·m²", numeric: true, cell: (joint) => pair(rotor, joint) }] : []),
     { label: "Viscous, N·m·s/rad", numeric: true, cell: (joint) => pair(friction.viscous, joint) },
     { label: "Coulomb, N·m", numeric: true, cell: (joint) => pair(friction.coulomb, joint) },

@@ -89,7 +89,7 @@ function unit(said, types) {
 function thinned(preview) {
   const drawn = Math.max(...preview.columns.map((column) => column.rows.length));
   if (drawn >= preview.samples) return `All ${count(preview.samples)} samples are drawn.`;
-  return `${count(drawn)} points a line stand for ${count(preview.samples)} samples: the smallest and the largest of each stretch.`;
+  return `Each line has ${count(drawn)} points for ${count(preview.samples)} samples: the smallest and the largest of each stretch.`;
 }
 
 /** What is zoomed in one plot is zoomed in all. */

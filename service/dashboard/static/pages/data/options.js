@@ -19,7 +19,7 @@ export function uploadOptions() {
     effort: select("effort", [["", "as the robot or the file says"], ...pairs(EFFORTS, ["measured", "commanded", "current"])]),
     torque_constants: text("torque_constants", "0.11, 0.11, 0.08"),
     torque_convention: select("torque_convention", [
-      ["", "what the torque means by itself"],
+      ["", "as the effort implies"],
       ["gravity_included", "gravity included"],
       ["gravity_compensated", "gravity compensated"],
     ]),
@@ -29,7 +29,7 @@ export function uploadOptions() {
     topic: text("topic", "/joint_states"),
     delimiter: select("delimiter", [["", "found out"], [",", "comma"], [";", "semicolon"], ["\t", "tab"], [" ", "space"]]),
     filtering: select("filtering", [
-      ["", "where something is derived (default)"],
+      ["", "if something is derived (default)"],
       ["always", "always"],
       ["never", "never"],
     ]),
@@ -37,7 +37,7 @@ export function uploadOptions() {
     form: select("form", [["", "without delay (default)"], ["causal", "causal, as a live stream could be"]]),
     rate: amount("rate", "as recorded", "0.01", "1000000"),
     gap: amount("gap", "1.5", "1.01", "1000000"),
-    trim: amount("trim", "what the filter spoils", "0", "1000000"),
+    trim: amount("trim", "the filter’s edges", "0", "1000000"),
   };
   let expected; // effort of the robot that was chosen
   const robot = robotSelect({
@@ -74,7 +74,7 @@ export function uploadOptions() {
     "details",
     { class: "options" },
     h("summary", {}, "How to read it: robot, units, columns, joints, effort, preparation"),
-    h("p", { class: "hint" }, "Found out where nothing is said here. What cannot be found out for sure is refused, with a message that says what to add."),
+    h("p", { class: "hint" }, "Leave these empty to let the service find out. If it cannot be sure, it refuses the file and says what to add."),
     h("div", { class: "grid" },
       field("Robot", robot.select, "Its limits, joint order and the meaning of its effort."),
       field("What the torque column holds", inputs.effort, "A wrong answer here teaches a wrong torque."),
@@ -95,13 +95,13 @@ export function uploadOptions() {
       field("Joints to leave out", inputs.drop_joints, "Grippers, and joints that are locked."),
     ),
     h("h3", {}, "Preparation"),
-    h("p", { class: "hint" }, "What has no velocity or acceleration gets them from a low-pass and central differences. The report tells every step."),
+    h("p", { class: "hint" }, "Missing velocity and acceleration are derived with a low-pass and central differences. The report lists every step."),
     h("div", { class: "grid" },
       field("Low-pass the signals", inputs.filtering),
       field("Cut-off, Hz", inputs.cutoff),
       field("Form of the filter", inputs.form),
       field("Rate of the samples, Hz", inputs.rate),
-      field("A gap is longer than, usual steps", inputs.gap),
+      field("A gap is longer than (usual steps)", inputs.gap),
       field("Cut off at both ends, s", inputs.trim),
       field("Torque convention", inputs.torque_convention),
       field("Topic", inputs.topic, "Of a bag, where several could be read."),

@@ -5,9 +5,9 @@ import { h } from "../../dom.js";
 import { button, table } from "../../ui.js";
 
 const ADVICE = {
-  unreachable: "It is not known whether the recording was stored: look at the list before you try again.",
-  unsupported_media_type: "Rename the file so that its ending says what it is, or export it in one of these formats.",
-  too_large: "Split the recording, or lower its rate: the service was set to take no larger files.",
+  unreachable: "The recording may have been stored. Look at the list before you try again.",
+  unsupported_media_type: "Give the file the ending of its format, or export it in one of these formats.",
+  too_large: "Split the recording, or lower its rate. The service takes no larger files.",
   storage_full: "Delete data sets or model versions that are no longer needed, then try again.",
   storage_unavailable: "Nothing was stored. Try again in a moment.",
   busy: "The service is busy. Try again in a moment.",

@@ -1,12 +1,12 @@
 // The report of a data set as cards: what to do first, then what was found.
 
 import { h } from "../../dom.js";
-import { count, number, percent, seconds, shortNames, when } from "../../format.js";
+import { count, counted, number, percent, seconds, shortNames, when } from "../../format.js";
 import { badge, card, facts, table } from "../../ui.js";
 import { prose, sentences, warned } from "./prose.js";
 
 const CONVENTIONS = { gravity_included: "gravity included", gravity_compensated: "gravity compensated: added to what holds the arm" };
-const PARTIAL = "This report was made by an older release of LIPServe: it has no advice and no figures beyond those shown.";
+const PARTIAL = "This report was made by an older release of LIPServe, without advice and further figures.";
 
 /** Advice, warnings and the facts. */
 export function summary(dataset) {
@@ -16,7 +16,7 @@ export function summary(dataset) {
     warned(report.warnings),
     card(
       "What to record next, or to correct",
-      report.advice.length ? sentences(report.advice) : h("p", {}, judged ? "Nothing was found that calls for more." : PARTIAL),
+      report.advice.length ? sentences(report.advice) : h("p", {}, judged ? "Nothing: the recording is good to train on." : PARTIAL),
     ),
     card(
       "In short",
@@ -31,7 +31,7 @@ export function summary(dataset) {
         ["Uploaded", when(dataset.created_at)],
         ["Id", h("code", {}, dataset.id)],
       ]),
-      h("p", {}, h("span", { class: "muted" }, `${dataset.joint_names.length} joints: `), dataset.joint_names.join(", ")),
+      h("p", {}, h("span", { class: "muted" }, `${counted(dataset.joint_names.length, "joint")}: `), dataset.joint_names.join(", ")),
     ),
   ];
 }
@@ -87,16 +87,16 @@ function excitation(found, joints) {
         { label: "Most collinear", numeric: true, cell: (row) => `${row.collinear_term} ${percent(row.collinear, 0)}` },
       ],
       found.joints,
-      { caption: `How well friction can be told apart, beside ${beside}; ± is the standard deviation that the data leave` },
+      { caption: `How well friction can be told from ${beside}; ± is the standard deviation that the data leave` },
     ),
     whole
       ? h(
           "p",
           {},
           `Rigid bodies: ${whole.rank} of ${whole.parameters} base parameters are excited enough. `,
-          `Least: those of the body that ${whole.weakest_body} moves, at ${percent(whole.weakest)} of what random motion gives.`,
+          `Weakest: the body that ${whole.weakest_body} moves, with ${percent(whole.weakest)} of what random motion gives.`,
         )
-      : h("p", { class: "hint" }, "Rigid bodies are judged where the upload names a robot whose URDF is known."),
+      : h("p", { class: "hint" }, "Rigid bodies are judged only if the upload names a robot with a URDF."),
     h("details", {}, h("summary", {}, "The same in words"), h("p", {}, prose(found.text))),
   );
 }
@@ -117,7 +117,7 @@ function limits(rows, joints) {
         { label: "Torque, of limit", numeric: true, cell: used("torque_used", "beyond_torque") },
       ],
       rows,
-      { caption: "What is not used here is extrapolated later" },
+      { caption: "Outside what is used here, a model has to extrapolate" },
     ),
   );
 }
@@ -220,7 +220,7 @@ function saturation(rows, joints) {
         { label: "At the robot's limit", numeric: true, cell: (row) => (row.at_limit > 0 ? badge(percent(row.at_limit, 2), "warn") : percent(row.at_limit, 2)) },
       ],
       rows,
-      { caption: "Shares of the samples in which the torque may have been cut off" },
+      { caption: "Share of samples whose torque may have been cut off" },
     ),
   );
 }

@@ -2,6 +2,7 @@
 
 import { get, pages } from "../../api.js";
 import { h, replace } from "../../dom.js";
+import { counted } from "../../format.js";
 import { prose } from "./prose.js";
 import { urdfButton } from "./urdf.js";
 
@@ -72,6 +73,6 @@ function group(label, options) {
 }
 
 function described(profile, withUrdf) {
-  const joints = `${profile.joints.length} joints: ${profile.joints.map((each) => each.name).join(", ")}.`;
+  const joints = `${counted(profile.joints.length, "joint")}: ${profile.joints.map((each) => each.name).join(", ")}.`;
   return withUrdf ? joints : `${joints} Its effort: ${EFFORTS[profile.effort]}. ${profile.effort_note}`;
 }

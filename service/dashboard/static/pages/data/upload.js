@@ -2,7 +2,7 @@
 
 import { upload } from "../../api.js";
 import { h, replace } from "../../dom.js";
-import { bytes, count } from "../../format.js";
+import { bytes, counted } from "../../format.js";
 import { button, card, field, link, notice, progress } from "../../ui.js";
 import { inWords, uploadOptions, withOption } from "./options.js";
 import { refusal } from "./refusal.js";
@@ -28,7 +28,7 @@ export function uploader({ onUploaded, signal }) {
   // options outlive an upload: who sends the next file shall see what it will be read as
   const say = () => {
     const values = options.values();
-    as.textContent = Object.keys(values).length ? `It is read as set below: ${inWords(values)}.` : "What it holds is found out; the options below say more.";
+    as.textContent = Object.keys(values).length ? `It is read as set below: ${inWords(values)}.` : "The service finds out what it holds. Set the options below to tell it.";
   };
   options.element.addEventListener("change", say);
   const outcomes = h("div", {});
@@ -109,16 +109,16 @@ export function uploader({ onUploaded, signal }) {
 
 function taken(dataset) {
   const { report } = dataset;
-  const found = [counted(report.warnings.length, "warning"), counted(report.advice.length, "piece", " of advice")].filter(Boolean);
+  const found = [some(report.warnings, "warning"), some(report.advice, "hint")].filter(Boolean);
   return h(
     "div",
     { class: "banner", role: "status", style: "border-color: var(--good); background: var(--good-bg); color: var(--good)" },
-    h("p", {}, `✓ ${dataset.name}: ${count(report.rows)} samples of ${dataset.joint_names.length} joints`, found.length ? `, ${found.join(" and ")}.` : "."),
+    h("p", {}, `✓ ${dataset.name}: ${counted(report.rows, "sample")} of ${counted(dataset.joint_names.length, "joint")}`, found.length ? `, ${found.join(" and ")}.` : "."),
     report.reading.length ? h("p", { class: "hint" }, report.reading.join(". "), ".") : null,
     h("div", { class: "actions" }, link("Read its report", `#/data/${dataset.id}`), link("Train on it", `#/train?datasets=${dataset.id}`)),
   );
 }
 
-function counted(many, what, rest = "") {
-  return many ? `${many} ${what}${many === 1 ? "" : "s"}${rest}` : "";
+function some(texts, what) {
+  return texts.length ? counted(texts.length, what) : "";
 }

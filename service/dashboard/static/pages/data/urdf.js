@@ -2,6 +2,7 @@
 
 import { upload } from "../../api.js";
 import { h, replace } from "../../dom.js";
+import { counted } from "../../format.js";
 import { button, errorBox, notice } from "../../ui.js";
 
 /** A button that uploads a URDF; onAdded(robot) is called then. What is refused is shown below it. */
@@ -15,7 +16,7 @@ export function urdfButton(onAdded) {
     replace(problem);
     try {
       const robot = await upload(file, {}, undefined, undefined, "/v1/robots");
-      notice(`${robot.name}, ${robot.joints.length} joints, is added.`);
+      notice(`${robot.name}, ${counted(robot.joints.length, "joint")}, is added.`);
       onAdded(robot);
     } catch (error) {
       replace(problem, errorBox(error));

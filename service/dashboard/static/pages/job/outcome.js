@@ -11,18 +11,18 @@ import { selectionCard } from "../model/selection.js";
 const LEAST_COVERAGE = 0.9;
 const ADVICE = {
   cannot_hold_out: "Hold out less, or in another way, or nothing.",
-  not_positive_definite: "The samples may be nearly the same, or their torque without any noise: look at the data sets' reports.",
+  not_positive_definite: "The samples may be nearly equal, or their torque without noise. Look at the data sets' reports.",
   damaged_data: "A data set's file is damaged: upload the recording again.",
   storage_full: "Delete data sets or versions that are no longer needed, then try again.",
   too_long: "Train on fewer samples or with fewer iterations.",
-  interrupted: "The service was stopped while it ran, too often: try again.",
+  interrupted: "The service was stopped too often while it ran. Try again.",
 };
 
 /** Show it in an element. */
 export async function outcome(element, job, signal) {
   if (job.state === "succeeded") return replace(element, await judged(job, signal));
   if (job.state !== "failed") return replace(element);
-  const advice = ADVICE[job.error?.code] ?? "The service's log says more. Its report may tell what is wrong with the data.";
+  const advice = ADVICE[job.error?.code] ?? "The service's log says more. The data sets' reports may show what is wrong.";
   return replace(
     element,
     h("div", { class: "error", role: "alert" }, h("p", {}, h("strong", {}, "The training failed. "), job.error?.message ?? ""), h("p", {}, advice)),
@@ -35,17 +35,17 @@ async function judged(job, signal) {
   try {
     version = await get(path`/v1/models/${job.model}/versions/${String(job.version)}`, {}, signal);
   } catch (error) {
-    return card("What it made", h("p", {}, more, `: ${error.message}`));
+    return card("Result", h("p", {}, more, `: ${error.message}`));
   }
   const held = version.lineage.holdout;
   const seen = version.lineage.training_metrics;
   const made = card(
-    "What it made",
-    h("p", {}, more, job.refresh ? ", which has to prove better before it answers." : ", which answers from now on where no other version is chosen."),
+    "Result",
+    h("p", {}, more, job.refresh ? ", which answers once it has predicted better than the old one." : ", which answers from now on unless another version was chosen to serve."),
     warned(version.warnings),
     held?.nmse
       ? figures(`On ${count(held.samples)} samples that were held out`, held, version)
-      : h("p", { class: "banner" }, "Nothing was held out: how well it predicts is not known. Evaluate it on a recording that it has not seen."),
+      : h("p", { class: "banner" }, "Nothing was held out, so how well it predicts is not known. Evaluate it on a recording that it has not seen."),
     !held?.nmse && seen?.nmse ? figures(`On ${count(seen.samples)} samples it was trained on: these figures flatter`, seen, version) : null,
   );
   return [made, selectionCard(version)];

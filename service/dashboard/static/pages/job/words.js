@@ -8,17 +8,17 @@ export const ACTIVE = new Set(["queued", "running"]);
 const STAGES = {
   waiting: "waiting for its turn",
   loading: "loading the data",
-  geometry: "looking for where the joint axes lie",
+  geometry: "searching for the joint axes",
   hyperparameters: "fitting hyperparameters",
-  posterior: "conditioning and compressing the posterior",
-  evaluating: "evaluating what was held out",
+  posterior: "computing the posterior",
+  evaluating: "evaluating on the held-out part",
   saving: "saving the version",
   done: "done",
 };
 
 /** The stage of a job's work. */
 export function stage({ progress: at }) {
-  if (at.stage === "hyperparameters" && !at.iteration) return "looking where to start the fit";
+  if (at.stage === "hyperparameters" && !at.iteration) return "choosing where to start the fit";
   const doing = STAGES[at.stage] ?? at.stage;
   return at.estimator ? `${at.estimator}: ${doing}` : doing;
 }
@@ -32,11 +32,11 @@ export function left({ progress: at }) {
 export function heldOut(holdout) {
   if (!holdout) return "nothing";
   const share = `${Math.round(100 * holdout.share)} %`;
-  const guard = holdout.guard_s === null ? "" : `, ${holdout.guard_s} s of guard`;
+  const guard = holdout.guard_s === null ? "" : `, with a guard of ${holdout.guard_s} s`;
   const what = {
     last: `the last ${share} of each data set`,
-    episodes: `${share} in whole episodes, by seed ${holdout.seed}`,
-    blocks: `${share} in some of ${holdout.blocks} blocks, by seed ${holdout.seed}`,
+    episodes: `${share}, in whole episodes chosen by seed ${holdout.seed}`,
+    blocks: `${share}, in some of ${holdout.blocks} blocks chosen by seed ${holdout.seed}`,
   };
   return `${what[holdout.kind]}${guard}`;
 }

@@ -2,12 +2,12 @@
 
 import { path, post } from "../../api.js";
 import { h, refresh, replace } from "../../dom.js";
-import { when } from "../../format.js";
+import { counted, when } from "../../format.js";
 import { badge, button, confirm, field, notice } from "../../ui.js";
 
 const WORDS = {
-  adapt: "The robot is a different one from now on, with a payload or a new tool: what was learnt before counts less, and it is learnt anew. Adapt?",
-  ignore: "Learning goes on as if nothing had been. If the robot has changed, that ruins what the model knows. Go on?",
+  adapt: "Use this if the robot has a payload or a new tool. What was learnt before counts less, and the robot is learnt anew. Adapt?",
+  ignore: "Use this if the robot is the same as before. If it has changed, going on ruins what the model knows. Go on?",
 };
 
 /** Show alarms, and buttons where learning is held; the buttons stay while they are needed. */
@@ -25,14 +25,14 @@ function decision({ held, alarms }, name, signal) {
   const decide = (choice) => async () => {
     if (!(await confirm(WORDS[choice], choice === "adapt" ? "Adapt" : "Go on as before", choice === "adapt" ? "primary" : "danger"))) return;
     const done = await post(path`/v1/models/${name}/learning/change`, { decision: choice, replay: replay.checked }, signal);
-    notice(`Learning goes on${done.rows ? `, with ${done.rows} rows that had been kept out` : ""}.`);
+    notice(`Learning goes on${done.rows ? `, with ${counted(done.rows, "row")} that had been kept out` : ""}.`);
   };
   const said = alarms.find((alarm) => alarm.kind === "change")?.message;
   return h(
     "section",
     { class: "banner", "aria-label": "Decision" },
     h("h2", {}, "Learning waits for you"),
-    h("p", {}, said ? `${said[0].toUpperCase()}${said.slice(1)}. ` : "The robot seems to have changed. ", held.at === null ? null : `It began on ${when(held.at)}. `, "The model goes on answering with what it knew before: its torque may be wrong."),
+    h("p", {}, said ? `${said[0].toUpperCase()}${said.slice(1)}. ` : "The robot seems to have changed. ", held.at === null ? null : `It began on ${when(held.at)}. `, "Until you decide, the model answers with what it knew before. Its torque may be wrong."),
     field("Also learn the rows kept out since", replay),
     h("div", { class: "actions" }, button("Adapt to the changed robot", decide("adapt"), { kind: "primary" }), button("Nothing has changed, go on", decide("ignore"))),
   );

@@ -8,8 +8,8 @@ export const CODES = {
   stationary: { words: "at rest", why: "stiction hides the torque", symbol: "circle-open", colour: "muted" },
   limit: { words: "beyond a limit", why: "position, speed, acceleration or torque", symbol: "triangle-up-open", colour: "contact" },
   non_finite: { words: "not a number", why: "a value is missing or not finite", symbol: "cross-open", colour: "contact" },
-  time_jump: { words: "time jumped", why: "time goes backwards or leaps", symbol: "triangle-left-open", colour: "novel" },
-  edge: { words: "acceleration not known yet", why: "comes again with the next batch", symbol: "line-ew-open", colour: "muted" },
+  time_jump: { words: "time jumped", why: "time goes backwards or skips", symbol: "triangle-left-open", colour: "novel" },
+  edge: { words: "acceleration not known yet", why: "used with the next batch", symbol: "line-ew-open", colour: "muted" },
 };
 export const NOVEL = { words: "beyond what was trained on", symbol: "diamond-open", colour: "novel" };
 

@@ -16,7 +16,7 @@ const MOST_MARKS = 150; // of a kind
 export function innovation(place, joints, signal) {
   const short = shortNames(joints);
   const element = h("div", { style: "min-height: 340px" });
-  const hint = `Measured minus predicted, in standard deviations of a measurement. 95 % should lie between the dotted lines at ± ${HALF_WIDTH}. Symbols mark rows that were kept out of learning, and motion that lies beyond what this version was trained on; they stand at the joint that was farthest off. What is beyond ± ${MOST} is drawn there.`;
+  const hint = `Measured minus predicted torque, in standard deviations of a measurement. 95 % of the rows should lie between the dotted lines at ± ${HALF_WIDTH}. Symbols mark rows kept out of learning, and motion beyond what this version was trained on. A symbol stands at the joint with the largest error. Values beyond ± ${MOST} are drawn at ± ${MOST}.`;
   replace(place, card("Innovation", element, h("p", { class: "hint" }, hint)));
   let made = null;
   return {

@@ -1,7 +1,7 @@
 // What to do where no measured torque comes.
 
 import { h } from "../../dom.js";
-import { count } from "../../format.js";
+import { counted } from "../../format.js";
 
 /** Says why there is nothing to see, and which command would change that. */
 export function quiet(name, status) {
@@ -10,10 +10,10 @@ export function quiet(name, status) {
   const panda = status.joint_names[0].startsWith("panda_joint") && status.joint_names.length === 7;
   const play = h("pre", { tabindex: "0" }, h("code", {}, panda ? `lipserve stream ${name} --simulate panda --learn` : `lipserve stream ${name} RECORDING.csv --learn`));
   if (!status.learns)
-    return box("This model does not take measured torque: its learning is switched off, so there is nothing to compare. It still answers. ", h("code", {}, `PUT /v1/models/${name}/learning`), " switches it on.");
+    return box("This model still answers, but its learning is switched off, so there is nothing to compare. ", h("code", {}, `PUT /v1/models/${name}/learning`), " switches it on.");
   if (asked)
-    return box(`A stream asks (${count(asked)} answers in the last second), but sends no measured torque to compare with. Connect with a stream_id and send tau with every query.`, play);
-  return box(panda ? "Nothing streams to this model now. Try a simulated robot, which also teaches the model:" : "Nothing streams to this model now. Play a recording of its robot, which also teaches the model:", play, h("p", {}, "Your own controller: StreamClient with a stream_id, and tau in every query. Or send batches of observations."));
+    return box(`A stream asks (${counted(asked, "answer")} in the last second), but sends no measured torque. Connect with a stream_id and send tau with every query.`, play);
+  return box(panda ? "Nothing streams to this model now. Try a simulated robot, which also teaches the model:" : "Nothing streams to this model now. Play a recording of its robot, which also teaches the model:", play, h("p", {}, "From your own controller: use StreamClient with a stream_id and tau in every query, or send batches of observations."));
 }
 
 function box(...children) {

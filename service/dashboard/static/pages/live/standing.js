@@ -1,7 +1,7 @@
 // Where learning, quality and answers stand, once a second.
 
 import { h } from "../../dom.js";
-import { count, number, percent, scientific, seconds, shortNames, torqueUnit } from "../../format.js";
+import { count, counted, number, percent, scientific, seconds, shortNames, torqueUnit } from "../../format.js";
 import { badge, facts, table } from "../../ui.js";
 import { words } from "./codes.js";
 
@@ -15,11 +15,11 @@ export function learningCard(status) {
     "Learning",
     facts([
       ["Answers contain", `version ${status.version}, revision ${count(status.revision)}`],
-      ["Behind what came", status.lag_events ? `${count(status.lag_events)} batches` : "nothing"],
+      ["Not learnt yet", status.lag_events ? counted(status.lag_events, "batch", "batches") : "nothing"],
       ["Learning", state],
-      ["Beyond the version", status.novel_share === null ? "not known yet" : `${percent(status.novel_share, 0)} of rows`],
+      ["Beyond what it was trained on", status.novel_share === null ? "not known yet" : `${percent(status.novel_share, 0)} of rows`],
     ]),
-    status.failure ? h("div", { class: "banner bad" }, `It cannot learn: ${status.failure}. It is tried again.`) : null,
+    status.failure ? h("div", { class: "banner bad" }, `It cannot learn: ${status.failure}. Trying again.`) : null,
     codes.length
       ? table(
           [
@@ -30,14 +30,14 @@ export function learningCard(status) {
           codes,
           { caption: "What became of rows" },
         )
-      : h("p", { class: "muted" }, "No row has come since the service has started."),
+      : h("p", { class: "muted" }, "No row has come since the service started."),
   );
 }
 
 /** How well rows of the last minute were predicted before they were learnt. */
 export function qualityCard({ windows: [latest], joint_names: names, joint_types: types, level }) {
   const short = shortNames(names);
-  if (!latest.rows) return panel("Quality", h("p", { class: "muted" }, `Nothing was predicted and measured in the last ${span(latest.seconds)}.`));
+  if (!latest.rows) return panel("Quality", h("p", { class: "muted" }, `No measured torque came in the last ${span(latest.seconds)}.`));
   return panel(
     "Quality",
     table(
@@ -50,7 +50,7 @@ export function qualityCard({ windows: [latest], joint_names: names, joint_types
       names.map((_name, joint) => joint),
       { caption: `${count(latest.rows)} rows of the last ${span(latest.seconds)}, each predicted before it was learnt` },
     ),
-    h("p", { class: "hint" }, "nMSE: mean squared error / variance of the torque, 0 is best. The last column should be near ", percent(level, 0), ". Contacts do not count."),
+    h("p", { class: "hint" }, "nMSE: mean squared error / variance of the torque; 0 is best. The last column should be near ", percent(level, 0), ". Contacts do not count."),
   );
 }
 
@@ -67,7 +67,7 @@ export function answersCard({ answers }) {
       ["Late", answers.late ? badge(`${count(answers.late)} late`, "warn") : "none"],
       ["Refused", answers.refused ? badge(`${count(answers.refused)} refused`, "bad") : "none"],
     ]),
-    h("p", { class: "hint" }, "All streams of this model in the last second, from a frame’s arrival until its answer was ready in the service: the network comes on top."),
+    h("p", { class: "hint" }, "All streams of this model in the last second: time inside the service, without the network."),
   );
 }
 

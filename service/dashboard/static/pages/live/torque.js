@@ -22,7 +22,7 @@ export function torque(place, joints, types, signal) {
     place,
     card(
       "Torque",
-      h("p", { class: "hint" }, swatch("border-top: 3px solid var(--measured)"), "measured  ", swatch("border-top: 3px solid var(--predicted)"), "predicted before it was learnt  ", swatch("height: 0.8em; background: var(--predicted); opacity: 0.3"), "where 95 % of measurements are expected: ± 1.96 √(std² + noise²)  ", h("b", { "aria-hidden": "true", style: "color: var(--contact)" }, "× "), "kept out of learning, drawn at the edge where it is far off"),
+      h("p", { class: "hint" }, swatch("border-top: 3px solid var(--measured)"), "measured  ", swatch("border-top: 3px solid var(--predicted)"), "predicted before it was learnt  ", swatch("height: 0.8em; background: var(--predicted); opacity: 0.3"), "95 % of measurements are expected here: ± 1.96 √(std² + noise²)  ", h("b", { "aria-hidden": "true", style: "color: var(--contact)" }, "× "), "kept out of learning (at the edge: far off)"),
       h("div", { class: "grid", style: "margin: 0; gap: 0.4rem" }, plots.map((each) => each.element)),
     ),
   );

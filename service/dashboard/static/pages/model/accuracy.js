@@ -49,9 +49,9 @@ export async function accuracy(view, state, { signal }) {
     views: { "measured and predicted torque": torque, "residual, measured − predicted": residual },
     about: {
       "measured and predicted torque":
-        "The band shall hold 95 % of the measurements: what the model does not know of the function and the noise of the sensors, both.",
+        "95 % of the measurements should lie in the band. It covers the model’s uncertainty and the sensors’ noise.",
       "residual, measured − predicted":
-        "What the model leaves over. The band shall hold 95 % of it; where it wanders without crossing zero, something is missing in the model.",
+        "95 % of the residual should lie in the band. Where it stays on one side of zero, the model lacks something.",
     },
   });
   const evaluation = await evaluated;

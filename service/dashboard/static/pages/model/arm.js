@@ -16,11 +16,11 @@ export async function arm(view, { name, version }, { signal }) {
   const { parameters } = version;
   if (!parameters?.geometry || !parameters.inertia) {
     const why = parameters?.inertia ? "It was trained before geometries were learnt: train it again." : "Its estimator has no rigid bodies: train one with the estimator rigid-body.";
-    replace(view, empty(`This version does not hold where the joints of its arm lie. ${why}`));
+    replace(view, empty(`This version has no arm to draw. ${why}`));
     return;
   }
   const place = h("div", {}), start = middle(version.training_range);
-  const figure = drawable() ? place : h("p", { class: "hint" }, "This browser cannot draw in 3-D, as WebGL is off. The tables hold the same in numbers.");
+  const figure = drawable() ? place : h("p", { class: "hint" }, "This browser cannot draw in 3-D (WebGL is off). The tables hold the same numbers.");
   const posture = h("div", {});
   replace(
     view,
@@ -31,7 +31,7 @@ export async function arm(view, { name, version }, { signal }) {
       posture,
       h("div", { class: "actions" }, button("Save as URDF", () => saveUrdf(name, version.version))),
     ),
-    card("In numbers", jointTable(version), massTable(version), h("p", { class: "hint" }, `Masses are the physically possible ones nearest to what was learnt${off(parameters.inertia)}. All is as trained: what was learnt online since is not in it.`)),
+    card("In numbers", jointTable(version), massTable(version), h("p", { class: "hint" }, `Masses are the physically possible ones nearest to what was learnt${off(parameters.inertia)}. All as trained, without what was learnt online.`)),
   );
   if (figure !== place) return;
   const { draw } = await drawing(place, version, start, { signal });
@@ -90,10 +90,10 @@ function latest(work) {
 }
 
 function off({ plausible_deviation: deviation }) {
-  return deviation ? `: their torque differs from it by ${number(Math.max(...deviation), 2)} N·m at most, root mean square of a joint` : "";
+  return deviation ? `; their torque differs by at most ${number(Math.max(...deviation), 2)} N·m (root mean square, worst joint)` : "";
 }
 
 function upturned(gravity) {
-  if (!Math.hypot(...gravity)) return " Its torque is without gravity, so nothing says how the base stands.";
+  if (!Math.hypot(...gravity)) return " Its torque is without gravity, so how the base stands is unknown.";
   return Math.hypot(gravity[0], gravity[1]) > 1e-6 || gravity[2] > 0 ? " It is turned so that gravity points downwards." : "";
 }

@@ -36,7 +36,7 @@ export async function ask(view, { where, version }, { signal }) {
     view,
     card(
       "Ask for a torque",
-      h("form", { onsubmit: submit }, table(columns, names.map((_name, joint) => joint), { caption: "A motion in SI units (sliding joints: m). It begins at rest in the middle of the trained range." }), h("button", { type: "submit", class: "primary" }, "Ask")),
+      h("form", { onsubmit: submit }, table(columns, names.map((_name, joint) => joint), { caption: "A motion in SI units (sliding joints: m). The form starts at rest, in the middle of the trained range." }), h("button", { type: "submit", class: "primary" }, "Ask")),
       answer,
     ),
   );
@@ -49,22 +49,23 @@ function fixed(value, std) {
 }
 
 function shown(found, motion, { training_range: range }) {
+  const short = shortNames(found.joint_names);
   const total = found.tau_std.map((each, joint) => Math.hypot(each, found.noise_std[joint]));
   const outside = (joint) => QUANTITIES.map(([quantity]) => quantity).filter((quantity) => motion[quantity][joint] < range[quantity].min[joint] || motion[quantity][joint] > range[quantity].max[joint]);
   const beyond = found.joint_names.some((_name, joint) => outside(joint).length);
   const numeric = (label, cell) => ({ label, numeric: true, cell });
   const columns = [
-    { label: "Joint", cell: (joint) => found.joint_names[joint] },
+    { label: "Joint", cell: (joint) => short[joint] },
     numeric("tau, N·m", (joint) => fixed(found.tau[joint], found.tau_std[joint])),
-    numeric("std of the function", (joint) => number(found.tau_std[joint], 2)),
-    numeric("std of the noise", (joint) => number(found.noise_std[joint], 2)),
+    numeric("tau_std", (joint) => number(found.tau_std[joint], 2)),
+    numeric("noise_std", (joint) => number(found.noise_std[joint], 2)),
     numeric("95 % of measurements", (joint) => `${fixed(found.tau[joint], total[joint])} ± ${fixed(Z95 * total[joint], total[joint])}`),
     { label: "Trained there?", cell: (joint) => (outside(joint).length ? badge(`${outside(joint).join(", ")} outside`, "warn") : badge("within", "good")) },
   ];
   const revision = found.revision ? `, revision ${found.revision}` : "";
   return [
-    beyond ? h("div", { class: "banner", role: "note" }, "Part of this motion lies outside the samples that the version was trained on. It guesses there: its interval grows, but not always enough. Do not command this torque unseen.") : null,
+    beyond ? h("div", { class: "banner", role: "note" }, "Part of this motion lies outside what the version was trained on. It guesses there: its interval grows, but not always enough. Do not send this torque to a robot unchecked.") : null,
     table(columns, found.joint_names.map((_name, joint) => joint), { caption: `Version ${found.version}${revision} of ${found.model}, ${found.torque_convention.replace("_", " ")}` }),
-    h("p", { class: "hint" }, "“Within” says that each number alone was seen, not that they were seen together."),
+    h("p", { class: "hint" }, "“Within” means that each value alone was seen in training, not all of them together."),
   ];
 }

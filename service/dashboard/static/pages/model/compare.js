@@ -2,7 +2,7 @@
 
 import { post } from "../../api.js";
 import { h, replace } from "../../dom.js";
-import { count, number, percent, scientific } from "../../format.js";
+import { count, counted, number, percent, scientific, shortNames } from "../../format.js";
 import { badge, button, errorBox, field, loading, select, table } from "../../ui.js";
 import { fitting, noData, relation } from "./choice.js";
 
@@ -32,6 +32,7 @@ export function compareForm(state, signal) {
 
 function verdict(said) {
   const [one, two] = said.versions;
+  const short = shortNames(said.joint_names);
   const label = said.better === null ? said.outcome.replace("_", " ") : `version ${said.better} is better`;
   const difference = (joint) => {
     const { difference: by, half_width: half } = said.differences.nlpd;
@@ -39,7 +40,7 @@ function verdict(said) {
   };
   const numeric = (heading, cell) => ({ label: heading, numeric: true, cell });
   const columns = [
-    { label: "Joint", cell: (joint) => said.joint_names[joint] },
+    { label: "Joint", cell: (joint) => short[joint] },
     numeric(`nMSE, v${one.version}`, (joint) => scientific(one.nmse[joint])),
     numeric(`nMSE, v${two.version}`, (joint) => scientific(two.nmse[joint])),
     numeric(`in 95 %, v${one.version}`, (joint) => percent(one.coverage[joint])),
@@ -49,7 +50,7 @@ function verdict(said) {
   return [
     said.warnings.map((text) => h("div", { class: "banner", role: "note" }, `Unfair: ${text}.`)),
     h("p", {}, badge(label, SIGN[said.outcome] ?? "good"), " ", said.verdict),
-    table(columns, said.joint_names.map((_name, joint) => joint), { caption: `${count(said.samples_used)} of ${count(said.samples)} samples in ${count(said.blocks)} blocks; ± is half of a 95 % interval` }),
-    h("p", { class: "hint" }, "NLPD, the negative log predictive density in nats a sample, rewards small errors and true uncertainty alike: below zero, the second version is better."),
+    table(columns, said.joint_names.map((_name, joint) => joint), { caption: `${count(said.samples_used)} of ${count(said.samples)} samples in ${counted(said.blocks, "block")}; ± is half of a 95 % interval` }),
+    h("p", { class: "hint" }, "NLPD is the negative log predictive density, in nats a sample. It rewards small errors and true uncertainty. Below zero, the second version is better."),
   ];
 }

@@ -1,7 +1,7 @@
 // Figures of an evaluation: a table per joint, nMSE by stretch as boxes, observed against promised coverage.
 
 import { h, replace } from "../../dom.js";
-import { count, number, percent, scientific, shortNames } from "../../format.js";
+import { count, counted, number, percent, scientific, shortNames } from "../../format.js";
 import { line, plot } from "../../plots.js";
 import { badge, card, table } from "../../ui.js";
 
@@ -10,6 +10,7 @@ const NARROW = 0.9, WIDE = 0.99;
 /** Figures of each joint, with what to make of its coverage. */
 export function figures(evaluation) {
   const { joint_names: joints, coverages, stretches } = evaluation;
+  const short = shortNames(joints);
   const used = evaluation.samples_used < evaluation.samples ? `${count(evaluation.samples_used)} evenly chosen of ${count(evaluation.samples)}` : `all ${count(evaluation.samples)}`;
   const at = (joint) => evaluation.coverage[joint];
   const verdict = (joint) => {
@@ -19,7 +20,7 @@ export function figures(evaluation) {
   };
   const numeric = (label, cell) => ({ label, cell, numeric: true });
   const columns = [
-    { label: "Joint", cell: (joint) => joints[joint] },
+    { label: "Joint", cell: (joint) => short[joint] },
     numeric("nMSE", (joint) => scientific(evaluation.nmse[joint])),
     numeric("RMSE, N·m", (joint) => number(evaluation.rmse[joint])),
     ...coverages.map((each, level) => numeric(`in ${percent(each.level, 0)}`, (joint) => percent(coverages[level].coverage[joint]))),
@@ -28,20 +29,20 @@ export function figures(evaluation) {
     { label: "95 % band", cell: verdict },
   ];
   return card(
-    "How good is it here?",
-    table(columns, joints.map((_name, joint) => joint), { caption: `On ${used} samples${stretches.kind === "episodes" ? `, ${stretches.samples.length} episodes` : ""}` }),
-    h("p", { class: "hint" }, "nMSE is the mean squared error over the variance of the measured torque: 1 is no better than always answering the average torque; a joint whose torque is mostly noise cannot come near 0. “In 95 %” is the share of measurements inside the 95 % band, and should be 95 %."),
+    "Accuracy on this recording",
+    table(columns, joints.map((_name, joint) => joint), { caption: `On ${used} samples${stretches.kind === "episodes" ? `, ${counted(stretches.samples.length, "episode")}` : ""}` }),
+    h("p", { class: "hint" }, "nMSE is the mean squared error / variance of the measured torque. 1 is no better than always answering the mean; a joint whose torque is mostly noise cannot come near 0. “In 95 %” is the share of measurements inside the 95 % band, and should be near 95 %."),
   );
 }
 
 /** nMSE of every stretch, a box a joint. */
 export async function boxes(element, { joint_names: joints, stretches }, signal) {
   const place = h("div", {}), names = shortNames(joints);
-  const what = stretches.kind === "episodes" ? `${stretches.samples.length} episodes` : `${stretches.samples.length} equal stretches of the recording`;
+  const what = stretches.kind === "episodes" ? counted(stretches.samples.length, "episode") : `${counted(stretches.samples.length, "equal stretch", "equal stretches")} of the recording`;
   replace(
     element,
     place,
-    h("p", { class: "hint" }, `A point is one of ${what}: its mean squared error over the variance of the measured torque of all samples. Boxes go from quarter to quarter, the line is the median. A box that reaches far up: some motion is predicted much worse than the rest.`),
+    h("p", { class: "hint" }, `Each point is the nMSE of one of ${what}. A box holds the middle half, its line is the median. If a box reaches far up, some motion is predicted much worse than the rest.`),
   );
   const traces = stretches.nmse.map((values, joint) => ({
     type: "box", y: values, name: names[joint], colour: joint, boxpoints: "all", jitter: 0.5, pointpos: 0, marker: { size: 4, opacity: 0.7 }, hovertemplate: "%{y:.3g}",
@@ -56,7 +57,7 @@ export async function reliability(element, { joint_names: joints, reliability: c
   replace(
     element,
     place,
-    h("p", { class: "hint" }, "Of intervals that promise to hold so much, how much they held. On the diagonal they are true; below it they are too narrow, and the model is surer of itself than it should be."),
+    h("p", { class: "hint" }, "The share of measurements that each interval promised to hold, against the share that it held. On the diagonal is right. Below it intervals are too narrow: the model is surer than it should be."),
   );
   const whole = { range: [0, 1], tickformat: ".0%", dtick: 0.2 };
   const traces = [

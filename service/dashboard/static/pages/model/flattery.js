@@ -8,11 +8,11 @@ export function flattery({ version, revision, in_training: trained, part }) {
   if (trained) {
     said.push(h("div", { class: "banner", role: "note" },
       h("strong", {}, "These samples flatter. "),
-      `Version ${version} was trained on them, or on some of them: figures and plots look better than they will on other motion. Choose a recording that it has not seen.`));
+      `Version ${version} was trained on them, or on some of them. Figures and plots look better than on other motion. Choose a recording that it has not seen.`));
   }
   if (revision > 0) {
     said.push(h("div", { class: "banner", role: "note" },
-      `Version ${version} has learnt online since it was trained (revision ${revision}). Where it learnt from this very motion, figures and plots flatter it.`));
+      `Version ${version} has learnt online since it was trained (revision ${revision}). If it learnt from this motion, figures and plots flatter it.`));
   }
   if (!trained && part === "held_out") {
     said.push(h("p", { class: "hint" }, `These samples were held out when version ${version} was trained.`));

@@ -128,5 +128,5 @@ function legend(traces) {
 function sentence(trace) {
   const part = trace.in_range === trace.samples ? "" : ` (rows ${count(trace.rows[0])} to ${count(trace.rows.at(-1))})`;
   if (trace.shown === trace.in_range) return `All ${count(trace.in_range)} samples${part} are drawn.`;
-  return `${count(trace.shown)} of ${count(trace.in_range)} samples${part} are drawn, evenly chosen: a peak between two of them is missing. Drag over a part of a plot to see every sample of it.`;
+  return `${count(trace.shown)} of ${count(trace.in_range)} samples${part} are drawn, evenly chosen, so short peaks may be missing. Drag over part of a plot to see every sample.`;
 }

@@ -2,7 +2,7 @@
 
 import { get } from "../../api.js";
 import { h, refresh, replace } from "../../dom.js";
-import { ago, count, number, percent, scientific, when } from "../../format.js";
+import { ago, count, counted, number, percent, scientific, shortNames, when } from "../../format.js";
 import { badge, card, empty, every, facts, link, loading, table } from "../../ui.js";
 
 /** The tab of learning; it looks again every five seconds. */
@@ -24,7 +24,7 @@ export async function learning(view, { where, name }, { signal }) {
   };
   await look(); // what goes wrong the first time is shown in the page's place
   every(5, () => look().catch((error) => {
-    if (!signal.aborted) refresh(stale, h("div", { class: "banner bad", role: "alert" }, `What is shown here is no longer up to date: ${error.message}. It is tried again.`));
+    if (!signal.aborted) refresh(stale, h("div", { class: "banner bad", role: "alert" }, `What is shown here is out of date: ${error.message}. Trying again.`));
   }), signal);
 }
 
@@ -32,23 +32,23 @@ function status({ options, status: at }, name) {
   const live = link("Follow it live", `#/live/${encodeURIComponent(name)}`, "primary");
   if (!at.events) {
     const said = options.enabled
-      ? "It has learnt nothing while serving so far. Send what the robot measured, with the answers’ stream or in batches; "
-      : "It does not learn while it serves: that is switched off. ";
+      ? "It has learnt nothing while serving so far. Send measured torque, along a stream or in batches. "
+      : "Learning while it serves is switched off. ";
     return empty([said, h("code", {}, `lipserve stream ${name} --simulate panda --learn`), " shows how with a simulated Panda."], live);
   }
-  const behind = at.lag_events ? badge(`${count(at.lag_events)} events behind`, "busy") : badge("up to date", "good");
+  const behind = at.lag_events ? badge(`${counted(at.lag_events, "event")} behind`, "busy") : badge("up to date", "good");
   return card(
-    "Where it stands",
-    at.held ? h("div", { class: "banner bad", role: "note" }, h("strong", {}, "Learning stands still. "), `The robot seems to have changed${at.held.at ? ` ${ago(at.held.at)}` : ""}: decide on the live page whether to adapt or to go on.`) : null,
+    "State",
+    at.held ? h("div", { class: "banner bad", role: "note" }, h("strong", {}, "Learning is held. "), `The robot seems to have changed${at.held.at ? ` ${ago(at.held.at)}` : ""}: decide on the live page whether to adapt or to go on.`) : null,
     at.failure ? h("div", { class: "banner bad", role: "note" }, `It cannot learn now: ${at.failure}`) : null,
     facts([
       ["Version that learns", String(at.version)],
       ["Answers contain", [`revision ${count(at.published)} `, behind]],
       ["Batches logged", count(at.events)],
-      ["Beyond what the version can hold", percent(at.novel_share)],
-      ...(at.linearisation_error ? [["Error of the arm as linear", `${percent(Math.max(...at.linearisation_error))} of what is stated`]] : []),
+      ["Rows beyond what it was trained on", percent(at.novel_share)],
+      ...(at.linearisation_error ? [["Linearisation error of the arm", `${percent(Math.max(...at.linearisation_error))} of the stated uncertainty`]] : []),
       ["Sources", at.streams.length ? at.streams.map((each) => each.stream_id).join(", ") : "none"],
-      ["Candidate", at.candidate ? `version ${at.candidate.version}, has yet to prove better` : "none"],
+      ["Candidate", at.candidate ? `version ${at.candidate.version}, which must predict better before it answers` : "none"],
     ]),
     h("p", {}, live),
   );
@@ -58,17 +58,18 @@ function qualityCard({ joint_names: names, windows, level }) {
   const told = windows.filter((each) => each.rows);
   if (!told.length) return null;
   const [latest] = told;
+  const short = shortNames(names);
   const columns = [
-    { label: "Joint", cell: (joint) => names[joint] },
+    { label: "Joint", cell: (joint) => short[joint] },
     { label: "nMSE", numeric: true, cell: (joint) => scientific(latest.nmse[joint]) },
     { label: "RMSE, N·m", numeric: true, cell: (joint) => number(latest.rmse[joint]) },
     { label: `in ${percent(level, 0)}`, numeric: true, cell: (joint) => percent(latest.coverage[joint]) },
   ];
   const kept = Object.entries(latest.rejected).filter(([, rows]) => rows).map(([code, rows]) => `${code} ${count(rows)}`);
   return card(
-    "How well it predicted lately",
-    table(columns, names.map((_name, joint) => joint), { caption: `The last ${count(latest.seconds)} s, ${count(latest.rows)} rows: each was predicted before it was learnt` }),
-    h("p", { class: "hint" }, `${count(latest.accepted)} of these rows teach${kept.length ? `; kept out: ${kept.join(", ")}` : ""}.`),
+    "Recent quality",
+    table(columns, names.map((_name, joint) => joint), { caption: `The last ${count(latest.seconds)} s, ${counted(latest.rows, "row")}, each predicted before it was learnt` }),
+    h("p", { class: "hint" }, `${count(latest.accepted)} of these rows were learnt${kept.length ? `; kept out: ${kept.join(", ")}` : ""}.`),
   );
 }
 
@@ -84,5 +85,5 @@ function alarmsCard(alarms) {
 
 function options(said) {
   const text = (value) => (value === null ? "none" : Array.isArray(value) ? value.join(", ") : String(value));
-  return card("How it is set", facts(Object.entries(said).map(([name, value]) => [name.replaceAll("_", " "), text(value)])), h("p", { class: "hint" }, "Changed over the API: ", h("code", {}, "PUT /v1/models/{model}/learning"), "."));
+  return card("Settings", facts(Object.entries(said).map(([name, value]) => [name.replaceAll("_", " "), text(value)])), h("p", { class: "hint" }, "Change them over the API: ", h("code", {}, "PUT /v1/models/{model}/learning"), "."));
 }

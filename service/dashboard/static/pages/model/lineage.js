@@ -1,8 +1,9 @@
 // Where a version comes from: data, what was held out, options, what the fit said, software.
 
 import { h, replace } from "../../dom.js";
-import { bytes, count, number, percent, scientific, seconds, when } from "../../format.js";
+import { bytes, count, number, percent, scientific, seconds, shortNames, when } from "../../format.js";
 import { badge, card, facts, link, table } from "../../ui.js";
+import { heldOut } from "../job/words.js";
 import { selectionCard } from "./selection.js";
 
 /** The tab of a version's lineage. */
@@ -14,7 +15,7 @@ export async function lineage(view, { version, datasets }) {
     selectionCard(version),
     dataCard(from, datasets),
     figuresCard(version, from),
-    card("Fit", facts(fit(version)), version.fit.converged === false ? h("p", { class: "banner" }, "The fit had not converged when it stopped: more iterations may give a better model.") : null),
+    card("Fit", facts(fit(version)), version.fit.converged === false ? h("p", { class: "banner" }, "The fit stopped before it converged. More iterations may give a better model.") : null),
     rangeCard(version),
     card(
       "Options and software",
@@ -29,7 +30,7 @@ function origin(version) {
   const found = [
     ["Model", version.model],
     ["Made", when(version.created_at)],
-    ["By", version.job ? link(version.job, `#/jobs/${version.job}`) : from.imported ? "import" : "came with LIPServe"],
+    ["Made by", version.job ? link("a training job", `#/jobs/${version.job}`) : from.imported ? "import" : "LIPServe, which it came with"],
     ["Estimator", version.estimator],
     ["Joints", version.joint_names.join(", ")],
     ["Torque", version.torque_convention.replace("_", " ")],
@@ -38,13 +39,13 @@ function origin(version) {
   if (version.robot?.name) found.push(["Robot", version.robot.name]);
   if (from.refresh) found.push(["Refresh of", `version ${from.refresh.version}`]);
   if (from.log) found.push(["Rows learnt from the log", `${count(from.log.rows)} of ${count(from.log.found)}`]);
-  if (from.made_by) found.push(["Made by", from.made_by]);
+  if (from.made_by) found.push(["Made with", from.made_by]);
   return found;
 }
 
 function dataCard(from, datasets) {
   if (!from.datasets?.length) {
-    const said = from.simulation ? "It was trained on simulated motion, before it came here." : from.imported ? "It was imported; its lineage names no data set." : "Its lineage names no data set.";
+    const said = from.simulation ? "It was trained on simulated motion, on another machine." : from.imported ? "It was imported; its archive names no data set." : "No data set is recorded for it.";
     return card("Trained on", h("p", {}, said));
   }
   const known = new Set(datasets.map((each) => each.id));
@@ -53,7 +54,7 @@ function dataCard(from, datasets) {
     { label: "Data set", cell: (row) => (known.has(row.id) ? link(row.name || row.id, `#/data/${row.id}`) : `${row.name || row.id} (deleted)`) },
     { label: "Samples", numeric: true, cell: (row) => count(row.rows) },
     { label: "Held out", numeric: true, cell: (row) => (held(row) ? `${count(held(row).rows)}${held(row).whole ? " (all)" : ""}` : "–") },
-    { label: "Guard, left out of both", numeric: true, cell: (row) => (held(row) ? count(held(row).guarded) : "–") },
+    { label: "Guard (used for neither)", numeric: true, cell: (row) => (held(row) ? count(held(row).guarded) : "–") },
     { label: "Content (sha256)", cell: (row) => h("code", { title: row.sha256 }, row.sha256?.slice(0, 12) ?? "–") },
   ];
   return card("Trained on", table(columns, from.datasets));
@@ -65,8 +66,9 @@ function figuresCard(version, from) {
     ["Trained on (flatters)", from.training_metrics],
   ].filter(([, figures]) => figures);
   if (!sets.length) return null;
+  const short = shortNames(version.joint_names);
   const columns = [
-    { label: "Joint", cell: (joint) => version.joint_names[joint] },
+    { label: "Joint", cell: (joint) => short[joint] },
     ...sets.flatMap(([label, figures]) => [
       { label: `${label}: nMSE`, numeric: true, cell: (joint) => scientific(figures.nmse[joint]) },
       { label: "RMSE, N·m", numeric: true, cell: (joint) => number(figures.rmse[joint]) },
@@ -75,9 +77,9 @@ function figuresCard(version, from) {
   ];
   const said = sets.map(([label, figures]) => `${label.toLowerCase()}: ${count(figures.samples)} of ${count(figures.of)} samples`).join("; ");
   return card(
-    "Figures from the day it was trained",
+    "Figures as trained",
     table(columns, version.joint_names.map((_name, joint) => joint), { caption: said }),
-    from.holdout ? h("p", { class: "hint" }, `Held out: ${percent(from.holdout.split.share, 0)} as ${from.holdout.split.kind}.`) : h("p", { class: "hint" }, "Nothing was held out: only a recording that it has not seen tells how good it is."),
+    from.holdout ? h("p", { class: "hint" }, `Held out: ${heldOut(from.holdout.split)}.`) : h("p", { class: "hint" }, "Nothing was held out. Evaluate it on a recording that it has not seen."),
   );
 }
 
@@ -87,33 +89,34 @@ function fit({ fit: said, compact, calibration, lineage: from }) {
     ["Iterations", count(said.iterations)],
     ["Took", seconds(said.seconds)],
     ["Samples given", count(said.samples_given)],
-    ["Hyperparameters fitted on", count(said.samples_hyperparameters)],
-    ["Posterior stands on", count(said.samples_posterior)],
-    ["Stds multiplied by", number(calibration.function_std_factor)],
+    ["Samples for the hyperparameters", count(said.samples_hyperparameters)],
+    ["Samples of the posterior", count(said.samples_posterior)],
+    ["Standard deviations multiplied by", number(calibration.function_std_factor)],
   ];
   if (compact) {
     found.push(
       ["Inducing outputs", count(compact.inducing_outputs)],
       ["Largest deviation of the mean from the exact posterior", `${percent(compact.mean_max)} of its std`],
       ["Largest deviation of the std", percent(compact.std_max)],
-      ["Tolerance reached", badge(compact.tolerance_reached ? "yes" : "no, answers say they know less than the data told", compact.tolerance_reached ? "good" : "warn")],
+      ["Tolerance reached", badge(compact.tolerance_reached ? "yes" : "no: tau_std is larger than the data would allow", compact.tolerance_reached ? "good" : "warn")],
     );
   }
-  if (from.peak_memory_bytes) found.push(["Memory at most", bytes(from.peak_memory_bytes)]);
+  if (from.peak_memory_bytes) found.push(["Most memory", bytes(from.peak_memory_bytes)]);
   return found;
 }
 
 function rangeCard({ joint_names: names, training_range: range }) {
+  const short = shortNames(names);
   const span = (quantity) => (joint) => `${number(range[quantity].min[joint])} to ${number(range[quantity].max[joint])}`;
   const columns = [
-    { label: "Joint", cell: (joint) => names[joint] },
+    { label: "Joint", cell: (joint) => short[joint] },
     { label: "q, rad", numeric: true, cell: span("q") },
     { label: "dq, rad/s", numeric: true, cell: span("dq") },
     { label: "ddq, rad/s²", numeric: true, cell: span("ddq") },
   ];
   return card(
-    "Where its samples lie",
+    "Range of its samples",
     table(columns, names.map((_name, joint) => joint), { caption: "Smallest and largest values (sliding joints: m)" }),
-    h("p", { class: "hint" }, "Outside these ranges it guesses: its bands grow, but not always enough."),
+    h("p", { class: "hint" }, "Outside these ranges it guesses. Its bands grow there, but not always enough."),
   );
 }

@@ -2,7 +2,7 @@
 
 import { post } from "../../api.js";
 import { h, replace } from "../../dom.js";
-import { number } from "../../format.js";
+import { number, shortNames } from "../../format.js";
 import { card, loading, table } from "../../ui.js";
 import { noData } from "./choice.js";
 import { around, broken, column } from "./curves.js";
@@ -29,12 +29,12 @@ export async function parts(view, state, { signal }) {
   };
   const trace = await fetch(0, null);
   const along = h("div", {});
-  const only = offered.length > 1 ? null : h("p", { class: "hint" }, `A model with the estimator ${state.version.estimator} tells friction apart from the rest, and no more: gravity, inertia and Coriolis are told by estimators that learn energies.`);
+  const only = offered.length > 1 ? null : h("p", { class: "hint" }, `The estimator ${state.version.estimator} tells only friction apart. Gravity, inertia and Coriolis need an estimator that learns energies.`);
   replace(view, flattery(trace), card("Parts of the torque", only, along), cards);
   const names = Object.keys(SAID).filter((name) => offered.includes(name));
   const views = names.length > 1 ? { "all parts": (...given) => names.flatMap((name, index) => part(name, index, ...given)) } : {};
   for (const [index, name] of names.entries()) views[SAID[name]] = (...given) => part(name, index, ...given);
-  const note = "No sensor measures these: bands hold the learnt function with 95 %, as far as the model itself can tell, and nothing here checks them.";
+  const note = "No sensor measures these, so nothing here checks the bands: they are the model’s own 95 % intervals of the function.";
   const sum = names.length > 1 ? " They add up to the predicted torque." : "";
   await joints(along, { first: trace, fetch, views, about: Object.fromEntries(Object.keys(views).map((view_) => [view_, note + sum])), signal });
 }
@@ -50,15 +50,16 @@ function part(name, index, trace, joint, x) {
 
 function frictionCard({ joint_names: names, joint_types: types, parameters }) {
   const friction = parameters?.friction;
-  if (!friction) return card("Friction parameters", h("p", { class: "muted" }, "This version does not tell any."));
+  if (!friction) return card("Friction parameters", h("p", { class: "muted" }, "This version has none."));
   const value = (term) => (joint) => {
     const { mean, std } = friction[term];
     const vague = Math.abs(mean[joint]) < 2 * std[joint];
     return [`${number(mean[joint])} ± ${number(std[joint], 2)}`, vague ? h("span", { class: "muted", title: "within two standard deviations of zero" }, " ≈ 0") : null];
   };
   const sliding = types.includes("prismatic") ? " (sliding joints: N·s/m and N)" : "";
+  const short = shortNames(names);
   const columns = [
-    { label: "Joint", cell: (joint) => names[joint] },
+    { label: "Joint", cell: (joint) => short[joint] },
     { label: "Viscous, N·m·s/rad", numeric: true, cell: value("viscous") },
     { label: "Coulomb, N·m", numeric: true, cell: value("coulomb") },
     { label: "Offset, N·m", numeric: true, cell: value("offset") },
@@ -67,7 +68,7 @@ function frictionCard({ joint_names: names, joint_types: types, parameters }) {
   return card(
     "Friction parameters",
     table(columns, names.map((_name, joint) => joint), { caption: `Mean ± one standard deviation${sliding}, as trained` }),
-    h("p", { class: "hint" }, "Friction is viscous · dq + Coulomb · sign(dq) + a constant offset, which also takes up what else is constant. ≈ 0: zero lies within two standard deviations, so the data do not show that there is any. What was learnt online since is not in this table."),
+    h("p", { class: "hint" }, "Friction is viscous · dq + Coulomb · sign(dq) + offset; the offset also holds whatever else is constant. ≈ 0: less than two standard deviations from zero, so the data show no such friction. All as trained, without what was learnt online."),
   );
 }
 
@@ -83,7 +84,7 @@ function bodiesCard({ parameters }) {
     "Masses",
     table(columns, inertia.bodies, { caption: "Mean ± one standard deviation, as trained" }),
     h("p", { class: "hint" },
-      inertia.mean_is_plausible ? "These are the masses of bodies that can exist. " : "The means alone are not those of bodies that can exist; the nearest possible ones are. ",
-      "Torques tell many inertial parameters only in combinations; the rest comes from the URDF, which is believed the more the better it fits the data, so a small deviation need not mean that the data tell this mass. Moments and inertias: ", h("code", {}, "parameters"), " of the version in the API."),
+      inertia.mean_is_plausible ? "These masses are physically possible. " : "The means are not physically possible together; the nearest possible masses are. ",
+      "Torque tells many inertial parameters only in combinations; the rest comes from the prior. So a small standard deviation does not prove that the data tell this mass. Moments and inertias: ", h("code", {}, "parameters"), " of the version in the API."),
   );
 }

@@ -1,7 +1,7 @@
 // How `auto` has chosen a version's estimator: a small table, shown with the version and with the job that made it.
 
 import { h } from "../../dom.js";
-import { count, number, percent, scientific } from "../../format.js";
+import { counted, number, percent, scientific } from "../../format.js";
 import { card, table } from "../../ui.js";
 
 /** The card of a choice; null where the estimator was named. */
@@ -12,15 +12,15 @@ export function selectionCard({ selection }) {
   return card(
     "How the estimator was chosen",
     h("p", {}, h("strong", {}, selection.chosen), `: ${selection.reason}.`),
-    held.repeats ? h("p", { class: "banner" }, "All motion of this recording repeats itself, also what was held out: these figures flatter.") : null,
+    held.repeats ? h("p", { class: "banner" }, "The held-out motion repeats the training motion: these figures flatter.") : null,
     held.blocks ? judged(selection, held) : null,
     failed.map((each) => h("p", { class: "hint" }, `${each.estimator} could not be trained: ${each.error}`)),
-    held.blocks ? h("p", { class: "hint" }, "The higher the log density, the better what was predicted, its uncertainty too. One that knows more of the arm is taken where it is within one standard error of the best, or errs no more. It has learnt the held-out samples afterwards.") : null,
+    held.blocks ? h("p", { class: "hint" }, "A higher log density means better predictions and truer uncertainty. An estimator that knows more of the arm is taken if it is within one standard error of the best, or errs no more. Afterwards it learnt the held-out samples too.") : null,
   );
 }
 
 function judged({ chosen, table: rows }, held) {
-  const stretches = held.blocks === 1 ? "1 stretch" : `${held.blocks} stretches`;
+  const stretches = counted(held.blocks, "stretch", "stretches");
   const columns = [
     { label: "Estimator", cell: (row) => (row.estimator === chosen ? h("strong", {}, row.estimator) : row.estimator) },
     { label: "Log density, nats a sample", numeric: true, cell: (row) => shown(row.log_density, number) },
@@ -28,7 +28,7 @@ function judged({ chosen, table: rows }, held) {
     { label: "nMSE, mean of the joints", numeric: true, cell: (row) => shown(mean(row.nmse), scientific) },
     { label: "Within the 95 % band", numeric: true, cell: (row) => shown(mean(row.coverage), percent) },
   ];
-  return table(columns, rows, { caption: `Judged on ${stretches} that the training did not see: ${count(held.rows)} samples` });
+  return table(columns, rows, { caption: `Judged on ${stretches} that the training did not see: ${counted(held.rows, "sample")}` });
 }
 
 function less({ difference, standard_error: error }) {

@@ -5,7 +5,7 @@ import { confirm } from "../../ui.js";
 /** Ask whether a version shall answer; true where it shall. */
 export function confirmServing(name, version, serving) {
   return confirm(
-    `Let version ${version} of ${name} answer instead of version ${serving}? Every query and stream that names no version is answered by it from the next one on. The step can be taken back under “Versions”.`,
+    `Serve version ${version} of ${name} instead of version ${serving}? It will answer every query and stream that names no version, from the next one on. You can undo this under “Versions”.`,
     `Serve version ${version}`,
     "primary",
   );

@@ -15,7 +15,7 @@ export async function versions(view, state, { signal, reload, select: look }) {
   replace(
     view,
     card("Versions", versionTable(state, aliases, reload, look)),
-    card("What versions are called", aliasTable(state, aliases, reload), aliasForm(state, reload)),
+    card("Aliases", aliasTable(state, aliases, reload), aliasForm(state, reload)),
     state.model.versions.length > 1 ? card("Compare two versions", compareForm(state, signal)) : null,
   );
 }
@@ -24,15 +24,15 @@ function versionTable({ name, where, model, version }, aliases, reload, look) {
   const serving = model.serving_version;
   const named = (number) => aliases.filter((each) => each.version === number && each.alias !== "serving").map((each) => each.alias);
   const actions = ({ version: number }) => {
-    const made = [button("Look at it", () => look(number, "accuracy"))];
-    if (number !== serving) made.push(button("Let it answer", async () => {
+    const made = [button("Show", () => look(number, "accuracy"))];
+    if (number !== serving) made.push(button("Serve", async () => {
       if (!(await confirmServing(name, number, serving))) return;
       await put(`${where}/aliases/serving`, { version: number });
       await done(reload, `Version ${number} of ${name} answers from now on.`);
     }, { kind: "primary" }));
     made.push(button("Export", () => exportVersion(name, number)));
     if (number !== serving && !named(number).length) made.push(button("Delete", async () => {
-      if (!(await confirm(`Delete version ${number} of ${name}? It cannot be brought back.`, `Delete version ${number}`))) return;
+      if (!(await confirm(`Delete version ${number} of ${name}? This cannot be undone.`, `Delete version ${number}`))) return;
       await del(`${where}/versions/${number}`);
       await done(reload, `Version ${number} is deleted.`);
     }, { kind: "danger" }));
@@ -47,10 +47,10 @@ function versionTable({ name, where, model, version }, aliases, reload, look) {
         each.version === serving ? badge("serving") : null,
         " ",
         named(each.version).map((alias) => [badge(alias, "plain"), " "]),
-        each.version === version.version ? h("span", { class: "muted" }, "looked at") : null,
+        each.version === version.version ? h("span", { class: "muted" }, "shown here") : null,
       ],
     },
-    { label: "Do", cell: actions },
+    { label: "Actions", cell: actions },
     { label: "Estimator", cell: (each) => each.estimator },
     { label: "Made", cell: (each) => when(each.created_at) },
   ];
@@ -59,13 +59,13 @@ function versionTable({ name, where, model, version }, aliases, reload, look) {
 
 function aliasTable({ name, where }, aliases, reload) {
   const back = (each) => button("Roll back", async () => {
-    const what = each.alias === "serving" ? `Version ${each.previous} of ${name} answers again then, and version ${each.version} no more.` : `${each.alias} means version ${each.previous} again then.`;
-    if (!(await confirm(`Take the last move of “${each.alias}” back? ${what}`, `Back to version ${each.previous}`, "primary"))) return;
+    const what = each.alias === "serving" ? `Version ${each.previous} of ${name} will answer again instead of version ${each.version}.` : `${each.alias} will be version ${each.previous} again.`;
+    if (!(await confirm(`Undo the last move of “${each.alias}”? ${what}`, `Back to version ${each.previous}`, "primary"))) return;
     const now = await post(`${where}/aliases/${encodeURIComponent(each.alias)}/rollback`, {});
     await done(reload, `${each.alias} is version ${now.version} again.`);
   });
   const remove = (each) => button("Remove", async () => {
-    if (!(await confirm(`Remove the alias “${each.alias}”? Who asks for it is refused then; version ${each.version} stays.`, "Remove it"))) return;
+    if (!(await confirm(`Remove the alias “${each.alias}”? Queries that name it will be refused. Version ${each.version} stays.`, "Remove it"))) return;
     await del(path`/v1/models/${name}/aliases/${each.alias}`);
     await done(reload, `The alias ${each.alias} is removed.`);
   }, { kind: "danger" });
@@ -76,19 +76,19 @@ function aliasTable({ name, where }, aliases, reload) {
   const columns = [
     { label: "Alias", cell: (each) => `${each.alias} → ${each.version}` },
     {
-      label: "Do",
+      label: "Actions",
       cell: (each) => h("div", { class: "actions" }, each.previous === null ? null : named(back(each), each), each.alias === "serving" ? null : named(remove(each), each)),
     },
     { label: "Before", cell: (each) => (each.previous === null ? "–" : `version ${each.previous}`) },
     { label: "Since", cell: (each) => when(each.changed_at) },
   ];
-  return table(columns, aliases, { caption: "“serving” answers where no version is named; clients may ask for other aliases by name" });
+  return table(columns, aliases, { caption: "“serving” answers queries that name no version; other aliases answer queries that name them" });
 }
 
 function aliasForm({ where, model, name }, reload) {
   const alias = h("input", { type: "text", required: true, pattern: "[a-z][a-z0-9._\\-]{0,63}", placeholder: "production", autocomplete: "off", spellcheck: "false" });
   const version = select([...model.versions].reverse().map((each) => [String(each.version), `version ${each.version}`]), String(model.serving_version));
-  const set = button("Point it there", async () => {
+  const set = button("Set alias", async () => {
     if (!alias.reportValidity()) return;
     const chosen = alias.value.trim(), number = Number(version.value);
     if (chosen === "serving" && !(await confirmServing(name, number, model.serving_version))) return;
@@ -99,7 +99,7 @@ function aliasForm({ where, model, name }, reload) {
     "details",
     {},
     h("summary", {}, "Make or move an alias"),
-    h("div", { class: "grid" }, field("Alias", alias, "Lower-case letters, digits, dots and hyphens, after a letter."), field("Points to", version)),
+    h("div", { class: "grid" }, field("Alias", alias, "A lower-case letter, then lower-case letters, digits, dots and hyphens."), field("Points to", version)),
     set,
   );
 }

@@ -36,17 +36,17 @@ export function health(place, seconds, signal) {
         const warned = ready.checks.some((check) => check.state !== "ok");
         show(warned ? "ready, with warnings" : "ready", warned ? "warn" : "good", ready.checks);
         answered = new Date();
-        since.textContent = "looked at every 2 s";
+        since.textContent = "checked every 2 s";
       } catch (error) {
         if (signal.aborted || error.name === "AbortError") return;
         if (error.status === 503 && error.detail?.length) {
           const failed = error.detail.map((item) => ({ name: item.field, state: "failed", message: item.value }));
           show("not ready", "bad", failed);
           answered = new Date();
-          since.textContent = "asked again every 2 s";
+          since.textContent = "checked every 2 s";
         } else {
           show("no answer", "bad", [{ name: "service", state: "failed", message: error.message }]);
-          since.textContent = answered ? `last answer ${when(answered.toISOString())}; asked again every 2 s` : "asked again every 2 s";
+          since.textContent = answered ? `last answer ${when(answered.toISOString())}; checked every 2 s` : "checked every 2 s";
         }
       }
     },

@@ -25,8 +25,8 @@ function row(job) {
 
 function said(job) {
   const { stage, remaining_s: left } = job.progress;
-  if (job.state === "queued") return `waiting, asked for ${ago(job.created_at)}`;
-  if (job.state === "running") return left ? `${stage}, at most about ${seconds(left)} more` : stage;
+  if (job.state === "queued") return `waiting, queued ${ago(job.created_at)}`;
+  if (job.state === "running") return left ? `${stage}, at most about ${seconds(left)} left` : stage;
   if (job.state === "succeeded") return `made version ${job.version}, ${ago(job.finished_at)}`;
   return `${job.error?.message ?? ""} ${ago(job.finished_at)}`.trim();
 }

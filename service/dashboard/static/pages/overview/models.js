@@ -13,7 +13,7 @@ export function newestModels(place, models) {
   if (!changed(place, newest) || !newest.length) return;
   const columns = [
     { label: "Model", cell: (model) => link(model.name, `#/models/${encodeURIComponent(model.name)}`) },
-    { label: "Serves", cell: (model) => `version ${model.serving_version} of ${model.latest_version}` },
+    { label: "Answers", cell: (model) => `version ${model.serving_version}` },
     { label: "Estimator", cell: (model) => serving(model)?.estimator ?? "–" },
     { label: "Trained", cell: (model) => (serving(model) ? when(serving(model).created_at) : "–") },
     { label: "Live", cell: (model) => h("a", { href: `#/live/${encodeURIComponent(model.name)}`, "aria-label": `Follow ${model.name} live` }, "follow") },

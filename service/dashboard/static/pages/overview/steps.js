@@ -20,7 +20,7 @@ export function steps(place, { data, models, jobs }) {
         { class: "steps" },
         step(done.data, link("Upload a recording", "#/data"), " of your robot: positions, velocities and torques. No robot at hand? Simulate one:", command("lipserve simulate panda panda.csv")),
         step(done.trained, link("Train a model", "#/train"), " on it: the defaults suit most recordings."),
-        step(false, "See how far its torques can be trusted on motion it was not trained on, and stream to it."),
+        step(false, "Judge it on motion that it was not trained on, then stream to it."),
       ),
       shipped
         ? h("p", { class: "hint" }, "Or look around first: ", link("panda-sim", "#/models/panda-sim"), " is a simulated Panda that comes with LIPServe.")

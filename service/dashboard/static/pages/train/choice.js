@@ -1,7 +1,7 @@
 // Choosing the data sets to train on: those that fit together.
 
 import { h } from "../../dom.js";
-import { ago, count, seconds, when } from "../../format.js";
+import { ago, count, counted, seconds, when } from "../../format.js";
 import { empty, link, table } from "../../ui.js";
 
 /** Checkboxes of data sets. Returns {element, chosen()}; onchange(chosen data sets) after every change. */
@@ -28,8 +28,8 @@ export function datasetChoice(datasets, preselected, onchange) {
       apart += fits ? 0 : 1;
     }
     const rows = picked.reduce((sum, each) => sum + each.report.rows, 0);
-    const others = apart ? ` Data sets with other joints or another torque convention cannot be joined with these: ${apart} left out.` : "";
-    note.textContent = picked.length ? `${picked.length} chosen, ${count(rows)} samples.${others}` : "None chosen yet.";
+    const others = apart ? ` ${counted(apart, "data set")} cannot be added: other joints, or another torque convention.` : "";
+    note.textContent = picked.length ? `${picked.length} chosen, ${counted(rows, "sample")}.${others}` : "None chosen yet.";
     onchange(picked);
   };
   const element = h(

@@ -4,10 +4,10 @@ import { h } from "../../dom.js";
 
 /** [name, what it knows and when to use it, whether it can use a robot's URDF]. */
 export const ESTIMATORS = [
-  ["auto", "Trains the next three, holds some of the recording out, and takes the one that predicts that best. It takes two minutes or three.", true],
-  ["rigid-body", "Learns where the joint axes lie, masses and friction: an arm of rigid bodies. For stiff arms.", true],
-  ["lip-chain", "Knows Lagrange's equations of a serial chain. For arms with springs, belts or links that bend.", false],
-  ["rigid-body+lip-chain", "Both: the chain learns what the rigid bodies miss. For much data.", true],
+  ["auto", "Trains the next three and takes the one that best predicts a held-out part. Two or three minutes.", true],
+  ["rigid-body", "An arm of rigid bodies: learns its joint axes, masses and friction. For stiff arms.", true],
+  ["lip-chain", "Lagrange's equations of a serial chain. For arms with springs, belts or links that bend.", false],
+  ["rigid-body+lip-chain", "Both: the chain learns what rigid bodies miss. For much data.", true],
   ["lip", "The kernel of the paper, to get the paper's results.", false],
   ["se", "The paper's baseline: a squared exponential for each joint. To compare with.", false],
   ["gip", "The paper's baseline: a geometrically inspired polynomial. To compare with.", false],
@@ -20,7 +20,7 @@ export function estimatorChoice(onchange) {
     "fieldset",
     {},
     h("legend", {}, "Estimator"),
-    h("p", { class: "hint" }, "What the model knows of physics before it sees data. All learn friction too: viscous, Coulomb and an offset."),
+    h("p", { class: "hint" }, "What the model knows of physics before it sees data. All learn friction: viscous, Coulomb and an offset."),
     ESTIMATORS.map(([name, said, robot], index) =>
       h(
         "div",

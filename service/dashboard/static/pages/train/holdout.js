@@ -10,10 +10,10 @@ const KINDS = [
   ["", "nothing: learn from all of it"],
 ];
 const SAID = {
-  last: "Not a test on motion of another kind: that needs another recording.",
-  episodes: "Of several data sets of one episode each, whole data sets are held out. The seed chooses which.",
-  blocks: "The seed chooses which. Neighbouring blocks resemble each other, so the figures are kinder than on a new recording.",
-  "": "There will be no honest figure of how well the model predicts. Choose this once another recording has told.",
+  last: "This does not test motion of another kind. For that, evaluate on another recording.",
+  episodes: "The seed chooses which. If each data set has 1 episode, whole data sets are held out.",
+  blocks: "The seed chooses which. Neighbouring blocks resemble each other, so figures look better than on a new recording.",
+  "": "Nothing will show how well the model predicts. Choose this only after you have judged it on another recording.",
 };
 
 /** The part of the form. Returns {element, value()}: the holdout of a job request, null for nothing. */
@@ -28,7 +28,7 @@ export function holdoutChoice() {
     share: field("Share, %", share),
     blocks: field("Blocks", blocks),
     seed: field("Seed of the choice", seed),
-    guard: field("Guard, s", guard, "Samples as near as that to the other side are left out of both."),
+    guard: field("Guard, s", guard, "Samples this close to the border are used for neither."),
   };
   const show = () => {
     about.textContent = SAID[kind.value];
@@ -44,8 +44,8 @@ export function holdoutChoice() {
       "fieldset",
       {},
       h("legend", {}, "Hold out"),
-      h("p", { class: "hint" }, "What is held out is not learnt from: the version is judged by it. Never single rows, as neighbours tell nearly the same."),
-      h("div", { class: "grid" }, field("What", kind), fields.share, fields.blocks, fields.seed, fields.guard),
+      h("p", { class: "hint" }, "The held-out part is not learnt from; the version is judged on it."),
+      h("div", { class: "grid" }, field("Which part", kind), fields.share, fields.blocks, fields.seed, fields.guard),
       about,
     ),
     value: () => {
