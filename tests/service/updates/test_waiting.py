@@ -8,7 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from service.learning.learner.process import LearnerProcess
 from service.models.served import Waiting
 from tests.service.data import error, service_of
 from tests.service.updates.lessons import QUERIES, lesson
@@ -40,7 +39,7 @@ def test_what_was_taught_is_in_the_answer(pupil):
 
 def test_a_revision_that_does_not_come_is_refused(pupil, monkeypatch):
     woken = []
-    monkeypatch.setattr(LearnerProcess, "wake", lambda self, model: woken.append(model))
+    monkeypatch.setattr(service_of(pupil.client).loaded, "_wake", woken.append)
     monkeypatch.setitem(vars(service_of(pupil.client).settings), "min_revision_wait_s", 0.05)
     for query in (SINGLE, QUERIES):
         woken.clear()
@@ -70,7 +69,7 @@ def test_a_waiter_misses_nothing_and_leaves_nothing():
     async def wait() -> None:
         with waiting.waiter("arm") as first, waiting.waiter("arm") as second:
             waiting.wake("other")
-            thread = threading.Thread(target=waiting.tell, args=("arm",))
+            thread = threading.Thread(target=waiting.wake, args=("arm",))
             thread.start()
             thread.join()
             await asyncio.gather(first.wait(60.0), second.wait(60.0))  # told before they wait
