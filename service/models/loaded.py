@@ -7,7 +7,7 @@ import itertools
 import logging
 import threading
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 from weakref import WeakValueDictionary
 
@@ -22,14 +22,39 @@ from service.foundation.fields import of_app
 from service.foundation.states import PartState
 from service.models import moves, registry
 from service.models.lineage import learnt_from
+from service.models.moves import SERVING
 from service.models.registry import Serving
-from service.models.served import Alias, Key, LearntStates, Served, Snapshot, Waiting
+from service.models.served import Alias, Key, LearntStates, Served, Waiting
 from service.storage.database import VersionRow
 from service.storage.storage import Storage
 
 logger = logging.getLogger(__name__)
 
 __all__ = ["LoadedModels", "Served"]
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """What is in memory, which version of each model answers, and where all aliases point; replaced as a whole."""
+
+    served: Mapping[Key, Served] = field(default_factory=dict)
+    serving: Mapping[str, Serving] = field(default_factory=dict)
+    aliases: Mapping[Alias, int] = field(default_factory=dict)
+
+    def pointed(self, model: str, alias: str | None) -> int | None:
+        """The version that an alias points to, or that serves where it is None; None where that is not known."""
+        if alias is None or alias == SERVING:
+            serving = self.serving.get(model)
+            return None if serving is None else serving.version
+        return self.aliases.get((model, alias))
+
+    def without(self, gone: set[Key], model: str | None) -> Snapshot:
+        """The same without some versions and, where given, without a model's pointers."""
+        return Snapshot(
+            {key: each for key, each in self.served.items() if key not in gone},
+            {name: each for name, each in self.serving.items() if name != model},
+            {key: each for key, each in self.aliases.items() if key[0] != model},
+        )
 
 
 class LoadedModels:
@@ -107,7 +132,7 @@ class LoadedModels:
         """The number of the version that is meant, and what serves where that is it; raise NotFoundError."""
         if version is not None:
             return version, None
-        if alias is None or alias == moves.SERVING:
+        if alias is None or alias == SERVING:
             serving = registry.serving(self.database, [model]).get(model)
             return (None, None) if serving is None else (serving.version, serving)
         number = self.newest(model, alias)

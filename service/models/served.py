@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
@@ -15,8 +15,6 @@ from anyio import to_thread
 
 from lipcore.model.torque_model import TorqueModel
 from service.foundation.errors import RevisionNotReachedError, problem
-from service.models.moves import SERVING
-from service.models.registry import Serving
 
 if TYPE_CHECKING:
     from service.models.loaded import LoadedModels
@@ -71,30 +69,6 @@ class LearntStates(Protocol):
 
     def consolidated(self, model: str, version: int, base: TorqueModel) -> Learnt | None:
         """All of it, as a model that can be saved: it takes the time to learn what came since the last snapshot."""
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """What is in memory, which version of each model answers, and where all aliases point; replaced as a whole."""
-
-    served: Mapping[Key, Served] = field(default_factory=dict)
-    serving: Mapping[str, Serving] = field(default_factory=dict)
-    aliases: Mapping[Alias, int] = field(default_factory=dict)
-
-    def pointed(self, model: str, alias: str | None) -> int | None:
-        """The version that an alias points to, or that serves where it is None; None where that is not known."""
-        if alias is None or alias == SERVING:
-            serving = self.serving.get(model)
-            return None if serving is None else serving.version
-        return self.aliases.get((model, alias))
-
-    def without(self, gone: set[Key], model: str | None) -> Snapshot:
-        """The same without some versions and, where given, without a model's pointers."""
-        return Snapshot(
-            {key: each for key, each in self.served.items() if key not in gone},
-            {name: each for name, each in self.serving.items() if name != model},
-            {key: each for key, each in self.aliases.items() if key[0] != model},
-        )
 
 
 AGAIN = {"Retry-After": "1"}

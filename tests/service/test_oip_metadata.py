@@ -102,7 +102,7 @@ def test_a_model_is_ready(api, trained, version):
 
 def test_asking_for_readiness_loads_what_was_dropped(api, trained):
     loaded = service_of(api).loaded
-    empty = type(loaded)(loaded.database, loaded.files, loaded.capacity)
+    empty = type(loaded)(loaded.storage, loaded.learnt, loaded.capacity)
     loaded._snapshot = empty._snapshot
     assert loaded.hot(trained.name, 1) is None
     assert api.get(f"/v2/models/{trained.name}/versions/1/ready").status_code == 200

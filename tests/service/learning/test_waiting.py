@@ -10,7 +10,7 @@ import pytest
 
 from service.models.served import Waiting
 from tests.service.data import error, service_of
-from tests.service.learning.lessons import QUERIES, lesson
+from tests.service.updates.lessons import QUERIES, lesson
 
 SINGLE = {name: rows[0] for name, rows in QUERIES.items()}
 
@@ -68,8 +68,8 @@ def test_a_waiter_misses_nothing_and_leaves_nothing():
 
     async def wait() -> None:
         with waiting.waiter("arm") as first, waiting.waiter("arm") as second:
-            waiting.tell("other")
-            thread = threading.Thread(target=waiting.tell, args=("arm",))
+            waiting.wake("other")
+            thread = threading.Thread(target=waiting.wake, args=("arm",))
             thread.start()
             thread.join()
             await asyncio.gather(first.wait(60.0), second.wait(60.0))  # told before they wait
@@ -77,4 +77,4 @@ def test_a_waiter_misses_nothing_and_leaves_nothing():
 
     asyncio.run(wait())
     assert waiting._waiters == {}
-    waiting.tell("arm")
+    waiting.wake("arm")
