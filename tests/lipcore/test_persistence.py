@@ -17,6 +17,7 @@ from safetensors.torch import save as save_tensors
 from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, copy_model, load, persistence, save, train
 from lipcore.robots import load_robot
 from lipcore.simulation import Stream, simulate
+from tests.choosing import slow
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +25,7 @@ def samples() -> Samples:
     return simulate(load_robot("double-pendulum"), Stream(n_samples=60, speed=10, noise=0.01), seed=1)
 
 
-@pytest.fixture(scope="module", params=["lip-chain", "lip", "lip untied"])
+@pytest.fixture(scope="module", params=["lip-chain", slow("lip"), slow("lip untied")])
 def model(request: pytest.FixtureRequest, samples: Samples) -> TorqueModel:
     name, *untied = request.param.split()
     options = FitOptions(hyperparameter_samples=20, max_iterations=10, starts=1, tied=not untied, device="cpu")

@@ -19,10 +19,11 @@ from tests.service import backend
 from tests.service.data import ADDRESS, service_of, stream, train, upload
 from tests.service.server import Server
 from tests.service.streams import Streaming, saved_model
+from tests.service.warm import warm_processes
 
-# parts of the tests run side by side: where these processes give way as they should, they hardly get to run
-for name in ("LIPSERVE_TRAINING_NICENESS", "LIPSERVE_LEARNER_NICENESS"):
-    os.environ.setdefault(name, "0")
+# tests run side by side: where these processes give way as they should, they hardly get to run
+for name, value in (("TRAINING_NICENESS", "0"), ("LEARNER_NICENESS", "0"), ("TRAINING_CPUS", "1000")):
+    os.environ.setdefault(f"LIPSERVE_{name}", value)
 
 LIMITS = {
     "max_upload_bytes": 200_000,
@@ -51,6 +52,12 @@ def services_share(request: pytest.FixtureRequest) -> Iterator[bool]:
         return
     with backend.shared():
         yield True
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _warm_processes() -> Iterator[None]:
+    with warm_processes():
+        yield
 
 
 @pytest.fixture(autouse=True)

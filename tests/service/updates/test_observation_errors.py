@@ -56,6 +56,7 @@ def test_sequences_are_whole_numbers(pupil, body, value):
     assert said["detail"][0]["field"] == "sequence"
 
 
+@pytest.mark.each_once
 @pytest.mark.parametrize("name", ["q", "dq", "ddq", "tau"])
 @pytest.mark.parametrize(
     ("rows", "field"),
