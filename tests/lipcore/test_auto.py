@@ -22,6 +22,7 @@ from lipcore.samples import Samples
 from lipcore.simulation import Stream, simulate
 from lipcore.splits import SplitError
 from lipcore.urdf import RigidBody
+from tests.choosing import slow
 
 ARM = "finger-edu"
 TYPES = ("revolute",) * 3
@@ -168,7 +169,7 @@ def test_a_robot_is_for_those_that_have_a_use_for_it():
         check_estimator("auto", TYPES, options=FitOptions(geometry="fixed"))
 
 
-@pytest.mark.parametrize("at_work", NAMES)
+@pytest.mark.parametrize("at_work", [NAMES[0], *map(slow, NAMES[1:])])
 def test_it_can_be_cancelled(at_work):
     seen = []
 

@@ -19,6 +19,7 @@ from lipcore.robots import load_robot
 from lipcore.samples import Samples
 from lipcore.signals import low_pass
 from lipcore.simulation import Stream, simulate
+from tests.choosing import slow
 
 SMALL = FitOptions(hyperparameter_samples=25, posterior_samples=60, max_iterations=12, starts=1, device="cpu")
 
@@ -103,7 +104,7 @@ def test_noise_stays_above_its_floor_on_noise_free_data() -> None:
     assert (noise < 20 * floor).all()
 
 
-@pytest.mark.parametrize(("robot", "viscous"), [("ur5", 0.1), ("double-pendulum", 0.0)])
+@pytest.mark.parametrize(("robot", "viscous"), [("double-pendulum", 0.0), slow("ur5", 0.1)])
 def test_noise_is_recovered(robot: str, viscous: float) -> None:
     arm = load_robot(robot)
     samples = simulate(arm, Stream(n_samples=200, speed=10, noise=0.05, viscous=viscous), seed=1)

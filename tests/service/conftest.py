@@ -95,14 +95,14 @@ def strict(strict_service: TestClient) -> Iterator[TestClient]:
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     """A service in a process of its own."""
     limits = {f"LIPSERVE_{name.upper()}": str(LIMITS[name]) for name in ("max_upload_bytes", "max_request_bytes")}
-    with Server(tmp_path_factory.mktemp("server"), **limits) as started:
+    with Server(tmp_path_factory.mktemp("server"), warm=True, **limits) as started:
         yield started
 
 
 @pytest.fixture(scope="session")
 def streaming(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Streaming]:
     """A service in a process of its own that streams torques of a double pendulum."""
-    with Server(tmp_path_factory.mktemp("streaming")) as started:
+    with Server(tmp_path_factory.mktemp("streaming"), warm=True) as started:
         dataset = upload(started.client, stream())["id"]
         train(started.client, "pendulum", dataset)
         yield Streaming(started, dataset, saved_model(started, "pendulum", 1))

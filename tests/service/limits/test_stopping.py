@@ -21,8 +21,8 @@ GET = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
 HELD = GET.replace(b"/ ", b"/held ", 1)
 HOLD = """
 import asyncio, sys, uvicorn
-from service.limits.stopping import Stopping
-from service.sockets import serve
+from service.web.limits.stopping import Stopping
+from service.web.server.sockets import serve
 
 async def app(scope, receive, send):
     print("begun", flush=True)
