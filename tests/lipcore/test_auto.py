@@ -181,6 +181,7 @@ def test_it_can_be_cancelled(at_work):
     assert seen[-1].estimator == at_work
 
 
+@pytest.mark.slow
 def test_the_search_is_taken_up_again_where_the_chain_leads(monkeypatch):
     searches = []
     learn = contest.learn
@@ -195,6 +196,7 @@ def test_the_search_is_taken_up_again_where_the_chain_leads(monkeypatch):
     assert searches[:2] == [0, 1]
 
 
+@pytest.mark.slow
 def test_both_together_stand_on_all_samples_around_the_arm_that_was_learnt(monkeypatch, tmp_path):
     monkeypatch.setattr(contest.Contest, "verdict", lambda self: ("rigid-body+lip-chain", "it was told to"))
     model = train(recorded(), TYPES, options=replace(OPTIONS, posterior_samples=300))

@@ -113,6 +113,7 @@ def test_noise_is_recovered(robot: str, viscous: float) -> None:
     assert np.allclose(noise, 0.05, rtol=0.3)
 
 
+@pytest.mark.slow
 def test_low_passed_torque_is_not_taken_for_free_of_noise() -> None:
     """What a filter leaves is smooth, but no less wrong: no white noise is left to read off it."""
     arm = load_robot("ur5")
