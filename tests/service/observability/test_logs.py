@@ -89,7 +89,7 @@ def test_readable_texts_stay_as_they_are():
 
 CONFIGURED = """
 import json, logging, warnings
-from service.observability import logs
+from service.web.observability import logs
 logs.configure(logs.LogOptions("debug", "json"))
 logs.configure(logs.LogOptions("debug", "json"))
 logging.getLogger("service.a").debug("ours")
