@@ -72,6 +72,7 @@ def rows(folder):
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_every_file_is_written_and_every_cell_computed_once(finished):
     assert {path.name for path in finished.iterdir()} == FILES
     for name in FILES:
@@ -85,6 +86,7 @@ def test_every_file_is_written_and_every_cell_computed_once(finished):
     assert len(rows(finished)) == len(found)
 
 
+@pytest.mark.slow
 def test_results_are_those_of_training_and_judging_by_hand(finished):
     """Error against Pinocchio's torque, coverage and width against the measured torque, all computed here."""
     robot = load_robot("double-pendulum")
@@ -120,6 +122,7 @@ def markdown_table(text, heading):
     return {name: rest for name, *rest in found}
 
 
+@pytest.mark.slow
 def test_tables_say_what_the_csv_holds(finished):
     text = (finished / "results.md").read_text()
     errors = markdown_table(text, "the best of each joint in bold:")
@@ -151,6 +154,7 @@ def test_tables_say_what_the_csv_holds(finished):
         assert said in text
 
 
+@pytest.mark.slow
 def test_summary_has_the_quartiles(finished):
     with (finished / "summary.csv").open() as file:
         for summary in csv.DictReader(file):
@@ -180,6 +184,7 @@ def test_a_killed_run_goes_on_with_what_is_missing(finished, tmp_path, capsys):
         assert before == after
 
 
+@pytest.mark.slow
 def test_a_finished_run_is_only_reported_again(finished, tmp_path, capsys):
     out = tmp_path / "again"
     shutil.copytree(finished, out)
@@ -192,6 +197,7 @@ def test_a_finished_run_is_only_reported_again(finished, tmp_path, capsys):
     assert (out / "results.csv").read_bytes() == (finished / "results.csv").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -211,6 +217,7 @@ def test_results_of_other_settings_are_not_mixed(finished, capsys, options, said
     assert (finished / "cells.jsonl").read_bytes() == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", [b"not JSON\n", b"{}\n", b"[]\n", b'{"settings": "x", "result": {}}\n'])
 def test_a_damaged_file_is_named_with_its_line(finished, tmp_path, capsys, damage):
     content = (finished / "cells.jsonl").read_bytes() + damage
@@ -233,6 +240,7 @@ def test_other_code_is_another_setting(tmp_path):
         Results(tmp_path, Experiment(code="after"))
 
 
+@pytest.mark.slow
 def test_a_failed_training_is_reported_and_tried_again(tmp_path):
     experiment = Experiment(robot="double-pendulum", samples=40, test_sets=1)
     good = Cell(estimator="se", speed=1.0, samples=40, seed=1)

@@ -53,7 +53,7 @@ def browser() -> Iterator[Browser]:
 @pytest.fixture(scope="package")
 def dashboard(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Dashboard]:
     """The service that tests share."""
-    with Server(tmp_path_factory.mktemp("dashboard")) as server:
+    with Server(tmp_path_factory.mktemp("dashboard"), warm=True) as server:
         dataset = upload(server.client, stream(samples=120), name="pendulum.npz")
         job = train(server.client, "pendulum", dataset["id"])
         yield Dashboard(server, dataset, "pendulum", job)

@@ -15,6 +15,7 @@ from tests.browser.accessibility import audit
 from tests.browser.conftest import Dashboard, Visit
 from tests.browser.looking import expect
 from tests.browser.visitor import PHONE, Visitor
+from tests.choosing import slow
 from tests.lipcore.arms import parameters, random_bodies, random_geometry
 from tests.service.models.arms import NO_BODIES, publish_arm_at
 
@@ -47,7 +48,7 @@ def model_of(geometry: Geometry) -> pin.Model:
     return model
 
 
-@pytest.mark.parametrize("kinds", ["RPRRPR", "RRRRRRR"])
+@pytest.mark.parametrize("kinds", ["RPRRPR", slow("RRRRRRR")])
 def test_frames_are_where_pinocchio_has_them(visitor: Visitor, kinds: str) -> None:
     n, rng = len(kinds), np.random.default_rng(1)
     geometry, order, q = random_geometry(kinds, 4), rng.permutation(n), rng.uniform(-2, 2, n)
@@ -98,6 +99,7 @@ def test_an_arm_is_drawn_and_moved(visitor: Visitor, arm: str, windows: Visit, d
     phone.shot("arm-phone", height=1200)
 
 
+@pytest.mark.slow
 def test_a_version_without_a_geometry_says_how_to_get_one(visitor: Visitor, dashboard: Dashboard) -> None:
     publish_arm_at(dashboard.server.home, "not-drawn", **NO_BODIES)
     page = visitor.open("#/models/not-drawn?tab=arm")
@@ -128,6 +130,7 @@ def streamed(dashboard: Dashboard, arm: str) -> Iterator[None]:
     thread.join(30)
 
 
+@pytest.mark.slow
 def test_the_arm_moves_as_its_stream_does(visitor: Visitor, arm: str, streamed: None) -> None:
     page = visitor.open(f"#/live/{arm}")
     figure = page.get_by_role("img", name=re.compile("The arm in 3-D"))

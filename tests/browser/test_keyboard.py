@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import pytest
+
 from tests.browser.accessibility import focused, tab_to
 from tests.browser.looking import expect
 from tests.browser.visitor import Visitor
@@ -13,6 +15,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import FileChooser
 
 
+@pytest.mark.slow
 def test_a_model_is_made_without_a_mouse(visitor: Visitor) -> None:
     samples = stream(seed=3)
     file = {"name": "keys.npz", "mimeType": "application/octet-stream", "buffer": npz(**arrays(samples))}

@@ -89,6 +89,7 @@ def test_who_chooses_no_model_is_asked_which(visitor: Visitor, dashboard: Dashbo
     expect(page.get_by_text("Not there.")).to_be_visible()
 
 
+@pytest.mark.slow
 def test_a_lost_connection_is_said_and_made_again(visitor: Visitor, dashboard: Dashboard) -> None:
     page = visitor.open(f"#/live/{dashboard.model}")
     expect(page.get_by_text("connected, no rows yet")).to_be_visible()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from tests.browser.accessibility import audit
 from tests.browser.conftest import Dashboard, Visit
 from tests.browser.looking import expect
@@ -29,6 +31,7 @@ def test_every_page_can_be_read_on_a_phone_in_both_themes(windows: Visit, dashbo
     assert problems == []
 
 
+@pytest.mark.slow
 def test_the_theme_that_was_chosen_stays(windows: Visit, dashboard: Dashboard) -> None:
     visitor = windows(dashboard.server.url)
     page = visitor.open("#/")

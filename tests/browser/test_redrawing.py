@@ -9,6 +9,7 @@ import pytest
 from tests.browser.conftest import Dashboard
 from tests.browser.looking import expect
 from tests.browser.visitor import Visitor
+from tests.choosing import slow
 
 if TYPE_CHECKING:
     from playwright.sync_api import ElementHandle, Locator, Route
@@ -69,7 +70,7 @@ def test_what_is_refreshed_is_changed_in_place(visitor: Visitor) -> None:
     assert all(found.values()), found
 
 
-@pytest.mark.parametrize("route", ["#/", "#/jobs"])
+@pytest.mark.parametrize("route", [slow("#/"), "#/jobs"])
 def test_a_job_that_comes_takes_no_link_away(visitor: Visitor, dashboard: Dashboard, route: str) -> None:
     page = visitor.open(route)
     place = page.get_by_role("main")
@@ -95,6 +96,7 @@ def test_a_job_that_comes_takes_no_link_away(visitor: Visitor, dashboard: Dashbo
     page.unroute_all(behavior="wait")
 
 
+@pytest.mark.slow
 def test_news_of_learning_take_no_link_away(visitor: Visitor, dashboard: Dashboard) -> None:
     page = visitor.open(f"#/models/{dashboard.model}?tab=learning")
     live = node(page.get_by_role("link", name="Follow it live"))
@@ -110,6 +112,7 @@ def test_news_of_learning_take_no_link_away(visitor: Visitor, dashboard: Dashboa
     page.unroute_all(behavior="wait")
 
 
+@pytest.mark.slow
 def test_controls_of_a_model_stay_while_another_tab_is_chosen(visitor: Visitor, dashboard: Dashboard) -> None:
     page = visitor.open(f"#/models/{dashboard.model}")
     controls = [

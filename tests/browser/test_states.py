@@ -38,7 +38,7 @@ def locked(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     home = tmp_path_factory.mktemp("locked")
     with closing(Database(home)) as database:
         _, key = keys.create(database, "browser", ["admin"], None)
-    with Server(home, LIPSERVE_KEYS="on") as server:
+    with Server(home, warm=True, LIPSERVE_KEYS="on") as server:
         yield Locked(server.url, key)
 
 

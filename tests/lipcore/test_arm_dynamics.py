@@ -68,6 +68,7 @@ def test_regressor_of_masses_is_that_of_pinocchio(kinds: str) -> None:
     agree(out.transpose(0, 2, 1) @ bodies.reshape(-1), inverse_dynamics(robot, *asked.transpose(1, 0, 2)))
 
 
+@pytest.mark.each_once
 @pytest.mark.parametrize("gravity", [True, False])
 @pytest.mark.parametrize("kinds", KINDS)
 def test_derivatives_by_geometry_are_those_of_the_lagrangian(kinds: str, gravity: bool) -> None:

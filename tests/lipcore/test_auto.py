@@ -22,6 +22,7 @@ from lipcore.robots.urdf import RigidBody
 from lipcore.training import auto
 from lipcore.training.held_out import LEAST_ROWS, hold_out
 from lipcore.training.train import train
+from tests.choosing import slow
 
 ARM = "finger-edu"
 TYPES = ("revolute",) * 3
@@ -168,7 +169,7 @@ def test_a_robot_is_for_those_that_have_a_use_for_it():
         check_estimator("auto", TYPES, options=FitOptions(geometry="fixed"))
 
 
-@pytest.mark.parametrize("at_work", NAMES)
+@pytest.mark.parametrize("at_work", [NAMES[0], *map(slow, NAMES[1:])])
 def test_it_can_be_cancelled(at_work):
     seen = []
 
@@ -180,6 +181,7 @@ def test_it_can_be_cancelled(at_work):
     assert seen[-1].estimator == at_work
 
 
+@pytest.mark.slow
 def test_the_search_is_taken_up_again_where_the_chain_leads(monkeypatch):
     searches = []
     learn = auto.learn
@@ -194,6 +196,7 @@ def test_the_search_is_taken_up_again_where_the_chain_leads(monkeypatch):
     assert searches[:2] == [0, 1]
 
 
+@pytest.mark.slow
 def test_both_together_stand_on_all_samples_around_the_arm_that_was_learnt(monkeypatch, tmp_path):
     monkeypatch.setattr(auto.Contest, "verdict", lambda self: ("rigid-body+lip-chain", "it was told to"))
     model = train(recorded(), TYPES, options=replace(OPTIONS, posterior_samples=300))

@@ -14,6 +14,7 @@ from lipcore.kernels.base import State
 from lipcore.kernels.chain import ChainKernel
 from lipcore.robots.library import Robot, pinocchio
 from lipcore.robots.simulation import Stream, simulate
+from tests.choosing import slow
 from tests.lipcore.agreement import RELATIVE, opposite, worst_block_error, worst_energy_error
 from tests.lipcore.oracles import chain_base_kernel
 from tests.lipcore.problems import Problem, chain_shapes, problems, random_problem
@@ -49,7 +50,7 @@ def test_energies_equal_automatic_differentiation(joint_types: tuple[str, ...]) 
     assert worst_energy_error(random_problem(joint_types, 2, seed=len(joint_types), kernel="chain")) < RELATIVE
 
 
-@pytest.mark.parametrize("offset", [0.0, 1e-14, 1e-11, 1e-8, 1e-5, 1e-2])
+@pytest.mark.parametrize("offset", [0.0, 1e-8, *map(slow, (1e-14, 1e-11, 1e-5, 1e-2))])
 @pytest.mark.parametrize("zero_joints", [(0,), (2,), (1, 2), (0, 1, 2, 3)], ids=str)
 @pytest.mark.parametrize(
     "joint_types", [("revolute",) * 4, ("prismatic", "revolute", "prismatic", "revolute")], ids=["rrrr", "prpr"]
@@ -144,7 +145,7 @@ def random_arm(kinds: str, seed: int) -> Robot:
     return Robot("random", model, names, types, np.full(n, -1.5), np.full(n, 1.5), np.full(n, np.inf))
 
 
-@pytest.mark.parametrize("kinds", ["rr", "rrr", "prr", "rpr"])
+@pytest.mark.parametrize("kinds", ["rr", "rpr", *map(slow, ("rrr", "prr"))])
 def test_dynamics_of_a_true_chain_lie_in_the_space_of_the_kernel(kinds: str) -> None:
     """Enough noise-free torques of an arm pin down all that it ever does, whatever the hyperparameters."""
     pytest.importorskip("pinocchio")

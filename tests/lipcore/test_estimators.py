@@ -81,6 +81,7 @@ AWKWARD: dict[str, Callable[[], Samples]] = {
 }
 
 
+@pytest.mark.each_once
 @pytest.mark.parametrize("data", AWKWARD)
 @every_estimator
 def test_awkward_data_end_in_a_model(name: str, data: str) -> None:

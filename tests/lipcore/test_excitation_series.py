@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lipcore.excitation import Limits, Series
@@ -34,7 +34,6 @@ def shapes(draw: st.DrawFn) -> tuple[Shape, np.ndarray]:
     return shape, x
 
 
-@settings(max_examples=60, deadline=None)
 @given(shapes())
 def test_no_limit_is_overshot_between_instants(problem):
     shape, x = problem
@@ -55,7 +54,6 @@ def test_no_limit_is_overshot_between_instants(problem):
     assert (used <= 1.01 * shares + ROUNDING).all()
 
 
-@settings(max_examples=30, deadline=None)
 @given(shapes())
 def test_both_ends_are_at_rest_at_the_same_place(problem):
     shape, x = problem

@@ -20,6 +20,7 @@ from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate
 from lipcore.training.train import train
+from tests.choosing import slow
 
 SMALL = FitOptions(hyperparameter_samples=25, posterior_samples=60, max_iterations=12, starts=1, device="cpu")
 
@@ -104,7 +105,7 @@ def test_noise_stays_above_its_floor_on_noise_free_data() -> None:
     assert (noise < 20 * floor).all()
 
 
-@pytest.mark.parametrize(("robot", "viscous"), [("ur5", 0.1), ("double-pendulum", 0.0)])
+@pytest.mark.parametrize(("robot", "viscous"), [("double-pendulum", 0.0), slow("ur5", 0.1)])
 def test_noise_is_recovered(robot: str, viscous: float) -> None:
     arm = load_robot(robot)
     samples = simulate(arm, Stream(n_samples=200, speed=10, noise=0.05, viscous=viscous), seed=1)
@@ -113,6 +114,7 @@ def test_noise_is_recovered(robot: str, viscous: float) -> None:
     assert np.allclose(noise, 0.05, rtol=0.3)
 
 
+@pytest.mark.slow
 def test_low_passed_torque_is_not_taken_for_free_of_noise() -> None:
     """What a filter leaves is smooth, but no less wrong: no white noise is left to read off it."""
     arm = load_robot("ur5")

@@ -56,6 +56,7 @@ def refined(case: Draw, begin: np.ndarray, centre: np.ndarray | None = None, flo
     return np.exp(out["noise.log_std"].numpy())
 
 
+@pytest.mark.each_once
 @pytest.mark.parametrize("factor", [1 / 3, 1 / 2, 1.0, 2.0, 3.0])
 @pytest.mark.parametrize("seed", [0, 2, 3])
 def test_known_noise_is_recovered_from_a_wrong_start(seed: int, factor: float) -> None:
@@ -72,6 +73,7 @@ def penalised(case: Draw, log_std: np.ndarray, centre: np.ndarray) -> float:
     return evidence + 0.5 * float(np.sum((log_std - np.log(centre)) ** 2)) / noise.PRIOR_STD**2
 
 
+@pytest.mark.each_once
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 @pytest.mark.parametrize("seed", [5, 6])
 def test_first_step_climbs_to_the_maximum_that_brute_force_finds(

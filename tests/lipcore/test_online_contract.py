@@ -11,13 +11,14 @@ from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import ROBOT_ESTIMATORS
+from tests.choosing import few
 from tests.lipcore.online_checks import CHECKS, Check, as_rows
 
 ROBOT = "double-pendulum"
 OPTIONS = FitOptions(hyperparameter_samples=40, max_iterations=25, starts=1, device="cpu", compact_tolerance=0.1)
 
 
-@pytest.fixture(scope="module", params=ESTIMATORS)
+@pytest.fixture(scope="module", params=few(ESTIMATORS, {"lip-chain", "se", "rigid-body+lip-chain"}.__contains__))
 def model(request: pytest.FixtureRequest) -> TorqueModel:
     samples = simulate(load_robot(ROBOT), Stream(n_samples=80, speed=10, noise=0.02, viscous=0.1), seed=1)
     robot = None

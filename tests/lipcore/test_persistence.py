@@ -18,6 +18,7 @@ from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, copy_mod
 from lipcore.files import persistence
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate
+from tests.choosing import slow
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +26,7 @@ def samples() -> Samples:
     return simulate(load_robot("double-pendulum"), Stream(n_samples=60, speed=10, noise=0.01), seed=1)
 
 
-@pytest.fixture(scope="module", params=["lip-chain", "lip", "lip untied"])
+@pytest.fixture(scope="module", params=["lip-chain", slow("lip"), slow("lip untied")])
 def model(request: pytest.FixtureRequest, samples: Samples) -> TorqueModel:
     name, *untied = request.param.split()
     options = FitOptions(hyperparameter_samples=20, max_iterations=10, starts=1, tied=not untied, device="cpu")

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import butter, freqz_sos
 
@@ -30,7 +30,6 @@ def row_by_row(stream, rows):
     return [answer for answer in answers if answer is not None]
 
 
-@settings(max_examples=30, deadline=None)
 @given(
     names=st.sampled_from(GIVEN),
     cuts=st.lists(st.integers(0, 120), max_size=5),

@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import butter, sosfiltfilt
 
@@ -274,7 +274,6 @@ recipes = st.builds(
 )
 
 
-@settings(max_examples=60, deadline=None)
 @given(recipe=recipes, uneven=st.booleans(), names=st.sampled_from([ALL, ("q", "tau"), ("q", "dq", "tau")]))
 def test_every_recipe_is_linear_finite_consistent_and_repeatable_from_its_json(recipe, uneven, names):
     rng = np.random.default_rng(7)

@@ -207,7 +207,6 @@ def test_what_is_recognised() -> None:
         assert recognise(nothing) == ()
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.lists(st.text(max_size=30), max_size=12))
 def test_any_names_are_taken(joints: list[str]) -> None:
     recognise(joints)

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lipcore.data.motion import Motion
@@ -55,7 +55,6 @@ def dense(basis: Basis, motion: Motion, residual: torch.Tensor) -> tuple[np.ndar
     return np.concatenate(rows), np.concatenate(variances), residual.numpy().reshape(-1)
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10_000), st.permutations(range(12)), st.lists(st.integers(1, 11), unique=True, max_size=4))
 def test_all_at_once_in_parts_in_any_order_and_one_by_one_are_the_same(
     seed: int, order: list[int], cuts: list[int]
@@ -73,7 +72,6 @@ def test_all_at_once_in_parts_in_any_order_and_one_by_one_are_the_same(
     assert same(one_by_one, whole)
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10_000), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
 def test_what_is_added_can_be_taken_back_and_ages_factor(seed: int, first: float, second: float) -> None:
     basis, motion, residual = problem(seed)

@@ -19,10 +19,11 @@ from tests.service import backend
 from tests.service.data import ADDRESS, service_of, stream, train, upload
 from tests.service.server import Server
 from tests.service.streams import Streaming, saved_model
+from tests.service.warm import warm_processes
 
-# parts of the tests run side by side: where these processes give way as they should, they hardly get to run
-for name in ("LIPSERVE_TRAINING_NICENESS", "LIPSERVE_LEARNER_NICENESS"):
-    os.environ.setdefault(name, "0")
+# tests run side by side: where these processes give way as they should, they hardly get to run
+for name, value in (("TRAINING_NICENESS", "0"), ("LEARNER_NICENESS", "0"), ("TRAINING_CPUS", "1000")):
+    os.environ.setdefault(f"LIPSERVE_{name}", value)
 
 LIMITS = {
     "max_upload_bytes": 200_000,
@@ -51,6 +52,12 @@ def services_share(request: pytest.FixtureRequest) -> Iterator[bool]:
         return
     with backend.shared():
         yield True
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _warm_processes() -> Iterator[None]:
+    with warm_processes():
+        yield
 
 
 @pytest.fixture(autouse=True)
@@ -88,14 +95,14 @@ def strict(strict_service: TestClient) -> Iterator[TestClient]:
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     """A service in a process of its own."""
     limits = {f"LIPSERVE_{name.upper()}": str(LIMITS[name]) for name in ("max_upload_bytes", "max_request_bytes")}
-    with Server(tmp_path_factory.mktemp("server"), **limits) as started:
+    with Server(tmp_path_factory.mktemp("server"), warm=True, **limits) as started:
         yield started
 
 
 @pytest.fixture(scope="session")
 def streaming(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Streaming]:
     """A service in a process of its own that streams torques of a double pendulum."""
-    with Server(tmp_path_factory.mktemp("streaming")) as started:
+    with Server(tmp_path_factory.mktemp("streaming"), warm=True) as started:
         dataset = upload(started.client, stream())["id"]
         train(started.client, "pendulum", dataset)
         yield Streaming(started, dataset, saved_model(started, "pendulum", 1))

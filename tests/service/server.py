@@ -15,31 +15,36 @@ import httpx
 
 from tests.service import backend
 from tests.service.data import DEADLINE, eventually
+from tests.service.warm import Served
 
 
 class Server:
-    """`lipserve serve` on a home; settings are environment variables."""
+    """`lipserve serve` on a home; settings are environment variables.
+
+    warm: forked from a process that has imported it already, for a service that is shared and nothing else.
+    """
 
     patience = DEADLINE
     """Seconds that it may take to start."""
 
-    def __init__(self, home: Path, **settings: str) -> None:
+    def __init__(self, home: Path, warm: bool = False, **settings: str) -> None:
         self.home, self.log = home, home.with_name(home.name + ".log")
         self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}"
         self.client = httpx.Client(base_url=self.url, timeout=DEADLINE)
-        with self.log.open("ab") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "service", "serve", "--port", str(self.port)],
-                env={**os.environ, "LIPSERVE_HOME": str(home), **backend.environment(home), **settings},
-                stdout=log,
-                stderr=log,
-            )
+        arguments = ["serve", "--port", str(self.port)]
+        environment = {**os.environ, "LIPSERVE_HOME": str(home), **backend.environment(home), **settings}
+        self.process = Served(arguments, environment, self.log) if warm else self._spawned(arguments, environment)
         try:
             eventually(self._ready, self.patience)
         except BaseException:
             self.kill()
             raise
+
+    def _spawned(self, arguments: list[str], environment: dict[str, str]) -> subprocess.Popen[bytes]:
+        with self.log.open("ab") as log:
+            command = [sys.executable, "-m", "service", *arguments]
+            return subprocess.Popen(command, env=environment, stdout=log, stderr=log)
 
     def _ready(self) -> bool:
         assert self.process.poll() is None, self.log.read_text()

@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.testing import assert_array_equal
@@ -14,7 +14,6 @@ from numpy.testing import assert_array_equal
 from tests.service.oip import HEADER, announced, ask, binary_tensors, listed, packed, path_of, refused, send, tensors
 
 NAMES = ("tau", "tau_std", "noise_std", "covariance", "tau_friction")
-FEW = settings(max_examples=40, deadline=None, derandomize=True)
 
 
 @st.composite
@@ -42,7 +41,6 @@ def messages(draw):
     )
 
 
-@FEW
 @given(messages())
 def test_binary_and_json_agree_to_the_last_bit(api, trained, both):
     plain, mixed, payload = both
@@ -65,7 +63,6 @@ def whole():
     return json.dumps({"inputs": inputs}).encode(), packed([0.5, -0.25]) * 3
 
 
-@FEW
 @given(data=st.data())
 def test_a_message_cut_off_anywhere_is_refused(api, trained, whole, data):
     text, payload = whole
@@ -73,7 +70,6 @@ def test_a_message_cut_off_anywhere_is_refused(api, trained, whole, data):
     refused(api.post(path_of(trained.name), content=(text + payload)[:length], headers={HEADER: str(len(text))}))
 
 
-@settings(FEW, max_examples=150)
 @given(data=st.data())
 def test_a_message_with_wrong_bytes_is_answered_or_refused(api, trained, whole, data):
     text, payload = whole
@@ -96,7 +92,6 @@ JSON = st.recursive(
 )
 
 
-@settings(FEW, max_examples=150)
 @given(data=st.data())
 def test_json_of_any_kind_is_answered_or_refused(api, trained, data):
     """Python's JSON at that, which has NaN."""

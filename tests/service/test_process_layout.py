@@ -116,6 +116,7 @@ def test_cpus_of_training(available, most, expected):
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="CPUs cannot be chosen here")
 def test_a_place_follows_the_settings(monkeypatch, tmp_path):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 2})
+    monkeypatch.delenv("LIPSERVE_TRAINING_CPUS")  # which tests set
     place = training_place(Settings(home=tmp_path, training_threads=3, training_niceness=2, training_policy="idle"))
     assert place == Place(threads=3, niceness=2, policy="idle", cpus=frozenset({1, 2}))
 

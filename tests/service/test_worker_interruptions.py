@@ -17,7 +17,7 @@ LONG = {**ENDLESS, "hyperparameter_samples": 60, "max_iterations": 25}
 
 def workers():
     """Process ids of the training processes of this process."""
-    return [child.pid for child in multiprocessing.active_children() if "spawn_main" in command(child.pid)]
+    return [child.pid for child in multiprocessing.active_children() if command(child.pid)]
 
 
 def test_a_job_whose_process_is_killed_is_tried_again(api):

@@ -41,6 +41,7 @@ def test_names_of_this_machine(api, host):
     assert api.get("/v1/models", headers={"Host": host}).status_code == 200
 
 
+@pytest.mark.each_once
 @pytest.mark.parametrize("host", ELSEWHERE)
 @pytest.mark.parametrize("path", ["/v1/models", "/docs", "/health/live"])
 def test_names_that_lead_here_from_elsewhere_are_refused(api, host, path):
@@ -54,6 +55,7 @@ def test_a_host_is_repeated_readably(api):
     assert error(answer, 403, "forbidden")["detail"][0]["value"].isprintable()
 
 
+@pytest.mark.each_once
 @pytest.mark.parametrize(
     "origin",
     [

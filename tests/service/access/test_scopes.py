@@ -90,6 +90,7 @@ def test_health_and_documentation_are_open(guarded):
         assert guarded.api.get(path).status_code == 200, path
 
 
+@pytest.mark.each_once
 @pytest.mark.parametrize(
     "path",
     [

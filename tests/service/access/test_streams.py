@@ -27,7 +27,7 @@ MOTION = np.zeros((3, 7))
 def locked(tmp_path_factory):
     """A server that asks for keys."""
     settings = {"LIPSERVE_KEYS": "on", "LIPSERVE_KEYS_REFRESH_S": "0.05", "LIPSERVE_LOG_LEVEL": "debug"}
-    with Server(tmp_path_factory.mktemp("locked"), **settings) as started:
+    with Server(tmp_path_factory.mktemp("locked"), warm=True, **settings) as started:
         yield started
 
 

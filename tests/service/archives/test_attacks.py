@@ -185,6 +185,7 @@ JSON_ATTACKS = {
 }
 
 
+@pytest.mark.each_once
 @pytest.mark.parametrize("attack", JSON_ATTACKS.values(), ids=JSON_ATTACKS)
 @pytest.mark.parametrize("name", ["checksums.json", "export.json", MANIFEST])
 def test_json_that_runs_away(api, files, name, attack):

@@ -5,9 +5,14 @@ from __future__ import annotations
 import pytest
 
 from tests.service.bad_requests import addresses, texts, uploads, values
+from tests.service.bad_requests.bad import PREDICT
 from tests.service.data import error
 
 BAD = [*texts.BAD, *values.BAD, *addresses.BAD, *uploads.BAD]
+KINDS = {(bad.method, bad.path.partition("?")[0], bad.status, bad.code, bad.named): bad for bad in reversed(BAD)}
+"""The first request of each kind: what it asks for, and what is wrong with it."""
+QUICK = {id(bad) for bad in (*KINDS.values(), *(bad for bad in texts.BAD if bad.path == PREDICT))}
+"""These, and every text that is no JSON of one route."""
 LISTS = ("/v1/datasets", "/v1/robots", "/v1/jobs", "/v1/models", "/v1/models/panda-sim/observations")
 
 
@@ -19,7 +24,10 @@ def nothing_stays(api):
     assert [api.get(path).json() for path in LISTS] == before
 
 
-@pytest.mark.parametrize("bad", BAD, ids=[bad.label for bad in BAD])
+@pytest.mark.parametrize(
+    "bad",
+    [pytest.param(bad, id=bad.label, marks=[] if id(bad) in QUICK else [pytest.mark.slow]) for bad in BAD],
+)
 def test_what_is_wrong_is_refused_by_name(api, bad):
     answer = api.request(bad.method, bad.path, content=bad.content, headers=bad.headers)
     assert answer.headers["content-type"] == "application/json"

@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lipcore.fitting.hyperparameters import FitCancelledError
@@ -65,7 +65,6 @@ class Shuffled(Executor):
         return False
 
 
-@settings(max_examples=25, deadline=None)
 @given(count=st.integers(1, 90), seed=st.integers(0, 10**6))
 def test_the_sum_does_not_depend_on_the_order(count, seed):
     executor = Shuffled(seed)

@@ -14,7 +14,7 @@ from fastapi.testclient import TestClient
 
 from service.app import create_app
 from service.foundation.settings import Settings
-from service.web.observability import readiness
+from service.training import metrics
 from tests.service.data import ADDRESS, service_of, stream, upload
 from tests.service.fuzz.document import fitting, narrowed
 from tests.service.test_robots import urdf
@@ -43,7 +43,7 @@ def fuzzed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fuzzed]:
         TestClient(create_app(settings), ADDRESS, raise_server_exceptions=False) as client,
     ):
         patch.setattr(service_of(client).jobs, "submit", lambda job: None)
-        patch.setattr(readiness, "START_S", inf)  # it is ready although none of these jobs ever starts
+        patch.setattr(metrics, "START_S", inf)  # it is ready although none of these jobs ever starts
         known = {
             "model": ["panda-sim"],
             "version": [1],

@@ -10,7 +10,7 @@ from schemathesis.checks import CHECKS, load_all_checks
 
 from tests.service.data import ADDRESS
 
-FEW, MANY = 3, 60
+FEW, MANY = 1, 60
 """Requests of each operation in each way."""
 NAMES = (
     "not_a_server_error",

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
@@ -44,18 +42,7 @@ def test_nothing_may_be_left_out(pupil, body, name):
     assert refused(pupil, sent)["detail"] == [{"field": name, "value": "missing", "expected": "a value"}]
 
 
-@pytest.mark.parametrize("value", ["", "-a", ".a", "a b", "a/b", "a" * 65, "ü", "a\n", 5, None, ["a"]])
-def test_stream_ids_are_names(pupil, body, value):
-    said = refused(pupil, {**batch(0, body), "stream_id": value})
-    assert said["detail"][0]["field"] == "stream_id"
-
-
-@pytest.mark.parametrize("value", [-1, 2**53, 0.5, 1.0, "1", True, None])
-def test_sequences_are_whole_numbers(pupil, body, value):
-    said = refused(pupil, {**batch(0, body), "sequence": value})
-    assert said["detail"][0]["field"] == "sequence"
-
-
+@pytest.mark.each_once
 @pytest.mark.parametrize("name", ["q", "dq", "ddq", "tau"])
 @pytest.mark.parametrize(
     ("rows", "field"),
@@ -126,19 +113,6 @@ def test_accelerations_or_times_are_needed(pupil, body):
 def test_unknown_fields_are_named(pupil, body):
     said = refused(pupil, batch(0, body, torque=[1.0]))
     assert (said["detail"][0]["field"], said["detail"][0]["expected"]) == ("torque", "no field of that name")
-
-
-@pytest.mark.parametrize("sent", [b"", b"{", b"[]", b"null", b'{"q": 01}', b"q=0"])
-def test_bodies_that_are_no_batch(pupil, sent):
-    answer = pupil.client.post(pupil.url("observations"), content=sent, headers={"content-type": "application/json"})
-    assert error(answer, 422, "invalid_request")["detail"][0]["field"] == "body"
-
-
-def test_json_has_to_be_announced(pupil, body):
-    answer = pupil.client.post(
-        pupil.url("observations"), content=json.dumps(batch(0, body)), headers={"content-type": "text/plain"}
-    )
-    assert "application/json" in error(answer, 415, "unsupported_media_type")["message"]
 
 
 def test_too_many_rows(pupil, school):

@@ -46,7 +46,7 @@ def measured() -> Measured:
 @pytest.fixture(scope="module")
 def learning(tmp_path_factory):
     """A server that logs frames soon."""
-    with Server(tmp_path_factory.mktemp("learning"), LIPSERVE_STREAM_FLUSH_S="0.05") as server:
+    with Server(tmp_path_factory.mktemp("learning"), warm=True, LIPSERVE_STREAM_FLUSH_S="0.05") as server:
         train(server.client, "pendulum", upload(server.client, stream())["id"])
         yield server
 

@@ -10,7 +10,7 @@ import pytest
 
 from service.models.served import Waiting
 from tests.service.data import error, service_of
-from tests.service.updates.lessons import QUERIES, lesson
+from tests.service.learning.lessons import QUERIES, lesson
 
 SINGLE = {name: rows[0] for name, rows in QUERIES.items()}
 

@@ -92,7 +92,7 @@ def test_cut_off_anywhere_is_an_answer(bags, tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["rosbag1", "bz2", "db3", "zip", "mcap", "plain"])
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_flipped_bytes_are_an_answer(bags, tmp_path, name, data):
     path, kind = bags[name]
@@ -106,7 +106,7 @@ def test_flipped_bytes_are_an_answer(bags, tmp_path, name, data):
     assert not [each for each in tmp_path.iterdir() if each.is_dir()]
 
 
-@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.text("abc[]<=0123456789 \n#/_MSG:float64stringtimeHeadernamepositionvelocityeffort", max_size=200))
 def test_definitions_of_any_text_are_an_answer(tmp_path, text):
     from service.datasets.formats.bags.container import Channel

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from service.datasets.formats.bags.states import Kind, choose, holds
@@ -111,7 +111,6 @@ kinds = st.builds(
 )
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.lists(st.tuples(kinds, st.integers(1, 100)), min_size=1, max_size=6), st.randoms())
 def test_the_choice_does_not_depend_on_the_order_of_the_kinds(told, random):
     merged: dict[Kind, int] = {}

@@ -8,7 +8,7 @@ import io
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from service.datasets.options import ReadOptions
@@ -173,7 +173,6 @@ def test_a_header_alone_is_a_table_of_no_rows(tmp_path):
     assert len(read(tmp_path, b"t,q1\n\n \n".replace(b" ", b""), "csv")["t"]) == 0
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     rows=st.lists(st.lists(st.floats(allow_nan=False), min_size=3, max_size=3), min_size=1, max_size=20),
     sep=st.sampled_from([",", ";", "\t", "|", " "]),

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from service.foundation.errors import InvalidDataError, TooLargeError
@@ -69,7 +69,6 @@ def test_nested_objects_of_arrays(tmp_path):
     assert any("rate" in fact for fact in found.facts)
 
 
-@settings(max_examples=50, deadline=None)
 @given(rows=st.lists(st.tuples(LEAVES, LEAVES, LEAVES), min_size=2, max_size=5))
 def test_python_writes_and_we_read(tmp_path_factory, rows):
     written = [{"t": t, "q": [first, second]} for t, first, second in rows]

@@ -8,7 +8,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from service.foundation.errors import InvalidDataError, TooLargeError
@@ -69,7 +69,6 @@ def test_joint_names_are_told(tmp_path):
     assert read(tmp_path, npz(q=Q, tau=TAU, joint_names=np.array(["a", "b"])), "npz").joint_names == ("a", "b")
 
 
-@settings(max_examples=40, deadline=None)
 @given(lengths=st.lists(st.integers(1, 9), min_size=1, max_size=8), step=st.floats(1e-4, 1.0))
 def test_dt_counts_every_episode_from_zero_whatever_the_blocks(tmp_path_factory, lengths, step):
     from service.datasets.formats import npz as module

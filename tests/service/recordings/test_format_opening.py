@@ -37,6 +37,7 @@ def bodies():
 BODIES = bodies()
 
 
+@pytest.mark.each_once
 @pytest.mark.parametrize("actual", BODIES)
 @pytest.mark.parametrize("said", [*KINDS, None])
 def test_a_file_is_read_as_what_it_is(tmp_path, actual, said):
@@ -55,6 +56,7 @@ def tar():
     return out.getvalue()
 
 
+@pytest.mark.each_once
 @pytest.mark.parametrize("said", [*KINDS, "zip", None])
 @pytest.mark.parametrize(
     ("body", "name"),
@@ -67,6 +69,7 @@ def tar():
         (b"\x89PNG\r\n\x1a\n" + bytes(100), "a picture"),
         (b"", "empty"),
     ],
+    ids=["HDF5", "MATLAB", "pickle", "gzip", "UTF-16", "picture", "empty"],
 )
 def test_what_is_not_read_is_named_with_what_it_was_sent_as(tmp_path, said, body, name):
     field, value, expected = refused(tmp_path, body, said, error=InvalidDataError)

@@ -1,0 +1,120 @@
+"""Processes of services that take a moment to start: forked from one that has imported what they need.
+
+A service that tests share, and training and learning of all services in this process, start so; others as always.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import cache
+from importlib import import_module
+from multiprocessing import current_process, forkserver
+from multiprocessing.context import ForkServerContext, ForkServerProcess
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import patch
+
+PRELOADED = ["service.app", "service.cli", "service.training.worker", "service.learning.learner.worker", __name__]
+STARTERS = ("service.training.slots", "service.learning.learner.process")
+"""Modules that start processes of the service."""
+
+
+class _Process(ForkServerProcess):
+    """A process with the environment of who starts it, as a spawned one has."""
+
+    def __init__(
+        self,
+        group: None = None,
+        target: Callable[..., object] | None = None,
+        name: str | None = None,
+        args: tuple[Any, ...] = (),
+        kwargs: Mapping[str, Any] | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(group, _enter, name, (dict(os.environ), target, args, kwargs or {}), **options)
+
+
+class _Context(ForkServerContext):
+    Process = _Process
+
+
+@cache
+def _context() -> _Context:
+    made = _Context()
+    made.set_forkserver_preload(PRELOADED)
+    return made
+
+
+def _enter(
+    environment: dict[str, str], target: Callable[..., object], args: tuple[Any, ...], kwargs: dict[str, Any]
+) -> None:
+    os.environ.clear()
+    os.environ.update(environment)
+    target(*args, **kwargs)
+
+
+@contextmanager
+def warm_processes() -> Iterator[None]:
+    """Let services of this process fork theirs."""
+    with patch.multiple(STARTERS[0], multiprocessing=_shim()), patch.multiple(STARTERS[1], multiprocessing=_shim()):
+        yield
+
+
+def _shim() -> SimpleNamespace:
+    return SimpleNamespace(get_context=lambda _: _context())
+
+
+class Served:
+    """`lipserve` with arguments, in a process of its own that is used like `subprocess.Popen`. log: of its output."""
+
+    def __init__(self, arguments: Sequence[str], environment: dict[str, str], log: Path) -> None:
+        context = _context()
+        forkserver.ensure_running()
+        address = forkserver._forkserver._forkserver_address  # type: ignore[attr-defined]
+        self._process = context.Process(target=_serve, args=(list(arguments), environment, log, address))
+        self._process.start()
+        assert self._process.pid is not None
+        self.pid = self._process.pid
+
+    def poll(self) -> int | None:
+        """The exit code, None while it runs."""
+        return self._process.exitcode
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for its end; return the exit code."""
+        self._process.join(timeout)
+        if self._process.exitcode is None:
+            raise subprocess.TimeoutExpired("lipserve", timeout or 0.0)
+        return self._process.exitcode
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal."""
+        os.kill(self.pid, number)
+
+    def terminate(self) -> None:
+        """Ask it to end."""
+        self.send_signal(signal.SIGTERM)
+
+
+def _serve(arguments: list[str], environment: dict[str, str], log: Path, address: str) -> None:
+    os.environ.clear()
+    os.environ.update(environment)
+    with log.open("ab") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    # its own processes are forked by the same server as itself, which is not its child
+    forkserver._forkserver._forkserver_address = address  # type: ignore[attr-defined]
+    forkserver._forkserver.ensure_running = lambda: None  # type: ignore[attr-defined]
+    for module in STARTERS:
+        import_module(module).multiprocessing = _shim()  # type: ignore[attr-defined]
+    current_process().name = "MainProcess"  # as logs have it
+    sys.argv = ["lipserve", *arguments]
+    from service.__main__ import main
+
+    main()
