@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
-from multiprocessing import current_process, forkserver
+from multiprocessing import current_process, forkserver, parent_process
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,7 +21,7 @@ from typing import Any
 from unittest.mock import patch
 
 PRELOADED = ["service.app", "service.cli", "service.training.worker", "service.learning.learner.worker", __name__]
-STARTERS = ("service.training.slots", "service.learning.learner.process")
+STARTERS = ("service.compute.process", "service.learning.learner.process")
 """Modules that start processes of the service."""
 
 
@@ -67,7 +67,7 @@ def warm_processes() -> Iterator[None]:
 
 
 def _shim() -> SimpleNamespace:
-    return SimpleNamespace(get_context=lambda _: _context())
+    return SimpleNamespace(get_context=lambda _: _context(), parent_process=parent_process)
 
 
 class Served:
