@@ -5,7 +5,8 @@ from __future__ import annotations
 from sqlalchemy import select
 
 from service.foundation.states import ACTIVE
-from service.storage.database import Database, JobRow
+from service.storage.database import JobRow
+from service.storage.storage import Storage
 from service.training import jobs
 from tests.service.data import eventually
 from tests.service.jobs.conftest import new_row
@@ -22,7 +23,7 @@ class Jobs:
 
     def __init__(self, settings):
         self.made = []
-        super().__init__(settings, Database.of(settings), lambda *made: self.made.append(made))
+        super().__init__(Storage.open(settings), lambda *made: self.made.append(made))
 
     def add(self, name, do, **options):
         with self.database.transaction() as session:

@@ -29,7 +29,7 @@ TYPES = ("revolute",) * 3
 OPTIONS = FitOptions(
     hyperparameter_samples=30, posterior_samples=100, max_iterations=12, starts=1, device="cpu", search_seconds=2.0
 )
-NAMES = ["rigid-body", "lip-chain", "rigid-body+lip-chain"]
+NAMES = ["rigid-body", "rigid-body+lip-chain", "lip-chain"]
 
 
 def recorded(rows=200, seed=3, speed=4.0):

@@ -17,6 +17,7 @@ from lipcore.warm_up import COMPILED, warm_up
 
 def signatures() -> set[tuple[str, str]]:
     """Every compiled function of ours with what it was compiled for."""
+    gc.unfreeze()  # a service that ran in this process has frozen what it imported
     # not `isinstance`, which would wake what others load lazily
     dispatchers = [each for each in gc.get_objects() if issubclass(type(each), Dispatcher)]
     ours = [each for each in dispatchers if each.py_func.__module__.startswith("lipcore.")]

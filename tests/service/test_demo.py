@@ -15,7 +15,7 @@ ROW = re.compile(r"(panda_joint[1-7]) +│ +([0-9.]+) │ ([0-9.e+-]+) │ +([0-
 
 def demo(home, *options):
     return subprocess.run(
-        [sys.executable, "-m", "service.cli", "demo", "--once", "--port", "0", *options],
+        [sys.executable, "-m", "service", "demo", "--once", "--port", "0", *options],
         env={**os.environ, "LIPSERVE_HOME": str(home)},
         capture_output=True,
         text=True,

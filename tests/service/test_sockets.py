@@ -197,7 +197,7 @@ def test_a_client_needs_an_absolute_path(url):
 def start(home, *arguments, stdout=subprocess.PIPE):
     """`lipserve serve` with arguments."""
     return subprocess.Popen(
-        [sys.executable, "-m", "service.cli", "serve", *map(str, arguments)],
+        [sys.executable, "-m", "service", "serve", *map(str, arguments)],
         env={**os.environ, "LIPSERVE_HOME": str(home)},
         stdout=stdout,
         stderr=subprocess.STDOUT,

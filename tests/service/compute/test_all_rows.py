@@ -106,7 +106,7 @@ def test_rows_without_times_count_for_no_more_than_the_chosen_ones(parts):
     table = Table(parts).weighed(500)
     assert [part.factor for part in table.parts] == [1.0, 500 / ROWS]
     assert table.independent_rows() == pytest.approx(0.1 * ROWS + 500, rel=0.01)
-    assert Table([parts[1]]).weighed(500).worth() == pytest.approx(500)
+    assert Table([parts[1]]).weighed(500).independent_rows() == pytest.approx(500)
 
 
 def test_shards_without_rows_are_left_out(parts):

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import schemathesis
+import schemathesis.specs.openapi.schemas  # before services run: compiling beside them trips over Python 3.11
 from fastapi.testclient import TestClient
 
 from service.app import create_app

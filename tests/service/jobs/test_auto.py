@@ -10,7 +10,7 @@ from lipcore.fitting.hyperparameters import FitProgress
 from service.training.pulse import LEAST_FRACTION, Remaining
 from tests.service.data import QUICK, ended, job, queue, stream, train, upload
 
-NAMES = ["rigid-body", "lip-chain", "rigid-body+lip-chain"]
+NAMES = ["rigid-body", "rigid-body+lip-chain", "lip-chain"]
 OPTIONS = {**QUICK, "posterior_samples": 100, "search_seconds": 1.0, "starts": 1}
 
 

@@ -123,13 +123,13 @@ def test_requests_that_are_refused(school, pupil):
 def test_what_is_taken_back_while_it_is_trained_on_fails_the_job(waiting, pupil, monkeypatch):
     pupil.teach(0, 1, 2, 3)
     job, service = answered_202(pupil), waiting.service
-    fit = worker.fitted
+    fit = worker.fit_model
 
     def slowly(*given, **more):
         pupil.delete("observations/arm/1")
         return fit(*given, **more)
 
-    monkeypatch.setattr(worker, "fitted", slowly)
+    monkeypatch.setattr(worker, "fit_model", slowly)
     worker.run(service.settings, job["id"])
     seen = answered(pupil.client.get(f"/v1/jobs/{job['id']}"))
     assert (seen["state"], seen["error"]["code"]) == ("failed", "observations_taken_back")

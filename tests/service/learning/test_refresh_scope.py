@@ -9,8 +9,7 @@ import pytest
 
 from service.journal import log
 from service.storage.database import DatasetRow, now
-from service.training import refresh_data as material
-from service.training import refresh_data as scope
+from service.training import refresh_data
 from service.training.refresh_data import Scope
 from tests.service.learning import batches
 from tests.service.learning.batches import MODEL, everything, note, opened, roll_back, rows, take_back, write
@@ -25,11 +24,11 @@ def database(tmp_path):
 
 def found_scope(database, through=None):
     with database.session() as session:
-        return scope.find(session, MODEL, log.newest(session, MODEL) if through is None else through)
+        return refresh_data.scope_of(session, MODEL, log.newest(session, MODEL) if through is None else through)
 
 
 def read(database, within, most=1000):
-    return material.read(database, MODEL, ("a", "b"), within, most, longest_step=0.5)
+    return refresh_data.read_log(database, MODEL, ("a", "b"), within, most, longest_step=0.5)
 
 
 def test_all_rows_that_teach_are_in_scope(database):
@@ -40,10 +39,10 @@ def test_all_rows_that_teach_are_in_scope(database):
     found = read(database, within)
     expected = np.concatenate([rows(seed=0).tau, rows(seed=2).tau, rows(seed=3).tau, rows(6, seed=9).tau[2:]])
     np.testing.assert_array_equal(found.samples.tau, expected)
-    assert found.found == 16
+    assert found.rows == 16
     assert len(found.samples.episodes()) == 4
     with database.session() as session:
-        assert scope.rows(session, MODEL, within) == 16
+        assert refresh_data.rows_within(session, MODEL, within) == 16
 
 
 def test_only_rows_up_to_an_event_are_in_scope(database):
@@ -64,7 +63,7 @@ def test_streams_are_told_apart(database):
 def test_many_rows_are_thinned_evenly(database, most):
     write(database, *(batches.batch(number, rows=rows(40, seed=number)) for number in range(10)))
     found = read(database, found_scope(database), most)
-    assert found.found == 400
+    assert found.rows == 400
     assert 0.9 * most <= len(found.samples) <= most
     everything_there = np.concatenate([rows(40, seed=number).time for number in range(10)])
     places = np.searchsorted(everything_there, found.samples.t)
@@ -94,8 +93,8 @@ def test_what_is_forgotten_is_left_out_and_the_rest_weighs_by_age(database):
     assert within.since == pytest.approx(112.003 - 5.0)
     found = read(database, within)
     np.testing.assert_array_equal(found.samples.tau, np.concatenate([rows(seed=10).tau, rows(seed=12).tau]))
-    np.testing.assert_allclose(material.weights(found.samples.t, within), np.exp(found.samples.t - 112.003))
-    assert material.weights(np.array([500.0]), within) == [1.0]
+    np.testing.assert_allclose(refresh_data.age_weights(found.samples.t, within), np.exp(found.samples.t - 112.003))
+    assert refresh_data.age_weights(np.array([500.0]), within) == [1.0]
     for age, kept in ((4.0, True), (6.0, False)):
         uploaded = datetime.fromtimestamp(112.003 - age, UTC).isoformat()
         assert (within.left_out(DatasetRow(created_at=uploaded)) is None) == kept
@@ -108,12 +107,12 @@ def test_data_sets_that_are_left_out_are_named_with_the_reason(database):
         session.add(row)
     lineage = {"datasets": [{"id": "ds_gone"}, {"id": "ds_kept"}]}
     with database.session() as session:
-        kept, left_out = scope.split(session, Scope(0, -np.inf, None, None, None), lineage)
+        kept, left_out = refresh_data.split_datasets(session, Scope(0, -np.inf, None, None, None), lineage)
         assert ([each.id for each in kept], left_out) == (
             ["ds_kept"],
             [{"id": "ds_gone", "reason": "it has been deleted"}],
         )
-        kept, left_out = scope.split(session, Scope(0, 5.0, None, None, 5.0), lineage)
+        kept, left_out = refresh_data.split_datasets(session, Scope(0, 5.0, None, None, 5.0), lineage)
         assert kept == []
         assert [each["id"] for each in left_out] == ["ds_gone", "ds_kept"]
 
@@ -124,7 +123,7 @@ def test_what_is_taken_back_is_seen_only_where_it_matters(database):
 
     def taken_back(through):
         with database.session() as session:
-            return scope.taken_back(session, MODEL, through, newest)
+            return refresh_data.taken_back(session, MODEL, through, newest)
 
     take_back(database, 3)
     assert [taken_back(through) for through in (2, 3, 4)] == [False, True, True]
