@@ -54,7 +54,7 @@ class Jobs:
         return eventually(lambda: (row := self.row(job)).state not in ACTIVE and row)
 
     def cancel(self, job):
-        jobs.cancel(type("Service", (), {"jobs": self, "database": self.database}), job)
+        jobs.cancel(self, job)
 
 
 def said(row):
