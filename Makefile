@@ -47,7 +47,7 @@ test-all: install
 
 # pictures of the dashboard for the README, made by its tests
 screenshots: install
-	LIPSERVE_SCREENSHOTS=docs/screenshots $(TEST) tests/browser/test_journey.py tests/browser/test_states.py
+	LIPSERVE_SCREENSHOTS=docs/screenshots $(TEST) tests/browser/test_journey.py tests/browser/test_states.py tests/browser/test_arm.py
 
 lint: install
 	$(BIN)/ruff check .

@@ -119,7 +119,7 @@ def search(first: int, last: int, seeds: int) -> None:
 
 def answer() -> None:
     """Print the median time of an answer in process, µs, and that of Pinocchio's RNEA."""
-    robot, shipped = load_robot("panda"), lipcore.load(Path(__file__).parents[1] / "models/panda-sim")
+    robot, shipped = load_robot("panda"), lipcore.load(Path(__file__).parents[2] / "models/panda-sim")
     q, dq, ddq = (part[0] for part in motion_arrays(*np.random.default_rng(0).uniform(-1, 1, (3, 7))))
     motion, data = np.ascontiguousarray(np.stack([q, dq, ddq])), robot.model.createData()
     shipped.warm_up()
