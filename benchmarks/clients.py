@@ -46,7 +46,35 @@ def post(path: str, body: bytes, media_type: str = "application/json", headers: 
     return "\r\n".join(lines).encode() + _END + body
 
 
-class HttpClient:
+class GoneError(BadAnswerError):
+    """The service closed the connection."""
+
+
+class Connection:
+    """A connection that is read in large parts; use it as a context manager or close it."""
+
+    _socket: socket.socket
+
+    def _more(self) -> bytes:
+        part = self._socket.recv(_CHUNK)
+        if not part:
+            raise GoneError("the service closed the connection")
+        return part
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._socket.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class HttpClient(Connection):
     """Sends one request at a time over one connection, which it opens again where the service closed it as idle."""
 
     def __init__(self, address: Address) -> None:
@@ -93,21 +121,3 @@ class HttpClient:
             return self._socket.recv(_CHUNK)
         except ConnectionError:
             return b""
-
-    def _more(self) -> bytes:
-        part = self._socket.recv(_CHUNK)
-        if not part:
-            raise BadAnswerError("the service closed the connection")
-        return part
-
-    def close(self) -> None:
-        """Close the connection."""
-        self._socket.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

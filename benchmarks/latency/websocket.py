@@ -7,12 +7,10 @@ from __future__ import annotations
 
 import base64
 import os
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 
-from benchmarks.clients import Address, BadAnswerError, connect
+from benchmarks.clients import Address, BadAnswerError, Connection, GoneError, connect
 from lipcore.data.samples import Array
 from service.stream.frames import ANSWER, ASK_STD, ERROR, HAS_STD, NUMBER, REQUEST
 
@@ -20,7 +18,6 @@ _BINARY, _TEXT, _CLOSE, _PING, _PONG = 2, 1, 8, 9, 10
 _FINAL, _MASKED = 0x80, 0x80
 _NO_MASK = bytes(4)
 """Clients must mask what they send; a mask of zeros leaves it as it is, and costs the service as much as any other."""
-_CHUNK = 1 << 16
 
 
 def request_frame(motion: Array, std: bool = True, deadline: float = 0.0, sequence: int = 0) -> bytes:
@@ -50,11 +47,7 @@ def frame(payload: bytes, opcode: int = _BINARY) -> bytes:
     return head + _NO_MASK + payload
 
 
-class _GoneError(BadAnswerError):
-    """The service closed the connection."""
-
-
-class WebSocket:
+class WebSocket(Connection):
     """Sends one message at a time and waits for the binary one that answers it.
 
     While nobody asks, nobody answers the service's pings either; it then closes the connection, which is opened again.
@@ -86,7 +79,7 @@ class WebSocket:
         """Send a message built by `frame` and return the payload of the next binary one."""
         try:
             return self._ask(message)
-        except (_GoneError, ConnectionError):
+        except (GoneError, ConnectionError):
             self._socket.close()
             self._open()
             return self._ask(message)
@@ -100,7 +93,7 @@ class WebSocket:
             if opcode == _PING:
                 self._socket.sendall(frame(payload, _PONG))
             elif opcode == _CLOSE:
-                raise _GoneError(f"the service closed the stream: {payload[2:].decode(errors='replace')}")
+                raise GoneError(f"the service closed the stream: {payload[2:].decode(errors='replace')}")
             elif opcode != _TEXT:  # what holds for all answers of a version; nothing here needs it
                 raise BadAnswerError(f"the service sent a frame with opcode {opcode}")
 
@@ -120,21 +113,3 @@ class WebSocket:
             data += self._more()
         self._left = data[end:]
         return data[0] & 0x0F, data[start:end]
-
-    def _more(self) -> bytes:
-        part = self._socket.recv(_CHUNK)
-        if not part:
-            raise _GoneError("the service closed the connection")
-        return part
-
-    def close(self) -> None:
-        """Close the connection."""
-        self._socket.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

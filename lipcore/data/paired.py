@@ -11,13 +11,13 @@ widens the standard error and costs degrees of freedom. For equal models whose d
 from __future__ import annotations
 
 from dataclasses import dataclass
-from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from lipcore.data.metrics import negative_log_density, quantile
 from lipcore.data.samples import Array, Samples
 
 LEVEL = 0.95
@@ -94,15 +94,14 @@ def compare(samples: Samples, first: Answer, second: Answer) -> Comparison:
 
 def surprise(tau: Array, answer: Answer) -> Array:
     """Negative log predictive density of torques (N, n), nats, noise included: (N, n)."""
-    variance = answer.std**2 + answer.noise_std**2
-    return np.asarray(0.5 * (np.log(2 * np.pi * variance) + (tau - answer.mean) ** 2 / variance))
+    return negative_log_density(tau - answer.mean, np.hypot(answer.std, answer.noise_std))
 
 
 def _figures(tau: Array, answer: Answer) -> tuple[Array, Array, Array]:
     """Squared error, whether the interval holds the measurement, and negative log density, (N, n) each."""
     error, spread = tau - answer.mean, np.hypot(answer.std, answer.noise_std)
-    inside = np.abs(error) <= NormalDist().inv_cdf(0.5 + LEVEL / 2) * spread
-    return error**2, inside.astype(np.float64), surprise(tau, answer)
+    inside = np.abs(error) <= quantile(LEVEL) * spread
+    return error**2, inside.astype(np.float64), negative_log_density(error, spread)
 
 
 def blocks(samples: Samples) -> NDArray[np.int64]:

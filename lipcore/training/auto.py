@@ -1,7 +1,8 @@
 """The estimator `auto`: several are trained, and the one is taken that predicts best what it has not seen.
 
 The measure is the log predictive density of held-out torque, noise included, summed over the joints, per sample. The
-best is chosen; of those within one standard error of it, the simplest. It then learns all samples.
+best is chosen, unless one that knows more of the arm is within one standard error of it, or errs no more. It then
+learns all samples.
 """
 
 from __future__ import annotations

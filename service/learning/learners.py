@@ -15,10 +15,11 @@ from contextvars import copy_context
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, TypeVar
 
-from fastapi import Depends, Request
+from fastapi import Depends
 
 from service.compute.process import Place
 from service.foundation.errors import BusyError
+from service.foundation.fields import of_app
 from service.foundation.states import PartState
 from service.learning.ingest.batches import observe_batch
 from service.learning.ingest.frames import Frames, FramesResult, observe_frames
@@ -211,9 +212,4 @@ class Learners:
         self._note(message, published=message, failed=None)
 
 
-async def _learners(request: Request) -> Learners:
-    learners: Learners = request.app.state.learners
-    return learners
-
-
-LearnersDep = Annotated[Learners, Depends(_learners)]
+LearnersDep = Annotated[Learners, Depends(of_app("learners"))]
