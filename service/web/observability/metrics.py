@@ -173,7 +173,7 @@ router = APIRouter(tags=["health"], route_class=Route)
 )
 def metrics(request: Request) -> Response:
     """Latency and errors of requests and streams, training jobs, quality and lag of models that learn, disk, memory,
-    and which parts of the service are in order. docs/metrics.md lists all.
+    and which parts of the service are in order. docs/reference/metrics.md lists all.
     """
     registry = CollectorRegistry()
     for collector in request.app.state.collectors:
