@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+import shutil
 import stat
 from pathlib import Path
 
 import pytest
 from numba import config
 
-from lipcore.kernels.compiled.compile import use_cache
+from lipcore.kernels.compiled import compile as compiling
+from lipcore.kernels.compiled.compile import source_stamp, use_cache
 
 
 @pytest.fixture
@@ -60,3 +62,15 @@ def test_without_a_cache_there_is_nothing_to_do(environment):
     before = dict(environment)
     assert use_cache(environment) is None
     assert environment == before
+
+
+def test_an_edited_file_is_compiled_anew_with_those_that_import_it_and_no_others(tmp_path):
+    shutil.copytree(
+        Path(compiling.__file__).parent, tmp_path / "compiled", ignore=shutil.ignore_patterns("__pycache__")
+    )
+    files = sorted((tmp_path / "compiled").glob("*.py"))
+    before = {path.stem: source_stamp(path) for path in files}
+    with (tmp_path / "compiled" / "chain_sums.py").open("a") as file:
+        file.write("# edited\n")
+    changed = {path.stem for path in files if source_stamp(path) != before[path.stem]}
+    assert changed == {"chain_sums", "chain_kinetic", "chain"}

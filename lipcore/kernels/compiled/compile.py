@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import atexit
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Callable, MutableMapping
 from contextlib import suppress
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -19,10 +21,7 @@ _F = TypeVar("_F", bound=Callable[..., object])
 # Fused multiply-add and sums in any order; NaN and infinity keep their meaning.
 _FASTMATH = {"contract", "reassoc", "nsz"}
 
-# Numba takes machine code from disk while the function's own file is unchanged, whatever became of the functions it
-# calls. Here it is taken while every file of this package is. (Should a later Numba not know `_source_stamp`: after
-# editing a function that is called from another file, run `make clean` or delete __pycache__.)
-_SOURCES = sha256(b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))).hexdigest()
+_IMPORTS = re.compile(rf"^from {re.escape(__package__)}(?:\.(\w+))? import (.+)", re.MULTILINE)
 
 
 def use_cache(environment: MutableMapping[str, str]) -> Path | None:
@@ -68,19 +67,36 @@ def inlined(function: _F) -> _F:
 
 def template(function: _F) -> _F:
     """Like `inlined`, of a function that is given compiled functions: its caller alone is kept on disk."""
-    return _compile(function, cache=False, forceinline=True, no_cpython_wrapper=True)
+    return _compile(function, keep=False, forceinline=True, no_cpython_wrapper=True)
 
 
-def _compile(function: _F, cache: bool = True, **options: Any) -> _F:
+def source_stamp(path: Path) -> str:
+    """Hash of a source file and of all files of its folder that it imports, directly or not.
+
+    Numba takes machine code from disk while the function's own file is unchanged, whatever became of the functions it
+    calls. Here it is taken while this is. (Should a later Numba not know `_source_stamp`: after editing a function that
+    is called from another file, run `make clean` or delete __pycache__.)
+    """
+    return sha256(b"".join(each.read_bytes() for each in sorted(_imported(path)))).hexdigest()
+
+
+@cache
+def _imported(path: Path) -> frozenset[Path]:
+    named = (module or names for module, names in _IMPORTS.findall(path.read_text()))
+    direct = [path.with_name(f"{name.strip()}.py") for names in named for name in names.split(",")]
+    return frozenset({path}.union(*(_imported(each) for each in direct)))
+
+
+def _compile(function: _F, keep: bool = True, **options: Any) -> _F:
     # entry points for C are never used, and take a fifth of the compile time
     options |= {"fastmath": _FASTMATH, "error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
     try:
-        dispatcher = njit(cache=cache, **options)(function)
+        dispatcher = njit(cache=keep, **options)(function)
     except RuntimeError as error:
         # raised at decoration time, so without this the import itself would fail
         if "no locator available" not in str(error):
             raise
         dispatcher = njit(cache=False, **options)(function)
     with suppress(AttributeError):
-        dispatcher._cache._cache_file._source_stamp = _SOURCES
+        dispatcher._cache._cache_file._source_stamp = source_stamp(Path(function.__code__.co_filename))
     return cast(_F, dispatcher)
