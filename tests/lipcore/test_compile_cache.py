@@ -64,13 +64,12 @@ def test_without_a_cache_there_is_nothing_to_do(environment):
     assert environment == before
 
 
-def test_an_edited_file_is_compiled_anew_with_those_that_import_it_and_no_others(tmp_path):
-    shutil.copytree(
-        Path(compiling.__file__).parent, tmp_path / "compiled", ignore=shutil.ignore_patterns("__pycache__")
-    )
-    files = sorted((tmp_path / "compiled").glob("*.py"))
-    before = {path.stem: source_stamp(path) for path in files}
-    with (tmp_path / "compiled" / "chain_sums.py").open("a") as file:
+def test_an_edited_file_is_compiled_anew_with_those_that_import_it_and_no_others(tmp_path, monkeypatch):
+    folder = tmp_path / "compiled"
+    shutil.copytree(compiling.FOLDER, folder, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(compiling, "FOLDER", folder)
+    before = {path: source_stamp(path) for path in folder.glob("*.py")}
+    with (folder / "chain_sums.py").open("a") as file:
         file.write("# edited\n")
-    changed = {path.stem for path in files if source_stamp(path) != before[path.stem]}
+    changed = {path.stem for path, stamp in before.items() if source_stamp(path) != stamp}
     assert changed == {"chain_sums", "chain_kinetic", "chain"}

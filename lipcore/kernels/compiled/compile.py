@@ -21,6 +21,8 @@ _F = TypeVar("_F", bound=Callable[..., object])
 # Fused multiply-add and sums in any order; NaN and infinity keep their meaning.
 _FASTMATH = {"contract", "reassoc", "nsz"}
 
+FOLDER = Path(__file__).parent
+"""Where the compiled functions are that those of other files call."""
 _IMPORTS = re.compile(rf"^from {re.escape(__package__)}(?:\.(\w+))? import (.+)", re.MULTILINE)
 
 
@@ -71,7 +73,7 @@ def template(function: _F) -> _F:
 
 
 def source_stamp(path: Path) -> str:
-    """Hash of a source file and of all files of its folder that it imports, directly or not.
+    """Hash of a source file and of all files of FOLDER that it imports, directly or not.
 
     Numba takes machine code from disk while the function's own file is unchanged, whatever became of the functions it
     calls. Here it is taken while this is. (Should a later Numba not know `_source_stamp`: after editing a function that
@@ -83,7 +85,7 @@ def source_stamp(path: Path) -> str:
 @cache
 def _imported(path: Path) -> frozenset[Path]:
     named = (module or names for module, names in _IMPORTS.findall(path.read_text()))
-    direct = [path.with_name(f"{name.strip()}.py") for names in named for name in names.split(",")]
+    direct = [FOLDER / f"{name.strip()}.py" for names in named for name in names.split(",")]
     return frozenset({path}.union(*(_imported(each) for each in direct)))
 
 
