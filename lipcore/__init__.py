@@ -11,9 +11,8 @@ pyproject.toml, checks it):
         excitation   the motion that tells a model most
     arm          the rigid arm learnt from torque alone: geometry, masses, friction (sections 6 and 7)
     model        a trained model: torque, dynamics, energies, parameters, warnings (section 9)
-    evaluator    the compiled form of a posterior, which answers queries
     fitting      estimators, hyperparameters, noise, options, what a training is given
-    posterior    exact and compact posteriors, sums over samples, linear algebra (section 8)
+    posterior    exact and compact posteriors, what answers queries, sums over samples, linear algebra (section 8)
     kernels      the torque priors and their compiled loops (sections 2 to 5)
     profiles     robots by name: limits, and what their effort field means
     preparation  from recordings to samples: filters, rates, derivatives

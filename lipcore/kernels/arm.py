@@ -15,7 +15,7 @@ from lipcore.kernels.compiled.arm_recursion import PARAMETERS
 from lipcore.kernels.compiled.views import Memory
 from lipcore.kernels.friction import friction_features
 from lipcore.kernels.geometry import Geometry
-from lipcore.kernels.regressor import Regressor
+from lipcore.kernels.query import Regressor
 
 REMEMBERED = 4
 """Motions whose features are kept: the training samples and the query in work, asked for over and over."""

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from lipcore.data.motion import Motion
-from lipcore.kernels.compiled.cross import Array, Cross
-from lipcore.kernels.regressor import Regressor
+from lipcore.kernels.query import Array, Cross, Regressor
 
 Params = Mapping[str, Tensor]
 """Unconstrained hyperparameters by name: logarithms of positive numbers, logits of shares."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from lipcore.data.motion import Motion
 from lipcore.kernels.base import LinearKernel, Params
-from lipcore.kernels.compiled.friction import friction_rows
-from lipcore.kernels.regressor import Array, Regressor
+from lipcore.kernels.compiled.compile import compiled
+from lipcore.kernels.query import Array, Regressor
 
 SIGN_WIDTH = 0.02
 """Velocity over which the Coulomb sign turns over, rad/s (m/s): tanh(dq / width) avoids a jump at standstill."""
@@ -74,4 +75,20 @@ class FrictionRegressor(Regressor):
 
     def fill(self, motion: Array, out: Array) -> None:
         """Write Φᵀ of the query, (f n, n)."""
-        friction_rows(motion, SIGN_WIDTH, STRIBECK_SPEED, out)
+        _friction_rows(motion, SIGN_WIDTH, STRIBECK_SPEED, out)
+
+
+@compiled
+def _friction_rows(motion: Array, width: float, speed: float, out: Array) -> None:
+    """Rows f j to f j + f − 1 of `out`, (f n, n), f = 3 or 4: joint j's dq, s = tanh(dq / width), 1 and, where f = 4,
+    s exp(−(dq / speed)²) in column j, else zero."""
+    out[:] = 0.0
+    terms = out.shape[0] // motion.shape[1]
+    for joint in range(motion.shape[1]):
+        velocity, first = motion[1, joint], terms * joint
+        sign = np.tanh(velocity / width)
+        out[first, joint] = velocity
+        out[first + 1, joint] = sign
+        out[first + 2, joint] = 1.0
+        if terms == 4:
+            out[first + 3, joint] = sign * np.exp(-((velocity / speed) ** 2))

@@ -9,12 +9,12 @@ from numpy.typing import ArrayLike
 
 from lipcore.data.motion import Motion, motion_arrays
 from lipcore.data.samples import Array
-from lipcore.evaluator import Evaluator
 from lipcore.fitting.estimators import NO_CALIBRATION, Calibration, Estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Arm
 from lipcore.model.selection import Selection
 from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.evaluator import Evaluator
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import JointType, TorqueConvention
 

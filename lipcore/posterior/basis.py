@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lipcore.data.motion import Motion
 from lipcore.kernels.base import LinearKernel, PairKernel, Params, SumKernel, TorqueKernel
-from lipcore.kernels.compiled.cross import Cross
+from lipcore.kernels.query import Cross
 from lipcore.posterior.linalg import cholesky
 
 

@@ -13,12 +13,11 @@ import torch
 from torch import Tensor
 
 from lipcore.data.motion import Motion
-from lipcore.evaluator import Evaluator
-from lipcore.evaluator.evaluator import QUERIES
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.base import LinearKernel, PairKernel, SumKernel
 from lipcore.kernels.friction import FrictionKernel
+from lipcore.posterior.evaluator import QUERIES, Evaluator
 from lipcore.robots.library import load_robot
 from lipcore.robots.urdf import RigidBody
 from tests.lipcore.problems import random_problem

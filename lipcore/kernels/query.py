@@ -1,4 +1,4 @@
-"""What serving needs of a nonlinear kernel: the covariance of one query with every inducing sample, and with itself."""
+"""What serving needs of a kernel: features of one query, or its covariances with inducing samples; no PyTorch."""
 
 from __future__ import annotations
 
@@ -8,6 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+
+
+class Regressor(ABC):
+    """Features Φ of tau = Φ w. Made by `LinearKernel.regressor`; safe from several threads; nothing is checked.
+
+    n_joints: joints n. size: weights p.
+    """
+
+    n_joints: int
+    size: int
+
+    @abstractmethod
+    def fill(self, motion: Array, out: Array) -> None:
+        """Write Φᵀ of the query `motion`, (3, n) its q, dq and ddq, into `out`, (p, n), C-contiguous."""
 
 
 class Cross(ABC):

@@ -1,5 +1,0 @@
-"""Answers of a compact posterior, compiled: what serving runs for every query."""
-
-from lipcore.evaluator.evaluator import Evaluator
-
-__all__ = ["Evaluator"]
