@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-import threading
 from collections.abc import Iterator
+from itertools import count
 
 import numpy as np
 import pinocchio as pin
@@ -14,10 +14,11 @@ from lipcore.kernels.geometry import Geometry
 from tests.browser.accessibility import audit
 from tests.browser.conftest import Dashboard, Visit
 from tests.browser.looking import expect
+from tests.browser.robot import playing
 from tests.browser.visitor import PHONE, Visitor
 from tests.choosing import slow
 from tests.lipcore.arms import parameters, random_bodies, random_geometry
-from tests.service.models.arms import NO_BODIES, publish_arm_at
+from tests.service.models.versions import NO_BODIES, publish_arm_at
 
 FRAMES = """async ([geometry, q]) => {
   const { frames } = await import("/dashboard/pages/arm/kinematics.js");
@@ -107,38 +108,22 @@ def test_a_version_without_a_geometry_says_how_to_get_one(visitor: Visitor, dash
     assert audit(page) == []
 
 
-@pytest.fixture
-def streamed(dashboard: Dashboard, arm: str) -> Iterator[None]:
-    """A robot that moves its second joint to and fro."""
-    from service.client.stream import StreamClient
-
-    stop = threading.Event()
-
-    def run() -> None:
-        with StreamClient(arm, dashboard.server.url, stream_id="cell") as stream:
-            for row in range(10**6):
-                q = np.zeros(7)
-                q[1] = 0.5 * np.sin(0.05 * row)
-                stream.ask(q, np.zeros(7), np.zeros(7), tau=np.zeros(7))
-                if stop.wait(0.02):
-                    return
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    yield
-    stop.set()
-    thread.join(30)
+def swinging() -> Iterator[list[np.ndarray]]:
+    """Rows of a robot that moves its second joint to and fro."""
+    for row in count():
+        yield [0.5 * np.sin(0.05 * row) * np.eye(7)[1], *np.zeros((3, 7))]
 
 
 @pytest.mark.slow
-def test_the_arm_moves_as_its_stream_does(visitor: Visitor, arm: str, streamed: None) -> None:
-    page = visitor.open(f"#/live/{arm}")
-    figure = page.get_by_role("img", name=re.compile("The arm in 3-D"))
-    figure.scroll_into_view_if_needed()
-    canvas = figure.locator("canvas").first.element_handle()
-    for _ in range(3):
-        before = figure.evaluate(LINKS)
-        visitor.until(lambda: figure.evaluate(LINKS) != before)  # noqa: B023
-    visitor.shot("arm-live", height=1600)
-    assert canvas.evaluate("(each) => each.isConnected"), "the plot was made anew"
-    assert audit(page) == []
+def test_the_arm_moves_as_its_stream_does(visitor: Visitor, dashboard: Dashboard, arm: str) -> None:
+    with playing(dashboard.server.url, arm, swinging(), rate=50.0):
+        page = visitor.open(f"#/live/{arm}")
+        figure = page.get_by_role("img", name=re.compile("The arm in 3-D"))
+        figure.scroll_into_view_if_needed()
+        canvas = figure.locator("canvas").first.element_handle()
+        for _ in range(3):
+            before = figure.evaluate(LINKS)
+            visitor.until(lambda: figure.evaluate(LINKS) != before)  # noqa: B023
+        visitor.shot("arm-live", height=1600)
+        assert canvas.evaluate("(each) => each.isConnected"), "the plot was made anew"
+        assert audit(page) == []

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import os
 import re
-import threading
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from lipcore.data.samples import Samples
-from service.client.stream import StreamClient
 from tests.browser.accessibility import audit
 from tests.browser.conftest import Dashboard
 from tests.browser.looking import expect
+from tests.browser.robot import playing
 from tests.browser.visitor import DESKTOP, PHONE, Visitor
 from tests.service.data import arrays, npz, stream, train
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Locator, Page
+    from playwright.sync_api import Locator
 
 PICTURES = bool(os.environ.get("LIPSERVE_SCREENSHOTS"))
 ROBOT = "panda" if PICTURES else "double-pendulum"
@@ -44,31 +43,11 @@ def drawn(place: Locator, plots: int = 1) -> None:
         assert each.get_attribute("aria-label"), each
 
 
-@contextmanager
-def playing(url: str, model: str, samples: Samples) -> Iterator[None]:
-    """Stream samples in real time from a thread, to be learnt from, until the block ends; afterwards nothing failed."""
-    stop, failures = threading.Event(), list[Exception]()
-
-    def play() -> None:
-        try:
-            with StreamClient(model, url, stream_id="cell-3") as client:
-                begin = time.monotonic()
-                for row in range(len(samples.t)):
-                    tau = samples.tau[row] + (40.0 if row in range(CONTACTS.start, CONTACTS.stop) else 0.0)
-                    client.ask(samples.q[row], samples.dq[row], samples.ddq[row], tau=tau)
-                    if stop.wait(max(0.0, begin + row / RATE - time.monotonic())):
-                        return
-        except Exception as error:
-            failures.append(error)
-
-    thread = threading.Thread(target=play)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
-    assert failures == []
+def bumping(samples: Samples) -> Iterator[tuple[np.ndarray, ...]]:
+    """Rows of a robot that hits something now and then."""
+    for row in range(len(samples.t)):
+        tau = samples.tau[row] + (40.0 if row in range(CONTACTS.start, CONTACTS.stop) else 0.0)
+        yield samples.q[row], samples.dq[row], samples.ddq[row], tau
 
 
 def phone(visitor: Visitor, name: str) -> None:
@@ -189,7 +168,7 @@ def followed(visitor: Visitor, dashboard: Dashboard) -> None:
     expect(page.get_by_text("lipserve stream my-arm")).to_be_visible()
     assert audit(page) == []
     samples = stream(ROBOT, samples=6000, seed=8, rate=RATE)
-    with playing(dashboard.server.url, "my-arm", samples):
+    with playing(dashboard.server.url, "my-arm", bumping(samples), RATE):
         state = page.locator("main").get_by_role("status").first
         expect(state).to_contain_text("live")
         drawn(page.get_by_role("region", name="Torque"), len(samples.joint_names))
@@ -198,7 +177,8 @@ def followed(visitor: Visitor, dashboard: Dashboard) -> None:
         expect(page.get_by_role("region", name="Quality").get_by_role("row").nth(1)).to_be_visible()
         expect(page.get_by_role("region", name="Answers of streams")).to_contain_text("at most")
         expect(page.get_by_role("region", name="Learning").get_by_role("row", name="contact")).to_be_visible()
-        revision_rises(visitor, page)
+        learning = page.get_by_role("region", name="Learning")
+        visitor.until(lambda: "revision 0" not in learning.inner_text())  # answers contain what was streamed
         if PICTURES:
             page.wait_for_timeout(25_000)
         assert audit(page) == []
@@ -207,12 +187,6 @@ def followed(visitor: Visitor, dashboard: Dashboard) -> None:
         page.get_by_role("button", name="Pause plots").click()
         expect(state).to_contain_text("paused")
     expect(state).to_contain_text("no new rows")
-
-
-def revision_rises(visitor: Visitor, page: Page) -> None:
-    """Wait until answers contain what was streamed."""
-    learning = page.get_by_role("region", name="Learning")
-    visitor.until(lambda: "revision 0" not in learning.inner_text())
 
 
 def test_from_a_recording_to_a_model_that_is_followed_live(visitor: Visitor, dashboard: Dashboard) -> None:

@@ -100,14 +100,6 @@ def test_a_motion_outside_the_training_is_said_to_be_a_guess(visitor: Visitor, m
     assert audit(page) == []
 
 
-def test_the_tab_in_the_address_is_where_a_link_leads(visitor: Visitor, model: str) -> None:
-    page = visitor.open(f"#/models/{model}?tab=learning")
-    expect(page.get_by_text("It has learnt nothing while serving so far")).to_be_visible()
-    page.get_by_role("tab", name="Learning").press("ArrowLeft")
-    expect(page.get_by_role("tab", name="Ask")).to_be_focused()
-    expect(page).to_have_url(re.compile("tab=ask$"))
-
-
 def test_how_auto_has_chosen_is_shown_with_the_job_and_with_the_version(visitor: Visitor, dashboard: Dashboard) -> None:
     dataset = upload(dashboard.client, stream(samples=120, seed=9), name="chosen.npz")
     options = {**QUICK, "posterior_samples": 100, "search_seconds": 1.0, "starts": 1}

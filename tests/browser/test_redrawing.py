@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -96,36 +97,14 @@ def test_a_job_that_comes_takes_no_link_away(visitor: Visitor, dashboard: Dashbo
     page.unroute_all(behavior="wait")
 
 
-@pytest.mark.slow
-def test_news_of_learning_take_no_link_away(visitor: Visitor, dashboard: Dashboard) -> None:
-    page = visitor.open(f"#/models/{dashboard.model}?tab=learning")
-    live = node(page.get_by_role("link", name="Follow it live"))
-    where = f"**/v1/models/{dashboard.model}/learning"
-
-    def later(route: Route) -> None:
-        answer: dict[str, Any] = route.fetch().json()
-        route.fulfill(json={**answer, "options": {**answer["options"], "forgetting": "another"}})
-
-    page.route(where, later)
-    expect(page.get_by_text("another")).to_be_visible()
-    assert there(live)
-    page.unroute_all(behavior="wait")
-
-
-@pytest.mark.slow
-def test_controls_of_a_model_stay_while_another_tab_is_chosen(visitor: Visitor, dashboard: Dashboard) -> None:
-    page = visitor.open(f"#/models/{dashboard.model}")
-    controls = [
-        node(page.get_by_role("link", name="Follow live")),
-        node(page.get_by_role("link", name="Train a new version")),
-        node(page.get_by_label("Version", exact=True)),
-    ]
-    recording = page.get_by_label("Recording", exact=True)
-    chosen = recording.input_value()
-    page.get_by_role("tab", name="Ask").click()
-    expect(page.get_by_role("button", name="Ask", exact=True)).to_be_visible()
-    expect(recording).to_have_count(0)
-    assert [there(each) for each in controls] == [True] * len(controls)
-    page.get_by_role("tab", name="Accuracy").click()
-    expect(recording).to_have_value(chosen)
-    assert [there(each) for each in controls] == [True] * len(controls)
+def test_the_overview_tells_how_the_service_is_and_looking_again_takes_the_focus_from_nobody(visitor: Visitor) -> None:
+    page = visitor.open("#/")
+    health = page.get_by_role("region", name="Health")
+    expect(health.get_by_role("status")).to_contain_text("ready")
+    expect(health.get_by_text("database")).to_be_visible()
+    expect(page.get_by_role("link", name="Data sets")).to_contain_text(re.compile("[1-9]"))
+    first = page.get_by_role("region", name="Newest models").get_by_role("link").first
+    first.focus()
+    with page.expect_response("**/v1/jobs"), page.expect_response("**/health/ready"):
+        pass
+    expect(first).to_be_focused()

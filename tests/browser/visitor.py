@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Request, Route
+    from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Route
 
 PATIENCE_MS = 60_000
 """Longest wait for anything on a page, ms: the machine may be busy with other tests."""
@@ -46,11 +46,11 @@ class Visitor:
         self.context.set_default_timeout(PATIENCE_MS)
         # only what is not the service's own goes through Python, which may be busy elsewhere
         self.context.route(re.compile(f"^(?!{re.escape(self.url)}/)"), self._outside)
-        self.context.on("console", self._said)
+        self.context.on("console", self._logged)
         self.context.on("weberror", lambda raised: self.problems.append(f"uncaught: {raised.error}"))
-        self.context.on("request", self._asked)
+        self.context.on("request", lambda request: self._asked(request.url))
         self.page: Page = self.context.new_page()
-        self.page.on("websocket", lambda socket: self._asked_for(socket.url))
+        self.page.on("websocket", lambda socket: self._asked(socket.url))
 
     def expect_refusals(self, *statuses: int) -> None:
         """Let answers of these statuses be: the browser reports each as an error on its console."""
@@ -119,15 +119,12 @@ class Visitor:
         else:
             route.abort()
 
-    def _asked(self, request: Request) -> None:
-        self._asked_for(request.url)
-
-    def _asked_for(self, url: str) -> None:
+    def _asked(self, url: str) -> None:
         address, ours = urlsplit(url), urlsplit(self.url)
         if address.scheme not in {"data", "blob"} and address.netloc != ours.netloc:
             self.problems.append(f"asked for {url}, which is not the service's")
 
-    def _said(self, message: ConsoleMessage) -> None:
+    def _logged(self, message: ConsoleMessage) -> None:
         text = message.text
         if message.type not in {"error", "warning"}:
             return

@@ -13,6 +13,7 @@ from service.foundation.settings import Settings
 from service.storage.database import Database
 from service.web.access import keys
 from service.web.access.scopes import SCOPES
+from tests.service.cli.conftest import lipserve  # noqa: F401 - a fixture
 
 REFRESH_S = 0.05
 

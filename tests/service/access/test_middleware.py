@@ -1,22 +1,89 @@
-"""The middleware by itself, around applications that no route is: events that last, a stream that cannot start."""
+"""The middleware by itself and before a service: who may ask without keys, and events that last with one."""
 
 from __future__ import annotations
 
 import asyncio
+from unittest.mock import AsyncMock
 
 import pytest
 
 from service.web.access import keys
 from service.web.access.keys import Keyring
-from service.web.access.middleware import KEY_ID, KeyAccess
-from tests.service.access.conftest import REFRESH_S
+from service.web.access.middleware import KEY_ID, MOST_KNOWN, KeyAccess, LocalAccess
+from tests.service.access.conftest import REFRESH_S, bearer
+from tests.service.data import error
+
+HERE = ["localhost:8000", "LocalHost", "localhost.", "127.0.0.1:65535", "127.8.9.1", "[::1]:80"]
+ELSEWHERE = ["evil.example:8000", "localhost.evil.example", "127.0.0.1.evil.example", "192.168.1.5", "[2001:db8::1]:80"]
+MALFORMED = ["[::1", "127.0.0.1@evil.example", "::1", "2130706433", "0.0.0.0:8000"]
+ORIGINS = ["http://evil.example", "null", "", "http://localhost:3000", "http://127.0.0.1", "https://", "localhost"]
+
+
+@pytest.mark.parametrize("host", HERE)
+def test_names_of_this_machine(api, host):
+    assert api.get("/v1/models", headers={"Host": host}).status_code == 200
+
+
+@pytest.mark.each_once
+@pytest.mark.parametrize("host", [*ELSEWHERE, *MALFORMED])
+@pytest.mark.parametrize("path", ["/v1/models", "/docs", "/health/live"])
+def test_names_that_lead_here_from_elsewhere_are_refused(api, host, path):
+    refusal = error(api.get(path, headers={"Host": host}), 403, "forbidden")
+    assert refusal["detail"][0]["field"] == "host"
+    assert "LIPSERVE_KEYS=on" in refusal["message"]
+
+
+def test_a_host_is_repeated_readably(api):
+    answer = api.get("/v1/models", headers={"Host": b"evil\xe2\x80\xae\x1b[31m"})
+    assert error(answer, 403, "forbidden")["detail"][0]["value"].isprintable()
+
+
+@pytest.mark.each_once
+@pytest.mark.parametrize("origin", ORIGINS)
+@pytest.mark.parametrize("request_", ["POST /v1/echo", "PUT /v1/models/nobody/learning", "DELETE /v1/models/nobody"])
+def test_pages_of_other_sites_change_nothing(api, request_, origin):
+    refusal = error(api.request(*request_.split(), headers={"Origin": origin}), 403, "forbidden")
+    assert "web pages of other sites may not ask" in refusal["message"]
+    assert refusal["detail"][0]["field"] == "origin"
+
+
+def test_own_pages_and_programs_may_ask(api):
+    for headers in ({}, {"Origin": "http://localhost"}):
+        assert api.post("/v1/echo", content=b"1", headers=headers).content == b"1"
+    headers = {"Host": "127.0.0.1:8000", "Origin": "http://127.0.0.1:8000"}
+    assert api.post("/v1/echo", content=b"1", headers=headers).content == b"1"
+
+
+def test_what_changes_nothing_is_left_to_browsers(api):
+    answer = api.get("/v1/models", headers={"Origin": "http://evil.example"})
+    assert answer.status_code == 200
+    assert "access-control-allow-origin" not in answer.headers
+
+
+def test_a_service_with_keys_goes_by_the_key_alone(guarded):
+    headers = {**bearer(guarded.secrets["predict"]), "Host": "robot.example.org", "Origin": "https://other.example"}
+    assert guarded.api.post("/v1/echo", content=b"1", headers=headers).content == b"1"
+
+
+def test_ports_that_clients_make_up_fill_no_memory():
+    app = AsyncMock()
+    local = LocalAccess(app)
+
+    async def ask():
+        for port in range(3 * MOST_KNOWN):
+            await local({"type": "http", "method": "GET", "headers": [(b"host", b"localhost:%d" % port)]}, None, None)
+
+    asyncio.run(ask())
+    assert app.await_count == 3 * MOST_KNOWN
+    assert len(local._known) == MOST_KNOWN
+
 
 EVENTS = "/v1/jobs/job_1/events"
 
 
-def events(database, app, scope_of_key="read", revoked=None):
+def events(database, app, revoked=None):
     """Ask for events of an application; return what was sent, and the ASGI scope."""
-    row, secret = keys.create(database, "test", [scope_of_key], None)
+    row, secret = keys.create(database, "test", ["read"], None)
     headers = [(b"authorization", b"Bearer " + secret.encode())]
     scope = {"type": "http", "method": "GET", "path": EVENTS, "query_string": b"", "headers": headers}
     sent = []
@@ -49,17 +116,6 @@ async def endless(scope, receive, send):
         await asyncio.sleep(REFRESH_S / 10)
 
 
-async def silent(scope, receive, send):
-    """Never begin to answer."""
-    await asyncio.Event().wait()
-
-
-async def short(scope, receive, send):
-    """Send one event and end."""
-    await send({"type": "http.response.start", "status": 200, "headers": []})
-    await send({"type": "http.response.body", "body": b"data: 1\n\n", "more_body": False})
-
-
 def test_events_end_with_their_key(keys_database):
     sent = events(keys_database, endless, revoked=3)
     assert sent[0]["status"] == 200
@@ -68,23 +124,21 @@ def test_events_end_with_their_key(keys_database):
 
 
 def test_events_that_have_not_begun_are_refused(keys_database):
+    async def silent(scope, receive, send):
+        await asyncio.Event().wait()
+
     start, body = events(keys_database, silent, revoked=0)
     assert start["status"] == 401
     assert b"is no longer valid" in body["body"]
 
 
-def test_events_that_end_by_themselves_are_left_alone(keys_database):
-    assert [message.get("body") for message in events(keys_database, short)] == [None, b"data: 1\n\n"]
+def test_the_end_and_the_errors_of_events_are_left_alone(keys_database):
+    async def short(scope, receive, send):
+        await send({"type": "http.response.start", "status": 200, "headers": []})
 
-
-def test_errors_of_events_are_passed_on(keys_database):
     async def broken(scope, receive, send):
         raise OSError("the client is gone")
 
+    assert len(events(keys_database, short)) == 1
     with pytest.raises(OSError, match="the client is gone"):
         events(keys_database, broken)
-
-
-def test_events_need_a_key_that_may_read(keys_database):
-    start, _ = events(keys_database, endless, scope_of_key="predict")
-    assert start["status"] == 403

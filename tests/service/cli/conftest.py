@@ -5,11 +5,18 @@ import json
 import pytest
 
 from service import cli
+from service.cli.simulate import write_recording
 from tests.service.data import QUICK, stream, train, upload
-from tests.service.models.arms import NO_BODIES, publish_arm_at
+from tests.service.models.versions import NO_BODIES, publish_arm_at
 
-QUICKLY = ["--estimator", "lip-chain"]
-QUICKLY += [part for name, value in QUICK.items() for part in ("--option", f"{name}={value}")]
+
+def options_of_train(options):
+    """Options of a fit as `lipserve train` takes them."""
+    values = [part for name, value in options.items() for part in ("--option", f"{name}={value}")]
+    return ["--estimator", "lip-chain", *values]
+
+
+QUICKLY = options_of_train(QUICK)
 """Options of `lipserve train` for a fit that takes a fraction of a second."""
 
 
@@ -21,8 +28,8 @@ def lipserve(monkeypatch, capsys):
         monkeypatch.setattr("sys.argv", ["lipserve", *map(str, arguments)])
         with pytest.raises(SystemExit) as ended:
             cli.main()
-        said = capsys.readouterr()
-        return ended.value.code or 0, said.out, said.err
+        printed = capsys.readouterr()
+        return ended.value.code or 0, printed.out, printed.err
 
     return run
 
@@ -32,11 +39,35 @@ def asked(lipserve, server):
     """Run a command against the shared service; return its output, or its JSON where that is asked for."""
 
     def run(*arguments):
-        code, said, err = lipserve(*arguments, "--url", server.url)
+        code, out, err = lipserve(*arguments, "--url", server.url)
         assert code == 0, err
-        return json.loads(said) if "--json" in arguments else said
+        return json.loads(out) if "--json" in arguments else out
 
     return run
+
+
+@pytest.fixture
+def refused(lipserve, server):
+    """Run a command that the shared service refuses; return what it says."""
+
+    def run(*arguments):
+        code, out, err = lipserve(*arguments, "--url", server.url)
+        assert (code, out.strip()) == (1, "")
+        assert "error: " in err
+        return err
+
+    return run
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """Write a recording as a file; return its path."""
+
+    def write(seed, name="arm.npz", **options):
+        write_recording(tmp_path / name, stream(seed=seed, **options))
+        return tmp_path / name
+
+    return write
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""The tree of commands: its reference, its lists, completion, exit codes and hints."""
+"""The tree of commands: its reference, its lists, completion, exit codes, and what it says of mistakes."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ import pytest
 from lipcore.fitting.estimators import ESTIMATORS
 from lipcore.robots.library import ROBOTS
 from lipcore.vocabulary import AUTO, CHOICES
+from service import __version__
 from service.cli import consoles, options
 from service.cli.consoles import plain
-from service.cli.main import commands
+from service.cli.main import Commands, commands
 from service.client import ApiError
 from tests.service.server import free_port
 
@@ -30,6 +31,13 @@ def test_names_that_help_lists_are_those_that_there_are():
     assert [AUTO, *ESTIMATORS] == list(CHOICES)
 
 
+def test_version_and_help(lipserve):
+    assert lipserve("--version") == (0, f"{__version__}\n", "")
+    code, out, _ = lipserve("--help")
+    assert code == 0
+    assert all(f"{command} " in out for command in Commands.entries)
+
+
 def test_every_command_prints_json_and_has_a_help():
     for path, command, _ in commands():
         assert command.help, path
@@ -44,14 +52,13 @@ def completed(lipserve, monkeypatch):
     """What a shell is offered for the last word of a command line."""
 
     def run(line):
-        found = line.split(" ")
-        monkeypatch.setenv("_LIPSERVE_COMPLETE", "complete_bash")
-        monkeypatch.setenv("COMP_WORDS", line)
-        monkeypatch.setenv("COMP_CWORD", str(len(found) - 1))
-        code, said, err = lipserve()
-        monkeypatch.delenv("_LIPSERVE_COMPLETE")
+        shell = {"_LIPSERVE_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(line.count(" "))}
+        with monkeypatch.context() as patch:
+            for name, value in shell.items():
+                patch.setenv(name, value)
+            code, out, err = lipserve()
         assert (code, err) == (0, "")
-        return said.split()
+        return out.split()
 
     return run
 
@@ -81,14 +88,37 @@ def test_exit_codes(lipserve):
     assert lipserve("models", "promote", "m")[0] == 2
     assert "Did you mean 'train'" in lipserve("trian")[2]
     nobody = f"http://127.0.0.1:{free_port()}"
-    for command in (
-        ("models", "list"),
-        ("open",),
-        ("stream", "m", "--simulate", "double-pendulum", "--seconds", "0.1"),
-    ):
-        code, said, err = lipserve(*command, "--url", nobody)
-        assert (code, said) == (1, "")
+    for command in (["models", "list"], ["open"], ["stream", "m", "--simulate", "panda", "--seconds", "0.1"]):
+        code, out, err = lipserve(*command, "--url", nobody)
+        assert (code, out) == (1, "")
         assert "lipserve serve" in err
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("simulate r2d2 x.csv", f"robot is 'r2d2', expected one of {', '.join(ROBOTS)}"),
+        ("simulate ur5 x.parquet", "expected the ending .csv or .npz"),
+        ("simulate ur5 x.csv --motion wild", "motion is 'wild'"),
+        ("simulate ur5 x.csv --noise -1", "noise is -1.0"),
+        ("simulate ur5 nowhere/x.csv --samples 40", "nowhere/x.csv"),
+        ("predict m --q 1,two,3", "--q is '1,two,3', expected numbers separated by commas"),
+        ("predict m --q=", "--q is ''"),
+        ("predict m --q 1 --dq x", "--dq is 'x'"),
+        ("serve --port 70000", "port: Input should be less than or equal to 65535"),
+        ("serve", "max_samples: "),
+    ],
+)
+def test_mistakes_are_explained_in_one_line(lipserve, tmp_path, monkeypatch, command, message):
+    monkeypatch.chdir(tmp_path)
+    if command == "serve":
+        monkeypatch.setenv("LIPSERVE_MAX_SAMPLES", "-5")
+    code, out, err = lipserve(*command.split())
+    assert (code, out) == (1, "")
+    assert err.startswith("error: ")
+    assert message in err
+    assert err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_address_of_the_dashboard(asked, server):
@@ -106,9 +136,9 @@ def test_address_of_the_dashboard(asked, server):
     ],
 )
 def test_hints(status, code, hint):
-    told = consoles.explain(ApiError(status, code, "no", []), (ApiError,))
-    assert told.message == f"no ({code}, {status})"
-    assert (told.hint is None) if hint is None else (hint in told.hint)
+    explained = consoles.explain(ApiError(status, code, "no", []), (ApiError,))
+    assert explained.message == f"no ({code}, {status})"
+    assert (explained.hint is None) if hint is None else (hint in explained.hint)
 
 
 def test_faults_are_not_explained_away():
@@ -118,8 +148,5 @@ def test_faults_are_not_explained_away():
 
 
 def test_numbers_that_json_does_not_know_are_null():
-    assert plain({"a": float("nan"), "b": (1.0, float("inf")), "c": Path("x")}) == {
-        "a": None,
-        "b": [1.0, None],
-        "c": "x",
-    }
+    values = {"a": float("nan"), "b": (1.0, float("inf")), "c": Path("x")}
+    assert plain(values) == {"a": None, "b": [1.0, None], "c": "x"}

@@ -13,8 +13,10 @@ from tests.service.data import ADDRESS
 
 
 class Losing(httpx.BaseTransport):
-    """Hands requests on and loses some answers. lose: says of a request whether its answer is lost, after the service
-    has done what it says; requests: all that were sent."""
+    """Hands requests on and loses some answers.
+
+    lose: whether the answer to a request is lost, once the service has done what it asks; requests: all that were sent.
+    """
 
     def __init__(self, inner: httpx.BaseTransport, lose: Callable[[httpx.Request, int], bool]) -> None:
         self.inner, self.lose = inner, lose
@@ -40,9 +42,9 @@ def over(transport: httpx.BaseTransport, **options: object) -> Client:
 @pytest.fixture
 def pauses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Nothing waits; what would have been waited for is listed."""
-    found: list[float] = []
-    monkeypatch.setattr("service.client.sync.time.sleep", found.append)
-    return found
+    listed: list[float] = []
+    monkeypatch.setattr("service.client.sync.time.sleep", listed.append)
+    return listed
 
 
 @pytest.fixture

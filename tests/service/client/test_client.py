@@ -1,14 +1,20 @@
-"""The Python client against a real server."""
+"""Both Python clients against a real server: the synchronous one, then the asynchronous one and its streams."""
 
 from __future__ import annotations
 
+import asyncio
+
+import httpx
 import numpy as np
 import pytest
 
 from service.cli.simulate import write_recording
-from service.client import ApiError, Client, ServiceUnreachableError
-from tests.service.data import QUICK, stream
+from service.client import ApiError, AsyncClient, Client, ServiceUnreachableError
+from service.client.async_stream import AsyncStreamClient
+from service.client.stream import StreamError
+from tests.service.data import DEADLINE, QUICK, stream, upload
 from tests.service.server import free_port
+from tests.service.streams import MOTION, TAU
 
 
 @pytest.fixture(scope="module")
@@ -17,102 +23,169 @@ def client(server):
         yield opened
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    """A training stream as CSV, an unseen one as NPZ."""
-    folder = tmp_path_factory.mktemp("files")
-    write_recording(folder / "train.csv", stream())
-    write_recording(folder / "test.npz", stream(seed=2))
-    return folder
-
-
-def test_from_files_to_torques(client, files):
-    names = list(stream().joint_names)
-    train = client.upload(files / "train.csv", joint_names=names)
-    test = client.upload(files / "test.npz", name="unseen")
-    assert (train.name, test.name) == ("train.csv", "unseen")
-    assert train.joint_names == test.joint_names == names
-
+def test_jobs_are_waited_for_cancelled_and_retried(client, server):
+    dataset = upload(server.client, stream())["id"]
     looks = []
-    job = client.train("roundtrip", [train.id], "lip", ["revolute", "revolute"], QUICK)
-    assert job.state == "queued"
-    job = client.wait(job.id, looks.append)
+    job = client.wait(client.train("waited", [dataset], "lip-chain", options=QUICK).id, looks.append)
     assert (job.state, job.version) == ("succeeded", 1)
     assert looks[-1] == job == client.job(job.id)
 
-    assert client.model("roundtrip").latest_version == 1
-    assert client.version("roundtrip", 1).lineage["datasets"][0]["sha256"] == train.sha256
-
-    s = stream()
-    batch = client.predict("roundtrip", s.q, s.dq, s.ddq, covariance=True)
-    single = client.predict("roundtrip", s.q[3], s.dq[3], s.ddq[3], version=1)
-    assert np.shape(batch.tau) == (80, 2)
-    np.testing.assert_allclose(single.tau, batch.tau[3], rtol=1e-9)
-    assert single.covariance is None
-    assert np.shape(batch.covariance) == (80, 2, 2)
-
-    result = client.evaluate("roundtrip", test.id, version=1)
-    assert (result.dataset, result.samples, result.in_training) == (test.id, 80, False)
-
-
-def test_cancelling(client, files):
-    dataset = client.upload(files / "train.csv").id
-    running = client.train(
-        "cancelled", [dataset], "lip-chain", options={"max_iterations": 10_000, "posterior_samples": 80}
-    )
-    job = client.cancel(running.id)
-    assert job.id == running.id
-    seen = list(client.job_events(job.id))
-    assert seen[-1].state == client.wait(job.id).state == "cancelled"
-    again = client.retry(job.id)
-    assert (again.retry_of, again.model) == (job.id, "cancelled")
+    endless = {"max_iterations": 10_000, "posterior_samples": 80}
+    running = client.train("cancelled", [dataset], "lip-chain", options=endless)
+    assert client.cancel(running.id).id == running.id
+    seen = list(client.job_events(running.id))
+    assert seen[-1].state == client.wait(running.id).state == "cancelled"
+    again = client.retry(running.id)
+    assert (again.retry_of, again.model) == (running.id, "cancelled")
     assert client.cancel(again.id).id == again.id
     with pytest.raises(ApiError) as caught:
         next(client.job_events("job_nowhere"))
     assert caught.value.status == 404
 
 
-def test_refusals_carry_code_message_and_detail(client):
+def test_refusals_carry_code_message_and_detail(client, tmp_path):
     with pytest.raises(ApiError) as caught:
         client.predict("panda-sim", [0.0] * 6, [0.0] * 6, [0.0] * 6)
     assert (caught.value.status, caught.value.code) == (422, "invalid_request")
     assert str(caught.value) == caught.value.message
     assert "q is 6 numbers long, expected 7 numbers: panda_joint1" in caught.value.message
     assert caught.value.detail[0]["field"] == "q"
-
+    large = tmp_path / "large.csv"
+    large.write_bytes(b"x" * 3_000_000)
     with pytest.raises(ApiError) as caught:
-        client.model("nobody")
-    assert (caught.value.status, caught.value.code) == (404, "not_found")
-
-
-def test_refused_data_say_why(client, tmp_path):
-    path = tmp_path / "bad.csv"
-    path.write_text("t,q1,speed1\n0,0,0\n")
-    with pytest.raises(ApiError, match="column tau1 is missing"):
-        client.upload(path)
-
-
-def test_uploads_beyond_the_limit_say_so(client, tmp_path):
-    path = tmp_path / "large.csv"
-    path.write_bytes(b"x" * 3_000_000)
-    with pytest.raises(ApiError) as caught:
-        client.upload(path)
+        client.upload(large)
     assert (caught.value.status, caught.value.code) == (413, "too_large")
 
 
-def test_other_endings_are_refused_before_anything_is_sent(tmp_path):
-    said = pytest.raises(ValueError, match=r"expected the ending \.csv, ")
-    with Client(f"http://127.0.0.1:{free_port()}") as client, said:
-        client.upload(tmp_path / "stream.xlsx")
-
-
-def test_nobody_listening_is_said_with_the_remedy():
-    url = f"http://127.0.0.1:{free_port()}"
-    with Client(url) as client:
-        assert client.ready() is False
-        with pytest.raises(ServiceUnreachableError, match=f"no service answers at {url}.*lipserve serve"):
-            client.model("panda-sim")
-
-
-def test_ready(client):
+def test_nobody_listening_is_said_with_the_remedy(client, tmp_path):
     assert client.ready() is True
+    url = f"http://127.0.0.1:{free_port()}"
+    with Client(url) as alone:
+        assert alone.ready() is False
+        with pytest.raises(ServiceUnreachableError, match=f"no service answers at {url}.*lipserve serve"):
+            alone.model("panda-sim")
+        with pytest.raises(ValueError, match=r"expected the ending \.csv, "):  # before anything is sent
+            alone.upload(tmp_path / "stream.xlsx")
+
+
+def ask(server, work):
+    """Run `work` with a client."""
+
+    async def main():
+        async with AsyncClient(server.url) as client:
+            return await asyncio.wait_for(work(client), DEADLINE)
+
+    return asyncio.run(main())
+
+
+def test_from_files_to_torques(streaming, tmp_path):
+    write_recording(tmp_path / "train.npz", stream())
+
+    async def work(client):
+        dataset = await client.upload(tmp_path / "train.npz")
+        assert dataset.id in [each.id async for each in client.datasets()]
+        job = await client.train("awaited", [dataset.id], "lip-chain", options=QUICK)
+        states = [each.state async for each in client.job_events(job.id)]
+        ended = await client.wait(job)
+        assert (ended.state, states[-1]) == ("succeeded", "succeeded")
+        path = await client.export("awaited", tmp_path / "awaited.tar")
+        assert (await client.import_model(path, "awaited-copy")).version == 1
+        assert (await client.set_learning("awaited-copy", contact_threshold=8.0)).options.contact_threshold == 8.0
+        return await client.predict("awaited", *MOTION), await client.evaluate("awaited", dataset.id)
+
+    answer, evaluated = ask(streaming.server, work)
+    with Client(streaming.server.url) as client:
+        np.testing.assert_allclose(client.predict("awaited", *MOTION).tau, answer.tau, rtol=1e-9)
+        assert client.evaluate("awaited", evaluated.dataset).as_dict() == evaluated.as_dict()
+    assert not (tmp_path / "awaited.tar.part").exists()
+
+
+def test_many_at_once(streaming):
+    async def work(client):
+        return await asyncio.gather(*(client.predict("pendulum", *(MOTION * scale)) for scale in (0.5, 1.0, 0.5)))
+
+    first, other, again = ask(streaming.server, work)
+    np.testing.assert_array_equal(first.tau, again.tau)
+    assert (first.tau != other.tau).all()
+
+
+def test_refusals_and_silence_of_the_asynchronous_client(streaming, tmp_path):
+    async def work(client):
+        with pytest.raises(ApiError) as caught:
+            await client.model("nobody")
+        assert caught.value.status == 404
+        with pytest.raises(ApiError):
+            await client.export("nobody", tmp_path / "nobody.tar")
+        with pytest.raises(ApiError):
+            await anext(client.job_events("job_nowhere"))
+        assert await client.ready()
+
+    ask(streaming.server, work)
+    assert list(tmp_path.iterdir()) == []
+
+    async def alone():
+        async with AsyncClient(f"http://127.0.0.1:{free_port()}") as client:
+            assert not await client.ready()
+            with pytest.raises(ServiceUnreachableError, match="lipserve serve"):
+                await client.model("pendulum")
+
+    asyncio.run(alone())
+
+
+def test_the_asynchronous_client_tries_again_after_a_lost_connection(monkeypatch):
+    sent = []
+
+    def answer(request):
+        sent.append(request)
+        if len(sent) < 3:
+            raise httpx.ReadError("lost")
+        return httpx.Response(200, json={"items": [], "next_cursor": None})
+
+    async def work():
+        client = AsyncClient()
+        client._http = httpx.AsyncClient(transport=httpx.MockTransport(answer), base_url="http://localhost")
+        return [each async for each in client.models()]
+
+    assert asyncio.run(work()) == []
+    assert len(sent) == 3
+
+
+def test_streams(streaming):
+    async def work(client):
+        async with client.stream("pendulum", stream_id="awaited") as opened:
+            assert opened.hello.joint_names == streaming.model.joint_names
+            tau, std = streaming.model.answer(MOTION)
+            answer = await opened.ask(*MOTION)
+            np.testing.assert_allclose(answer.tau, tau, rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(answer.tau_std, std, rtol=1e-12, atol=1e-12)
+            with pytest.raises(StreamError, match="q"):
+                await opened.ask(MOTION[0] * np.inf, *MOTION[1:])
+            with pytest.raises(ValueError, match="expected"):
+                await opened.send(MOTION[0], MOTION[1], [1.0])
+            numbers = [await opened.send(*(MOTION * scale), std=False) for scale in (0.5, 1.0)]
+            assert [(await opened.receive()).sequence for _ in numbers] == numbers
+            assert (await opened.flush()).accepted == 0
+            await opened.ask(*MOTION, deadline=1e-9)
+            assert (await opened.ask(*MOTION)).late_answers == 1
+            assert opened.refusals == ()
+
+    ask(streaming.server, work)
+
+
+def test_streams_that_cannot_be_had(streaming):
+    async def work(client):
+        with pytest.raises(StreamError, match="no model 'nobody'"):
+            async with client.stream("nobody"):
+                pass
+        async with client.stream("pendulum") as opened:
+            with pytest.raises(ValueError, match="stream_id"):
+                await opened.ask(*MOTION, tau=TAU)
+        with pytest.raises(StreamError, match=r"lost|closed"):
+            await opened.ask(*MOTION)
+        with pytest.raises(StreamError, match="not open"):
+            await AsyncStreamClient("pendulum").ask(*MOTION)
+        with pytest.raises(StreamError, match="no service answers"):
+            async with AsyncStreamClient("pendulum", f"http://127.0.0.1:{free_port()}"):
+                pass
+
+    ask(streaming.server, work)

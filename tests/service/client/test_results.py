@@ -1,42 +1,37 @@
-"""Results of the client: arrays, intervals of measurements, tables."""
+"""Results of the client: arrays, intervals of measurements, tables, and the arm that was learnt."""
 
 from __future__ import annotations
 
 import json
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
+from lipcore.robots.urdf import RigidBody
 from service.client.call import Answer
-from service.client.results.evaluation import read_comparison, read_evaluation
+from service.client.results.arm import Arm, read_arm
+from service.client.results.evaluation import read_evaluation
 from service.client.results.series import LiveRows, read_live
 from service.learning.live.schema import LiveLost
+from service.models.schema import Version
+from tests.lipcore.arms import parameters_of
+from tests.service.client.conftest import over
 from tests.service.data import stream, upload
+from tests.service.models.versions import JOINTS, panda, publish
 
 EVALUATION = {
-    "model": "m<b>",
-    "version": 2,
-    "revision": 3,
-    "dataset": "ds_1",
-    "part": "all",
-    "joint_names": ["a", "b"],
-    "samples": 100,
-    "samples_used": 50,
-    "level": 0.95,
-    "nmse": [0.0123, None],
-    "rmse": [0.5, 0.25],
-    "coverage": [0.94, 1.0],
-    "nlpd": [-1.5, 0.125],
-    "interval_width": [2.0, 1.0],
+    **{"model": "m<b>", "version": 2, "revision": 3, "dataset": "ds_1", "part": "all", "joint_names": ["a", "b"]},
+    **{"samples": 100, "samples_used": 50, "level": 0.95, "nmse": [0.0123, None], "rmse": [0.5, 0.25]},
+    **{"coverage": [0.94, 1.0], "nlpd": [-1.5, 0.125], "interval_width": [2.0, 1.0], "in_training": True},
     "coverages": [{"level": 0.5, "coverage": [0.5, 0.6], "interval_width": [0.7, 0.4]}],
     "reliability": {"nominal": [0.5, 0.9], "observed": [[0.5, 0.9], [0.6, 0.95]]},
     "stretches": {"kind": "equal", "samples": [25, 25], "nmse": [[0.01, 0.02], [None, None]]},
-    "in_training": True,
 }
 
 
-def answer(said, event=""):
-    return Answer(200, json.dumps(said).encode(), event=event)
+def answer(body, event=""):
+    return Answer(200, json.dumps(body).encode(), event=event)
 
 
 def test_predictions_are_arrays(api, local):
@@ -48,21 +43,16 @@ def test_predictions_are_arrays(api, local):
     np.testing.assert_allclose(many.tau[1], one.tau, rtol=1e-9)
     assert one.joint_names[0] == "panda_joint1"
     assert (many.covariance, many.components) == (None, None)
-    said = api.post("/v1/models/panda-sim/predict", json={"q": [*q], "dq": [0] * 7, "ddq": [0] * 7}).json()
-    assert json.loads(json.dumps(local.predict("panda-sim", q, 0 * q, 0 * q).as_dict())) == said
+    plain = api.post("/v1/models/panda-sim/predict", json={"q": [*q], "dq": [0] * 7, "ddq": [0] * 7}).json()
+    assert json.loads(json.dumps(local.predict("panda-sim", q, 0 * q, 0 * q).as_dict())) == plain
 
-
-def test_intervals_are_those_of_measurements(local):
-    zero = np.zeros(7)
-    found = local.predict("panda-sim", zero, zero, zero)
-    lower, upper = found.interval()
-    np.testing.assert_allclose((upper - lower) / 2, 1.959964 * np.hypot(found.tau_std, found.noise_std), rtol=1e-6)
-    np.testing.assert_allclose((lower + upper) / 2, found.tau)
-    wider = found.interval(0.99)
-    assert (wider[1] > upper).all()
+    lower, upper = one.interval()  # of a measurement
+    np.testing.assert_allclose((upper - lower) / 2, 1.959964 * np.hypot(one.tau_std, one.noise_std), rtol=1e-6)
+    np.testing.assert_allclose((lower + upper) / 2, one.tau)
+    assert (one.interval(0.99)[1] > upper).all()
     for level in (0.0, 1.0, 95):
         with pytest.raises(ValueError, match="expected a probability"):
-            found.interval(level)
+            one.interval(level)
 
 
 def test_an_evaluation_is_a_table():
@@ -81,46 +71,26 @@ def test_an_evaluation_is_a_table():
     assert np.isnan(second["nmse"])
     assert found.as_dict() == EVALUATION
     assert (found.reliability.observed.shape, found.stretches.nmse.shape) == ((2, 2), (2, 2))
-
-
-def test_held_out_samples_are_said_to_be():
-    found = read_evaluation(answer({**EVALUATION, "part": "held_out", "in_training": False}))
-    assert found.title == "m<b> version 2 on 50 held-out samples of ds_1"
+    held_out = read_evaluation(answer({**EVALUATION, "part": "held_out", "in_training": False}))
+    assert held_out.title == "m<b> version 2 on 50 held-out samples of ds_1"
 
 
 def test_an_evaluation_says_what_the_service_says(api, local, trained):
-    found = local.evaluate(trained.name, trained.dataset)
     asked = {"dataset": trained.dataset}
-    assert found.as_dict() == api.post(f"/v1/models/{trained.name}/evaluate", json=asked).json()
-    assert found.in_training
+    answered = api.post(f"/v1/models/{trained.name}/evaluate", json=asked).json()
+    assert local.evaluate(trained.name, trained.dataset).as_dict() == answered
 
 
-def test_a_comparison_says_its_verdict_and_what_makes_it_unfair():
-    figures = {name: EVALUATION[name] for name in ("nmse", "rmse", "coverage", "nlpd", "interval_width")}
-    versions = [{"version": version, "revision": 0, **figures, "in_training": version == 1} for version in (1, 2)]
-    nothing = {"difference": None, "standard_error": None, "half_width": None}
-    joints = {"difference": [0.1, None], "standard_error": [None, None], "half_width": [None, None]}
-    body = {
-        "model": "m",
-        "dataset": "ds_1",
-        "joint_names": ["a", "b"],
-        "samples": 100,
-        "samples_used": 50,
-        "blocks": 1,
-        "versions": versions,
-        "differences": dict.fromkeys(("nmse", "rmse", "coverage", "nlpd"), joints),
-        "nlpd": nothing,
-        "nmse": nothing,
-        "outcome": "cannot_tell",
-        "better": None,
-        "verdict": "cannot tell",
-        "warnings": ["version 1 was trained on it"],
-    }
-    found = read_comparison(answer(body))
-    assert str(found) == "cannot tell\ncareful: version 1 was trained on it"
-    assert np.isnan(found.nlpd.difference)
-    assert found.differences["nmse"].difference[0] == 0.1
-    assert [each.in_training for each in found.versions] == [True, False]
+def test_a_comparison_says_its_verdict_and_what_makes_it_unfair(api, local, pendulum):
+    publish(api, "client-compared", lineage={"datasets": [pendulum]})
+    publish(api, "client-compared")
+    compared = local.compare("client-compared", pendulum["id"], 1, 2)
+    (warning,) = compared.warnings
+    assert str(compared) == f"{compared.verdict}\ncareful: {warning}"
+    assert [each.in_training for each in compared.versions] == [True, False]
+    asked = {"dataset": pendulum["id"], "versions": [1, 2]}
+    answered = api.post("/v1/models/client-compared/compare", json=asked).json()
+    assert compared.as_dict() | {"better": None} == answered
 
 
 def test_a_preview_has_its_columns(local, pendulum):
@@ -148,18 +118,9 @@ def test_a_trace_stands_beside_what_was_measured(local, trained):
 
 def test_live_rows_are_arrays():
     part = {
-        "stream_id": "arm",
-        "version": 1,
-        "revision": 0,
-        "rows": 50,
-        "counts": {"learnt": 49, "contact": 1},
-        "worst": [2.0, None],
-        "noise_std": [0.3, 0.4],
-        "q": [0.1, -0.2],
-        "time": [1.0, None],
-        "tau": [[1.0, 2.0], [None, 1.0]],
-        "mean": [[0.5, 2.0], [0.0, 1.0]],
-        "std": [[0.4, 0.3], [0.4, 0.3]],
+        **{"stream_id": "arm", "version": 1, "revision": 0, "rows": 50, "counts": {"learnt": 49, "contact": 1}},
+        **{"worst": [2.0, None], "noise_std": [0.3, 0.4], "q": [0.1, -0.2], "time": [1.0, None]},
+        **{"tau": [[1.0, 2.0], [None, 1.0]], "mean": [[0.5, 2.0], [0.0, 1.0]], "std": [[0.4, 0.3], [0.4, 0.3]]},
         "code": ["learnt", "contact"],
     }
     found = read_live(answer({"parts": [part]}, "rows"))
@@ -172,10 +133,76 @@ def test_live_rows_are_arrays():
 
 
 def test_lists_go_over_all_pages(strict):
-    from tests.service.client.conftest import over
-
     made = [upload(strict, stream(samples=30, seed=seed))["id"] for seed in range(5)]  # three fit on a page
-    client = over(strict._transport)
-    found = client.datasets()
-    assert next(found).id == made[-1]
-    assert [each.id for each in found] == made[-2::-1]
+    assert [each.id for each in over(strict._transport).datasets()] == made[::-1]
+
+
+REVERSED = JOINTS[::-1]
+NAMES = {"joint_names": list(REVERSED), "joint_types": ["revolute"] * 7}
+
+
+def version(parameters) -> Version:
+    return Version.model_construct(
+        model="m", version=1, joint_names=list(REVERSED), joint_types=["revolute"] * 7, parameters=parameters
+    )
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return RigidBody.from_profile("panda", REVERSED, panda().joint_types)
+
+
+@pytest.fixture
+def arm(robot) -> Arm:
+    return read_arm(version(parameters_of(robot)))
+
+
+def test_it_is_pinocchios(robot, arm):
+    data = robot.model.createData()
+    pin.forwardKinematics(robot.model, data, np.zeros(7))
+    joints = list(data.oMi)[1:]
+    assert arm.joint_names == JOINTS
+    np.testing.assert_allclose(arm.frames.place, [each.translation for each in joints], atol=1e-12)
+    np.testing.assert_allclose(arm.frames.axis, [each.rotation[:, 2] for each in joints], atol=1e-12)
+    bodies = list(robot.model.inertias)[1:]
+    np.testing.assert_allclose(arm.mass, [each.mass for each in bodies])
+    np.testing.assert_allclose(arm.centre, [each.lever for each in bodies], atol=1e-12)
+
+
+def test_deviations_of_centres_are_those_of_draws(robot, arm):
+    """First moment and mass are drawn apart, as the manifest holds no covariance of theirs."""
+    body = parameters_of(robot)["inertia"]["bodies"][-1]  # of the first joint
+    mean, std = body["plausible"], body["std"]
+    rng = np.random.default_rng(0)
+    draws = rng.normal(mean["first_moment"], std["first_moment"], (100_000, 3))
+    draws /= rng.normal(mean["mass"], std["mass"], (100_000, 1))
+    np.testing.assert_allclose(arm.centre_std[0], draws.std(axis=0), rtol=0.03)
+
+
+def test_text_and_html_show_every_joint_and_what_torque_does_not_tell(arm):
+    parts = (*JOINTS, "shift 2", "mirror image", "0.1 ± 0.01", "0.057, 0.11", "torque off N·m")
+    assert [part for part in parts if part not in str(arm)] == []
+    assert "<td>mass, first moment</td>" in arm._repr_html_()
+    assert arm.as_dict()["frames"]["mode"] == "learn"
+
+
+def test_versions_of_earlier_releases(robot):
+    report = parameters_of(robot)
+    del report["inertia"]["plausible_deviation"]
+    old = read_arm(version({name: report[name] for name in ("friction", "inertia")}))
+    assert old.frames is None
+    assert old.joint_names == REVERSED
+    assert "rotor" not in str(old)
+    assert "torque off N·m" not in str(old)
+    assert read_arm(version({"friction": report["friction"]})) is None
+    assert read_arm(version(None)) is None
+
+
+def test_friction_of_slow_joints_is_shown_where_it_was_learnt(robot, arm):
+    parameters = parameters_of(robot)
+    parameters["friction"]["stribeck"] = {"mean": [float(k) for k in range(7)], "std": [0.01] * 7}
+    shown = read_arm(version(parameters))
+    np.testing.assert_allclose(shown.friction["stribeck"][0], range(6, -1, -1))
+    assert list(shown.tables()["friction"])[-1] == "at low speed N·m"
+    assert "stribeck" not in arm.friction
+    assert "low speed" not in str(arm)

@@ -10,6 +10,9 @@ from contextlib import suppress
 from typing import Any, Self
 
 import uvicorn
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.websockets import WebSocket
 
 from service.foundation.settings import Settings
 from service.web.observability.readiness import Stopping
@@ -20,7 +23,7 @@ from tests.service.server import free_port
 
 
 class SmallApp:
-    """Answers `hello`; /large: many bytes; /body: the size of the body; /held: once it may; /unread: reads no body.
+    """Answers `hello`; /large: many bytes; /body: the size of the body; /held: once it may. Echoes what streams send.
 
     begun: how many requests have come; go: lets those that are held go on.
     """
@@ -31,34 +34,20 @@ class SmallApp:
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         if scope["type"] == "websocket":
-            await _echo(receive, send)
-        if scope["type"] != "http":
+            stream = WebSocket(scope, receive, send)
+            await stream.accept()
+            async for data in stream.iter_bytes():
+                await stream.send_bytes(data)
             return
         self.begun += 1
         content = b"hello"
         if scope["path"] == "/large":
             content = bytes(64 * 1024 * 1024)
         elif scope["path"] == "/body":
-            size, more = 0, True
-            while more:
-                message = await receive()
-                if message["type"] == "http.disconnect":
-                    return
-                size, more = size + len(message["body"]), message["more_body"]
-            content = str(size).encode()
+            content = str(len(await Request(scope, receive).body())).encode()
         elif scope["path"] == "/held":
             await self.go.wait()
-        headers = [(b"content-length", str(len(content)).encode())]
-        await send({"type": "http.response.start", "status": 200, "headers": headers})
-        await send({"type": "http.response.body", "body": content})
-
-
-async def _echo(receive: Any, send: Any) -> None:
-    """Say again what comes over a WebSocket."""
-    await receive()
-    await send({"type": "websocket.accept"})
-    while (message := await receive())["type"] == "websocket.receive":
-        await send({"type": "websocket.send", "bytes": message["bytes"]})
+        await Response(content)(scope, receive, send)
 
 
 class Serving:
@@ -96,7 +85,7 @@ class Serving:
 
 
 class Raw:
-    """A connection that says what it is told to, byte for byte."""
+    """A connection on which a test sends byte for byte."""
 
     def __init__(self, port: int) -> None:
         self.socket = socket.create_connection(("127.0.0.1", port), DEADLINE)
@@ -108,25 +97,25 @@ class Raw:
 
     def rest(self) -> bytes:
         """All that comes until the other side closes, empty where it says nothing."""
-        found = bytearray()
+        received = bytearray()
         with suppress(ConnectionError):
             while piece := self.socket.recv(1 << 16):
-                found += piece
-        return bytes(found)
+                received += piece
+        return bytes(received)
 
     def exactly(self, size: int) -> bytes:
         """The next bytes, as many as that."""
-        found = bytearray()
-        while len(found) < size:
-            found += self._some(size - len(found))
-        return bytes(found)
+        received = bytearray()
+        while len(received) < size:
+            received += self._some(size - len(received))
+        return bytes(received)
 
     def answer(self) -> tuple[int, bytes]:
         """Status and content of the next answer, whose length is announced."""
-        found = self.ahead
-        while b"\r\n\r\n" not in found:
-            found += self._some()
-        head, _, content = found.partition(b"\r\n\r\n")
+        received = self.ahead
+        while b"\r\n\r\n" not in received:
+            received += self._some()
+        head, _, content = received.partition(b"\r\n\r\n")
         length = next(int(line[15:]) for line in head.lower().split(b"\r\n") if line.startswith(b"content-length:"))
         while len(content) < length:
             content += self._some()

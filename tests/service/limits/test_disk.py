@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from contextlib import contextmanager
 from types import SimpleNamespace
 
 import pytest
@@ -16,7 +17,7 @@ from service.storage import disk as measuring
 from service.storage.disk import Disk, measure
 from service.storage.files import new_id
 from service.web.limits.upload import WRITE_BYTES
-from tests.service.data import QUICK, arrays, error, npz, post, service_of, stream, upload
+from tests.service.data import QUICK, arrays, error, npz, post, service_of, stream
 
 KiB = 1024
 
@@ -30,15 +31,10 @@ def clock(monkeypatch):
 
 
 @pytest.fixture
-def full(api, monkeypatch):
-    """The session's service, with a home that has no room for more."""
-    monkeypatch.setattr(service_of(api).disk, "quota", 1)
-    return api
-
-
-def home_of(tmp_path, size):
-    (tmp_path / "file").write_bytes(bytes(size))
-    return tmp_path
+def disk(tmp_path):
+    """The disk of a home that holds 500 bytes of the 1000 that it may."""
+    (tmp_path / "file").write_bytes(bytes(500))
+    return Disk(Settings(home=tmp_path, max_home_bytes=1000, min_free_bytes=0))
 
 
 def test_a_home_is_measured_with_all_below_it_but_not_what_links_lead_to(tmp_path):
@@ -53,8 +49,7 @@ def test_a_home_is_measured_with_all_below_it_but_not_what_links_lead_to(tmp_pat
     assert measure(tmp_path / "nowhere") == 0
 
 
-def test_a_quota_is_kept_between_measurements(tmp_path, clock):
-    disk = Disk(Settings(home=home_of(tmp_path, 500), max_home_bytes=1000, min_free_bytes=0))
+def test_a_quota_is_kept_between_measurements(disk, clock):
     disk.take(300)
     disk.take(200)
     disk.require()
@@ -66,8 +61,7 @@ def test_a_quota_is_kept_between_measurements(tmp_path, clock):
         disk.require(1)
 
 
-def test_what_others_write_is_seen_after_a_while_and_what_they_delete_soon(tmp_path, clock):
-    disk = Disk(Settings(home=home_of(tmp_path, 500), max_home_bytes=1000, min_free_bytes=0))
+def test_what_others_write_is_seen_after_a_while_and_what_they_delete_soon(disk, tmp_path, clock):
     disk.require(500)
     (tmp_path / "other").write_bytes(bytes(400))
     disk.require(500)
@@ -90,56 +84,47 @@ def test_space_stays_free(tmp_path):
     assert disk.usage().shortage() is not None
 
 
-def nothing_comes(api):
-    """Look that nothing of what follows in the block stays."""
-    files = service_of(api).files
-    return sorted(files.datasets.iterdir()), sorted(files.uploads.iterdir())
+@contextmanager
+def nothing_comes(api, monkeypatch, room):
+    """Let the session's service have no more room than this, and check that no file of a data set comes meanwhile."""
+    service = service_of(api)
+
+    def files():
+        return sorted([*service.files.datasets.iterdir(), *service.files.uploads.iterdir()])
+
+    before = files()
+    with monkeypatch.context() as patch:
+        patch.setattr(service.disk, "quota", service.disk.usage(0).used + room)
+        yield
+    assert files() == before
 
 
-@pytest.mark.parametrize("form", [False, True], ids=["body", "form"])
-def test_uploads_are_refused_before_they_are_read_while_queries_go_on(full, form):
-    before = nothing_comes(full)
-    if form:
-        answer = full.post("/v1/datasets", files={"file": ("full.npz", npz(**arrays(stream())))})
-    else:
-        answer = post(full, npz(**arrays(stream())))
-    assert "LIPSERVE_MAX_HOME_BYTES" in error(answer, 507, "storage_full")["message"]
-    assert nothing_comes(full) == before
-    query = {"q": [0.0] * 7, "dq": [0.0] * 7, "ddq": [0.0] * 7}
-    assert full.post("/v1/models/panda-sim/predict", json=query).status_code == 200
-    assert full.get("/v1/datasets").status_code == 200
+def test_what_is_stored_is_refused_before_it_is_read_while_queries_go_on(api, pendulum, monkeypatch):
+    packed = npz(**arrays(stream()))
+    job = {"model": "limits-full", "datasets": [pendulum["id"]], "estimator": "lip-chain", "options": QUICK}
+    with nothing_comes(api, monkeypatch, room=-1):
+        for answer in (
+            post(api, packed),
+            api.post("/v1/datasets", files={"file": ("full.npz", packed)}),
+            api.post("/v1/jobs", json=job),
+            api.post("/v1/robots", content=b"<robot/>", headers={"content-type": "application/xml"}),
+        ):
+            assert "LIPSERVE_MAX_HOME_BYTES" in error(answer, 507, "storage_full")["message"]
+        query = {"q": [0.0] * 7, "dq": [0.0] * 7, "ddq": [0.0] * 7}
+        assert api.post("/v1/models/panda-sim/predict", json=query).status_code == 200
+        assert api.get("/v1/datasets").status_code == 200
 
 
 def test_an_upload_of_unknown_length_is_ended_where_the_room_ends(api, monkeypatch):
-    before, disk = nothing_comes(api), service_of(api).disk
-    sent = 0
-
-    def body():
-        nonlocal sent
-        for _ in range(64):
-            sent += 64 * KiB
-            yield bytes(64 * KiB)
-
-    monkeypatch.setattr(disk, "quota", disk.usage(0).used + WRITE_BYTES + 1)
-    error(post(api, body(), "text/csv"), 507, "storage_full")
-    assert sent <= 64 * 64 * KiB
-    assert nothing_comes(api) == before
+    pieces = iter([bytes(64 * KiB)] * 64)
+    with nothing_comes(api, monkeypatch, room=WRITE_BYTES + 1):
+        error(post(api, pieces, "text/csv"), 507, "storage_full")
 
 
 def test_data_that_is_larger_once_unpacked_is_refused(api, monkeypatch):
-    before, disk = nothing_comes(api), service_of(api).disk
     packed = npz(**arrays(stream()))
-    monkeypatch.setattr(disk, "quota", disk.usage(0).used + len(packed) + 100)
-    error(post(api, packed), 507, "storage_full")
-    assert nothing_comes(api) == before
-
-
-def test_robots_and_jobs_are_refused(api, pendulum, monkeypatch):
-    monkeypatch.setattr(service_of(api).disk, "quota", 1)
-    body = {"model": "limits-full", "datasets": [pendulum["id"]], "estimator": "lip-chain", "options": QUICK}
-    error(api.post("/v1/jobs", json=body), 507, "storage_full")
-    answer = api.post("/v1/robots", content=b"<robot/>", headers={"content-type": "application/xml"})
-    error(answer, 507, "storage_full")
+    with nothing_comes(api, monkeypatch, room=len(packed) + 100):
+        error(post(api, packed), 507, "storage_full")
 
 
 def test_observations_are_refused_and_repeated_ones_are_still_known(api, monkeypatch):
@@ -154,17 +139,6 @@ def test_observations_are_refused_and_repeated_ones_are_still_known(api, monkeyp
     monkeypatch.setattr(service_of(api).disk, "quota", 1)
     assert api.post(address, json=body).json()["duplicate"] is True
     error(api.post(address, json=body | {"sequence": 1, "t": [0.02, 0.03]}), 507, "storage_full")
-
-
-def test_a_deleted_data_set_makes_room(api, monkeypatch):
-    disk, samples = service_of(api).disk, stream()
-    large = upload(api, stream(samples=2000), name="limits-large")["id"]
-    monkeypatch.setattr(measuring, "AGAIN_S", 0.0)
-    monkeypatch.setattr(disk, "quota", disk.usage(0).used + 1)
-    error(post(api, npz(**arrays(samples))), 507, "storage_full")
-    assert api.delete(f"/v1/datasets/{large}").status_code == 204
-    small = upload(api, samples, name="limits-small")["id"]
-    assert api.delete(f"/v1/datasets/{small}").status_code == 204
 
 
 def test_a_state_without_room_is_not_stored_and_learning_goes_on(monkeypatch, caplog, tmp_path):

@@ -17,6 +17,7 @@ from tests.service.server import Server
 from tests.service.streams import ask, dial, frame, hello
 
 PANDA = "/v1/models/panda-sim/stream"
+QUERY = {each: [0.1] * 7 for each in ("q", "dq", "ddq")}
 GET = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
 HELD = GET.replace(b"/ ", b"/held ", 1)
 HOLD = """
@@ -77,13 +78,13 @@ def test_a_second_signal_ends_what_would_be_waited_for():
         [sys.executable, "-c", HOLD], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, bufsize=1
     )
     try:
-        said = iter(process.stdout.readline, "")
-        port = next(line for line in said if "running on" in line).split("127.0.0.1:")[1].split()[0]
+        lines = iter(process.stdout.readline, "")
+        port = next(line for line in lines if "running on" in line).split("127.0.0.1:")[1].split()[0]
         with Raw(int(port)) as client:
             client.send(GET)
-            assert next(said) == "begun\n"
+            assert next(lines) == "begun\n"
             process.terminate()
-            assert any("Waiting for connections to close" in line for line in said)
+            assert any("Waiting for connections to close" in line for line in lines)
             process.send_signal(signal.SIGINT)
             assert process.wait(DEADLINE) == -signal.SIGINT
     finally:
@@ -92,13 +93,12 @@ def test_a_second_signal_ends_what_would_be_waited_for():
 
 
 def test_a_service_that_was_told_to_stop_says_so_and_answers_until_it_is_told_again(home):
-    with Server(home, LIPSERVE_STOP_NOTICE_S="3600") as server, dial(server, PANDA) as connection:
+    with Server(home, warm=True, LIPSERVE_STOP_NOTICE_S="3600") as server, dial(server, PANDA) as connection:
         hello(connection)
         server.process.terminate()
         refused = eventually(lambda: (seen := server.client.get("/health/ready")).status_code == 503 and seen)
         assert "stopping" in error(refused, 503, "not_ready")["message"]
-        query = {each: [0.1] * 7 for each in ("q", "dq", "ddq")}
-        assert server.client.post("/v1/models/panda-sim/predict", json=query).status_code == 200
+        assert server.client.post("/v1/models/panda-sim/predict", json=QUERY).status_code == 200
         ask(connection, frame([[0.0] * 7] * 3))
         assert server.terminate() == -signal.SIGTERM
         assert "Traceback" not in server.log.read_text()
@@ -110,7 +110,7 @@ def test_a_service_that_stops_keeps_what_it_has_learnt_and_its_jobs(home):
         rows = {each: [[0.1] * 7] * 5 for each in ("q", "dq", "ddq", "tau")}
         body = {"stream_id": "arm", "sequence": 0, "t": [0.0, 0.1, 0.2, 0.3, 0.4], **rows}
         assert server.client.post("/v1/models/panda-sim/observations", json=body).status_code == 200
-        eventually(lambda: revision(server) > 0)
+        eventually(lambda: server.client.post("/v1/models/panda-sim/predict", json=QUERY).json()["revision"] > 0)
         name = queue(server.client, "stopped", upload(server.client, stream("panda", 200))["id"], options=ENDLESS)["id"]
         running(server.client, name)
         assert server.terminate() == -signal.SIGTERM
@@ -120,9 +120,3 @@ def test_a_service_that_stops_keeps_what_it_has_learnt_and_its_jobs(home):
         assert (row.state, row.attempts) == ("queued", 0)
         assert session.scalars(select(SnapshotRow.number)).all() == [1]
     database.close()
-
-
-def revision(server):
-    """That which answers of the shipped model contain."""
-    with dial(server, PANDA) as connection:
-        return hello(connection)["revision"]

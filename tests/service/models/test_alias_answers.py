@@ -9,6 +9,7 @@ import pytest
 
 from service.inference.predicting import decode
 from tests.service.data import error, service_of, stream, upload
+from tests.service.models.test_aliases import CODES
 from tests.service.models.versions import QUERY, predict, publish, worse
 
 BINARY = {
@@ -43,36 +44,32 @@ def test_the_hot_route_knows_aliases(api, arm):
 
 
 @pytest.mark.parametrize(
-    ("chosen", "status", "field"),
+    ("model", "chosen", "status", "field"),
     [
-        ({"alias": "production", "version": 1}, 422, "alias"),
-        ({"alias": "Production"}, 422, "alias"),
-        ({"alias": "production\n"}, 422, "alias"),
-        ({"alias": 1}, 422, "alias"),
-        ({"alias": "nowhere"}, 404, "alias"),
+        ("alias-answers", {"alias": "production", "version": 1}, 422, "alias"),
+        ("alias-answers", {"alias": "Production"}, 422, "alias"),
+        ("alias-answers", {"alias": "production\n"}, 422, "alias"),
+        ("alias-answers", {"alias": 1}, 422, "alias"),
+        ("alias-answers", {"alias": "nowhere"}, 404, "alias"),
+        ("nobody", {"alias": "production"}, 404, "model"),
     ],
 )
-def test_bad_aliases_are_named(api, arm, chosen, status, field):
-    code = {422: "invalid_request", 404: "not_found"}[status]
-    assert error(predict(api, arm, **chosen), status, code)["detail"][0]["field"] == field
-
-
-def test_an_unknown_model_is_said_before_its_alias(api):
-    assert error(predict(api, "nobody", alias="production"), 404, "not_found")["detail"][0]["field"] == "model"
+def test_bad_aliases_are_named(api, arm, model, chosen, status, field):
+    assert error(predict(api, model, **chosen), status, CODES[status])["detail"][0]["field"] == field
 
 
 def test_evaluations_follow_an_alias(api, arm):
     dataset = upload(api, stream(seed=7))["id"]
-    asked = {"dataset": dataset, "alias": "production"}
-    found = api.post(f"/v1/models/{arm}/evaluate", json=asked).json()
-    assert found["version"] == 1
-    assert found == api.post(f"/v1/models/{arm}/evaluate", json={"dataset": dataset, "version": 1}).json()
+    choices = ({"alias": "production"}, {"version": 1})
+    first, second = (api.post(f"/v1/models/{arm}/evaluate", json={"dataset": dataset, **each}) for each in choices)
+    assert first.json()["version"] == 1
+    assert first.json() == second.json()
 
 
 def test_the_open_inference_protocol_takes_an_alias_for_a_version(api, arm):
-    found = api.post(f"/v2/models/{arm}/versions/production/infer", json=BINARY).json()
-    assert found["model_version"] == "1"
-    assert found["outputs"][0]["data"] == predict(api, arm, version=1).json()["tau"]
+    answer = api.post(f"/v2/models/{arm}/versions/production/infer", json=BINARY).json()
+    assert answer["model_version"] == "1"
+    assert answer["outputs"][0]["data"] == predict(api, arm, version=1).json()["tau"]
     assert api.get(f"/v2/models/{arm}/versions/production").json()["parameters"]["version"] == "1"
     assert api.get(f"/v2/models/{arm}/versions/serving/ready").json()["ready"]
     assert api.post(f"/v2/models/{arm}/versions/serving/infer", json=BINARY).json()["model_version"] == "2"

@@ -49,23 +49,6 @@ def kept(streaming):
     return "kept"
 
 
-def test_the_python_client_looks_after_aliases(streaming, kept):
-    with Client(streaming.server.url) as client:
-        assert client.set_alias(kept, "production", 1).version == 1
-        assert client.set_alias(kept, "canary", "serving").version == 2
-        assert {each.alias: each.version for each in client.aliases(kept)} == {
-            "serving": 2,
-            "canary": 2,
-            "production": 1,
-        }
-        assert client.predict(kept, *MOTION, alias="production").version == 1
-        assert client.evaluate(kept, streaming.dataset, alias="production").in_training
-        assert client.compare(kept, streaming.dataset, "production", 2).outcome == "cannot_tell"
-        with pytest.raises(ApiError, match="has the alias 'production'"):
-            client.delete_version(kept, 1)
-        client.remove_alias(kept, "production")
-
-
 def test_a_stream_says_that_its_version_or_its_model_was_deleted(streaming, kept):
     server, path = streaming.server, f"/v1/models/{kept}/stream"
     with Client(server.url) as client, dial(server, f"{path}?version=1") as pinned, dial(server, path) as free:

@@ -10,6 +10,7 @@ import pytest
 from lipcore.data.paired import Answer, Comparison, Difference, compare
 from service.inference.comparison import _verdict
 from tests.service.data import arrays, error, npz, post, stream, upload
+from tests.service.models.test_aliases import CODES
 from tests.service.models.versions import publish, trained, worse
 
 SAMPLES = {"seed": 9, "samples": 400}
@@ -37,8 +38,8 @@ def ask(api, model, dataset, *versions):
 
 def expected():
     samples = stream(**SAMPLES)
-    found = [model.predict(samples.q, samples.dq, samples.ddq) for model in (worse(), trained())]
-    return compare(samples, *(Answer(each.tau, each.tau_std, each.noise_std) for each in found))
+    answers = [model.predict(samples.q, samples.dq, samples.ddq) for model in (worse(), trained())]
+    return compare(samples, *(Answer(each.tau, each.tau_std, each.noise_std) for each in answers))
 
 
 def test_the_better_version_is_named_with_the_evidence(api, arm, recorded):
@@ -46,19 +47,15 @@ def test_the_better_version_is_named_with_the_evidence(api, arm, recorded):
     assert (found["outcome"], found["better"]) == ("second_better", 2)
     assert found["verdict"].startswith("Version 2 predicts better than version 1: its negative log predictive density")
     assert (found["samples"], found["samples_used"], found["blocks"]) == (400, 400, 40)
-    wanted = expected()
+    exact = expected()
     for name in ("nmse", "rmse", "coverage", "nlpd"):
-        shown, wants = found["differences"][name], getattr(wanted, name)
-        np.testing.assert_allclose(shown["difference"], wants.mean, rtol=1e-9)
-        np.testing.assert_allclose(shown["standard_error"], wants.standard_error, rtol=1e-9)
-        np.testing.assert_allclose(shown["half_width"], wants.half_width, rtol=1e-9)
+        shown, figures = found["differences"][name], getattr(exact, name)
+        np.testing.assert_allclose(shown["difference"], figures.mean, rtol=1e-9)
+        np.testing.assert_allclose(shown["standard_error"], figures.standard_error, rtol=1e-9)
+        np.testing.assert_allclose(shown["half_width"], figures.half_width, rtol=1e-9)
     for place, name in enumerate(("nlpd", "nmse")):
-        np.testing.assert_allclose(found[name]["difference"], wanted.total.mean[place], rtol=1e-9)
+        np.testing.assert_allclose(found[name]["difference"], exact.total.mean[place], rtol=1e-9)
     assert found["warnings"] == []
-
-
-def test_figures_are_those_of_an_evaluation(api, arm, recorded):
-    found = ask(api, arm, recorded["id"], 1, 2).json()
     for shown in found["versions"]:
         asked = {"dataset": recorded["id"], "version": shown["version"]}
         evaluated = api.post(f"/v1/models/{arm}/evaluate", json=asked).json()
@@ -72,7 +69,8 @@ def test_the_order_turns_the_signs_and_not_the_verdict(api, arm, recorded):
 
 
 def test_versions_that_answer_alike_do_not_differ_and_training_data_are_noticed(api, arm, recorded):
-    found = ask(api, arm, recorded["id"], 2, 3).json()
+    api.put(f"/v1/models/{arm}/aliases/second", json={"version": 2})
+    found = ask(api, arm, recorded["id"], "second", "serving").json()
     assert (found["outcome"], found["better"], found["nlpd"]["difference"]) == ("no_difference", None, 0.0)
     assert found["verdict"].startswith("These data show no difference between versions 2 and 3")
     assert [each["in_training"] for each in found["versions"]] == [False, True]
@@ -87,12 +85,6 @@ def test_a_short_recording_cannot_tell(api, arm):
     assert "Record longer" in found["verdict"]
 
 
-def test_versions_are_named_by_aliases_too(api, arm, recorded):
-    api.put(f"/v1/models/{arm}/aliases/old", json={"version": 1})
-    found = ask(api, arm, recorded["id"], "old", "serving").json()
-    assert [each["version"] for each in found["versions"]] == [1, 3]
-
-
 @pytest.mark.parametrize(
     ("versions", "status", "field"),
     [
@@ -105,16 +97,16 @@ def test_versions_are_named_by_aliases_too(api, arm, recorded):
     ],
 )
 def test_bad_choices_are_named(api, arm, recorded, versions, status, field):
-    code = {422: "invalid_request", 404: "not_found"}[status]
-    assert error(ask(api, arm, recorded["id"], *versions), status, code)["detail"][0]["field"] == field
+    answer = ask(api, arm, recorded["id"], *versions)
+    assert error(answer, status, CODES[status])["detail"][0]["field"] == field
 
 
 def test_data_sets_have_to_fit(api, arm):
     error(ask(api, arm, "ds_none", 1, 2), 404, "not_found")
     others = stream(seed=7)
     answer = post(api, npz(**arrays(others), joint_names=np.array(["a", "b"])))
-    said = error(ask(api, arm, answer.json()["id"], 1, 2), 422, "invalid_request")
-    assert said["detail"][0]["field"] == "dataset"
+    refusal = error(ask(api, arm, answer.json()["id"], 1, 2), 422, "invalid_request")
+    assert refusal["detail"][0]["field"] == "dataset"
 
 
 def compared(density, nmse, blocks=30):
@@ -136,8 +128,8 @@ def compared(density, nmse, blocks=30):
     ],
 )
 def test_the_words_say_what_the_numbers_do(density, nmse, outcome, words):
-    found, text = _verdict(4, 5, compared(density, nmse))
-    assert found == outcome
+    verdict, text = _verdict(4, 5, compared(density, nmse))
+    assert verdict == outcome
     assert words in text
     assert ("how true its stated uncertainty is" in text) == (outcome == "second_better" and nmse[0] > nmse[1])
     assert _verdict(4, 5, replace(compared(density, nmse), blocks=19))[0] == "cannot_tell"

@@ -9,8 +9,8 @@ from lipcore.kernels.geometry import Geometry
 from lipcore.robots.urdf import RigidBody
 from service.client import ApiError
 from tests.service.client.conftest import over
-from tests.service.data import service_of
-from tests.service.models.arms import JOINTS, NO_BODIES, WARNING, panda, publish_arm
+from tests.service.data import error, service_of
+from tests.service.models.versions import JOINTS, NO_BODIES, WARNING, panda, publish_arm
 
 
 @pytest.fixture(scope="module")
@@ -34,10 +34,6 @@ def test_it_is_the_robot(api, arm):
     np.testing.assert_allclose(Geometry.from_robot(robot).constants, expected, atol=1e-12)
 
 
-def test_its_version_warns_of_what_is_open(api, arm):
-    assert api.get(f"/v1/models/{arm}/versions/2").json()["warnings"] == [WARNING]
-
-
 def test_a_version_is_named_by_number_or_alias(api, arm):
     assert api.put(f"/v1/models/{arm}/aliases/best", json={"version": 2}).status_code == 200
     for params in ({"version": 2}, {"alias": "best"}, {"alias": "serving"}):
@@ -51,27 +47,21 @@ def test_a_version_is_named_by_number_or_alias(api, arm):
     [("urdf-arm", 1, "where its joints lie"), ("urdf-none", 1, "no rigid bodies")],
 )
 def test_a_version_without_an_arm_is_refused(api, arm, model, version, reason):
-    error = api.get(f"/v1/models/{model}/urdf", params={"version": version})
-    assert error.status_code == 422
-    body = error.json()["error"]
-    assert body["code"] == "invalid_request"
-    assert f"version {version} of model {model!r}" in body["message"]
-    assert reason in body["message"]
-    assert body["detail"][0]["field"] == "version"
+    refusal = error(api.get(f"/v1/models/{model}/urdf", params={"version": version}), 422, "invalid_request")
+    assert f"version {version} of model {model!r}" in refusal["message"]
+    assert reason in refusal["message"]
+    assert refusal["detail"][0]["field"] == "version"
 
 
-def test_the_client_has_its_text(api, arm):
+def test_the_client_has_its_text_and_shows_the_arm(api, arm):
     with over(api._transport) as client:
         assert client.urdf(arm) == client.urdf(arm, 2) == client.urdf(arm, alias="serving")
         assert client.urdf(arm) == api.get(f"/v1/models/{arm}/urdf").text
         with pytest.raises(ApiError, match="no rigid bodies"):
             client.urdf("urdf-none")
-
-
-def test_the_client_shows_the_arm(api, arm):
-    with over(api._transport) as client:
         shown = client.version(arm, 2)
         assert shown.arm.joint_names == JOINTS
+        assert str(shown).splitlines()[1] == f"careful: {WARNING}"
         assert "mirror image" in str(shown)
         bare = client.version("urdf-none", 1)
         assert bare.arm is None

@@ -1,14 +1,22 @@
-"""Versions put into a running service without training them."""
+"""Versions put into a service without training them: pendulums, and the shipped arm."""
 
 from __future__ import annotations
 
+import json
 from functools import cache
 from typing import Any
 
 import lipcore
 from lipcore import FitOptions, TorqueModel
+from lipcore.files import persistence
+from lipcore.files.manifest import MANIFEST, read_manifest_bytes
+from lipcore.robots.library import load_robot
+from lipcore.robots.urdf import RigidBody
+from service.foundation.settings import Settings, shipped_models
 from service.models import registry
-from service.storage.files import new_id
+from service.storage.database import Database
+from service.storage.files import Files, new_id
+from tests.lipcore.arms import parameters_of
 from tests.service.data import QUICK, service_of, stream
 from tests.service.learning.pendulums import trained
 
@@ -38,3 +46,40 @@ def publish(api: Any, model: str, found: TorqueModel | None = None, lineage: Any
 def predict(api: Any, model: str, **chosen: Any) -> Any:
     """Ask for a torque; return the answer."""
     return api.post(f"/v1/models/{model}/predict", json=QUERY | chosen)
+
+
+WARNING = "Two arms explain it."
+JOINTS = tuple(f"panda_joint{number}" for number in range(1, 8))
+
+
+NO_BODIES: dict[str, Any] = {"inertia": None, "rotor": None, "geometry": None}
+"""What an estimator without rigid bodies leaves out of its `parameters`."""
+
+
+def panda() -> RigidBody:
+    """The robot that the shipped model was trained on."""
+    return RigidBody.from_profile("panda", JOINTS, load_robot("panda").joint_types)
+
+
+def publish_arm(database: Database, files: Files, model: str, **changed: Any) -> dict[str, Any]:
+    """Add a version to a model: the shipped one, with its robot's geometry and WARNING; return its manifest.
+
+    changed: other entries of its `parameters`; None leaves one out.
+    """
+    source, folder = persistence.read_files(shipped_models() / registry.SHIPPED), new_id("mv")
+    manifest = json.loads(source[MANIFEST])
+    report = parameters_of(panda()) | changed
+    manifest["parameters"] = {name: value for name, value in report.items() if value is not None}
+    manifest["warnings"] = [WARNING] if "geometry" in manifest["parameters"] else []
+    source[MANIFEST] = persistence.manifest_bytes(manifest)
+    with files.new_version(folder) as target:
+        persistence.write(target, source)
+    with database.transaction() as session:
+        registry.publish(session, model, folder, read_manifest_bytes(source[MANIFEST]), None)
+    return manifest
+
+
+def publish_arm_at(home: Any, model: str, **changed: Any) -> dict[str, Any]:
+    """`publish_arm` in the home of a service that may be running in another process."""
+    settings = Settings(home=home)
+    return publish_arm(Database.of(settings), Files.of(settings), model, **changed)

@@ -1,10 +1,15 @@
-"""What is counted: in the right bucket, and without labels that clients could make up."""
+"""What is counted: in the right bucket, without labels that clients could make up, for the model that a stream asks."""
 
 from __future__ import annotations
 
+from time import perf_counter
+
 import pytest
 
-from service.web.observability.meters import BOUNDS, OTHER, Durations, Kind, Meters, MetricKind, RequestMeter, merged
+from service.foundation.settings import Settings
+from service.web.observability.meters import BOUNDS, OTHER, Durations, Kind, Meters, RequestMeter, merged
+from tests.service.streams import frame
+from tests.service.test_stream_session import Loaded, Model, reply, session
 
 
 def test_a_duration_counts_up_to_its_bound():
@@ -15,21 +20,6 @@ def test_a_duration_counts_up_to_its_bound():
     assert durations.total == pytest.approx(6.2000001)
 
 
-def test_histograms_are_cumulative():
-    durations = Durations((0.1, 1.0))
-    for seconds in (0.05, 0.5, 5.0):
-        durations.add(seconds)
-    family = MetricKind("histogram", "h_seconds", "said", ("a",)).spread([(["x"], durations)])
-    found = {(sample.name, sample.labels.get("le")): sample.value for sample in family.samples}
-    assert found == {
-        ("h_seconds_bucket", "0.1"): 1,
-        ("h_seconds_bucket", "1.0"): 2,
-        ("h_seconds_bucket", "+Inf"): 3,
-        ("h_seconds_count", None): 3,
-        ("h_seconds_sum", None): pytest.approx(5.55),
-    }
-
-
 def test_merged_durations_are_those_of_all():
     one, two = Durations(), Durations()
     one.add(BOUNDS[0])
@@ -37,15 +27,6 @@ def test_merged_durations_are_those_of_all():
     two.add(1e9)
     both = merged([one, two])
     assert (both.counts[0], both.counts[-1], both.total) == (2, 1, pytest.approx(1e9))
-
-
-def test_what_clients_make_up_is_not_told_apart():
-    meter = RequestMeter(most_models=10)
-    for number in range(100):
-        meter.find(Kind(f"M{number}", "/r", f"model-{number}", 404, "not_found"), exists=False).add(0.1)
-    ((kind, durations),) = meter.known.items()
-    assert kind == (OTHER, "/r", "", 404, "not_found")
-    assert sum(durations.counts) == 100
 
 
 def test_models_beyond_the_most_are_taken_together():
@@ -61,3 +42,39 @@ def test_streams_share_the_models_of_requests():
     assert meters.stream("b") is meters.stream("c")
     assert meters.stream("a") is not meters.stream("b")
     assert set(meters.streams()) == {"a", OTHER}
+
+
+@pytest.fixture
+def talk():
+    return session(Loaded(v1=Model()), 1)[0]
+
+
+def test_each_answer_is_timed_and_refused_frames_are_counted_by_code(talk):
+    reply(talk)
+    reply(talk, arrived=perf_counter() - 7.0)
+    reply(talk, b"short")
+    reply(talk, b"short")
+    assert sum(talk._meter.durations.counts) == 2
+    assert 7.0 <= talk._meter.durations.total < 60.0
+    assert talk._meter.refused == {"invalid_request": 2}
+
+
+def test_without_a_budget_the_setting_is_the_deadline(talk):
+    assert talk._deadline == Settings().stream_deadline_s
+    talk._deadline = 60.0
+    reply(talk)
+    assert talk._meter.late == 0
+    seen = reply(talk, arrived=perf_counter() - 61.0)
+    assert (talk._meter.late, seen.late) == (1, 0)  # the client named none: it does not hear of one
+
+
+def test_a_budget_is_the_deadline_of_its_frame_until_its_answer_is_read(talk):
+    talk._deadline = 0.0
+    reply(talk, frame(budget=60.0))
+    assert talk._meter.late == 0
+    reply(talk, frame(budget=5.0), perf_counter() - 10.0)
+    assert talk._meter.late == 1
+    reply(talk, frame(budget=60.0))
+    talk.left = perf_counter() + 100.0
+    reply(talk, frame(budget=60.0))
+    assert talk._meter.late == 2

@@ -12,8 +12,8 @@ from sqlalchemy import delete
 from docs import metrics as table
 from service.storage.database import JobRow
 from service.training.metrics import DURATION, FINISHED, JOBS, Work
-from tests.service.data import QUICK, service_of, stream, upload
-from tests.service.observability.test_request_ids import QUERY
+from tests.service.data import QUICK, queue, service_of, stream, upload
+from tests.service.observability.test_requests import QUERY
 
 DOCUMENT = Path(__file__).parents[3] / "docs/reference/metrics.md"
 FEW = {**QUICK, "posterior_samples": 40}
@@ -39,11 +39,8 @@ def grown(api, ask):
     return {key: now - before.get(key, 0) for key, now in after.items() if now != before.get(key, 0)}
 
 
-def test_the_documentation_has_the_table():
+def test_the_table_of_the_documentation_has_what_is_shown(api):
     assert "\n".join(table.lines()) in DOCUMENT.read_text()
-
-
-def test_the_table_has_what_is_shown(api):
     documented = {kind.name.removesuffix("_total"): kind for kind in table.KINDS}
     shown = {family.name: family for family in parse(api.get("/metrics").text)}
     assert {name for name in shown if name.startswith("lipserve_")} == set(documented)
@@ -52,11 +49,8 @@ def test_the_table_has_what_is_shown(api):
         assert (family.type, family.documentation) == (kind.kind, kind.meaning)
         for sample in family.samples:
             assert set(sample.labels) - {"le"} == set(kind.labels)
-
-
-def test_openmetrics_can_be_read(api):
     answer = api.get("/metrics", headers={"accept": "application/openmetrics-text; version=1.0.0"})
-    assert {kind.name.removesuffix("_total") for kind in table.KINDS} <= {each.name for each in parse_open(answer.text)}
+    assert set(documented) <= {each.name for each in parse_open(answer.text)}
 
 
 def test_requests_are_counted_and_timed_by_route_and_model(api):
@@ -100,14 +94,11 @@ def test_names_that_clients_make_up_are_no_labels(api):
     assert value(more, "lipserve_requests_total", method="other", route="/v1/models", status="405") == 3
 
 
-def test_a_request_that_asks_is_in_flight(api):
-    assert value(scraped(api), "lipserve_requests_in_flight") == 1
-    assert service_of(api).meters.requests.in_flight == 0
-
-
 @pytest.mark.own_files("counts the bytes of files below the home")
 def test_the_service_tells_of_itself(api):
     samples = scraped(api)
+    assert value(samples, "lipserve_requests_in_flight") == 1  # this one
+    assert service_of(api).meters.requests.in_flight == 0
     assert value(samples, "lipserve_models_loaded") == len(service_of(api).loaded.versions())
     assert value(samples, "lipserve_disk_used_bytes", what="versions") > 1000
     assert value(samples, "lipserve_disk_free_bytes") > 0
@@ -115,32 +106,26 @@ def test_the_service_tells_of_itself(api):
     assert value(samples, "lipserve_ready", part="database") == 1
 
 
+BEGAN = "2026-01-01T00:00:00.000+00:00"
+ENDED = [
+    ("succeeded", BEGAN, "2026-01-01T00:00:20.000+00:00"),
+    ("succeeded", BEGAN, "2026-01-01T02:00:00.000+00:00"),
+    ("failed", BEGAN, "2026-01-01T00:00:00.500+00:00"),
+    ("failed", "2026-01-01T00:00:01.000+00:00", BEGAN),  # the clock was set back
+    ("cancelled", None, BEGAN),
+]
+
+
 @pytest.fixture
 def jobs(api):
-    """Jobs that ended after known times, in the database alone."""
+    """What is counted before and after jobs that ended after known times, in the database alone."""
     database = service_of(api).database
-    made = [
-        ("succeeded", "2026-01-01T00:00:00.000+00:00", "2026-01-01T00:00:20.000+00:00"),
-        ("succeeded", "2026-01-01T00:00:00.000+00:00", "2026-01-01T02:00:00.000+00:00"),
-        ("failed", "2026-01-01T00:00:00.000+00:00", "2026-01-01T00:00:00.500+00:00"),
-        ("failed", "2026-01-01T00:00:01.000+00:00", "2026-01-01T00:00:00.000+00:00"),  # the clock was set back
-        ("cancelled", None, "2026-01-01T00:00:00.000+00:00"),
-    ]
     before = families(database)
     with database.transaction() as session:
-        for number, (state, started, finished) in enumerate(made):
-            session.add(
-                JobRow(
-                    id=f"job_metrics_{number}",
-                    model="m",
-                    state=state,
-                    request={},
-                    progress={},
-                    created_at="2026-01-01T00:00:00.000+00:00",
-                    started_at=started,
-                    finished_at=finished,
-                )
-            )
+        for number, (state, started, finished) in enumerate(ENDED):
+            row = JobRow(id=f"job_metrics_{number}", model="m", state=state, request={}, progress={}, created_at=BEGAN)
+            row.started_at, row.finished_at = started, finished
+            session.add(row)
     yield before, families(database)
     with database.transaction() as session:
         session.execute(delete(JobRow).where(JobRow.id.startswith("job_metrics_")))
@@ -158,12 +143,10 @@ def test_jobs_are_counted_and_timed_by_outcome(jobs):
     before, after = jobs
     more = {key: now - before[key] for key, now in after.items()}
     name = DURATION.name
-    assert more[FINISHED.name, "succeeded"] == 2
-    assert more[FINISHED.name, "failed"] == 2
-    assert more[FINISHED.name, "cancelled"] == 1
-    assert [more[f"{name}_bucket", "succeeded", le] for le in ("10.0", "30.0", "3600.0", "10800.0", "+Inf")] == [
-        *(0, 1, 1, 2, 2)
-    ]
+    finished = {state: more[FINISHED.name, state] for state in ("succeeded", "failed", "cancelled")}
+    assert finished == {"succeeded": 2, "failed": 2, "cancelled": 1}
+    buckets = {"10.0": 0, "30.0": 1, "3600.0": 1, "10800.0": 2, "+Inf": 2}
+    assert {le: more[f"{name}_bucket", "succeeded", le] for le in buckets} == buckets
     assert more[f"{name}_sum", "succeeded"] == pytest.approx(7220.0, abs=1e-3)
     assert more[f"{name}_bucket", "failed", "1.0"] == 2
     assert more[f"{name}_sum", "failed"] == pytest.approx(0.5, abs=1e-3)
@@ -171,12 +154,13 @@ def test_jobs_are_counted_and_timed_by_outcome(jobs):
 
 
 def test_jobs_that_wait_are_counted(no_worker):
-    before = families(service_of(no_worker).database)[JOBS.name, "queued"]
-    dataset = upload(no_worker, stream())["id"]
-    answer = no_worker.post(
-        "/v1/jobs", json={"model": "waits-for-metrics", "datasets": [dataset], "estimator": "lip-chain", "options": FEW}
-    )
-    assert answer.status_code == 202, answer.text
-    assert families(service_of(no_worker).database)[JOBS.name, "queued"] == before + 1
-    assert no_worker.post(f"/v1/jobs/{answer.json()['id']}/cancel").json()["state"] == "cancelled"
-    assert families(service_of(no_worker).database)[JOBS.name, "queued"] == before
+    database = service_of(no_worker).database
+
+    def waiting():
+        return families(database)[JOBS.name, "queued"]
+
+    before = waiting()
+    job = queue(no_worker, "waits-for-metrics", upload(no_worker, stream())["id"], options=FEW)["id"]
+    assert waiting() == before + 1
+    assert no_worker.post(f"/v1/jobs/{job}/cancel").json()["state"] == "cancelled"
+    assert waiting() == before

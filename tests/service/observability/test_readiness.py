@@ -12,7 +12,7 @@ from service.learning.learners import RESTART_S
 from service.storage import storage
 from service.training.metrics import START_S
 from service.web.observability.readiness import KEPT_S, Readiness
-from tests.service.data import QUICK, error, service_of, stream, upload
+from tests.service.data import QUICK, error, queue, service_of, stream, upload
 
 FEW = {**QUICK, "posterior_samples": 40}
 """Options of a fit as small as the strict service wants it."""
@@ -20,10 +20,9 @@ PARTS = ["database", "home", "models", "learner", "training"]
 
 
 class Clock:
-    """Time that passes when told to."""
+    """Time that stands still until `now` is changed."""
 
-    def __init__(self):
-        self.now = 1000.0
+    now = 1000.0
 
     def __call__(self):
         return self.now
@@ -47,17 +46,15 @@ def look(clock):
     return look
 
 
-def test_all_parts_are_named(api, fresh_looks):
+def test_all_parts_are_named_and_what_does_not_work(api, fresh_looks, monkeypatch):
     answer = api.get("/health/ready")
     assert answer.status_code == 200, answer.text
     assert [part["name"] for part in answer.json()["checks"]] == PARTS
-
-
-def test_what_does_not_work_is_named(api, fresh_looks, monkeypatch):
+    service_of(api).readiness.forget()
     monkeypatch.setattr(service_of(api).disk, "floor", 2**62)
-    said = error(api.get("/health/ready"), 503, "not_ready")
-    assert [item["field"] for item in said["detail"]] == ["home"]
-    assert "LIPSERVE_MIN_FREE_BYTES" in said["message"]
+    refusal = error(api.get("/health/ready"), 503, "not_ready")
+    assert [item["field"] for item in refusal["detail"]] == ["home"]
+    assert "LIPSERVE_MIN_FREE_BYTES" in refusal["message"]
 
 
 def test_a_locked_database_is_found(api, look, monkeypatch):
@@ -73,41 +70,32 @@ def test_a_locked_database_is_found(api, look, monkeypatch):
 def test_a_home_that_cannot_be_written_is_found_and_not_named(api, look, monkeypatch, tmp_path):
     service = service_of(api)
     monkeypatch.setattr(service.files, "uploads", tmp_path / "gone")
-    state, said = look(service)["home"]
+    state, message = look(service)["home"]
     assert state == "failed"
-    assert "gone" not in said  # whoever asks needs no key
+    assert "gone" not in message  # whoever asks needs no key
 
 
-def test_nothing_is_left_behind(api, look):
+def test_a_look_leaves_nothing_behind_and_does_not_count_as_using_a_version(api, look):
     service = service_of(api)
-    before = list(service.files.uploads.iterdir())
+    files, used = list(service.files.uploads.iterdir()), dict(service.loaded._used)
     look(service)
-    assert list(service.files.uploads.iterdir()) == before
+    assert list(service.files.uploads.iterdir()) == files
+    assert service.loaded._used == used
 
 
 def test_versions_that_cannot_be_read_are_a_warning_while_others_can(api, trained, look, monkeypatch):
     service = service_of(api)
-    monkeypatch.setattr(service.loaded, "versions", set)
+    service.loaded.get(trained.name, 1)
+    before = look(service)["models"]
     monkeypatch.setattr(service.loaded, "unreadable", lambda: {(trained.name, 1): "damaged"})
-    state, said = look(service)["models"]
-    assert state == "warning"
-    assert said.startswith("1 of ")
-    assert trained.name not in said
-
-
-def test_without_a_version_that_can_be_read_the_service_is_not_ready(api, look, monkeypatch):
-    service = service_of(api)
+    assert look(service)["models"] == before  # what is in memory answers whatever its files are
     monkeypatch.setattr(service.loaded, "versions", set)
+    state, message = look(service)["models"]
+    assert state == "warning"
+    assert message.startswith("1 of ")
+    assert trained.name not in message
     monkeypatch.setattr(service.files, "has_version", lambda folder: False)
     assert look(service)["models"][0] == "failed"
-
-
-def test_a_version_in_memory_answers_whatever_its_files_are(api, trained, look, monkeypatch):
-    service = service_of(api)
-    found = service.loaded.get(trained.name, 1)
-    before = look(service)["models"]
-    monkeypatch.setattr(service.loaded, "unreadable", lambda: {(found.name, found.version): "damaged since"})
-    assert look(service)["models"] == before
 
 
 def test_a_learner_that_is_gone_for_long_is_found(api, look, clock, monkeypatch):
@@ -127,35 +115,28 @@ def test_a_learner_that_is_gone_for_long_is_found(api, look, clock, monkeypatch)
 
 def test_jobs_that_nobody_starts_are_found(no_worker, look, clock):
     service = service_of(no_worker)
-    dataset = upload(no_worker, stream())["id"]
-    body = {"model": "waits-for-health", "datasets": [dataset], "estimator": "lip-chain", "options": FEW}
-    queued = no_worker.post("/v1/jobs", json=body).json()["id"]
+    job = queue(no_worker, "waits-for-health", upload(no_worker, stream())["id"], options=FEW)["id"]
     assert look(service)["training"] == ("ok", "1 jobs wait, 0 run")
     clock.now += START_S + 1.0
     assert look(service)["training"][0] == "failed"
-    assert no_worker.post(f"/v1/jobs/{queued}/cancel").json()["state"] == "cancelled"
+    assert no_worker.post(f"/v1/jobs/{job}/cancel").json()["state"] == "cancelled"
     assert look(service)["training"][0] == "ok"
 
 
 def test_a_service_that_stops_is_not_ready_though_all_parts_work(api, monkeypatch):
     monkeypatch.setattr(service_of(api).stopping, "begun", True)
-    said = error(api.get("/health/ready"), 503, "not_ready")
-    assert [item["field"] for item in said["detail"]] == ["stopping"]
+    refusal = error(api.get("/health/ready"), 503, "not_ready")
+    assert [item["field"] for item in refusal["detail"]] == ["stopping"]
 
 
 def test_a_report_is_kept_for_a_moment(api, clock):
     looked = []
-    seen = Readiness({"home": lambda lasting: looked.append(1) or ("ok", "")}, service_of(api).stopping, clock)
+    seen = Readiness(
+        {"home": lambda lasting: looked.append(1) or ("ok", "")}, service_of(api).stopping, lambda: clock.now
+    )
     for _ in range(5):
         seen.report()
     assert len(looked) == 1
     clock.now += KEPT_S
     seen.report()
     assert len(looked) == 2
-
-
-def test_asking_does_not_count_as_using_a_version(api, look):
-    service = service_of(api)
-    used = dict(service.loaded._used)
-    look(service)
-    assert service.loaded._used == used

@@ -1,0 +1,38 @@
+"""A robot that streams to a service in real time, for pages to follow."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+
+from service.client.stream import StreamClient
+
+
+@contextmanager
+def playing(url: str, model: str, rows: Iterable[Sequence[np.ndarray]], rate: float) -> Iterator[None]:
+    """Stream rows of q, dq, ddq and tau from a thread, to be learnt from, until the block ends; nothing may fail."""
+    stop, failures = threading.Event(), list[Exception]()
+
+    def play() -> None:
+        try:
+            with StreamClient(model, url, stream_id="cell") as client:
+                begin = time.monotonic()
+                for number, (q, dq, ddq, tau) in enumerate(rows):
+                    client.ask(q, dq, ddq, tau=tau)
+                    if stop.wait(max(0.0, begin + number / rate - time.monotonic())):
+                        return
+        except Exception as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=play)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+    assert failures == []

@@ -1,0 +1,172 @@
+"""compose.yaml and docs/examples/kubernetes.yaml: settings, commands, ports and names in them are those there are."""
+
+from __future__ import annotations
+
+import re
+import shlex
+
+import click
+import pytest
+import yaml
+from distributed.cli.dask_scheduler import main as dask_scheduler
+
+from service.app import create_app
+from service.foundation.settings import Settings
+from tests.docs.blocks import ROOT
+from tests.docs.test_commands import parse
+
+COMPOSE = yaml.safe_load((ROOT / "compose.yaml").read_text("utf-8"))
+SERVICES = COMPOSE["services"]
+VARIABLE = re.compile(r"\$\{([A-Z0-9_]+)([^}]*)\}")
+EXAMPLES = ROOT / "docs/examples"
+OBJECTS = list(yaml.safe_load_all((EXAMPLES / "kubernetes.yaml").read_text("utf-8")))
+GPU = yaml.safe_load((EXAMPLES / "kubernetes-gpu.yaml").read_text("utf-8"))
+"""What a Deployment of workers with a GPU has instead."""
+PORT = Settings.model_fields["port"].default
+
+
+def environment(name: str) -> dict[str, str]:
+    """Of a container of Compose, with something in place of every variable."""
+    given = SERVICES[name].get("environment", {})
+    return {key: VARIABLE.sub("0123456789abcdef", value) for key, value in given.items()}
+
+
+def of_kind(kind: str) -> dict[str, dict]:
+    """Objects of Kubernetes by their names."""
+    return {each["metadata"]["name"]: each for each in OBJECTS if each["kind"] == kind}
+
+
+DEPLOYMENTS = of_kind("Deployment")
+
+
+def container(deployment: str) -> dict:
+    """The one of a Deployment."""
+    (only,) = DEPLOYMENTS[deployment]["spec"]["template"]["spec"]["containers"]
+    return only
+
+
+def given() -> dict[str, str]:
+    """What containers have in their environment on Kubernetes."""
+    more = {each["name"]: each["value"] for each in container("lipserve").get("env", [])}
+    return {**of_kind("ConfigMap")["lipserve"]["data"], **of_kind("Secret")["lipserve"]["stringData"], **more}
+
+
+ENVIRONMENTS = {name: environment(name) for name, each in SERVICES.items() if each["image"] == "lipserve"}
+ENVIRONMENTS["kubernetes"] = given()
+
+
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_settings_are_those_that_there_are(name, monkeypatch):
+    for key, value in ENVIRONMENTS[name].items():
+        assert isinstance(value, str), f"{key} is {value!r}: quote it"
+        if key.startswith("LIPSERVE_"):
+            assert key.removeprefix("LIPSERVE_").lower() in Settings.model_fields, key
+            monkeypatch.setenv(key, value)
+    Settings()
+
+
+def test_commands_are_those_that_there_are():
+    commands = [SERVICES[name]["command"] for name in ("service", "worker", "scheduler")]
+    commands += [container(name)["command"] for name in DEPLOYMENTS]
+    commands += [each["command"] for each in GPU["spec"]["template"]["spec"]["containers"]]
+    for program, *words in commands:
+        if program == "dask":
+            dask_scheduler.make_parser(click.Context(dask_scheduler)).parse_args(words[1:])
+        else:
+            parse(shlex.join([program, *words]))
+    program, flag, code = SERVICES["bucket"]["command"]
+    assert (program, flag) == ("python", "-c")
+    compile(code, "compose.yaml", "exec")
+    assert SERVICES["service"]["environment"]["LIPSERVE_FILES_URL"].split("/")[2] in code
+
+
+def port_of(url: str) -> tuple[str, int]:
+    """Host and port that a URL names."""
+    named = re.fullmatch(r"\w+://(?:[^@/]*@)?([\w-]+):(\d+)(?:/.*)?", url)
+    assert named is not None, url
+    return named[1], int(named[2])
+
+
+def test_who_is_named_in_compose_is_there_and_listens():
+    urls = environment("service")
+    command = SERVICES["scheduler"]["command"]
+    assert port_of(urls["LIPSERVE_CLUSTER"]) == ("scheduler", int(command[command.index("--port") + 1]))
+    host, port = port_of(urls["AWS_ENDPOINT_URL"])
+    assert {f"-{host}.port={port}", f"-ip={host}"} <= set(SERVICES[host]["command"])
+    assert port_of(urls["LIPSERVE_DATABASE_URL"]) == ("postgres", 5432)
+    user, _, name = re.match(r"postgresql://(\w+):(.*)@.*/(\w+)", urls["LIPSERVE_DATABASE_URL"]).groups()
+    database = SERVICES["postgres"]["environment"]
+    assert (user, name) == (database["POSTGRES_USER"], database["POSTGRES_DB"])
+    published = SERVICES["balancer"]["ports"][0].rpartition(":")[2]
+    balancing = COMPOSE["configs"]["haproxy"]["content"]
+    assert f"bind :{published}\n" in balancing
+    assert set(re.findall(r"server-template \S+ \d+ (\S+)", balancing)) == {f"service:{PORT}"}
+    assert set(re.findall(r"uri (\S+)", balancing)) <= {"/health/ready", "/health/live"}
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_what_a_service_of_compose_uses_is_declared_and_limited(name):
+    each = SERVICES[name]
+    assert set(each.get("networks", [])) <= COMPOSE["networks"].keys()
+    assert {config["source"] for config in each.get("configs", [])} <= COMPOSE["configs"].keys()
+    mounted = {volume.partition(":")[0] for volume in each.get("volumes", []) if ":" in volume}
+    assert mounted <= COMPOSE["volumes"].keys()
+    for other, needed in each.get("depends_on", {}).items():
+        if needed["condition"] == "service_healthy":
+            check = SERVICES[other].get("healthcheck", {"disable": other not in ENVIRONMENTS})
+            assert not check.get("disable", False), f"{name} waits for the health of {other}, which has none"
+    assert each["deploy"]["resources"]["limits"].keys() == {"cpus", "memory"}
+    assert each["restart"] in ("unless-stopped", "on-failure")
+    assert re.fullmatch(r"[\w./-]+:[\w.-]+|lipserve", each["image"]), "name a version"
+
+
+def test_only_the_balancer_of_compose_is_published_and_no_secret_has_a_default():
+    assert COMPOSE["networks"]["inside"] == {"internal": True}
+    assert [name for name, each in SERVICES.items() if "ports" in each or "outside" in each["networks"]] == ["balancer"]
+    assert SERVICES["service"]["environment"]["LIPSERVE_KEYS"] == "on"
+    # each container has a home of its own: a volume without a name
+    assert SERVICES["service"]["volumes"] == SERVICES["worker"]["volumes"] == ["/data"]
+    text = (ROOT / "compose.yaml").read_text("utf-8")
+    body = "\n".join(line for line in text.splitlines() if not line.lstrip().startswith("#"))
+    for name, rest in VARIABLE.findall(body):
+        assert rest.startswith(":?" if re.search("PASSWORD|SECRET|KEY", name) else ":-"), name
+    for key, value in re.findall(r"(\w*(?:PASSWORD|SECRET)\w*): (.*)", body):
+        assert value.startswith("${"), key
+
+
+@pytest.mark.parametrize("name", DEPLOYMENTS)
+def test_selectors_of_kubernetes_find_what_is_made(name):
+    spec = DEPLOYMENTS[name]["spec"]
+    assert spec["selector"]["matchLabels"] == spec["template"]["metadata"]["labels"]
+    mounts = {mount["name"] for mount in container(name).get("volumeMounts", [])}
+    assert mounts == {volume["name"] for volume in spec["template"]["spec"].get("volumes", [])}
+    for source in container(name).get("envFrom", []):
+        (kind,) = source
+        assert source[kind]["name"] in of_kind({"configMapRef": "ConfigMap", "secretRef": "Secret"}[kind])
+
+
+def test_services_of_kubernetes_lead_to_ports_that_are_listened_on(tmp_path):
+    for service in of_kind("Service").values():
+        selector = service["spec"]["selector"]
+        (name,) = (name for name, each in DEPLOYMENTS.items() if each["spec"]["selector"]["matchLabels"] == selector)
+        ports = {port["name"] for port in container(name)["ports"]}
+        assert {port["targetPort"] for port in service["spec"]["ports"]} <= ports
+    host, port = port_of(given()["LIPSERVE_CLUSTER"])
+    assert of_kind("Service")[host]["spec"]["ports"][0]["port"] == port
+    assert str(port) in container("lipserve-scheduler")["command"]
+    assert container("lipserve")["ports"][0]["containerPort"] == PORT
+    paths = create_app(Settings(home=tmp_path)).openapi()["paths"]
+    for probe in ("startupProbe", "livenessProbe", "readinessProbe"):
+        assert container("lipserve")[probe]["httpGet"]["path"] in paths
+
+
+def test_only_members_reach_the_cluster_on_kubernetes():
+    policy = of_kind("NetworkPolicy")["lipserve-cluster"]["spec"]
+    members = {each["key"]: set(each["values"]) for each in policy["podSelector"]["matchExpressions"]}
+    for name in ("lipserve-scheduler", "lipserve-worker"):
+        labels = DEPLOYMENTS[name]["spec"]["template"]["metadata"]["labels"]
+        assert all(labels[key] in values for key, values in members.items())
+    service = DEPLOYMENTS["lipserve"]["spec"]["template"]["metadata"]["labels"]
+    assert service["part"] not in members["part"]
+    (source,) = policy["ingress"][0]["from"]
+    assert source["podSelector"]["matchLabels"].items() <= service.items()

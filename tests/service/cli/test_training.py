@@ -1,0 +1,130 @@
+"""From a recording to a torque: `lipserve train`, `jobs`, `evaluate` and `predict`."""
+
+from __future__ import annotations
+
+import json
+from contextlib import contextmanager
+
+import pytest
+
+from service.client import Client
+from tests.service.cli.conftest import QUICKLY, options_of_train
+from tests.service.data import ENDLESS, ended, queue, stream, upload
+
+ENDLESSLY = options_of_train(ENDLESS)
+
+
+def test_from_a_recording_to_figures_on_what_was_held_out_and_a_torque(asked, server, recording):
+    path = recording(11, samples=120, rate=10.0)
+    types = ("--joint-types", "revolute, revolute", "--hold-out", 0.25, "--hold-out-by", "blocks")
+    text = asked("train", path, "--model", "from-cli", *types, *QUICKLY)
+    assert "from-cli version 1 is trained and answers" in text
+    held = server.client.get("/v1/models/from-cli/versions/1").json()["lineage"]["holdout"]
+    assert (held["split"]["kind"], held["split"]["share"]) == ("blocks", 0.25)
+    assert f"on {held['samples']} samples held out" in text
+    assert f"{held['nmse'][1]:.2e}" in text
+
+    dataset = held["datasets"][0]["id"]
+    text = asked("evaluate", "from-cli", dataset, "--held-out")
+    assert f"on {held['samples']} held-out samples of {dataset}" in text
+    assert f"{held['rmse'][0]:.4f}" in text
+    assert asked("evaluate", "from-cli", dataset, "--json")["part"] == "all"
+    assert "which it was trained on" in asked("evaluate", "from-cli", dataset)
+    assert not asked("evaluate", "from-cli", recording(83), "--json")["in_training"]
+
+    answer = asked("predict", "from-cli", "--q", "0.1,-0.2", "--json")
+    query = {"q": [0.1, -0.2], "dq": [0.0, 0.0], "ddq": [0.0, 0.0]}
+    assert answer == server.client.post("/v1/models/from-cli/predict", json=query).json()
+    text = asked("predict", "from-cli", "--q", "0.1,-0.2")
+    assert "joint1" in text
+    assert f"{answer['tau'][1]:.4f}" in text
+
+
+def test_components_are_printed_beside_the_torque(asked, refused, server):
+    q, names = [0.0, -0.5, 0.0, -2.0, 0.0, 1.5, 0.7], ["gravity", "inertia_matrix", "potential_energy"]
+    query = {"q": q, "dq": [0.0] * 7, "ddq": [0.0] * 7, "components": names}
+    expected = server.client.post("/v1/models/panda-sim/predict", json=query).json()["components"]
+    command = ("predict", "panda-sim", "--q", ",".join(map(str, q)), "--components", ", ".join(names))
+    text = asked(*command)
+    assert f"{expected['gravity']['mean'][1]:.4f} ± {expected['gravity']['std'][1]:.4f}" in text
+    inertia = expected["inertia_matrix"]
+    assert f"{inertia['mean'][2][3]:.4f} ± {inertia['std'][2][3]:.4f}" in text
+    assert f"{expected['potential_energy']['mean']:.4f}" in text
+    assert asked(*command, "--json")["components"] == expected
+    assert "tau is given, expected no tau" in refused(*command, "--tau", "0,0,0,0,0,0,0")
+
+
+def test_refusals_of_the_service_are_passed_on(refused, recording, tmp_path):
+    message, hint = refused("predict", "nobody", "--q", "1").splitlines()
+    assert message == "error: no model 'nobody' (not_found, 404)"
+    assert hint.startswith("hint: models that exist: ")
+    assert "panda-sim" in hint
+    bad = tmp_path / "bad.csv"
+    bad.write_text("t,q1,speed1\n0,0,0\n")
+    assert "column tau1 is missing" in refused("train", bad, "--model", "m")
+    assert "holdout.kind" in refused("train", recording(12), "--model", "m", "--hold-out-by", "rows")
+
+
+@pytest.fixture
+def interrupted(monkeypatch):
+    """Ctrl-C at the first look at the job."""
+
+    @contextmanager
+    def bar(console):
+        def look(job):
+            raise KeyboardInterrupt
+
+        yield look
+
+    monkeypatch.setattr("service.client.progress.job_bar", bar)
+
+
+@pytest.fixture(scope="module")
+def long(server):
+    """A data set that a fit with the options ENDLESS takes half a minute for."""
+    return upload(server.client, stream("panda", 200, seed=81))["id"]
+
+
+def test_ctrl_c_in_train_cancels_the_job(lipserve, server, long, interrupted):
+    code, out, err = lipserve("train", long, "--model", "cli-cut", *ENDLESSLY, "--url", server.url, "--json")
+    assert code == 130
+    job = json.loads(out)
+    assert job["state"] == "cancelled"
+    assert f"job {job['id']} is cancelled" in err
+
+
+def test_ctrl_c_while_the_job_is_queued_cancels_it(lipserve, server, long, monkeypatch):
+    """It has come before its answer could be read: there is a job, whose id nobody knows."""
+    send, interruptions = Client.send, iter([KeyboardInterrupt])
+
+    def cut(client, call):
+        answer = send(client, call)
+        if (call.method, call.path) == ("POST", "/v1/jobs") and (interruption := next(interruptions, None)):
+            raise interruption
+        return answer
+
+    monkeypatch.setattr(Client, "send", cut)
+    code, out, _ = lipserve("train", long, "--model", "cli-torn", *ENDLESSLY, "--url", server.url)
+    assert (code, out) == (130, "")
+    (torn,) = [job for job in server.client.get("/v1/jobs").json()["items"] if job["model"] == "cli-torn"]
+    assert ended(server.client, torn["id"])["state"] == "cancelled"
+
+
+def test_ctrl_c_in_follow_leaves_the_job(lipserve, asked, server, long, interrupted):
+    job = queue(server.client, "cli-left", long, options=ENDLESS)["id"]
+    code, out, err = lipserve("jobs", "follow", job, "--url", server.url, "--json")
+    assert (code, json.loads(out)["state"] in ("queued", "running")) == (130, True)
+    assert "goes on" in err
+    assert asked("jobs", "cancel", job, "--json")["id"] == job
+
+
+def test_a_job_is_queued_followed_and_listed(refused, asked, recording):
+    queued = asked(
+        "train", recording(82), "--model", "cli-queued", "--no-wait", *QUICKLY, "--estimator", "se", "--json"
+    )
+    job = queued["id"]
+    assert "cli-queued (se): succeeded, version 1" in asked("jobs", "follow", job)
+    assert asked("jobs", "show", job, "--json")["state"] == "succeeded"
+    assert job in [each["id"] for each in asked("jobs", "list", "--json")]
+    assert "cli-queued" in asked("jobs", "list")
+    assert "conflict" in refused("jobs", "retry", job)
