@@ -10,7 +10,7 @@ from torch.func import jacrev
 
 from lipcore.data.motion import Motion
 from lipcore.kernels.arm import ArmKernel
-from lipcore.kernels.arm_prior import Arm, arm_of_robot
+from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.compiled.arm import arm_energies, arm_features, arm_masses, arm_shapes, arm_torques
 from lipcore.kernels.geometry import Geometry
 from lipcore.robots.library import load_robot
@@ -115,37 +115,3 @@ def test_energies_and_their_derivatives(kinds: str) -> None:
         slopes = jacrev(lambda step, at=q, v=dq: energies(geometry, bodies, step, tensor(at), tensor(v)))(nowhere)
         for part, slope in zip(found, slopes, strict=True):
             np.testing.assert_allclose(part, slope.numpy(), rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize("kinds", ["RPR", "PRR", "RRRR"])
-def test_power_is_the_change_of_energy(kinds: str) -> None:
-    """dq · τ = d/dt (T + V), for each weight by itself: of masses, rotors and steps of the geometry."""
-    geometry, bodies, _ = arm(kinds, 10)
-    n, h = len(kinds), 1e-4
-    (q, dq, ddq), size = motions(n, 11, size=1)[0], 11 * n + geometry.size
-    given = geometry.constants, geometry.gravity, bodies, np.arange(n)
-    features = np.empty((1, size, n))
-    arm_features(*given, np.array([[q, dq, ddq]]), features)
-    times = np.array([-2, -1, 1, 2]) * h
-    along = np.array([[q + t * dq + 0.5 * t * t * ddq, dq + t * ddq, ddq] for t in times])
-    out = np.empty((4, 2, size))
-    arm_energies(*given, along, out)
-    before2, before, after, after2 = out.sum(1)
-    change = (8 * (after - before) - (after2 - before2)) / (12 * h)
-    np.testing.assert_allclose(features[0] @ dq, change, rtol=1e-6, atol=1e-7 * np.abs(change).max())
-
-
-@pytest.mark.parametrize("kinds", ["RPR", "RRRR"])
-def test_one_query_has_the_features_of_many(kinds: str) -> None:
-    geometry, bodies, _ = arm(kinds, 12)
-    n = len(kinds)
-    order = np.random.default_rng(0).permutation(n)
-    steps = np.zeros(geometry.size)
-    made = Arm(geometry, order, "learn", bodies, 0 * bodies, np.ones(11 * n), steps, steps + 1)
-    kernel, asked = ArmKernel(made), motions(n, 13)
-    features = kernel.features(Motion.from_arrays(*asked.transpose(1, 0, 2))).numpy()
-    regressor = kernel.regressor()
-    for each, motion in zip(features, asked, strict=True):
-        out = np.empty((kernel.size, n))
-        regressor.fill(np.ascontiguousarray(motion), out)
-        agree(out, each.T)

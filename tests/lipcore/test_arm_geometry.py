@@ -11,8 +11,10 @@ from lipcore.kernels.geometry import Geometry, aligned, rotation_of, skew, turn_
 from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import inverse_dynamics
 from lipcore.robots.urdf import RigidBody
-from tests.lipcore.arm_oracles import arm, as_robot, motions
+from tests.lipcore.arm_oracles import arm, motions
 from tests.lipcore.arms import random_geometry
+from tests.lipcore.test_urdf import joint, link
+from tests.lipcore.test_urdf import robot as robot_of
 
 KINDS = ("R", "RPR", "PRR", "RRRR")
 
@@ -67,14 +69,6 @@ def test_how_many_numbers_torque_tells() -> None:
 
 
 @pytest.mark.parametrize("kinds", KINDS)
-def test_across_the_axis_lie_two_unit_vectors(kinds: str) -> None:
-    geometry = random_geometry(kinds, 4)
-    frames = np.concatenate([geometry.across, geometry.axis[:, None]], axis=1)
-    np.testing.assert_allclose(frames @ frames.mT, np.broadcast_to(np.eye(3), frames.shape), atol=1e-12)
-    np.testing.assert_allclose(np.linalg.det(frames), 1.0)
-
-
-@pytest.mark.parametrize("kinds", KINDS)
 def test_the_canonical_arm_has_the_same_torques(kinds: str) -> None:
     """Bodies are told relative to their frames, so the same weights do not: but some weights do."""
     geometry, _, robot = arm(kinds, 5)
@@ -108,31 +102,6 @@ def test_steps_cover_all_that_torque_tells(gravity: bool) -> None:
     assert reaches(regressor(moved, asked), torque) < 1e-10
 
 
-def test_a_mirror_image_has_the_same_torque() -> None:
-    geometry, bodies, robot = arm("RPRR", 9)
-    mirror = np.diag([1.0, -1.0, 1.0])
-    axis = np.array([
-        mirror @ each * (1 if kind == "prismatic" else -1)  # what turns is seen to turn the other way
-        for each, kind in zip(geometry.axis, geometry.joint_types, strict=True)
-    ])  # fmt: skip
-    image = Geometry(
-        geometry.joint_types,
-        mirror @ geometry.rotation @ mirror,
-        geometry.translation @ mirror,
-        axis,
-        mirror @ geometry.gravity,
-    )
-    seen = bodies * [1, 1, -1, 1, 1, -1, 1, 1, -1, 1]
-    asked = motions(4, 10).transpose(1, 0, 2)
-    np.testing.assert_allclose(
-        inverse_dynamics(as_robot(image, seen), *asked), inverse_dynamics(robot, *asked), rtol=1e-9, atol=1e-9
-    )
-    features = regressor(image, np.ascontiguousarray(asked.transpose(1, 0, 2)))
-    np.testing.assert_allclose(
-        features @ seen.reshape(-1), inverse_dynamics(robot, *asked).reshape(-1), rtol=1e-9, atol=1e-9
-    )
-
-
 @pytest.mark.parametrize("name", ["double-pendulum", "panda", "kinova", "tiago"])
 def test_placements_of_a_robot_are_those_of_pinocchio(name: str) -> None:
     robot = load_robot(name)
@@ -145,21 +114,14 @@ def test_placements_of_a_robot_are_those_of_pinocchio(name: str) -> None:
     assert not Geometry.from_robot(body, gravity=False).gravity.any()
 
 
-UNALIGNED = """<robot name="odd"><link name="a"/><link name="b">{body}</link><link name="c">{body}</link>
-<link name="d">{body}</link>
-<joint name="one" type="revolute"><origin xyz="0.1 0.2 0.3" rpy="0.1 0.2 0.3"/><parent link="a"/><child link="b"/>
-<axis xyz="1 2 -2"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
-<joint name="two" type="prismatic"><origin xyz="0 0.2 0" rpy="1 0 0"/><parent link="b"/><child link="c"/>
-<axis xyz="2 -1 2"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
-<joint name="three" type="continuous"><origin xyz="0.3 0 0"/><parent link="c"/><child link="d"/>
-<axis xyz="-3 0 4"/></joint></robot>"""
-BODY = """<inertial><origin xyz="0.1 0 0.2"/><mass value="2"/>
-<inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial>"""
-
-
 def test_axes_that_are_aligned_with_nothing_are_read_from_pinocchio() -> None:
     types = ("revolute", "prismatic", "revolute")
-    body = RigidBody.from_urdf(UNALIGNED.format(body=BODY), ("one", "two", "three"), types)
+    parts = [joint(name, *name, kind=kind) for name, kind in zip(("ab", "bc", "cd"), types, strict=True)]
+    tilted = [
+        part.replace('"0 1 0"', axis).replace('xyz="0 0 0.3"', 'xyz="0.1 0.2 0.3" rpy="0.1 0.2 0.3"')
+        for part, axis in zip(parts, ('"1 2 -2"', '"2 -1 2"', '"-3 0 4"'), strict=True)
+    ]
+    body = RigidBody.from_urdf(robot_of(*map(link, "abcd"), *tilted), ("ab", "bc", "cd"), types)
     geometry = Geometry.from_robot(body)
     np.testing.assert_allclose(geometry.axis, np.array([[1, 2, -2], [2, -1, 2], [-1.8, 0, 2.4]]) / 3, atol=1e-12)
     robot = Robot("odd", body.model, body.joint_names, types, *np.zeros((3, 3)))
@@ -183,12 +145,12 @@ def test_rotations() -> None:
 def test_what_is_no_geometry_is_refused() -> None:
     good = random_geometry("RR", 13)
     parts = {name: getattr(good, name) for name in ("rotation", "translation", "axis", "gravity")}
-    for name, value, said in (
+    for name, value, message in (
         ("rotation", 2 * good.rotation, "no rotation"),
         ("rotation", good.rotation[:1], "rotation has shape"),
         ("translation", np.full((2, 3), np.nan), "translation has shape"),
         ("axis", 3 * good.axis, "not of length one"),
         ("gravity", np.zeros(2), "gravity has shape"),
     ):
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             Geometry(good.joint_types, **{**parts, name: value})

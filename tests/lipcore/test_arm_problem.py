@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from lipcore import FitOptions, Samples
+from lipcore import FitOptions
 from lipcore.arm.posing import make_problem
 from lipcore.arm.problem import NOISE_WIDTH, Expected, Point, Problem, root_of
 from lipcore.arm.scales import _Evidence, rescale
-from lipcore.data.independence import residual_correlation
 from lipcore.kernels.geometry import Geometry
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import inverse_dynamics
@@ -207,24 +206,3 @@ def test_expectations_of_nothing_and_of_a_robot() -> None:
     assert around.value(geometry) == 0.0
     step = np.linspace(-0.1, 0.1, geometry.size)
     assert around.value(geometry.moved(step)) == pytest.approx(0.5 * np.sum((step / around.widths) ** 2), rel=0.1)
-
-
-def noisy(size: int, memory: float, seed: int, episodes: int = 1) -> tuple[np.ndarray, Samples]:
-    """An autoregression e_k = φ e_{k−1} + white, in each of several recordings."""
-    rng = np.random.default_rng(seed)
-    white = rng.standard_normal((size, 2))
-    episode = np.arange(size) * episodes // size
-    for k in range(1, size):
-        if episode[k] == episode[k - 1]:
-            white[k] += memory * white[k - 1]
-    nothing = np.zeros((size, 2))
-    return white, Samples(("a", "b"), np.arange(size) * 0.01, episode, nothing, nothing, nothing, white)
-
-
-@pytest.mark.parametrize("episodes", [1, 5])
-def test_rows_that_an_independent_one_stands_for(episodes: int) -> None:
-    assert residual_correlation(*noisy(5000, 0.0, 1, episodes)) == pytest.approx(1.0, abs=0.1)
-    for memory in (0.5, 0.8):  # 1 + 2 Σ φ^k
-        expected = (1 + memory) / (1 - memory)
-        assert residual_correlation(*noisy(20_000, memory, 2, episodes)) == pytest.approx(expected, rel=0.2)
-    assert residual_correlation(np.zeros((3, 2)), noisy(3, 0.0, 3)[1]) == 1.0

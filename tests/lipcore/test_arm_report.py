@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lipcore import ModelFormatError, copy_model
+from lipcore import ModelFormatError
 from lipcore.files import persistence
 from lipcore.files.arm import bodies_of, read_geometry
 from lipcore.files.manifest import read_manifest_bytes
@@ -59,7 +59,6 @@ WRONG: dict[str, Change] = {
     r"parameters.geometry.order is .*, expected each of the joints 0 to 2": lambda r: r["geometry"].update(
         order=[0, 0, 1]
     ),
-    r"parameters.geometry.order is .*each": lambda r: r["geometry"].update(order=[True, 0, 2]),
     r"parameters.geometry.gravity\[2\] is": lambda r: r["geometry"].update(gravity=[0, 0, "down"]),
     r"parameters.geometry.joints is .*a list of 3": lambda r: r["geometry"]["joints"].pop(),
     r"parameters.geometry.joints\[1\].type": lambda r: r["geometry"]["joints"][1].update(type="ball"),
@@ -67,13 +66,9 @@ WRONG: dict[str, Change] = {
     r"parameters.geometry.joints\[0\].undetermined": lambda r: r["geometry"]["joints"][0].update(undetermined=["x"]),
     r"parameters.geometry.joints\[2\] has the entry 'mesh'": lambda r: r["geometry"]["joints"][2].update(mesh="file"),
     r"parameters.geometry: rotation holds a matrix": lambda r: r["geometry"]["joints"][0]["rotation"][0].reverse(),
-    r"parameters.geometry: axis holds a vector": lambda r: r["geometry"]["joints"][0].update(axis=[0, 0, 2]),
     r"parameters.rotor.std is": lambda r: r["rotor"].update(std=[0.1]),
     r"parameters.inertia.bodies\[1\].mean.first_moment\[0\] is": lambda r: r["inertia"]["bodies"][1]["mean"].update(
         first_moment=[None, 0, 0]
-    ),
-    r"parameters.inertia.bodies\[0\].plausible.mass is": lambda r: r["inertia"]["bodies"][0]["plausible"].update(
-        mass=True
     ),
     r"parameters.inertia.bodies\[0\].undetermined is": lambda r: r["inertia"]["bodies"][0].update(undetermined="mass"),
     r"parameters has the entry 'colour'": lambda r: r.update(colour="red"),
@@ -86,7 +81,3 @@ def test_anything_else_is_refused(report: Any, expected: str) -> None:
     WRONG[expected](changed)
     with pytest.raises(ModelFormatError, match=expected.replace("'", "['\"]")):
         read_manifest_bytes(manifest(changed))
-
-
-def test_the_shipped_model_is_read(tmp_path: Path) -> None:
-    copy_model(SHIPPED, tmp_path / "copy")

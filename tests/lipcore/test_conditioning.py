@@ -10,11 +10,10 @@ import torch
 
 import lipcore
 from lipcore.data import independence
-from lipcore.fitting import noise
 from lipcore.fitting.options import FitOptions
 from lipcore.posterior.statistics import collect, empty, merge
 from lipcore.posterior.summing import Summing, Total
-from lipcore.training.conditioning import condition, should_condition, sum_samples, with_statistics
+from lipcore.training.conditioning import condition, should_condition
 from tests.service.data import QUICK, stream
 
 TWO = ["revolute"] * 2
@@ -88,17 +87,6 @@ def test_the_form_of_other_devices_sums_alike(few, samples):
     np.testing.assert_allclose(slow.b, fast.b, rtol=1e-8, atol=1e-8 * np.abs(fast.b).max())
 
 
-def test_parts_are_added_to_the_whole(few, samples):
-    summing = Summing.of(few.posterior)
-    parts = sum_samples(summing, samples.rows(slice(0, 90))) + sum_samples(summing, samples.rows(slice(90, 200)))
-    whole = sum_samples(summing, samples)
-    np.testing.assert_allclose(parts.a, whole.a, rtol=1e-9, atol=1e-9 * np.abs(whole.a).max())
-    assert (parts.weight, parts.low.tolist(), parts.high.tolist()) == (200.0, whole.low.tolist(), whole.high.tolist())
-    model = with_statistics(few, parts, 200)
-    assert model.training_range["dq"]["max"] == samples.dq.max(0).tolist()
-    assert model.fit["samples_posterior"] == 200
-
-
 def test_what_is_worth_more_than_the_chosen_ones_is_learnt_whole(samples):
     options = FitOptions(**QUICK)
     assert same(lipcore.train(samples, TWO, "lip-chain", options), condition_timed(samples, options))
@@ -106,13 +94,6 @@ def test_what_is_worth_more_than_the_chosen_ones_is_learnt_whole(samples):
     assert same(lipcore.train(faster, TWO, "lip-chain", options), chosen(faster, options))
     every = replace(options, statistics="all")
     assert lipcore.train(faster, TWO, "lip-chain", every).fit["samples_posterior"] == 200
-
-
-def test_few_samples_are_learnt_as_ever(samples):
-    """Where all are chosen there is nothing more to sum up: the same model."""
-    part = samples.rows(slice(0, QUICK["posterior_samples"]))
-    models = [lipcore.train(part, TWO, "lip-chain", FitOptions(**QUICK, statistics=how)) for how in ("all", "chosen")]
-    assert same(*models)
 
 
 def chosen(samples, options):
@@ -138,31 +119,6 @@ def test_when_all_samples_are_wanted(statistics, count, worth, expected):
     assert should_condition(FitOptions(statistics=statistics), count, worth) is expected
 
 
-def test_options_know_their_words():
-    with pytest.raises(ValueError, match="statistics is 'some', expected one of auto, all, chosen"):
-        FitOptions(statistics="some")
-
-
 def test_conditioning_can_be_cancelled(few, samples):
     with pytest.raises(lipcore.FitCancelledError):
         condition(few, samples, cancelled=lambda: True)
-
-
-def test_thinned_samples_do_not_tell_the_noise():
-    """Contiguous stretches do, however far apart the samples of the fit are."""
-    fast = stream(samples=12_000, rate=200.0, noise=0.01)
-    thinned = fast.rows(slice(None, None, 200))
-    start = noise.start
-    assert (start(thinned, fast.rows(slice(0, 500))) < 0.5 * start(thinned)).all()
-    np.testing.assert_allclose(start(thinned, fast.rows(slice(0, 500))), start(fast), rtol=0.5)
-
-
-@pytest.mark.parametrize("rate", [1000.0, 100.0, 8.0])
-def test_rows_of_a_recording_count_for_their_time(rate):
-    time = np.r_[np.arange(50) / rate, 5 + np.arange(50) / rate, 9.0]
-    episode = np.r_[np.zeros(50), np.ones(50), 2].astype(np.int64)
-    found = independence.recording_weights(time, episode)
-    np.testing.assert_allclose(found, np.r_[np.full(100, min(1.0, 10 / rate)), 1.0], rtol=1e-9)
-    # a piece with one more row at both ends knows what the whole knows
-    np.testing.assert_array_equal(independence.recording_weights(time[29:72], episode[29:72])[1:-1], found[30:71])
-    assert len(independence.recording_weights(np.empty(0), np.empty(0, np.int64))) == 0

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from lipcore.data.metrics import evaluate
 from lipcore.data.samples import Samples
-from lipcore.data.signals import low_pass
 from lipcore.fitting import hyperparameters as fitting
 from lipcore.fitting.estimators import make_estimator
 from lipcore.fitting.hyperparameters import Fit, FitCancelledError, FitProgress, fit
@@ -64,8 +62,10 @@ def test_gradient_is_that_of_evidence_and_priors_together(estimator: str) -> Non
         assert gradient[k] == pytest.approx((8 * near - far) / 12e-4, rel=1e-6, abs=1e-5)
 
 
-@pytest.mark.parametrize("allowed", [0, 1, 5])
-def test_cancellation_stops_before_the_next_evaluation(allowed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("starts", "allowed"), [(1, 0), (1, 5), (6, 3)])
+def test_cancellation_stops_before_the_next_evaluation(
+    starts: int, allowed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     evaluations = 0
 
     def counted(*arguments):
@@ -75,15 +75,8 @@ def test_cancellation_stops_before_the_next_evaluation(allowed: int, monkeypatch
 
     monkeypatch.setattr(fitting, "negative_log_evidence", counted)
     with pytest.raises(FitCancelledError):
-        fit_pendulum(pendulum(), cancelled=lambda: evaluations >= allowed)
+        fit_pendulum(pendulum(), replace(SMALL, starts=starts), cancelled=lambda: evaluations >= allowed)
     assert evaluations == allowed
-
-
-def test_fit_is_deterministic() -> None:
-    one, two = fit_pendulum(pendulum()), fit_pendulum(pendulum())
-    assert one.report.objective == two.report.objective
-    assert np.array_equal(one.rows, two.rows)
-    assert all(torch.equal(one.params[name], two.params[name]) for name in one.params)
 
 
 def test_report_says_what_was_used() -> None:
@@ -112,21 +105,6 @@ def test_noise_is_recovered(robot: str, viscous: float) -> None:
     options = FitOptions(hyperparameter_samples=70, max_iterations=50, device="cpu")
     noise = np.exp(fit(make_estimator("lip", arm.joint_types).kernel, samples, options).params["noise.log_std"].numpy())
     assert np.allclose(noise, 0.05, rtol=0.3)
-
-
-@pytest.mark.slow
-def test_low_passed_torque_is_not_taken_for_free_of_noise() -> None:
-    """What a filter leaves is smooth, but no less wrong: no white noise is left to read off it."""
-    arm = load_robot("ur5")
-    stream = Stream(n_samples=300, rate=30, speed=10, noise=0.3, viscous=1.0, coulomb=1.0)
-    samples = simulate(arm, stream, seed=1)
-    samples = replace(samples, tau=low_pass(samples.tau, stream.rate))
-    model = train(samples, arm.joint_types, "lip-chain", FitOptions(hyperparameter_samples=60, max_iterations=60))
-    unseen = simulate(arm, replace(stream, noise=0.0, n_sinusoids=100), seed=101)
-    answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
-    metrics = evaluate(unseen.tau, answer.tau, answer.tau_std, answer.noise_std)
-    # with the torque as measured the worst joint has 0.016
-    assert (metrics.nmse < 0.1).all(), metrics.nmse.round(3)
 
 
 def test_line_search_survives_a_covariance_that_cannot_be_factored(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -160,14 +138,12 @@ def test_start_that_cannot_be_factored_is_an_error(starts: int, monkeypatch: pyt
     ("name", "value"),
     [
         ("hyperparameter_samples", 9),
-        ("hyperparameter_samples", 2001),
         ("hyperparameter_samples", 50.0),
-        ("posterior_samples", 9),
         ("posterior_samples", 5001),
-        ("max_iterations", 0),
         ("max_iterations", "many"),
         ("starts", 0),
         ("device", "tpu"),
+        ("statistics", "some"),
     ],
 )
 def test_bad_option_is_named(name: str, value: object) -> None:

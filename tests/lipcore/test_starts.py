@@ -15,7 +15,7 @@ from lipcore.data.motion import Motion
 from lipcore.data.samples import Samples
 from lipcore.fitting import hyperparameters as fitting
 from lipcore.fitting.estimators import make_estimator
-from lipcore.fitting.hyperparameters import FitCancelledError, fit
+from lipcore.fitting.hyperparameters import fit
 from lipcore.fitting.options import FitOptions
 from lipcore.kernels.base import SumKernel
 from lipcore.kernels.chain import ChainKernel
@@ -62,13 +62,6 @@ def test_the_lowest_valley_is_chosen_and_starts_that_fail_are_left_out(barred: t
     assert Hills.height(origin) == pytest.approx(reached[chosen], abs=1e-6)
 
 
-def test_one_start_is_the_kernels_own() -> None:
-    hills = Hills()
-    chosen, _ = fitting._best_start(hills, 1)
-    assert chosen == 0
-    assert [begin.tolist() for begin in hills.begun] == [[3.0]]
-
-
 class FarOff(ChainKernel):
     """The chain kernel, started where joints seem not to turn anything and inertia is a million times too large."""
 
@@ -88,9 +81,9 @@ def samples() -> Samples:
 def test_fit_from_several_starts_says_which_it_followed_and_repeats(samples: Samples) -> None:
     kernel = SumKernel(FarOff(("revolute",) * 2), FrictionKernel(2))
     one = fit(kernel, samples, replace(OPTIONS, starts=1)).report
-    several = [fit(kernel, samples, replace(OPTIONS, starts=6)) for _ in range(2)]
+    several = [fit(kernel, samples, replace(OPTIONS, starts=3)) for _ in range(2)]
     assert one.start == 0
-    assert several[0].report.start in range(6)
+    assert several[0].report.start in range(3)
     # even so bad a start of its own finds the only good optimum, and more starts lose nothing
     assert several[0].report.objective < one.objective + 0.1
     assert several[0].report.start == several[1].report.start
@@ -114,16 +107,3 @@ def test_noise_of_a_drawn_start_keeps_above_its_floor(samples: Samples, monkeypa
     floor = torch.from_numpy(np.log(np.maximum(1e-4 * spread, 1e-5 * np.sqrt((still.tau**2).mean(0)).max())))
     assert all((noise >= floor - 1e-9).all() for noise in seen)
     assert any((noise <= floor + 1e-9).any() for noise in seen)
-
-
-def test_cancelling_while_starts_are_tried(samples: Samples) -> None:
-    asked = 0
-
-    def cancelled() -> bool:
-        nonlocal asked
-        asked += 1
-        return asked > 3
-
-    with pytest.raises(FitCancelledError):
-        fit(make_estimator("lip-chain", ("revolute",) * 2).kernel, samples, OPTIONS, cancelled=cancelled)
-    assert asked == 4
