@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -64,13 +63,6 @@ def test_predictions(plain: TorqueModel, corrected: TorqueModel, samples: Sample
     assert (one.tau_std > 0).all()
 
 
-def test_a_term_alone(plain: TorqueModel, corrected: TorqueModel, samples: Samples) -> None:
-    for name in plain.estimator.terms:
-        one, other = (m.posterior.predict(samples.motion()[:5], m.estimator.terms[name]) for m in (plain, corrected))
-        alike(other.mean, one.mean)
-        alike(other.std, FACTOR * one.std)
-
-
 def test_components(plain: TorqueModel, corrected: TorqueModel, samples: Samples) -> None:
     motion, tau = samples.motion()[10:15], samples.torque()[10:15]
     one, other = (dynamics.components(m, motion, dynamics.COMPONENTS, tau) for m in (plain, corrected))
@@ -103,14 +95,6 @@ def test_it_is_saved_and_loaded(corrected: TorqueModel, samples: Samples, tmp_pa
         assert np.array_equal(getattr(again.predict(*query), name), getattr(corrected.predict(*query), name)), name
     # what a model was saved with counts, not what its estimator has by now
     assert calibrate(corrected.estimator.name).function_std_factor != FACTOR
-
-
-def test_the_manifest_decides(plain: TorqueModel, samples: Samples, tmp_path: Path) -> None:
-    save(plain, tmp_path / "model")
-    path = tmp_path / "model" / "manifest.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"calibration": {"function_std_factor": 3.0}}))
-    query = samples.q, samples.dq, samples.ddq
-    np.testing.assert_allclose(load(path.parent).predict(*query).tau_std, 3 * plain.predict(*query).tau_std, rtol=1e-12)
 
 
 @pytest.mark.parametrize("factor", [0.999, 0.0, -2.0, float("nan"), float("inf"), 100.0])

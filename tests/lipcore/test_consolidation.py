@@ -57,16 +57,6 @@ def test_answers_alike_to_the_last_bit_also_when_loaded(
             assert np.array_equal(getattr(answer, name), getattr(expected, name)), name
 
 
-def test_loaded_model_learns_on_as_the_first_would(base: TorqueModel, rows: Rows, tmp_path: Path) -> None:
-    first, rest = rows.take(slice(0, 40)), rows.take(slice(40, None))
-    begun = OnlineModel.start(base).learn(first)
-    save(consolidate(begun), tmp_path / "model")
-    expected = begun.learn(rest).model().predict(rows.q, rows.dq, rows.ddq)
-    answer = OnlineModel.start(load(tmp_path / "model")).learn(rest).model().predict(rows.q, rows.dq, rows.ddq)
-    np.testing.assert_allclose(answer.tau, expected.tau, rtol=0, atol=1e-8 * np.abs(expected.tau).max())
-    np.testing.assert_allclose(answer.tau_std, expected.tau_std, rtol=1e-5)
-
-
 def test_manifest_counts_what_was_learnt(base: TorqueModel, rows: Rows, tmp_path: Path) -> None:
     trained = base.posterior.statistics
     assert trained is not None
