@@ -88,20 +88,6 @@ def test_with_every_output_it_is_the_exact_posterior(case: Case) -> None:
     assert max(found.mean_max, found.std_max) < 1e-3
 
 
-def test_covariance_between_joints(case: Case) -> None:
-    expected = case.exact.predict(case.unseen).covariance
-    answer = case.model.posterior.predict(case.unseen).covariance
-    scale = expected.diagonal(dim1=1, dim2=2).sqrt()
-    assert ((answer - expected) / (scale[:, :, None] * scale[:, None, :])).abs().max() < 0.05
-
-
-def test_terms_sum_to_the_whole(case: Case) -> None:
-    posterior = case.model.posterior
-    terms = [posterior.mean(case.unseen, term) for term in case.model.estimator.terms.values()]
-    whole = posterior.mean(case.unseen)
-    assert torch.allclose(torch.stack(terms).sum(0), whole, rtol=0, atol=1e-9 * float(whole.abs().max()))
-
-
 def test_components_and_energies(case: Case) -> None:
     names = [name for name in dynamics.available(case.model.estimator) if name != "forward_dynamics"]
     expected = dynamics.components(replace(case.model, posterior=case.exact), case.unseen[:20], names)
@@ -131,14 +117,6 @@ def test_too_few_outputs_are_admitted_and_leave_the_interval_wide(chain: Case) -
     assert ((answer.mean - expected.mean).abs() < 4 * answer.std).double().mean() > 0.98
 
 
-def test_a_finer_tolerance_takes_more_outputs_and_deviates_less(chain: Case) -> None:
-    coarse, fine = (compress(chain.exact, chain.samples.torque(), tolerance, 1500) for tolerance in (0.2, 1e-3))
-    assert coarse.reached
-    assert fine.reached
-    assert len(coarse.posterior.basis) < len(chain.model.posterior.basis) <= len(fine.posterior.basis)
-    assert fine.deviation.mean_max <= 1e-3 < coarse.deviation.mean_max
-
-
 def test_its_size_does_not_follow_the_number_of_samples(chain: Case) -> None:
     """Four times the samples of the same motion: hardly more outputs, so the answer costs the same."""
     params, kernel = chain.exact.params, chain.exact.kernel
@@ -149,12 +127,6 @@ def test_its_size_does_not_follow_the_number_of_samples(chain: Case) -> None:
         exact = ExactPosterior.fit(kernel, params, samples.motion(), samples.torque())
         sizes.append(len(compress(exact, samples.torque(), 0.02, 1500).posterior.basis))
     assert sizes[1] < 1.25 * sizes[0]
-
-
-def test_the_choice_is_reproducible(chain: Case) -> None:
-    again = compress(chain.exact, chain.samples.torque(), 0.01, 1500)
-    assert again.report() == chain.model.compact
-    assert torch.equal(again.posterior.weights, chain.model.posterior.weights)
 
 
 def test_statistics_that_no_samples_have_are_refused(chain: Case) -> None:

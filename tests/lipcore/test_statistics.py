@@ -82,34 +82,22 @@ def test_what_is_added_can_be_taken_back_and_ages_factor(seed: int, first: float
     assert same(decay(decay(one, first), second), decay(one, first * second))
 
 
-def test_weights_are_repetitions() -> None:
-    basis, motion, residual = problem(3)
-    weights = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    rows = torch.tensor([0, 1, 1, 2, 2, 2])
-    assert same(
-        collect(basis, NOISE, motion[:3], residual[:3], weights), collect(basis, NOISE, motion[rows], residual[rows])
-    )
-
-
-def test_functions_leave_their_arguments_alone() -> None:
-    basis, motion, residual = problem(4)
-    statistics = collect(basis, NOISE, motion, residual)
-    a, b, asked = statistics.a.clone(), statistics.b.clone(), residual.clone()
-    merge(statistics, statistics), subtract(statistics, statistics), decay(statistics, 0.5), solve(statistics)
-    update(statistics, basis, NOISE, motion, residual)
-    assert torch.equal(statistics.a, a)
-    assert torch.equal(statistics.b, b)
-    assert torch.equal(residual, asked)
-
-
-def test_sums_are_those_of_every_sample_by_itself() -> None:
+def test_sums_are_those_of_every_sample_by_itself_and_their_solution_that_of_linear_regression() -> None:
     basis, motion, residual = problem(5)
     rows, variances, values = dense(basis, motion, residual)
-    found = collect(basis, NOISE, motion, residual)
+    counts = torch.arange(1, 13, dtype=torch.float64) / 6
+    variances = variances / np.repeat(counts.numpy(), 3)
+    found = collect(basis, NOISE, motion, residual, counts)
     assert np.allclose(found.a.numpy(), rows.T @ (rows / variances[:, None]), rtol=1e-10, atol=1e-10)
     assert np.allclose(found.b.numpy(), rows.T @ (values / variances), rtol=1e-10, atol=1e-10)
-    assert found.samples == 12
+    assert found.samples == pytest.approx(13.0)
     assert torch.equal(found.a, found.a.T)
+    centre = torch.randn(len(basis), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    solution = solve(found, centre)
+    # the dual form: conditioning on the N n values themselves
+    gain = rows.T @ np.linalg.inv(rows @ rows.T + np.diag(variances))
+    assert np.allclose(solution.mean.numpy(), centre.numpy() + gain @ (values - rows @ centre.numpy()), atol=1e-9)
+    assert np.allclose((solution.learnt.T @ solution.learnt).numpy(), gain @ rows, atol=1e-9)
 
 
 def test_large_products_are_symmetric_and_those_of_small_ones() -> None:
@@ -122,19 +110,6 @@ def test_large_products_are_symmetric_and_those_of_small_ones() -> None:
     )
     assert torch.allclose(whole.a, features @ features.T, rtol=1e-12, atol=1e-9)
     assert torch.equal(whole.a, whole.a.T)
-
-
-def test_solution_is_that_of_bayesian_linear_regression() -> None:
-    basis, motion, residual = problem(7)
-    rows, variances, values = dense(basis, motion, residual)
-    centre = torch.randn(len(basis), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    found = solve(collect(basis, NOISE, motion, residual), centre)
-    # the dual form: conditioning on the N n values themselves
-    gram = rows @ rows.T + np.diag(variances)
-    gain = rows.T @ np.linalg.inv(gram)
-    assert np.allclose(found.mean.numpy(), centre.numpy() + gain @ (values - rows @ centre.numpy()), atol=1e-9)
-    covariance = np.eye(len(basis)) - gain @ rows
-    assert np.allclose((found.learnt.T @ found.learnt).numpy(), np.eye(len(basis)) - covariance, atol=1e-9)
 
 
 @pytest.mark.parametrize(("told", "largest"), [(3, 1e2), (20, 1e2), (60, 1e2), (60, 1e5)])
