@@ -33,16 +33,6 @@ def test_joints_are_judged_apart_and_noise_may_differ_by_sample() -> None:
     assert answer.coverage.tolist() == [0.5, 1.0]
 
 
-@pytest.mark.parametrize("level", [0.5, 0.8, 0.95, 0.99])
-def test_coverage_of_a_true_gaussian_is_the_level(level: float) -> None:
-    rng = np.random.default_rng(0)
-    std, noise = rng.uniform(0.1, 2.0, (20_000, 2)), np.array([0.5, 1.5])
-    mean = rng.normal(size=std.shape)
-    tau = mean + np.sqrt(std**2 + noise**2) * rng.standard_normal(std.shape)
-    # three standard errors of a binomial share
-    assert np.allclose(evaluate(tau, mean, std, noise, level).coverage, level, atol=3 * math.sqrt(0.25 / 20_000))
-
-
 def gaussian(confidence: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Torques, means, and stds that are too small by the factor `confidence`."""
     rng = np.random.default_rng(1)
@@ -67,17 +57,6 @@ def test_overconfident_intervals_cover_less_at_every_level_and_timid_ones_more()
         assert (getattr(proud, name) < getattr(true, name)).all()
         assert (getattr(timid, name) > getattr(true, name)).all()
     assert np.allclose(proud.widths * 2, true.widths)
-
-
-def test_coverage_and_width_grow_with_the_level() -> None:
-    answer = evaluate(*gaussian())
-    assert answer.coverages.shape == answer.widths.shape == (4, 2)
-    assert answer.reliability.shape == (20, 2)
-    for figures in (answer.coverages, answer.widths, answer.reliability):
-        assert (np.diff(figures, axis=0) > 0).all()
-    # half a Gaussian's mass lies within 0.6745 deviations
-    _, _, std, noise = gaussian()
-    assert answer.widths[0] == pytest.approx(2 * 0.6744897501960817 * np.hypot(std, noise).mean(axis=0))
 
 
 # the mean of seven times 0.1 is not 0.1: a variance by formula is not exactly zero
