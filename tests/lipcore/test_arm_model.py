@@ -1,10 +1,13 @@
-"""A model that stands on an arm: stored, judged by its parameters, taught further, and with arms to choose from."""
+"""A model that stands on an arm: stored, reported, taught further, and with arms to choose from."""
 
 from __future__ import annotations
 
+import copy
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -17,18 +20,20 @@ from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, load, sa
 from lipcore.data.metrics import evaluate
 from lipcore.data.motion import Motion
 from lipcore.files import persistence
+from lipcore.files.arm import bodies_of, read_geometry
+from lipcore.files.manifest import read_manifest_bytes
 from lipcore.fitting.estimators import make_estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative
 from lipcore.kernels.friction import friction_features
-from lipcore.model.parameters import inertial_parameters, report, weight_posterior
+from lipcore.model.parameters import inertial_parameters, report
 from lipcore.online.learner import OnlineModel
 from lipcore.posterior.compression import linear
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate
 from lipcore.robots.urdf import RigidBody
 from tests.lipcore.arm_oracles import arm, as_robot, followed, motions, recorded
-from tests.lipcore.arms import random_bodies
+from tests.lipcore.arms import parameters, random_bodies, random_geometry
 from tests.lipcore.online_checks import as_rows
 
 OPTIONS = FitOptions(device="cpu", statistics="chosen")
@@ -217,8 +222,68 @@ def test_what_is_reported_of_a_learnt_arm(learnt: TorqueModel) -> None:
     assert "mass" in reported["inertia"]["bodies"][0]["undetermined"]
     inertia = inertial_parameters(learnt.posterior, learnt.estimator)
     assert inertia.mean.shape == inertia.std.shape == (3, 10)
-    term = learnt.estimator.terms["rigid_body"]
-    assert isinstance(term, ArmKernel)
-    weights = weight_posterior(learnt.posterior, term)
-    np.testing.assert_allclose(inertia.mean.reshape(-1), weights.mean[:30])
-    assert (weights.std <= weights.scale * (1 + 1e-9)).all()
+
+
+ORDER = [2, 0, 1]
+SHIPPED = Path(__file__).parents[2] / "models" / "panda-sim"
+
+
+def manifest(reported: Any) -> bytes:
+    """The manifest of the shipped model, with three joints only and these parameters."""
+    shipped = json.loads((SHIPPED / "manifest.json").read_text())
+    for name in ("joint_names", "joint_types", "noise_std"):
+        shipped[name] = shipped[name][:3]
+    for ends in shipped["training_range"].values():
+        ends["min"], ends["max"] = ends["min"][:3], ends["max"][:3]
+    return persistence.manifest_bytes({**shipped, "parameters": reported})
+
+
+@pytest.fixture
+def reported() -> Any:
+    names = json.loads(manifest({}))["joint_names"]
+    return parameters(random_geometry("RPR", 1), random_bodies(3, 1), names, ORDER)
+
+
+def test_a_report_is_read_back(reported: Any) -> None:
+    entry = read_manifest_bytes(manifest(reported))["parameters"]
+    geometry, order = read_geometry(entry["geometry"], 3)
+    assert order == ORDER
+    np.testing.assert_array_equal(geometry.constants, random_geometry("RPR", 1).constants)
+    np.testing.assert_array_equal(bodies_of(entry["inertia"])[order], random_bodies(3, 1))
+
+
+def test_what_earlier_releases_reported_is_read(reported: Any) -> None:
+    for body in reported["inertia"]["bodies"]:
+        del body["undetermined"]
+    read_manifest_bytes(manifest({name: reported[name] for name in ("friction", "inertia")}))
+    read_manifest_bytes(manifest({"friction": reported["friction"]}))
+
+
+MALFORMED: dict[str, Callable[[Any], None]] = {
+    r"parameters.geometry.mode is 'guess', expected one of learn": lambda r: r["geometry"].update(mode="guess"),
+    r"parameters.geometry lacks order": lambda r: r["geometry"].pop("order"),
+    r"parameters.geometry.order is .*, expected each of the joints 0 to 2": lambda r: r["geometry"].update(
+        order=[0, 0, 1]
+    ),
+    r"parameters.geometry.gravity\[2\] is": lambda r: r["geometry"].update(gravity=[0, 0, "down"]),
+    r"parameters.geometry.joints is .*a list of 3": lambda r: r["geometry"]["joints"].pop(),
+    r"parameters.geometry.joints\[1\].type": lambda r: r["geometry"]["joints"][1].update(type="ball"),
+    r"parameters.geometry.joints\[0\].turn_std is": lambda r: r["geometry"]["joints"][0].update(turn_std=[0.1]),
+    r"parameters.geometry.joints\[0\].undetermined": lambda r: r["geometry"]["joints"][0].update(undetermined=["x"]),
+    r"parameters.geometry.joints\[2\] has the entry 'mesh'": lambda r: r["geometry"]["joints"][2].update(mesh="file"),
+    r"parameters.geometry: rotation holds a matrix": lambda r: r["geometry"]["joints"][0]["rotation"][0].reverse(),
+    r"parameters.rotor.std is": lambda r: r["rotor"].update(std=[0.1]),
+    r"parameters.inertia.bodies\[1\].mean.first_moment\[0\] is": lambda r: r["inertia"]["bodies"][1]["mean"].update(
+        first_moment=[None, 0, 0]
+    ),
+    r"parameters.inertia.bodies\[0\].undetermined is": lambda r: r["inertia"]["bodies"][0].update(undetermined="mass"),
+    r"parameters has the entry 'colour'": lambda r: r.update(colour="red"),
+}
+
+
+@pytest.mark.parametrize("expected", MALFORMED)
+def test_anything_else_is_refused(reported: Any, expected: str) -> None:
+    changed = copy.deepcopy(reported)
+    MALFORMED[expected](changed)
+    with pytest.raises(ModelFormatError, match=expected.replace("'", "['\"]")):
+        read_manifest_bytes(manifest(changed))

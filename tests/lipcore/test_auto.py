@@ -175,24 +175,13 @@ def test_it_can_be_cancelled(at_work):
 
 
 @pytest.mark.slow
-def test_the_search_is_taken_up_again_where_the_chain_leads(monkeypatch):
-    searches = []
-    learn = auto.learn
-
-    def counted(*given):
-        searches.append(given[-1])  # the seed
-        return learn(*given)
-
-    monkeypatch.setattr(auto, "learn", counted)
+def test_where_the_chain_leads_the_search_is_taken_up_again_and_both_stand_around_its_arm(monkeypatch, tmp_path):
+    seeds, learn = [], auto.learn
+    monkeypatch.setattr(auto, "learn", lambda *given: (seeds.append(given[-1]), learn(*given))[1])
     monkeypatch.setattr(auto.Contest, "_chain_leads", lambda self: True)
-    train(recorded(), TYPES, options=OPTIONS)
-    assert searches[:2] == [0, 1]
-
-
-@pytest.mark.slow
-def test_both_together_stand_on_all_samples_around_the_arm_that_was_learnt(monkeypatch, tmp_path):
-    monkeypatch.setattr(auto.Contest, "verdict", lambda self: ("rigid-body+lip-chain", "it was told to"))
+    monkeypatch.setattr(auto.Contest, "verdict", lambda self: ("rigid-body+lip-chain", "both are wanted"))
     model = train(recorded(), TYPES, options=replace(OPTIONS, posterior_samples=300))
+    assert seeds[:2] == [0, 1]
     assert model.selection["chosen"] == model.estimator.name == "rigid-body+lip-chain"
     assert model.fit["samples_given"] == len(recorded())
     assert 100 < model.fit["samples_posterior"] <= len(recorded())

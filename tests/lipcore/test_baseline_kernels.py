@@ -149,24 +149,6 @@ def test_se_and_gip_equal_plain_loops(name: str, loop: Callable[..., np.ndarray]
             np.testing.assert_allclose(blocks[:, :, i, j], loop(joint_types, arrays_, x, y), rtol=1e-12, atol=1e-14)
 
 
-@robots
-@pytest.mark.parametrize("name", BASELINES)
-def test_gram_is_symmetric_and_positive_semidefinite(name: str, joint_types: tuple[str, ...]) -> None:
-    kernel, params, motion = random_case(name, joint_types, samples=12)
-    gram = kernel.symmetric_gram(params, motion)
-    assert torch.equal(gram, gram.T)
-    torch.testing.assert_close(gram, kernel.gram(params, motion, motion), rtol=1e-12, atol=1e-12 * float(gram.max()))
-    eigenvalues = torch.linalg.eigvalsh(gram)
-    assert eigenvalues[0] > -1e-12 * eigenvalues[-1]
-
-
-@pytest.mark.parametrize("name", ["gip", "lse"])
-def test_a_full_turn_of_a_revolute_joint_changes_nothing(name: str) -> None:
-    kernel, params, motion = random_case(name, ("revolute", "prismatic"), samples=4)
-    turned = Motion(motion.q + torch.tensor([2 * math.pi, 0.0], dtype=torch.float64), motion.dq, motion.ddq)
-    torch.testing.assert_close(kernel.gram(params, turned, motion), kernel.gram(params, motion, motion))
-
-
 @pytest.mark.parametrize("still", [(0,), (0, 1, 2)], ids=["one", "all"])
 @pytest.mark.parametrize("name", BASELINES)
 def test_start_is_scaled_to_the_data_even_where_joints_stand_still(name: str, still: tuple[int, ...]) -> None:

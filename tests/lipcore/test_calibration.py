@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 from numpy.typing import ArrayLike
 
 from lipcore import FitOptions, Samples, TorqueModel, load, save, train
-from lipcore.fitting.estimators import ESTIMATORS, FUNCTION_STD_FACTOR, NO_CALIBRATION, Calibration, calibrate
+from lipcore.fitting.estimators import FUNCTION_STD_FACTOR, NO_CALIBRATION, Calibration, calibrate
 from lipcore.model import dynamics
 from lipcore.model.parameters import friction_coefficients, inertial_parameters, weight_posterior
 from lipcore.robots.library import load_robot
@@ -101,12 +100,3 @@ def test_it_is_saved_and_loaded(corrected: TorqueModel, samples: Samples, tmp_pa
 def test_factor_out_of_range_is_refused(factor: float) -> None:
     with pytest.raises(ValueError, match=f"function_std_factor is {factor!r}, expected a number from 1 to 100"):
         Calibration(factor)
-
-
-def test_every_factor_belongs_to_an_estimator_and_can_be_used() -> None:
-    assert FUNCTION_STD_FACTOR.keys() <= ESTIMATORS.keys()
-    for name in ESTIMATORS:
-        assert calibrate(name).function_std_factor == FUNCTION_STD_FACTOR.get(name, 1.0)
-    assert NO_CALIBRATION.function_std_factor == 1.0
-    with pytest.raises(ValueError, match="function_std_factor"):
-        replace(NO_CALIBRATION, function_std_factor=0.5)

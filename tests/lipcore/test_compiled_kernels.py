@@ -8,9 +8,7 @@ import torch
 
 from lipcore.data.motion import Motion
 from lipcore.kernels.compiled.lanes import LANES
-from tests.lipcore.agreement import opposite
-from tests.lipcore.oracles import shares_of
-from tests.lipcore.problems import KERNELS, Problem, TorchForm, random_problem
+from tests.lipcore.oracles import KERNELS, Problem, TorchForm, opposite, random_problem, shares_of
 
 RELATIVE = 1e-11
 ROBOTS = [

@@ -13,7 +13,7 @@ from lipcore.data.motion import Motion
 from lipcore.kernels.base import PAIRS_PER_CHUNK, SumKernel, row_chunks
 from lipcore.kernels.friction import SIGN_WIDTH, STRIBECK_SPEED, FrictionKernel, friction_features
 from lipcore.kernels.lip import LipKernel
-from tests.lipcore.problems import KERNELS, Problem, TorchForm, problems, random_problem
+from tests.lipcore.oracles import KERNELS, Problem, problems, random_problem
 
 JOINTS = ("revolute", "prismatic", "revolute")
 
@@ -26,17 +26,6 @@ def test_gram_is_symmetric_and_positive_semidefinite(problem: Problem) -> None:
     assert (symmetric - gram).abs().max() <= 1e-13 * gram.abs().max()
     values = torch.linalg.eigvalsh(0.5 * (gram + gram.T))
     assert values[0] >= -1e-10 * values[-1]
-
-
-@pytest.mark.parametrize("pairs", [1, 7, 20, 10**6])
-def test_results_do_not_depend_on_the_chunk_size(pairs: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    problem = random_problem(JOINTS, samples=11, seed=1)
-    kernel, params, motion = TorchForm(problem.kernel), problem.params, problem.motion
-    gram, symmetric = kernel.gram(params, motion[:4], motion), kernel.symmetric_gram(params, motion)
-    monkeypatch.setattr("lipcore.kernels.base.PAIRS_PER_CHUNK", pairs)
-    tolerance = {"rtol": 1e-12, "atol": 1e-13 * float(gram.abs().max())}
-    assert torch.allclose(kernel.gram(params, motion[:4], motion), gram, **tolerance)
-    assert torch.allclose(kernel.symmetric_gram(params, motion), symmetric, **tolerance)
 
 
 def test_chunks_cover_all_rows_once_and_stay_small() -> None:
@@ -64,8 +53,6 @@ def test_sum_kernel_adds_its_terms() -> None:
     initial = SumKernel(problem.kernel, friction).initial(problem.motion, problem.motion.q)
     assert initial.keys() == problem.params.keys() - {"noise.log_std"}
 
-
-def test_sum_kernel_refuses_terms_of_different_robots() -> None:
     with pytest.raises(ValueError, match=r"\[2, 3\] joints"):
         SumKernel(LipKernel(JOINTS), FrictionKernel(2))
 

@@ -16,7 +16,7 @@ from lipcore.fitting import noise
 from lipcore.kernels.base import SumKernel
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.posterior.exact import negative_log_evidence, noisy_gram
-from tests.lipcore.problems import random_problem
+from tests.lipcore.oracles import random_problem
 
 JOINTS = ("revolute", "prismatic", "revolute")
 TRUE = np.array([0.02, 0.3, 0.08])

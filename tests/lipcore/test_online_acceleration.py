@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from lipcore.online.acceleration import RateError, derive, rate_of, window
@@ -45,6 +45,7 @@ def test_noise_comes_out_as_stated() -> None:
     extra=st.integers(-1, 5),
     rate=st.integers(50, 1000),
 )
+@example(coefficients=(1.0, 1.0, 1.0), half=4, extra=-1, rate=100)
 @settings(deadline=None)
 def test_exact_on_quadratics_and_as_late_as_stated(
     coefficients: tuple[float, float, float], half: int, extra: int, rate: int

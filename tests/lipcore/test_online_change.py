@@ -12,7 +12,6 @@ import pytest
 from scipy.signal import lfilter
 
 from lipcore.online.change import Change, ChangeDetector, friction_share, suspect
-from lipcore.online.gates import is_contact
 from lipcore.online.record import Record
 from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import Payload, Stream, inverse_dynamics, simulate
@@ -202,17 +201,6 @@ def test_friction_that_grows_slowly_is_found_and_looks_like_friction(panda: Robo
     share = friction_share(dq[after], (tau - mean)[after])
     assert suspect(share, change.joints) == "friction"
     assert change.evidence(panda.joint_names, share)["suspect"] == "friction"
-
-
-def test_collision_of_half_a_second_is_no_change_whether_gated_or_too_soft_to_be(panda: Robot) -> None:
-    t, _, tau, mean, std = judged(panda, PLAIN)
-    push = (t >= 40) & (t < 40.5)
-    for force, passing in ((0.3, 24), (5.0, 0)):
-        pushed = tau.copy()
-        pushed[push, 2] += force
-        free = ~is_contact(pushed, mean, std, NOISE, 8.0)
-        assert free[push].sum() == passing
-        assert watch(t[free], pushed[free], mean[free], std[free], NOISE)[1] == []
 
 
 def test_friction_share_of_pure_friction_is_whole_and_of_weight_and_noise_none() -> None:

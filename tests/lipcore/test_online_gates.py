@@ -141,14 +141,6 @@ def test_wrong_time_at_the_end_of_a_batch_and_a_clock_set_back_cost_no_more_than
     assert after_each([[101, 102, 103], [1, 2, 3], [4, 5, 6]]) == [[], [0, 1, 2], []]
 
 
-def test_time_span_counts_believed_times() -> None:
-    learnt, jump = CODES.index("learnt"), CODES.index("time_jump")
-    t = np.array([np.nan, 1.0, 9.0, 3.0])
-    assert time_span(t, np.array([1, learnt, jump, learnt], dtype=np.uint8)) == (1.0, 3.0)
-    assert time_span(t, np.array([1, jump, jump, jump], dtype=np.uint8)) == (1.0, 3.0)
-    assert time_span(t[:1], np.array([1], dtype=np.uint8)) is None
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [

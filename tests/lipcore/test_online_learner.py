@@ -1,4 +1,4 @@
-"""A model that learns, against dense references: late rows, forgetting, changes, and what it must refuse."""
+"""A model that learns, against dense references: late rows, forgetting, changes, refusals, becoming a version."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 import torch
 
-from lipcore import FitOptions, TorqueModel, save, train
+from lipcore import FitOptions, ModelFormatError, TorqueModel, load, save, train
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Samples
+from lipcore.files.probing import probe
 from lipcore.online import transfer
 from lipcore.online.batch import Rows
 from lipcore.online.learner import ForgottenError, OnlineModel, uncovered
-from lipcore.online.transfer import Revision
+from lipcore.online.transfer import Revision, consolidate
 from lipcore.posterior.compact import CompactPosterior
-from lipcore.posterior.exact import ExactPosterior
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Payload, Stream, simulate
 from tests.lipcore.online_checks import as_rows, same_answers
@@ -71,18 +71,6 @@ def test_learning_is_the_posterior_of_all_samples_old_and_new(base: TorqueModel,
     zeros = np.zeros(len(base.posterior.basis))
     expected = regression(base.posterior, motion, tau, np.ones(len(motion)), zeros)
     assert_solution(OnlineModel.start(base).learn(rows), *expected)
-
-
-def test_where_the_basis_reaches_it_is_the_exact_gaussian_process(base: TorqueModel, rows: Rows) -> None:
-    old, posterior = recorded(1), base.posterior
-    motion = Samples.concatenate([old, recorded(2)]).motion()
-    tau = torch.from_numpy(np.concatenate([old.tau, rows.tau]))
-    exact = ExactPosterior.fit(posterior.kernel, posterior.params, motion, tau, posterior.std_factor)
-    answer, expected = OnlineModel.start(base).learn(rows).model(), exact.predict(rows.motion())
-    found = answer.predict(rows.q, rows.dq, rows.ddq)
-    off = np.abs(found.tau - expected.mean.numpy()) / expected.std.numpy()
-    assert off.max() < 0.1
-    assert (found.tau_std / expected.std.numpy()).max() < 1.1
 
 
 def test_forgetting_weighs_rows_by_their_age_and_keeps_the_mean_of_the_version(base: TorqueModel, rows: Rows) -> None:
@@ -225,3 +213,62 @@ def test_adding_in_place_gives_the_same_bits(base: TorqueModel, rows: Rows, forg
     assert transfer.dump(own.symmetrised()) == transfer.dump(usual)
     assert transfer.dump(OnlineModel.start(base, forgetting, since=float(rows.time.min()))) == untouched
     assert torch.equal(usual.now.statistics.a, usual.now.statistics.a.T)
+
+
+FLOOR = np.array([0.5, 0.0])
+
+
+def online(base: TorqueModel, rows: Rows, how: str) -> OnlineModel:
+    learnt = OnlineModel.start(base, 3.0 if how == "forgetting" else None).learn(rows.take(slice(0, 50)))
+    if how == "changed":
+        learnt = learnt.change(float(rows.time[50]))
+    return learnt.learn(rows.take(slice(50, None)))
+
+
+@pytest.mark.parametrize("how", ["plain", "forgetting", "changed"])
+@pytest.mark.parametrize("floor", [None, FLOOR], ids=["no floor", "floor"])
+def test_answers_alike_to_the_last_bit_also_when_loaded(
+    base: TorqueModel, rows: Rows, how: str, floor: np.ndarray | None, tmp_path: Path
+) -> None:
+    learnt = online(base, rows, how)
+    whole = consolidate(learnt, floor)
+    save(whole, tmp_path / "model")
+    expected = learnt.model(floor).predict(rows.q, rows.dq, rows.ddq, covariance=True)
+    trained = base.predict(rows.q, rows.dq, rows.ddq)
+    assert np.abs(expected.tau - trained.tau).max() > 1e-3, "nothing was learnt"
+    for model in (whole, load(tmp_path / "model")):
+        answer = model.predict(rows.q, rows.dq, rows.ddq, covariance=True)
+        for name in ("tau", "tau_std", "covariance", "noise_std"):
+            assert np.array_equal(getattr(answer, name), getattr(expected, name)), name
+
+
+def test_manifest_counts_what_was_learnt(base: TorqueModel, rows: Rows, tmp_path: Path) -> None:
+    trained = base.posterior.statistics
+    assert trained is not None
+    weight = float(rows.weight.sum())
+    plain = save(consolidate(online(base, rows, "plain")), tmp_path / "plain")
+    assert plain["compact"]["data_samples"] == round(trained.samples + weight)
+    changed = save(consolidate(online(base, rows, "changed")), tmp_path / "changed")
+    assert 0 < changed["compact"]["data_samples"] < trained.samples
+
+
+def test_floor_below_zero_is_never_loaded(base: TorqueModel, rows: Rows, tmp_path: Path) -> None:
+    saved = consolidate(online(base, rows, "plain"), FLOOR)
+    saved.posterior.floor[1] = -1.0
+    save(saved, tmp_path / "model")
+    with pytest.raises(ModelFormatError, match="'floor' has a number below zero"):
+        load(tmp_path / "model")
+
+
+def test_probe_finds_answers_that_are_none(base: TorqueModel) -> None:
+    probe(base)
+    posterior = base.posterior
+    params = {name: value.clone() for name, value in posterior.params.items()}
+    params["noise.log_std"] += 400.0
+    statistics = posterior.statistics
+    assert statistics is not None
+    inducing, outputs = posterior.basis.inducing, posterior.basis.outputs
+    restored = CompactPosterior.restore(base.estimator.kernel, params, inducing, outputs, statistics)
+    broken = replace(base, posterior=restored)
+    with pytest.raises(ModelFormatError, match="noise_std of a probe"):
+        probe(broken)

@@ -1,7 +1,8 @@
-"""Exact posterior and evidence against dense references that share nothing with them but the kernel of two samples."""
+"""Exact posterior and evidence against dense references, and the compact posterior against the exact one."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -9,12 +10,24 @@ import pytest
 import torch
 from scipy.stats import multivariate_normal
 
+from lipcore import FitOptions, Samples, TorqueModel, train
 from lipcore.data.motion import Motion
+from lipcore.fitting.estimators import ESTIMATORS
 from lipcore.kernels.base import Params, SumKernel, TorqueKernel
 from lipcore.kernels.friction import FrictionKernel
+from lipcore.model import dynamics
+from lipcore.model.parameters import weight_posterior
+from lipcore.posterior.basis import Basis
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.compression import Deviation, compress
 from lipcore.posterior.exact import ExactPosterior, negative_log_evidence
 from lipcore.posterior.linalg import NotPositiveDefiniteError
-from tests.lipcore.problems import KERNELS, Problem, TorchForm, random_problem
+from lipcore.posterior.statistics import collect
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.urdf import RigidBody
+from lipcore.vocabulary import ROBOT_ESTIMATORS
+from tests.lipcore.oracles import KERNELS, Problem, TorchForm, random_problem
 
 JOINTS = ("revolute", "prismatic", "revolute")
 N_JOINTS = len(JOINTS)
@@ -137,3 +150,122 @@ def test_covariance_that_cannot_be_factored_is_reported() -> None:
     kernel = SumKernel(problem.kernel, FrictionKernel(1))
     with pytest.raises(NotPositiveDefiniteError):
         negative_log_evidence(kernel, params, problem.motion, torch.zeros(5, 1).double())
+
+
+ROBOT = "double-pendulum"
+OPTIONS = FitOptions(hyperparameter_samples=40, max_iterations=40, starts=1, device="cpu")
+STREAM = Stream(n_samples=120, speed=10, noise=0.02, viscous=0.1, coulomb=0.05)
+
+
+class Case(NamedTuple):
+    """A model, the exact posterior of the same samples, and motions that neither has seen."""
+
+    model: TorqueModel
+    exact: ExactPosterior
+    samples: Samples
+    unseen: Motion
+
+
+def fitted(name: str) -> Case:
+    samples = simulate(load_robot(ROBOT), STREAM, seed=1)
+    body = RigidBody.from_profile(ROBOT, samples.joint_names, ("revolute",) * 2) if name in ROBOT_ESTIMATORS else None
+    model = train(samples, ("revolute",) * 2, name, OPTIONS, robot=body)
+    posterior = model.posterior
+    kernel, params, motion = posterior.kernel, posterior.params, samples.motion()
+    exact = ExactPosterior.fit(kernel, params, motion, samples.torque(), posterior.std_factor)
+    return Case(model, exact, samples, simulate(load_robot(ROBOT), replace(STREAM, n_sinusoids=100), seed=2).motion())
+
+
+@pytest.fixture(scope="module", params=ESTIMATORS)
+def case(request: pytest.FixtureRequest) -> Case:
+    return fitted(request.param)
+
+
+@pytest.fixture(scope="module")
+def chain() -> Case:
+    return fitted("lip-chain")
+
+
+def deviation(case: Case, posterior: CompactPosterior) -> Deviation:
+    expected, answer = case.exact.predict(case.unseen), posterior.predict(case.unseen)
+    return Deviation.between(expected, answer.mean, answer.std, posterior.noise_variance.sqrt())
+
+
+def everything(case: Case) -> CompactPosterior:
+    """A compact posterior with all torques among its inducing outputs."""
+    exact, noise = case.exact, torch.exp(2 * case.exact.params["noise.log_std"])
+    count = len(exact.weights) if case.model.posterior.basis.term is not None else 0
+    basis = Basis.build(exact.kernel, exact.params, exact.motion, torch.arange(count))
+    residual = case.samples.torque() - exact.kernel.mean(exact.motion)
+    return CompactPosterior.build(
+        exact.kernel, basis, collect(basis, noise, exact.motion, residual), noise, exact.std_factor
+    )
+
+
+def test_it_keeps_its_tolerance_on_motion_it_was_not_chosen_on(case: Case) -> None:
+    report = case.model.compact
+    assert report["tolerance_reached"] is True
+    assert max(report["mean_max"], report["std_max"]) <= report["tolerance"] == 0.01
+    found = deviation(case, case.model.posterior)
+    assert max(found.mean_max, found.std_max) < 0.02
+
+
+def test_with_every_output_it_is_the_exact_posterior(case: Case) -> None:
+    found = deviation(case, everything(case))
+    assert max(found.mean_max, found.std_max) < 1e-3
+
+
+def test_components_and_energies(case: Case) -> None:
+    names = [name for name in dynamics.available(case.model.estimator) if name != "forward_dynamics"]
+    expected = dynamics.components(replace(case.model, posterior=case.exact), case.unseen[:20], names)
+    answer = dynamics.components(case.model, case.unseen[:20], names)
+    for name in names:
+        unit = expected[name].std.clamp_min(1e-3 * float(expected[name].std.max()))
+        assert ((answer[name].mean - expected[name].mean) / unit).abs().max() < 0.1, name
+        assert ((answer[name].std - expected[name].std) / unit).abs().max() < 0.05, name
+
+
+def test_weights_of_linear_terms(case: Case) -> None:
+    for term in case.model.posterior.basis.linear:
+        expected, answer = (weight_posterior(each, term) for each in (case.exact, case.model.posterior))
+        assert (np.abs(answer.mean - expected.mean) < 0.1 * expected.std).all()
+        np.testing.assert_allclose(answer.std, expected.std, rtol=0.05)
+
+
+def test_too_few_outputs_are_admitted_and_leave_the_interval_wide(chain: Case) -> None:
+    """With a tenth of the outputs the answer says that it knows less, and its intervals still hold the exact mean."""
+    enough = chain.model.compact["inducing_outputs"]
+    found = compress(chain.exact, chain.samples.torque(), 0.02, enough // 4)
+    assert not found.reached
+    assert len(found.posterior.basis.outputs) == enough // 4
+    assert max(found.deviation.mean_max, found.deviation.std_max) > 0.02
+    expected, answer = chain.exact.predict(chain.unseen), found.posterior.predict(chain.unseen)
+    assert (answer.std > 0.95 * expected.std).all()
+    assert ((answer.mean - expected.mean).abs() < 4 * answer.std).double().mean() > 0.98
+
+
+def test_its_size_does_not_follow_the_number_of_samples(chain: Case) -> None:
+    """Four times the samples of the same motion: hardly more outputs, so the answer costs the same."""
+    params, kernel = chain.exact.params, chain.exact.kernel
+    sizes = []
+    for count in (1, 4):
+        stream = replace(STREAM, n_samples=120 * count, rate=10.0 * count)
+        samples = simulate(load_robot(ROBOT), stream, seed=1)
+        exact = ExactPosterior.fit(kernel, params, samples.motion(), samples.torque())
+        sizes.append(len(compress(exact, samples.torque(), 0.02, 1500).posterior.basis))
+    assert sizes[1] < 1.25 * sizes[0]
+
+
+def test_statistics_that_no_samples_have_are_refused(chain: Case) -> None:
+    posterior = chain.model.posterior
+    broken = replace(posterior.statistics, a=posterior.statistics.a - 10 * torch.eye(len(posterior.basis)).double())
+    with pytest.raises(NotPositiveDefiniteError, match=r"statistics of size .* have the eigenvalue -"):
+        CompactPosterior.build(posterior.kernel, posterior.basis, broken, posterior.noise_variance)
+
+
+def test_terms_of_another_model_are_refused(chain: Case) -> None:
+    other = fitted("lip").model.estimator.terms
+    with pytest.raises(ValueError, match="none of this posterior"):
+        chain.model.posterior.mean(chain.unseen, other["energy"])
+    with pytest.raises(ValueError, match="none of this basis"):
+        chain.model.posterior.mean(chain.unseen, other["friction"])

@@ -208,8 +208,9 @@ def test_a_urdf_of_ones_own() -> None:
     assert found.order_of(("elbow", "t", "shoulder")) == [2, 0]
     assert found.order_of(("left_elbow", "left_shoulder", "left_slide")) == [2, 1, 0]
     assert found.order_of(("wrist",)) is None
-    with pytest.raises(UrdfError, match="no joint that moves"):
-        from_urdf(robot(link("base")), "mine")
+    for wrong, message in (("", "well-formed"), (robot(link("base")), "no joint that moves")):
+        with pytest.raises(UrdfError, match=message):
+            from_urdf(wrong, "mine")
     with pytest.raises(ValueError, match=r"torque of 'mine' has shape \(2,\), expected \(3,\)"):
         replace(found, torque=np.ones(2))
     with pytest.raises(ValueError, match="joint_aliases of 'mine' has 1 entries, expected 3"):

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from lipcore import FitOptions, Samples, TorqueModel, load, save
+from lipcore import FitOptions, Samples, TorqueModel
 from lipcore.arm import learning
 from lipcore.data.motion import Motion
 from lipcore.files.arm import arm_tensors, read_arm
@@ -71,15 +70,6 @@ def test_it_is_not_learnt_where_there_is_none() -> None:
     assert model.fit["friction_terms"] == 3
     assert float(model.fit["stribeck_nats"]) < 2
     assert friction_coefficients(model.posterior, model.estimator).stribeck is None
-
-
-def test_it_is_stored(model: TorqueModel, tmp_path: Path) -> None:
-    manifest = save(model, tmp_path / "model")
-    again, asked = load(tmp_path / "model"), recorded(3, 0.5)
-    one, other = (each.predict(asked.q, asked.dq, asked.ddq) for each in (model, again))
-    np.testing.assert_allclose(other.tau, one.tau, rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(other.tau_std, one.tau_std, rtol=1e-8)
-    assert list(manifest["parameters"]["friction"]) == ["viscous", "coulomb", "offset", "stribeck"]
 
 
 def test_alternative_arms_have_it_too(model: TorqueModel) -> None:

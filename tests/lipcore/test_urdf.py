@@ -15,7 +15,7 @@ from lipcore.fitting.estimators import MissingRobotError, UnknownEstimatorError,
 from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.compiled.arm import arm_torques
 from lipcore.kernels.geometry import rotation_of
-from lipcore.robots.library import ROBOTS, load_robot, profile_urdf
+from lipcore.robots.library import ROBOTS, UnknownRobotError, load_robot, profile_urdf
 from lipcore.robots.urdf import MAX_LINKS, JointMismatchError, RigidBody, UrdfError, describe
 from tests.lipcore.arms import parameters, random_bodies, random_geometry
 
@@ -92,6 +92,9 @@ def test_profile_that_does_not_fit_names_both_lists(names: tuple[str, ...]) -> N
     with pytest.raises(JointMismatchError) as caught:
         RigidBody.from_profile("panda", names, ("revolute",) * len(names))
     assert all(name in str(caught.value) for name in (*names, *ROBOTS["panda"].free))
+    for take in (load_robot, lambda name: RigidBody.from_profile(name, ("a",), ("revolute",))):
+        with pytest.raises(UnknownRobotError, match=r"robot is 'r2d2', expected one of panda, ur3.*finger-edu"):
+            take("r2d2")
 
 
 @pytest.mark.parametrize("names", [("a", "b"), ("j1", "b"), ("j1", "j2", "j3")])
