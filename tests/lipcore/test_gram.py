@@ -52,7 +52,6 @@ def test_sum_kernel_adds_its_terms() -> None:
     assert torch.allclose(total, parts[0] + parts[1], rtol=1e-14, atol=0)
     initial = SumKernel(problem.kernel, friction).initial(problem.motion, problem.motion.q)
     assert initial.keys() == problem.params.keys() - {"noise.log_std"}
-
     with pytest.raises(ValueError, match=r"\[2, 3\] joints"):
         SumKernel(LipKernel(JOINTS), FrictionKernel(2))
 
