@@ -10,10 +10,14 @@ import torch
 from torch import Tensor
 from torch.func import grad, jvp
 
+from lipcore import FitOptions, TorqueModel
+from lipcore.arm.learning import learn
 from lipcore.data.samples import Samples
+from lipcore.fitting.task import Task
 from lipcore.kernels.geometry import Geometry
 from lipcore.robots.library import Robot
 from lipcore.robots.simulation import Stream, simulate
+from lipcore.training.fit import fit_estimator
 from tests.lipcore.arms import random_bodies, random_geometry
 
 
@@ -39,6 +43,12 @@ def arm(kinds: str, seed: int, gravity: bool = True) -> tuple[Geometry, np.ndarr
 def motions(n: int, seed: int, size: int = 5) -> np.ndarray:
     """Random q, dq and ddq: (N, 3, n)."""
     return np.random.default_rng(seed).uniform(-2, 2, (size, 3, n))
+
+
+def followed(geometry: Geometry, robot: Robot, samples: Samples, options: FitOptions) -> TorqueModel:
+    """The model of an arm that is followed from its true geometry, where a search would lead after seconds."""
+    task = Task(samples, robot.joint_types, options)
+    return fit_estimator(task, "rigid-body", learn(task, begin=(geometry.canonical(),)))
 
 
 def recorded(robot: Robot, seed: int, size: int = 120, noise: float = 0.01, viscous: float = 0.2) -> Samples:

@@ -1,15 +1,22 @@
-"""Slow, independent references: the definition, differentiated by machine."""
+"""Slow, independent references: the definition, differentiated by machine; kernels to hold against them."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from torch import Tensor
 from torch.func import jacrev
 
 from lipcore.data.motion import Motion
+from lipcore.kernels.base import PairKernel, Params, State
+from lipcore.kernels.chain import ChainKernel
+from lipcore.kernels.lip import LipKernel
 
 Instant = tuple[Tensor, Tensor, Tensor]
 """(q, v, a) of one sample, each (n,)."""
@@ -155,3 +162,140 @@ def scale_of(energies: Sequence[Energy], x: Instant, y: Instant, terms: Tensor) 
 def instant(motion: Motion, row: int) -> Instant:
     """One sample of a motion."""
     return motion.q[row], motion.dq[row], motion.ddq[row]
+
+
+Shapes = dict[str, tuple[int, ...]]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A kernel with hyperparameters and a motion to evaluate it on."""
+
+    kernel: LipKernel | ChainKernel
+    params: dict[str, Tensor]
+    motion: Motion
+
+    def energies(self) -> list[Energy]:
+        """The energies that the kernel's documentation states: the potential one, then one for each link."""
+        energies = lip_energies if isinstance(self.kernel, LipKernel) else chain_energies
+        return energies(self.kernel.joint_types, self.params)
+
+
+class TorchForm(PairKernel):
+    """A compiled kernel as devices other than the CPU have it: blocks in PyTorch, gradients by autograd."""
+
+    def __init__(self, kernel: PairKernel) -> None:
+        self.kernel, self.n_joints = kernel, kernel.n_joints
+
+    def blocks(self, params: Params, x: State, y: State) -> Tensor:
+        """Blocks of the kernel itself."""
+        return self.kernel.blocks(params, x, y)
+
+    def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
+        """Start of the kernel itself."""
+        return self.kernel.initial(motion, tau)
+
+
+def weight_shapes(n: int) -> Shapes:
+    """Shapes of the velocity weights' hyperparameters."""
+    vectors = {f"kinetic.{name}": (n,) for name in ("log_link", "log_joint", "log_gap")}
+    return {"kinetic.log_scale": (), **vectors, "kinetic.log_deviation": (n * (n + 1) // 2,)}
+
+
+def lip_shapes(n: int, tied: bool) -> Shapes:
+    """Shapes of the paper's kernel's hyperparameters as its documentation states them."""
+    kinetic = {"kinetic.logits": n} if tied else {f"kinetic.{link}.logits": link for link in range(1, n + 1)}
+    shapes: Shapes = {"potential.log_scale": (), "potential.logits": (n, 2)}
+    return shapes | {name: (size, 2) for name, size in kinetic.items()} | weight_shapes(n)
+
+
+def chain_shapes(n: int) -> Shapes:
+    """Shapes of the chain kernel's hyperparameters as its documentation states them."""
+    return {"chain.logits": (n,), "potential.log_scales": (n,), **weight_shapes(n)}
+
+
+KERNELS: Mapping[str, tuple[Callable[[Sequence[str]], LipKernel | ChainKernel], Callable[[int], Shapes]]] = {
+    "tied": (lambda joint_types: LipKernel(joint_types, tied=True), lambda n: lip_shapes(n, tied=True)),
+    "untied": (lambda joint_types: LipKernel(joint_types, tied=False), lambda n: lip_shapes(n, tied=False)),
+    "chain": (ChainKernel, chain_shapes),
+}
+"""Energy kernels by name, each with the shapes of its hyperparameters for n joints."""
+
+
+def random_problem(joint_types: Sequence[str], samples: int, seed: int, kernel: str = "tied") -> Problem:
+    """Problem of moderate hyperparameters and motion, noise and friction included. kernel: of KERNELS."""
+    rng, n = np.random.default_rng(seed), len(joint_types)
+    make, shapes = KERNELS[kernel]
+    both = shapes(n) | {"noise.log_std": (n,), "friction.log_std": (n, 3)}
+    params = {name: torch.tensor(rng.uniform(*width(name), shape)).double() for name, shape in both.items()}
+    params["noise.log_std"] = params["noise.log_std"] - 1.0
+    motion = Motion.from_arrays(*rng.uniform(-2.0, 2.0, (3, samples, n)))
+    return Problem(make(joint_types), params, motion)
+
+
+def width(name: str) -> tuple[float, float]:
+    """Range that a hyperparameter is drawn from; five of the velocity weights' add up."""
+    return (-0.5, 0.4) if name.startswith("kinetic.log_") else (-1.5, 1.0)
+
+
+@st.composite
+def problems(
+    draw: st.DrawFn, max_joints: int = 4, samples: int = 2, kernels: Sequence[str] = tuple(KERNELS)
+) -> Problem:
+    """Drawn problems: revolute and prismatic joints mixed, any state within a few rad. kernels: of KERNELS."""
+    joint_types = draw(st.lists(st.sampled_from(["revolute", "prismatic"]), min_size=1, max_size=max_joints))
+    make, shapes = KERNELS[draw(st.sampled_from(kernels))]
+    n = len(joint_types)
+
+    def array(shape: tuple[int, ...], bound: float) -> np.ndarray:
+        return draw(arrays(np.float64, shape, elements=st.floats(-bound, bound, allow_subnormal=False)))
+
+    bounds = {name: 1.0 if name.startswith("kinetic.log_") else 3.0 for name in shapes(n)}
+    params = {name: torch.from_numpy(array(shape, bounds[name])) for name, shape in shapes(n).items()}
+    motion = Motion.from_arrays(*(array((samples, n), 4.0) for _ in range(3)))
+    return Problem(make(joint_types), params, motion)
+
+
+RELATIVE = 1e-10
+"""Error admitted, relative to `scale_of` the terms."""
+PAIRS = ((0, 0), (0, 1))
+
+
+def worst_block_error(problem: Problem, pairs: Sequence[tuple[int, int]] = PAIRS) -> float:
+    """Largest error of the torques' covariance over pairs of samples, relative to `scale_of` their terms."""
+    motion, energies = problem.motion, problem.energies()
+    blocks = problem.kernel.blocks(problem.params, State.rows(motion), State.columns(motion))
+    worst = 0.0
+    for i, j in pairs:
+        x, y = instant(motion, i), instant(motion, j)
+        terms = torque_terms(energies, x, y)
+        error = float((blocks[:, :, i, j] - terms.sum(0)).abs().max())
+        worst = max(worst, error / scale_of(energies, x, y, terms))
+    return worst
+
+
+def worst_energy_error(problem: Problem, pairs: Sequence[tuple[int, int]] = PAIRS) -> float:
+    """The same for the covariances of kinetic and potential energy with the torques and with themselves."""
+    kernel, motion, energies = problem.kernel, problem.motion, problem.energies()
+    rows, columns = State.rows(motion), State.columns(motion)
+    torques = kernel.energies(problem.params, rows, columns)
+    values = kernel.energy_covariance(problem.params, rows, columns)
+    worst = 0.0
+    for i, j in pairs:
+        x, y = instant(motion, i), instant(motion, j)
+        terms = energy_torque(energies, x, y)
+        alone = torch.stack([energy.kernel(*x[:2], *y[:2]) for energy in energies])
+        scale = scale_of(energies, x, y, terms)
+        for found, each in ((torques, terms), (values, alone)):
+            expected = torch.stack([each[1:].sum(0), each[0]])
+            worst = max(worst, float((found[..., i, j] - expected).abs().max()) / scale)
+    return worst
+
+
+def opposite(kind: str, share: Sequence[float], q: float) -> float:
+    """The position q' at which the base kernel p(q, q') of shares (σ, α, β) is zero."""
+    sigma, alpha, beta = share
+    if kind == "prismatic":
+        return -(sigma + beta) / (alpha * q)
+    cosine, sine = alpha * math.cos(q), beta * math.sin(q)
+    return math.atan2(sine, cosine) + math.acos(-sigma / math.hypot(cosine, sine))

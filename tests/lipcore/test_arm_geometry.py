@@ -1,18 +1,25 @@
-"""Where joint axes lie: steps between geometries, what torque cannot tell, and Pinocchio's placements."""
+"""Where joint axes lie, and the compiled dynamics: against Pinocchio and the derivatives of the arm's energies."""
 
 from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
 import pytest
+import torch
+from torch.func import jacrev
 
-from lipcore.kernels.compiled.arm import arm_masses
+from lipcore.data.motion import Motion
+from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.arm_prior import arm_of_robot
+from lipcore.kernels.compiled.arm import arm_energies, arm_features, arm_masses, arm_shapes, arm_torques
 from lipcore.kernels.geometry import Geometry, aligned, rotation_of, skew, turn_of
 from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import inverse_dynamics
 from lipcore.robots.urdf import RigidBody
-from tests.lipcore.arm_oracles import arm, as_robot, motions
+from tests.lipcore.arm_oracles import arm, energies, lagrangian_torque, motions, tensor
 from tests.lipcore.arms import random_geometry
+from tests.lipcore.test_urdf import joint, link
+from tests.lipcore.test_urdf import robot as robot_of
 
 KINDS = ("R", "RPR", "PRR", "RRRR")
 
@@ -67,14 +74,6 @@ def test_how_many_numbers_torque_tells() -> None:
 
 
 @pytest.mark.parametrize("kinds", KINDS)
-def test_across_the_axis_lie_two_unit_vectors(kinds: str) -> None:
-    geometry = random_geometry(kinds, 4)
-    frames = np.concatenate([geometry.across, geometry.axis[:, None]], axis=1)
-    np.testing.assert_allclose(frames @ frames.mT, np.broadcast_to(np.eye(3), frames.shape), atol=1e-12)
-    np.testing.assert_allclose(np.linalg.det(frames), 1.0)
-
-
-@pytest.mark.parametrize("kinds", KINDS)
 def test_the_canonical_arm_has_the_same_torques(kinds: str) -> None:
     """Bodies are told relative to their frames, so the same weights do not: but some weights do."""
     geometry, _, robot = arm(kinds, 5)
@@ -93,46 +92,6 @@ def test_the_canonical_arm_has_the_same_torques(kinds: str) -> None:
         assert reaches(regressor(geometry.moved(np.full(geometry.size, 0.1)), asked), torque) > 1e-3
 
 
-@pytest.mark.parametrize("gravity", [True, False])
-def test_steps_cover_all_that_torque_tells(gravity: bool) -> None:
-    """Turned about its own axis, shifted along it, or moved as a whole, an arm can do the same torques."""
-    geometry, _, robot = arm("RRR", 7, gravity)
-    asked = motions(3, 8, size=40)
-    torque = inverse_dynamics(robot, *asked.transpose(1, 0, 2)).reshape(-1)
-    rotation, translation = geometry.rotation.copy(), geometry.translation.copy()
-    translation[0] += [0.3, -0.2, 0.5]
-    translation[2] += rotation[2] @ geometry.axis[2] * 0.7
-    whole = rotation_of(np.array([0.4, -0.8, 0.3]))
-    rotation[0] = whole @ rotation[0]
-    moved = Geometry(geometry.joint_types, rotation, translation, geometry.axis, whole @ geometry.gravity)
-    assert reaches(regressor(moved, asked), torque) < 1e-10
-
-
-def test_a_mirror_image_has_the_same_torque() -> None:
-    geometry, bodies, robot = arm("RPRR", 9)
-    mirror = np.diag([1.0, -1.0, 1.0])
-    axis = np.array([
-        mirror @ each * (1 if kind == "prismatic" else -1)  # what turns is seen to turn the other way
-        for each, kind in zip(geometry.axis, geometry.joint_types, strict=True)
-    ])  # fmt: skip
-    image = Geometry(
-        geometry.joint_types,
-        mirror @ geometry.rotation @ mirror,
-        geometry.translation @ mirror,
-        axis,
-        mirror @ geometry.gravity,
-    )
-    seen = bodies * [1, 1, -1, 1, 1, -1, 1, 1, -1, 1]
-    asked = motions(4, 10).transpose(1, 0, 2)
-    np.testing.assert_allclose(
-        inverse_dynamics(as_robot(image, seen), *asked), inverse_dynamics(robot, *asked), rtol=1e-9, atol=1e-9
-    )
-    features = regressor(image, np.ascontiguousarray(asked.transpose(1, 0, 2)))
-    np.testing.assert_allclose(
-        features @ seen.reshape(-1), inverse_dynamics(robot, *asked).reshape(-1), rtol=1e-9, atol=1e-9
-    )
-
-
 @pytest.mark.parametrize("name", ["double-pendulum", "panda", "kinova", "tiago"])
 def test_placements_of_a_robot_are_those_of_pinocchio(name: str) -> None:
     robot = load_robot(name)
@@ -145,21 +104,14 @@ def test_placements_of_a_robot_are_those_of_pinocchio(name: str) -> None:
     assert not Geometry.from_robot(body, gravity=False).gravity.any()
 
 
-UNALIGNED = """<robot name="odd"><link name="a"/><link name="b">{body}</link><link name="c">{body}</link>
-<link name="d">{body}</link>
-<joint name="one" type="revolute"><origin xyz="0.1 0.2 0.3" rpy="0.1 0.2 0.3"/><parent link="a"/><child link="b"/>
-<axis xyz="1 2 -2"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
-<joint name="two" type="prismatic"><origin xyz="0 0.2 0" rpy="1 0 0"/><parent link="b"/><child link="c"/>
-<axis xyz="2 -1 2"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
-<joint name="three" type="continuous"><origin xyz="0.3 0 0"/><parent link="c"/><child link="d"/>
-<axis xyz="-3 0 4"/></joint></robot>"""
-BODY = """<inertial><origin xyz="0.1 0 0.2"/><mass value="2"/>
-<inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial>"""
-
-
 def test_axes_that_are_aligned_with_nothing_are_read_from_pinocchio() -> None:
     types = ("revolute", "prismatic", "revolute")
-    body = RigidBody.from_urdf(UNALIGNED.format(body=BODY), ("one", "two", "three"), types)
+    parts = [joint(name, *name, kind=kind) for name, kind in zip(("ab", "bc", "cd"), types, strict=True)]
+    tilted = [
+        part.replace('"0 1 0"', axis).replace('xyz="0 0 0.3"', 'xyz="0.1 0.2 0.3" rpy="0.1 0.2 0.3"')
+        for part, axis in zip(parts, ('"1 2 -2"', '"2 -1 2"', '"-3 0 4"'), strict=True)
+    ]
+    body = RigidBody.from_urdf(robot_of(*map(link, "abcd"), *tilted), ("ab", "bc", "cd"), types)
     geometry = Geometry.from_robot(body)
     np.testing.assert_allclose(geometry.axis, np.array([[1, 2, -2], [2, -1, 2], [-1.8, 0, 2.4]]) / 3, atol=1e-12)
     robot = Robot("odd", body.model, body.joint_names, types, *np.zeros((3, 3)))
@@ -183,12 +135,111 @@ def test_rotations() -> None:
 def test_what_is_no_geometry_is_refused() -> None:
     good = random_geometry("RR", 13)
     parts = {name: getattr(good, name) for name in ("rotation", "translation", "axis", "gravity")}
-    for name, value, said in (
+    for name, value, message in (
         ("rotation", 2 * good.rotation, "no rotation"),
         ("rotation", good.rotation[:1], "rotation has shape"),
         ("translation", np.full((2, 3), np.nan), "translation has shape"),
         ("axis", 3 * good.axis, "not of length one"),
         ("gravity", np.zeros(2), "gravity has shape"),
     ):
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             Geometry(good.joint_types, **{**parts, name: value})
+
+
+ROBOTS = ("double-pendulum", "panda", "kinova", "tiago")
+CHAINS = ("RPR", "PRR", "RRP", "RRRR", "P", "R")
+EXACT = 1e-10
+"""Share of the largest number that rounding may make of a difference."""
+
+
+def agree(found: np.ndarray, expected: np.ndarray, share: float = EXACT) -> None:
+    np.testing.assert_allclose(found, expected, rtol=0, atol=share * np.abs(expected).max())
+
+
+def torque_of(geometry: Geometry, bodies: np.ndarray, order: np.ndarray, asked: np.ndarray) -> np.ndarray:
+    out = np.empty((len(asked), geometry.n_joints))
+    arm_torques(geometry.constants, geometry.gravity, np.ascontiguousarray(bodies), order, asked, out)
+    return out
+
+
+@pytest.mark.parametrize("gravity", [True, False])
+@pytest.mark.parametrize("name", ROBOTS)
+def test_torque_of_a_robot_is_that_of_pinocchio(name: str, gravity: bool) -> None:
+    robot = load_robot(name)
+    n = robot.n_joints
+    asked = motions(n, 1)
+    expected = inverse_dynamics(robot, *asked.transpose(1, 0, 2))
+    if not gravity:
+        data = robot.model.createData()
+        still = [pin.computeGeneralizedGravity(robot.model, data, robot.configuration(q)).copy() for q in asked[:, 0]]
+        expected = expected - np.array(still)
+    for seed in (None, 0, 1):
+        columns = np.arange(n) if seed is None else np.random.default_rng(seed).permutation(n)
+        names, types = (tuple(parts[i] for i in columns) for parts in (robot.joint_names, robot.joint_types))
+        body = RigidBody.from_profile(name, names, types)
+        made = arm_of_robot(body, gravity)
+        mine = np.ascontiguousarray(asked[:, :, columns])
+        agree(torque_of(made.geometry, made.parameters, made.order, mine), expected[:, columns])
+        kernel = ArmKernel(made)
+        agree(kernel.mean(Motion.from_arrays(*mine.transpose(1, 0, 2))).numpy(), expected[:, columns])
+
+
+@pytest.mark.parametrize("kinds", CHAINS)
+def test_regressor_of_masses_is_that_of_pinocchio(kinds: str) -> None:
+    geometry, bodies, robot = arm(kinds, 2)
+    n = len(kinds)
+    asked, data = motions(n, 3), robot.model.createData()
+    out = np.empty((len(asked), 10 * n, n))
+    arm_masses(geometry.constants, geometry.gravity, np.arange(n), asked, out)
+    expected = [pin.computeJointTorqueRegressor(robot.model, data, *motion).copy() for motion in asked]
+    agree(out.transpose(0, 2, 1), np.array(expected).reshape(len(asked), n, 10 * n))
+    agree(out.transpose(0, 2, 1) @ bodies.reshape(-1), inverse_dynamics(robot, *asked.transpose(1, 0, 2)))
+
+
+@pytest.mark.each_once
+@pytest.mark.parametrize("gravity", [True, False])
+@pytest.mark.parametrize("kinds", CHAINS)
+def test_derivatives_by_geometry_are_those_of_the_lagrangian(kinds: str, gravity: bool) -> None:
+    geometry, bodies, _ = arm(kinds, 4, gravity)
+    n, asked = len(kinds), motions(len(kinds), 5, size=2)
+    found = np.empty((len(asked), geometry.size, n))
+    arm_shapes(geometry.constants, geometry.gravity, bodies, np.arange(n), asked, found)
+    nowhere = torch.zeros(geometry.size, dtype=torch.float64)
+    torque = torque_of(geometry, bodies, np.arange(n), asked)
+    for each, slopes, motion in zip(torque, found, asked, strict=True):
+        agree(each, lagrangian_torque(geometry, bodies, nowhere, motion).numpy())
+        if geometry.size:
+            slope = jacrev(lambda step, at=motion: lagrangian_torque(geometry, bodies, step, at))(nowhere)
+            np.testing.assert_allclose(slopes, slope.numpy().T, rtol=0, atol=EXACT * np.abs(torque).max() * 10)
+
+
+def test_derivatives_in_the_order_of_other_data() -> None:
+    geometry, bodies, _ = arm("RPR", 6)
+    order, asked = np.array([2, 0, 1]), motions(3, 7)
+    straight, turned = np.empty((2, len(asked), geometry.size + 33, 3))
+    given = geometry.constants, geometry.gravity, bodies
+    arm_features(*given, np.arange(3), asked, straight)
+    arm_features(*given, order, np.ascontiguousarray(asked[:, :, np.argsort(order)]), turned)
+    for place, at in enumerate(order):
+        rows, its = slice(10 * at, 10 * at + 10), slice(10 * place, 10 * place + 10)
+        agree(turned[:, rows][:, :, order], straight[:, its])
+        agree(turned[:, 30 + at][:, order], straight[:, 30 + place])
+    agree(turned[:, 33:][:, :, order], straight[:, 33:])
+
+
+@pytest.mark.parametrize("kinds", CHAINS)
+def test_energies_and_their_derivatives(kinds: str) -> None:
+    geometry, bodies, robot = arm(kinds, 8)
+    n, asked, data = len(kinds), motions(len(kinds), 9), robot.model.createData()
+    out = np.empty((len(asked), 2, 11 * n + geometry.size))
+    arm_energies(geometry.constants, geometry.gravity, bodies, np.arange(n), asked, out)
+    kinetic, potential = (out[:, part, : 10 * n] @ bodies.reshape(-1) for part in (0, 1))
+    agree(kinetic, np.array([pin.computeKineticEnergy(robot.model, data, q, dq) for q, dq, _ in asked]))
+    agree(potential, np.array([pin.computePotentialEnergy(robot.model, data, q) for q, _, _ in asked]))
+    agree(out[:, 0, 10 * n : 11 * n], 0.5 * asked[:, 1] ** 2)  # of a rotor
+    assert not out[:, 1, 10 * n : 11 * n].any()
+    nowhere = torch.zeros(geometry.size, dtype=torch.float64)
+    for found, (q, dq, _) in zip(out[:, :, 11 * n :], asked, strict=True):
+        slopes = jacrev(lambda step, at=q, v=dq: energies(geometry, bodies, step, tensor(at), tensor(v)))(nowhere)
+        for part, slope in zip(found, slopes, strict=True):
+            np.testing.assert_allclose(part, slope.numpy(), rtol=1e-9, atol=1e-9)

@@ -1,10 +1,13 @@
-"""A model that stands on an arm: stored, judged by its parameters, taught further, and with arms to choose from."""
+"""A model that stands on an arm: stored, reported, taught further, and with arms to choose from."""
 
 from __future__ import annotations
 
+import copy
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -17,39 +20,35 @@ from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, load, sa
 from lipcore.data.metrics import evaluate
 from lipcore.data.motion import Motion
 from lipcore.files import persistence
+from lipcore.files.arm import bodies_of, read_geometry
+from lipcore.files.manifest import read_manifest_bytes
 from lipcore.fitting.estimators import make_estimator
 from lipcore.kernels.arm import ArmKernel
-from lipcore.kernels.arm_prior import Alternative, Arm
+from lipcore.kernels.arm_prior import Alternative
 from lipcore.kernels.friction import friction_features
-from lipcore.model import dynamics
-from lipcore.model.parameters import inertial_parameters, report, weight_posterior
-from lipcore.online.batch import Rows
+from lipcore.model.parameters import inertial_parameters, report
 from lipcore.online.learner import OnlineModel
 from lipcore.posterior.compression import linear
-from lipcore.posterior.statistics import collect, merge
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate
 from lipcore.robots.urdf import RigidBody
-from tests.lipcore.arm_oracles import arm, as_robot, motions, recorded
-from tests.lipcore.arms import random_bodies
+from tests.lipcore.arm_oracles import arm, as_robot, followed, motions, recorded
+from tests.lipcore.arms import parameters, random_bodies, random_geometry
+from tests.lipcore.online_checks import as_rows
 
-OPTIONS = FitOptions(device="cpu", search_seconds=2.0, statistics="chosen")
-TYPES = ("revolute", "prismatic", "revolute")
+OPTIONS = FitOptions(device="cpu", statistics="chosen")
+GEOMETRY, _, ROBOT = arm("RPR", 51)
+TYPES = ROBOT.joint_types
 
 
 @pytest.fixture(scope="module")
 def samples() -> Samples:
-    return recorded(arm("RPR", 51)[2], 1, 100)
-
-
-@pytest.fixture(scope="module")
-def unseen() -> Samples:
-    return recorded(arm("RPR", 51)[2], 2, 60)
+    return recorded(ROBOT, 1, 100)
 
 
 @pytest.fixture(scope="module")
 def learnt(samples: Samples) -> TorqueModel:
-    return train(samples, TYPES, "rigid-body", OPTIONS)
+    return followed(GEOMETRY, ROBOT, samples, OPTIONS)
 
 
 def of_robot(mode: str) -> TorqueModel:
@@ -87,15 +86,12 @@ def with_alternatives(model: TorqueModel, samples: Samples, count: int = 1) -> T
     return replace(model, estimator=chosen, posterior=made.posterior)
 
 
-def some_model(kind: str, learnt: TorqueModel, samples: Samples) -> TorqueModel:
-    if kind == "learn":
-        return learnt
-    return with_alternatives(learnt, samples, 2) if kind == "alternatives" else of_robot(kind)
-
-
 @pytest.mark.parametrize("kind", ["learn", "calibrate", "fixed", "alternatives"])
 def test_a_saved_arm_comes_back(kind: str, learnt: TorqueModel, samples: Samples, tmp_path: Path) -> None:
-    model = some_model(kind, learnt, samples)
+    if kind == "learn":
+        model = learnt
+    else:
+        model = with_alternatives(learnt, samples, 2) if kind == "alternatives" else of_robot(kind)
     manifest = save(model, tmp_path / "model")
     again = load(tmp_path / "model")
     asked = motions(model.n_joints, 3).transpose(1, 0, 2)
@@ -103,7 +99,8 @@ def test_a_saved_arm_comes_back(kind: str, learnt: TorqueModel, samples: Samples
     for name in ("tau", "tau_std", "covariance", "noise_std"):
         one, other = getattr(before, name), getattr(after, name)
         np.testing.assert_allclose(other, one, rtol=1e-8, atol=1e-9 * np.abs(one).max())
-    assert (model.arm is None, again.arm is None) == (False, False)
+    assert model.arm is not None
+    assert again.arm is not None
     assert again.arm.mode == manifest["parameters"]["geometry"]["mode"] == model.arm.mode
     assert again.arm.order.tolist() == manifest["parameters"]["geometry"]["order"]
     assert len(again.arm.alternatives) == (3 if kind == "alternatives" else 0)
@@ -118,9 +115,7 @@ WRONG: dict[str, tuple[Edit, str]] = {
     "no axis": (lambda t: t["arm/axis"].zero_(), "not of length one"),
     "missing": (lambda t: t.pop("arm/unit"), "'arm/unit' is missing"),
     "order": (lambda t: t["arm/order"].zero_(), "expected each joint once"),
-    "order of others": (lambda t: t.update({"arm/order": torch.zeros(2, dtype=torch.float64)}), "each joint once"),
     "widths": (lambda t: t["arm/widths"].zero_(), "not above zero"),
-    "negative": (lambda t: t["arm/unit"].mul_(-1), "not above zero"),
     "parameters": (lambda t: t.update({"arm/parameters": t["arm/parameters"][:2].clone()}), "parameters has shape"),
     "steps": (lambda t: t.update({"arm/expected": t["arm/expected"][:1].clone()}), "expected has shape"),
     "not finite": (lambda t: t["arm/translation"].fill_(np.nan), "finite"),
@@ -128,7 +123,6 @@ WRONG: dict[str, tuple[Edit, str]] = {
         lambda t: t.update({"arm/other/linear": t["arm/other/linear"][:, :, :2].clone()}),
         r"'arm/other/linear' has shape \(3, 3, 2\), expected \(3, 3, 4\)",
     ),
-    "half an alternative": (lambda t: t.pop("arm/other/rotation"), "'arm/other/rotation' is missing"),
     "no probability": (lambda t: t["arm/other/probability"].zero_(), "between 0 and 1"),
     "improbable": (lambda t: t["arm/other/probability"].fill_(0.9), "positive definite|cholesky"),
     "none": (lambda t: t.update({"arm/other/probability": torch.zeros(0, dtype=torch.float64)}), "has shape"),
@@ -138,29 +132,27 @@ WRONG: dict[str, tuple[Edit, str]] = {
 
 @pytest.mark.parametrize("name", WRONG)
 def test_an_arm_that_does_not_fit_is_refused(name: str, learnt: TorqueModel, samples: Samples) -> None:
-    edit, said = WRONG[name]
+    edit, message = WRONG[name]
     manifest, files = persistence.encode(with_alternatives(learnt, samples, 2))
     tensors = load_tensors(files["model.safetensors"])
     edit(tensors)
     payload = save_tensors(tensors)
     manifest["tensors"] |= {"bytes": len(payload), "sha256": persistence.sha256(payload)}
     changed = {**files, "model.safetensors": payload, "manifest.json": persistence.manifest_bytes(manifest)}
-    with pytest.raises(ModelFormatError, match=said):
+    with pytest.raises(ModelFormatError, match=message):
         persistence.decode(changed)
 
 
 def test_a_way_to_come_by_a_geometry_that_there_is_not(learnt: TorqueModel) -> None:
-    for mode in ("guess", 3, None):
-        manifest, files = persistence.encode(learnt)
-        manifest["fit"]["geometry"] = mode
-        with pytest.raises(ModelFormatError, match=r"fit\.geometry is .*, expected one of learn, calibrate, fixed|fit"):
-            persistence.decode({**files, "manifest.json": persistence.manifest_bytes(manifest)})
+    manifest, files = persistence.encode(learnt)
+    manifest["fit"]["geometry"] = "guess"
+    with pytest.raises(ModelFormatError, match=r"fit\.geometry is .*, expected one of learn, calibrate, fixed"):
+        persistence.decode({**files, "manifest.json": persistence.manifest_bytes(manifest)})
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_a_choice_of_arms_has_the_moments_of_their_mixture(learnt: TorqueModel, samples: Samples, count: int) -> None:
-    model = with_alternatives(learnt, samples, count)
-    found = model.arm
+    found = with_alternatives(learnt, samples, count).arm
     assert found is not None
     asked = motions(3, 4)
     query = Motion.from_arrays(*asked.transpose(1, 0, 2))
@@ -182,11 +174,6 @@ def test_a_choice_of_arms_has_the_moments_of_their_mixture(learnt: TorqueModel, 
     np.testing.assert_allclose(added, spread, rtol=1e-8, atol=1e-12 * prior)
 
 
-def rows_of(samples: Samples) -> Rows:
-    code = np.zeros(len(samples), np.uint8)
-    return Rows(samples.t, samples.q, samples.dq, samples.ddq, samples.tau, code)
-
-
 def errors(model: TorqueModel, unseen: Samples) -> np.ndarray:
     answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
     return np.asarray(evaluate(unseen.tau, answer.tau, answer.tau_std, answer.noise_std).nmse)
@@ -201,14 +188,14 @@ def heavier(seed: int, size: int) -> Samples:
     return recorded(robot, seed, size)
 
 
-def test_an_arm_learns_online_and_unlearns(learnt: TorqueModel, unseen: Samples) -> None:
-    more, asked = heavier(5, 300), heavier(6, 60)
+def test_an_arm_learns_online_and_unlearns(learnt: TorqueModel) -> None:
+    more, asked, unseen = heavier(5, 300), heavier(6, 60), recorded(ROBOT, 2, 60)
     first = more.q, more.dq, more.ddq
-    start, rows = OnlineModel.start(learnt, forgetting_s=None), rows_of(more)
+    start, rows = OnlineModel.start(learnt, forgetting_s=None), as_rows(more, began=0.0)
     before = errors(start.model(), asked)
-    told = errors(start.change(-1.0).learn(rows).model(), asked)
-    assert (told < 0.01 * before).all(), (before, told)
-    taught = start.learn(rows)  # a change that nobody told: in between
+    changed = errors(start.change(-1.0).learn(rows).model(), asked)
+    assert (changed < 0.01 * before).all(), (before, changed)
+    taught = start.learn(rows)  # a change that nobody named: in between
     assert (np.abs(taught.model().predict(*first).tau - learnt.predict(*first).tau) > 0.01).any()
     back = taught.unlearn(rows).model()
     one, other = (each.predict(unseen.q, unseen.dq, unseen.ddq) for each in (learnt, back))
@@ -216,35 +203,10 @@ def test_an_arm_learns_online_and_unlearns(learnt: TorqueModel, unseen: Samples)
     np.testing.assert_allclose(other.tau_std, one.tau_std, rtol=1e-2)
 
 
-def test_two_halves_of_a_recording_know_together_what_the_whole_tells(learnt: TorqueModel, samples: Samples) -> None:
-    basis, noise = learnt.posterior.basis, torch.exp(2 * learnt.posterior.params["noise.log_std"])
-    motion, left = samples.motion(), samples.torque() - learnt.estimator.kernel.mean(samples.motion())
-    halves = [collect(basis, noise, motion[part], left[part]) for part in (slice(0, 40), slice(40, None))]
-    whole, joined = collect(basis, noise, motion, left), merge(*halves)
-    torch.testing.assert_close(joined.a, whole.a, rtol=1e-9, atol=1e-9 * float(whole.a.abs().max()))
-    torch.testing.assert_close(joined.b, whole.b, rtol=1e-9, atol=1e-9 * float(whole.b.abs().max()))
-    assert joined.samples == whole.samples == len(samples)
-
-
-def test_components_of_a_learnt_arm(learnt: TorqueModel, unseen: Samples) -> None:
-    motion, tau = unseen.motion()[:10], unseen.torque()[:10]
-    found = dynamics.components(learnt, motion, dynamics.COMPONENTS, tau)
-    robot, data = arm("RPR", 51)[2], arm("RPR", 51)[2].model.createData()
-    for k, estimate in enumerate(found["gravity"].mean.numpy()):
-        expected = pin.computeGeneralizedGravity(robot.model, data, unseen.q[k])
-        np.testing.assert_allclose(estimate, expected, rtol=0, atol=0.02 * np.abs(unseen.tau).max())
-    for name in dynamics.COMPONENTS:
-        assert torch.isfinite(found[name].mean).all(), name
-        assert torch.isfinite(found[name].std).all(), name
-    parts = found["inertial"].mean + found["coriolis"].mean + found["gravity"].mean + found["friction"].mean
-    answer = learnt.predict(*(part.numpy() for part in (motion.q, motion.dq, motion.ddq)))
-    np.testing.assert_allclose(parts.numpy(), answer.tau, rtol=1e-6, atol=1e-6 * np.abs(answer.tau).max())
-
-
 def test_what_is_reported_of_a_learnt_arm(learnt: TorqueModel) -> None:
-    said = report(learnt.posterior, learnt.estimator, learnt.joint_names)
-    assert said["geometry"]["mode"] == "learn"
-    joints = said["geometry"]["joints"]
+    reported = report(learnt.posterior, learnt.estimator, learnt.joint_names)
+    assert reported["geometry"]["mode"] == "learn"
+    joints = reported["geometry"]["joints"]
     assert [joint["type"] for joint in joints] == list(TYPES)
     assert [len(joint["turn_std"]) for joint in joints] == [2, 2, 2]
     assert [len(joint["shift_std"]) for joint in joints] == [0, 0, 2]
@@ -255,27 +217,73 @@ def test_what_is_reported_of_a_learnt_arm(learnt: TorqueModel) -> None:
         spread = dict(zip(("turn 1", "turn 2"), joint["turn_std"], strict=True))  # of one radian before
         spread |= dict(zip(("shift 1", "shift 2"), 2 * np.array(joint["shift_std"]), strict=False))  # of half a metre
         assert joint["undetermined"] == [name for name, share in spread.items() if share > 0.5]
-    assert len(said["rotor"]["mean"]) == len(said["rotor"]["std"]) == 3
+    assert len(reported["rotor"]["mean"]) == len(reported["rotor"]["std"]) == 3
     # of what turns about the first axis, torque does not tell the mass
-    assert "mass" in said["inertia"]["bodies"][0]["undetermined"]
+    assert "mass" in reported["inertia"]["bodies"][0]["undetermined"]
     inertia = inertial_parameters(learnt.posterior, learnt.estimator)
     assert inertia.mean.shape == inertia.std.shape == (3, 10)
-    term = learnt.estimator.terms["rigid_body"]
-    assert isinstance(term, ArmKernel)
-    weights = weight_posterior(learnt.posterior, term)
-    np.testing.assert_allclose(inertia.mean.reshape(-1), weights.mean[:30])
-    assert (weights.std <= weights.scale * (1 + 1e-9)).all()
 
 
-def test_what_is_no_arm_is_refused(learnt: TorqueModel) -> None:
-    good = learnt.arm
-    assert good is not None
-    for name, value, said in (
-        ("unit", good.unit[:-1], "unit has shape"),
-        ("widths", good.widths[:-1], "widths has shape"),
-        ("order", np.array([0, 0, 1]), "each joint from 0 to 2 once"),
-        ("unit", 0 * good.unit, "not above zero"),
-        ("centre", np.full_like(good.centre, np.inf), "centre has shape"),
-    ):
-        with pytest.raises(ValueError, match=said):
-            Arm(**{**{each: getattr(good, each) for each in good.__dataclass_fields__}, name: value})
+ORDER = [2, 0, 1]
+SHIPPED = Path(__file__).parents[2] / "models" / "panda-sim"
+
+
+def manifest(reported: Any) -> bytes:
+    """The manifest of the shipped model, with three joints only and these parameters."""
+    shipped = json.loads((SHIPPED / "manifest.json").read_text())
+    for name in ("joint_names", "joint_types", "noise_std"):
+        shipped[name] = shipped[name][:3]
+    for ends in shipped["training_range"].values():
+        ends["min"], ends["max"] = ends["min"][:3], ends["max"][:3]
+    return persistence.manifest_bytes({**shipped, "parameters": reported})
+
+
+@pytest.fixture
+def reported() -> Any:
+    names = json.loads(manifest({}))["joint_names"]
+    return parameters(random_geometry("RPR", 1), random_bodies(3, 1), names, ORDER)
+
+
+def test_a_report_is_read_back(reported: Any) -> None:
+    entry = read_manifest_bytes(manifest(reported))["parameters"]
+    geometry, order = read_geometry(entry["geometry"], 3)
+    assert order == ORDER
+    np.testing.assert_array_equal(geometry.constants, random_geometry("RPR", 1).constants)
+    np.testing.assert_array_equal(bodies_of(entry["inertia"])[order], random_bodies(3, 1))
+
+
+def test_what_earlier_releases_reported_is_read(reported: Any) -> None:
+    for body in reported["inertia"]["bodies"]:
+        del body["undetermined"]
+    read_manifest_bytes(manifest({name: reported[name] for name in ("friction", "inertia")}))
+    read_manifest_bytes(manifest({"friction": reported["friction"]}))
+
+
+MALFORMED: dict[str, Callable[[Any], None]] = {
+    r"parameters.geometry.mode is 'guess', expected one of learn": lambda r: r["geometry"].update(mode="guess"),
+    r"parameters.geometry lacks order": lambda r: r["geometry"].pop("order"),
+    r"parameters.geometry.order is .*, expected each of the joints 0 to 2": lambda r: r["geometry"].update(
+        order=[0, 0, 1]
+    ),
+    r"parameters.geometry.gravity\[2\] is": lambda r: r["geometry"].update(gravity=[0, 0, "down"]),
+    r"parameters.geometry.joints is .*a list of 3": lambda r: r["geometry"]["joints"].pop(),
+    r"parameters.geometry.joints\[1\].type": lambda r: r["geometry"]["joints"][1].update(type="ball"),
+    r"parameters.geometry.joints\[0\].turn_std is": lambda r: r["geometry"]["joints"][0].update(turn_std=[0.1]),
+    r"parameters.geometry.joints\[0\].undetermined": lambda r: r["geometry"]["joints"][0].update(undetermined=["x"]),
+    r"parameters.geometry.joints\[2\] has the entry 'mesh'": lambda r: r["geometry"]["joints"][2].update(mesh="file"),
+    r"parameters.geometry: rotation holds a matrix": lambda r: r["geometry"]["joints"][0]["rotation"][0].reverse(),
+    r"parameters.rotor.std is": lambda r: r["rotor"].update(std=[0.1]),
+    r"parameters.inertia.bodies\[1\].mean.first_moment\[0\] is": lambda r: r["inertia"]["bodies"][1]["mean"].update(
+        first_moment=[None, 0, 0]
+    ),
+    r"parameters.inertia.bodies\[0\].undetermined is": lambda r: r["inertia"]["bodies"][0].update(undetermined="mass"),
+    r"parameters has the entry 'colour'": lambda r: r.update(colour="red"),
+}
+
+
+@pytest.mark.parametrize("expected", MALFORMED)
+def test_anything_else_is_refused(reported: Any, expected: str) -> None:
+    changed = copy.deepcopy(reported)
+    MALFORMED[expected](changed)
+    with pytest.raises(ModelFormatError, match=expected.replace("'", "['\"]")):
+        read_manifest_bytes(manifest(changed))

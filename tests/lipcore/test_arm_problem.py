@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from lipcore import FitOptions, Samples
+from lipcore import FitOptions
 from lipcore.arm.posing import make_problem
-from lipcore.arm.problem import NOISE_WIDTH, Expected, Point, Problem, root_of
+from lipcore.arm.problem import NOISE_WIDTH, Point, Problem, root_of
 from lipcore.arm.scales import _Evidence, rescale
-from lipcore.data.independence import residual_correlation
 from lipcore.kernels.geometry import Geometry
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import inverse_dynamics
 from lipcore.robots.urdf import RigidBody
 from tests.lipcore.arm_oracles import arm, recorded
 
@@ -95,20 +93,6 @@ def test_weights_are_the_posterior_mean(case: tuple[Problem, Point]) -> None:
     expected = problem.centre + gain @ np.linalg.solve(features @ gain + np.diag(noise), left)
     np.testing.assert_allclose(problem.weights(point) / problem.scale, expected / problem.scale, atol=1e-5)
     np.testing.assert_allclose(problem.mean(point), problem.tau - problem.residual(point), atol=1e-9)
-
-
-def test_features_are_those_of_the_torque() -> None:
-    _, bodies, robot = arm(KINDS, 22)
-    samples = recorded(robot, 3, size=5)
-    geometry = arm(KINDS, 22)[0]
-    problem, order = make_problem(samples, robot.joint_types, FitOptions(device="cpu"), True)
-    np.testing.assert_array_equal(order, np.arange(3))
-    rotors, friction = np.array([0.1, 0.2, 0.3]), np.array([[0.5, 1.0, -1.0], [0.0, 0.2, 0.3], [0.4, 0.0, 0.1]])
-    weights = np.concatenate([bodies.reshape(-1), rotors, friction.reshape(-1)])
-    terms = np.stack([samples.dq, np.tanh(samples.dq / 0.02), np.ones_like(samples.dq)], axis=-1)
-    expected = inverse_dynamics(robot, samples.q, samples.dq, samples.ddq) + rotors * samples.ddq
-    expected = expected + (terms * friction).sum(-1)
-    np.testing.assert_allclose(plain_features(problem, geometry) @ weights, expected, rtol=1e-8, atol=1e-8)
 
 
 def test_slope_of_the_normal_equations(case: tuple[Problem, Point]) -> None:
@@ -197,34 +181,3 @@ def test_a_matrix_that_rounding_has_spoilt_is_factored() -> None:
     np.testing.assert_allclose(root_of(good), np.linalg.cholesky(good))
     with pytest.raises(np.linalg.LinAlgError, match="not finite"):
         root_of(np.full((2, 2), np.nan))
-
-
-def test_expectations_of_nothing_and_of_a_robot() -> None:
-    geometry = arm("RPR", 23)[0].canonical()
-    anything = Expected.anything(geometry)
-    np.testing.assert_allclose(anything.step(geometry), -geometry.shifts())
-    around = Expected(anything.widths, geometry)
-    assert around.value(geometry) == 0.0
-    step = np.linspace(-0.1, 0.1, geometry.size)
-    assert around.value(geometry.moved(step)) == pytest.approx(0.5 * np.sum((step / around.widths) ** 2), rel=0.1)
-
-
-def noisy(size: int, memory: float, seed: int, episodes: int = 1) -> tuple[np.ndarray, Samples]:
-    """An autoregression e_k = φ e_{k−1} + white, in each of several recordings."""
-    rng = np.random.default_rng(seed)
-    white = rng.standard_normal((size, 2))
-    episode = np.arange(size) * episodes // size
-    for k in range(1, size):
-        if episode[k] == episode[k - 1]:
-            white[k] += memory * white[k - 1]
-    nothing = np.zeros((size, 2))
-    return white, Samples(("a", "b"), np.arange(size) * 0.01, episode, nothing, nothing, nothing, white)
-
-
-@pytest.mark.parametrize("episodes", [1, 5])
-def test_rows_that_an_independent_one_stands_for(episodes: int) -> None:
-    assert residual_correlation(*noisy(5000, 0.0, 1, episodes)) == pytest.approx(1.0, abs=0.1)
-    for memory in (0.5, 0.8):  # 1 + 2 Σ φ^k
-        expected = (1 + memory) / (1 - memory)
-        assert residual_correlation(*noisy(20_000, memory, 2, episodes)) == pytest.approx(expected, rel=0.2)
-    assert residual_correlation(np.zeros((3, 2)), noisy(3, 0.0, 3)[1]) == 1.0

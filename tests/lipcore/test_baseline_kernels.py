@@ -8,21 +8,14 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 from torch import Tensor
 
-from lipcore import FitOptions, train
 from lipcore.data.motion import Motion
-from lipcore.fitting.estimators import make_estimator
 from lipcore.kernels.base import PairKernel, State
 from lipcore.kernels.gip import GeometricallyInspiredKernel
 from lipcore.kernels.lse import LagrangianSEKernel
 from lipcore.kernels.se import SquaredExponentialKernel
 from lipcore.posterior.exact import negative_log_evidence
-from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, simulate
 from tests.lipcore.oracles import Energy, instant, scale_of, torque_terms
 
 BASELINES = ["se", "gip", "lse"]
@@ -105,33 +98,6 @@ def test_lse_equals_automatic_differentiation(joint_types: tuple[str, ...]) -> N
     assert worst_lse_error(joint_types, params, motion) < 1e-12
 
 
-@given(st.data())
-def test_lse_equals_automatic_differentiation_for_drawn_robots(data: st.DataObject) -> None:
-    joint_types = data.draw(st.lists(st.sampled_from(["revolute", "prismatic"]), min_size=1, max_size=3))
-    n = len(joint_types)
-
-    def array(shape: tuple[int, ...], low: float, high: float) -> np.ndarray:
-        return data.draw(arrays(np.float64, shape, elements=st.floats(low, high, allow_subnormal=False)))
-
-    params = {key: torch.as_tensor(array(shape, -0.5, 2.0)) for key, shape in shapes("lse", n).items()}
-    motion = Motion.from_arrays(*(array((2, n), -3.0, 3.0) for _ in range(3)))
-    assert worst_lse_error(joint_types, params, motion) < 1e-9
-
-
-def test_lse_variance_of_one_straight_joint_adds_up() -> None:
-    """At x = y of one prismatic joint: s² (c d v² + 3 c² a² + d), d = 1 / ℓ², from moments of L's derivatives."""
-    ell, m, scale, v, a = 0.7, 1.3, 2.0, 0.4, -0.9
-    params = {
-        "lse.log_scale": torch.tensor(math.log(scale), dtype=torch.float64),
-        "lse.log_position_lengthscales": torch.tensor([math.log(ell)], dtype=torch.float64),
-        "lse.log_velocity_lengthscales": torch.tensor([math.log(m)], dtype=torch.float64),
-    }
-    variance = LagrangianSEKernel(["prismatic"]).variance(params, Motion.from_arrays([0.2], [v], [a]))
-    # tau = v L_qv + a L_vv − L_q: var L_qv = s² c d, var L_vv = 3 s² c², var L_q = s² d, all uncorrelated
-    c, d = m**-2, ell**-2
-    assert variance.item() == pytest.approx(scale * (v**2 * c * d + 3 * a**2 * c**2 + d), rel=1e-12)
-
-
 def se_loop(joint_types: Sequence[str], params: Mapping[str, np.ndarray], x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """x, y: (3, n), rows q, dq, ddq."""
     n = len(joint_types)
@@ -183,43 +149,6 @@ def test_se_and_gip_equal_plain_loops(name: str, loop: Callable[..., np.ndarray]
             np.testing.assert_allclose(blocks[:, :, i, j], loop(joint_types, arrays_, x, y), rtol=1e-12, atol=1e-14)
 
 
-@robots
-@pytest.mark.parametrize("name", BASELINES)
-def test_gram_is_symmetric_and_positive_semidefinite(name: str, joint_types: tuple[str, ...]) -> None:
-    kernel, params, motion = random_case(name, joint_types, samples=12)
-    gram = kernel.symmetric_gram(params, motion)
-    assert torch.equal(gram, gram.T)
-    torch.testing.assert_close(gram, kernel.gram(params, motion, motion), rtol=1e-12, atol=1e-12 * float(gram.max()))
-    eigenvalues = torch.linalg.eigvalsh(gram)
-    assert eigenvalues[0] > -1e-12 * eigenvalues[-1]
-
-
-@pytest.mark.parametrize("name", ["gip", "lse"])
-def test_a_full_turn_of_a_revolute_joint_changes_nothing(name: str) -> None:
-    kernel, params, motion = random_case(name, ("revolute", "prismatic"), samples=4)
-    turned = Motion(motion.q + torch.tensor([2 * math.pi, 0.0], dtype=torch.float64), motion.dq, motion.ddq)
-    torch.testing.assert_close(kernel.gram(params, turned, motion), kernel.gram(params, motion, motion))
-
-
-@pytest.mark.parametrize("name", BASELINES)
-def test_gradient_of_the_evidence_equals_finite_differences(name: str) -> None:
-    joint_types = ("revolute", "prismatic", "revolute")
-    kernel, params, motion = random_case(name, joint_types, samples=8)
-    rng = np.random.default_rng(5)
-    tau = torch.from_numpy(rng.standard_normal((8, 3)))
-    params["noise.log_std"] = torch.full((3,), -1.0, dtype=torch.float64)
-    gradient = negative_log_evidence(kernel, params, motion, tau).gradient
-    for key in shapes(name, 3):
-        at = int(rng.integers(params[key].numel()))
-        values = []
-        for step in (1e-5, -1e-5):
-            moved = {other: value.clone() for other, value in params.items()}
-            moved[key].view(-1)[at] += step
-            values.append(negative_log_evidence(kernel, moved, motion, tau).value)
-        expected = (values[0] - values[1]) / 2e-5
-        assert float(gradient[key].reshape(-1)[at]) == pytest.approx(expected, rel=1e-6, abs=1e-7), key
-
-
 @pytest.mark.parametrize("still", [(0,), (0, 1, 2)], ids=["one", "all"])
 @pytest.mark.parametrize("name", BASELINES)
 def test_start_is_scaled_to_the_data_even_where_joints_stand_still(name: str, still: tuple[int, ...]) -> None:
@@ -238,21 +167,3 @@ def test_start_is_scaled_to_the_data_even_where_joints_stand_still(name: str, st
     assert 0.2 < float(prior / tau.square().mean(0).sum()) < 5.0
     params["noise.log_std"] = torch.log(0.01 * tau.std(0))
     assert math.isfinite(negative_log_evidence(kernel, params, motion, tau).value)
-
-
-@pytest.mark.parametrize("name", BASELINES)
-def test_short_fit_predicts_unseen_samples(name: str) -> None:
-    robot = load_robot("double-pendulum")
-    samples = simulate(robot, Stream(n_samples=120, rate=5.0, noise=0.001), seed=1)
-    seen = np.arange(len(samples)) % 2 == 0
-    training, unseen = samples.rows(seen), samples.rows(~seen)
-    model = train(training, robot.joint_types, name, FitOptions(hyperparameter_samples=60, max_iterations=30))
-    error = unseen.tau - model.predict(unseen.q, unseen.dq, unseen.ddq).tau
-    assert (np.mean(error**2, axis=0) / unseen.tau.var(axis=0) < 0.5).all()
-
-
-def test_baselines_can_be_chosen_by_name() -> None:
-    for name in BASELINES:
-        estimator = make_estimator(name, ["revolute", "prismatic"])
-        assert isinstance(estimator.terms["torque"], PairKernel)
-        assert "friction" in estimator.terms

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +9,7 @@ import pytest
 from numpy.typing import ArrayLike
 
 from lipcore import FitOptions, Samples, TorqueModel, load, save, train
-from lipcore.fitting.estimators import ESTIMATORS, FUNCTION_STD_FACTOR, NO_CALIBRATION, Calibration, calibrate
+from lipcore.fitting.estimators import FUNCTION_STD_FACTOR, NO_CALIBRATION, Calibration, calibrate
 from lipcore.model import dynamics
 from lipcore.model.parameters import friction_coefficients, inertial_parameters, weight_posterior
 from lipcore.robots.library import load_robot
@@ -64,13 +62,6 @@ def test_predictions(plain: TorqueModel, corrected: TorqueModel, samples: Sample
     assert (one.tau_std > 0).all()
 
 
-def test_a_term_alone(plain: TorqueModel, corrected: TorqueModel, samples: Samples) -> None:
-    for name in plain.estimator.terms:
-        one, other = (m.posterior.predict(samples.motion()[:5], m.estimator.terms[name]) for m in (plain, corrected))
-        alike(other.mean, one.mean)
-        alike(other.std, FACTOR * one.std)
-
-
 def test_components(plain: TorqueModel, corrected: TorqueModel, samples: Samples) -> None:
     motion, tau = samples.motion()[10:15], samples.torque()[10:15]
     one, other = (dynamics.components(m, motion, dynamics.COMPONENTS, tau) for m in (plain, corrected))
@@ -105,24 +96,7 @@ def test_it_is_saved_and_loaded(corrected: TorqueModel, samples: Samples, tmp_pa
     assert calibrate(corrected.estimator.name).function_std_factor != FACTOR
 
 
-def test_the_manifest_decides(plain: TorqueModel, samples: Samples, tmp_path: Path) -> None:
-    save(plain, tmp_path / "model")
-    path = tmp_path / "model" / "manifest.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"calibration": {"function_std_factor": 3.0}}))
-    query = samples.q, samples.dq, samples.ddq
-    np.testing.assert_allclose(load(path.parent).predict(*query).tau_std, 3 * plain.predict(*query).tau_std, rtol=1e-12)
-
-
 @pytest.mark.parametrize("factor", [0.999, 0.0, -2.0, float("nan"), float("inf"), 100.0])
 def test_factor_out_of_range_is_refused(factor: float) -> None:
     with pytest.raises(ValueError, match=f"function_std_factor is {factor!r}, expected a number from 1 to 100"):
         Calibration(factor)
-
-
-def test_every_factor_belongs_to_an_estimator_and_can_be_used() -> None:
-    assert FUNCTION_STD_FACTOR.keys() <= ESTIMATORS.keys()
-    for name in ESTIMATORS:
-        assert calibrate(name).function_std_factor == FUNCTION_STD_FACTOR.get(name, 1.0)
-    assert NO_CALIBRATION.function_std_factor == 1.0
-    with pytest.raises(ValueError, match="function_std_factor"):
-        replace(NO_CALIBRATION, function_std_factor=0.5)

@@ -1,4 +1,4 @@
-"""Compiled Gram matrices and their hand-written gradients against the PyTorch form and autograd."""
+"""Compiled Gram matrices, cross covariances and hand-written gradients against the PyTorch form and autograd."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ import torch
 
 from lipcore.data.motion import Motion
 from lipcore.kernels.compiled.lanes import LANES
-from tests.lipcore.agreement import opposite
-from tests.lipcore.oracles import shares_of
-from tests.lipcore.problems import KERNELS, Problem, TorchForm, random_problem
+from tests.lipcore.oracles import KERNELS, Problem, TorchForm, opposite, random_problem, shares_of
 
 RELATIVE = 1e-11
 ROBOTS = [
@@ -86,19 +84,6 @@ def test_base_kernels_of_zero(kernel: str, joint_types: tuple[str, ...], zeros: 
     check(Problem(problem.kernel, problem.params, Motion(q, problem.motion.dq, problem.motion.ddq)))
 
 
-def test_links_may_share_their_shapes_or_not() -> None:
-    """Products are taken over from link to link where all have the same: then the untied kernel is the tied one."""
-    problem = random_problem(("revolute", "prismatic", "revolute"), samples=4, seed=3)
-    untied = dict(problem.params)
-    logits = untied.pop("kinetic.logits")
-    untied |= {f"kinetic.{link}.logits": logits[:link] for link in (1, 2, 3)}
-    other = random_problem(problem.kernel.joint_types, 1, seed=0, kernel="untied").kernel
-    agree(
-        other.gram(untied, problem.motion, problem.motion),
-        problem.kernel.symmetric_gram(problem.params, problem.motion),
-    )
-
-
 @kernels
 def test_no_samples(kernel: str) -> None:
     problem = random_problem(("revolute",) * 2, 3, seed=0, kernel=kernel)
@@ -107,3 +92,21 @@ def test_no_samples(kernel: str) -> None:
     assert not any(
         bool(each.any()) for each in problem.kernel.gradient(problem.params, problem.motion[:0], nothing).values()
     )
+
+
+@robots
+@kernels
+# part of a block of columns, with and without room for the query, exactly one, and several
+@pytest.mark.parametrize("size", [1, LANES - 1, LANES, 2 * LANES - 1, 8 * LANES + 5])
+def test_cross_equals_the_gram_matrix(kernel: str, joint_types: tuple[str, ...], size: int) -> None:
+    problem, n = random_problem(joint_types, size + 3, seed=size, kernel=kernel), len(joint_types)
+    asked = problem.motion[size:]
+    queries = np.ascontiguousarray(torch.stack([asked.q, asked.dq, asked.ddq], dim=1).numpy())
+    found = np.full((len(asked), size + 1, n, n), np.nan)  # where anything left out would show
+    problem.kernel.cross(problem.params, problem.motion[:size]).fill_many(queries, found)
+    gram = problem.kernel.gram(problem.params, problem.motion[:size], asked).numpy()
+    expected = gram.reshape(size, n, 3, n).transpose(2, 0, 1, 3)
+    np.testing.assert_allclose(found[:, :size], expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    prior = problem.kernel.variance(problem.params, asked).numpy()
+    np.testing.assert_allclose(found[:, size], prior, rtol=0, atol=1e-12 * np.abs(prior).max())
+    assert np.array_equal(found[:, size], found[:, size].transpose(0, 2, 1))

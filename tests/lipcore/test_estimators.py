@@ -11,13 +11,13 @@ import torch
 
 from lipcore import FitOptions, Samples, TorqueModel, train
 from lipcore.data.metrics import evaluate
-from lipcore.fitting.estimators import ESTIMATORS, UnknownEstimatorError, make_estimator
+from lipcore.fitting.estimators import ESTIMATORS, make_estimator
 from lipcore.kernels.arm_prior import Arm, arm_of_robot
 from lipcore.posterior.exact import negative_log_evidence
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate
 from lipcore.robots.urdf import RigidBody
-from lipcore.vocabulary import AUTO, CHOICES, DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS
+from lipcore.vocabulary import ROBOT_ESTIMATORS
 
 ROBOT = "double-pendulum"
 TYPES = ("revolute", "revolute")
@@ -50,7 +50,6 @@ def test_it_learns_a_small_robot(name: str) -> None:
     unseen = samples.rows(~even)
     answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
     figures = evaluate(unseen.tau, answer.tau, answer.tau_std, answer.noise_std)
-    print(f"\n{name}: nMSE {figures.nmse}, coverage {figures.coverage}")  # noqa: T201
     assert (figures.nmse < (0.1 if name in ("se", "gip", "lse") else 0.01)).all(), figures.nmse
     assert (figures.coverage > 0.7).all(), figures.coverage
     assert model.estimator.name == name
@@ -130,30 +129,59 @@ def test_gradient_of_the_evidence_equals_finite_differences(name: str, prior: st
             assert float(gradient[key][index]) == pytest.approx(expected, rel=1e-6, abs=1e-7), (key, index)
 
 
-def test_every_kernel_names_its_hyperparameters() -> None:
-    samples = recorded()
-    for name in ESTIMATORS:
-        kernel = make_estimator(name, TYPES, arm=arm_of(name, samples)).kernel
-        start = kernel.initial(samples.motion(), samples.torque())
-        assert kernel.names() == list(start), name
-        assert kernel.prior_std().keys() <= start.keys(), name
-        assert all(value.dtype == torch.float64 and value.isfinite().all() for value in start.values()), name
+JOINT_TYPES = ("revolute", "revolute")
+SMALL = FitOptions(
+    hyperparameter_samples=20, posterior_samples=50, max_iterations=10, starts=1, device="cpu", statistics="chosen"
+)
 
 
-def test_default_is_an_estimator_that_needs_no_robot() -> None:
-    assert (AUTO, *ESTIMATORS) == CHOICES
-    assert DEFAULT_ESTIMATOR in CHOICES
-    assert set(ROBOT_ESTIMATORS) <= set(ESTIMATORS)
+@pytest.fixture(scope="module")
+def samples() -> Samples:
+    return simulate(load_robot("double-pendulum"), Stream(n_samples=60, speed=10, noise=0.01), seed=1)
 
 
-def test_unknown_name_lists_the_known_ones() -> None:
-    with pytest.raises(UnknownEstimatorError) as caught:
-        make_estimator("newton", TYPES)
-    assert str(caught.value) == f"estimator is 'newton', expected one of {', '.join(ESTIMATORS)}"
+@pytest.fixture(scope="module")
+def model(samples: Samples) -> TorqueModel:
+    return train(samples, JOINT_TYPES, "lip-chain", SMALL)
 
 
-@pytest.mark.parametrize("joint_types", [(), ("revolute", "planar")])
-@every_estimator
-def test_unknown_joint_types_are_refused(name: str, joint_types: tuple[str, ...]) -> None:
-    with pytest.raises(ValueError, match="joint_types"):
-        make_estimator(name, joint_types)
+def test_answer_for_many_is_the_answers_for_each(model: TorqueModel, samples: Samples) -> None:
+    many = model.predict(samples.q, samples.dq, samples.ddq, covariance=True)
+    assert many.tau.shape == many.tau_std.shape == (60, 2)
+    assert many.covariance.shape == (60, 2, 2)
+    assert many.noise_std.shape == (2,)
+    for k in (0, 31, 59):
+        one = model.predict(samples.q[k], samples.dq[k], samples.ddq[k], covariance=True)
+        assert np.allclose(one.tau[0], many.tau[k], rtol=1e-8, atol=1e-10)
+        assert np.allclose(one.covariance[0], many.covariance[k], rtol=1e-6, atol=1e-12)
+    assert np.allclose(many.tau_std**2, np.diagonal(many.covariance, axis1=1, axis2=2), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("shapes", "message"),
+    [
+        (((4, 3),) * 3, "q has 3 joints, expected 2: joint1, joint2"),
+        (((4, 2), (4, 2), (3, 2)), r"ddq has shape \(3, 2\), expected \(4, 2\)"),
+    ],
+    ids=str,
+)
+def test_query_of_wrong_shape_is_refused(model: TorqueModel, shapes: tuple, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        model.predict(*(np.zeros(shape) for shape in shapes))
+
+
+def test_bad_argument_of_training_is_named(samples: Samples) -> None:
+    good = {"joint_types": JOINT_TYPES, "estimator": "lip-chain", "options": SMALL}
+    for arguments, message in (
+        ({"joint_types": ("revolute",)}, "joint_types has 1 entries, expected 2"),
+        ({"joint_types": ("revolute", "spherical")}, r"joint_types\[1\] is 'spherical'"),
+        ({"torque_convention": "none"}, "torque_convention is 'none', expected one of gravity_included"),
+        ({"estimator": "oracle"}, "estimator is 'oracle', expected one of auto, lip"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            train(samples, **(good | arguments))
+    for name in ("q", "dq", "ddq", "tau"):
+        values = getattr(samples, name).copy()
+        values[3, 1] = np.nan
+        with pytest.raises(ValueError, match=rf"{name}\[3, 1\]"):
+            train(replace(samples, **{name: values}), JOINT_TYPES, "lip-chain", SMALL)

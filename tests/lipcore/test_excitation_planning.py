@@ -1,4 +1,4 @@
-"""Planning: variance against the posterior of a model that has really seen the motion, slopes, limits, and benefit."""
+"""Planned motions: limits that hold at every instant, variance against the posterior of a model that has seen them."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 import lipcore
 from lipcore.data.motion import Motion
-from lipcore.excitation import Belief, Limits, PlanOptions, plan
+from lipcore.excitation import Belief, Limits, PlanOptions, Series, plan
 from lipcore.excitation.information import Information
-from lipcore.excitation.motions import Shape, draw
+from lipcore.excitation.motions import Shape, draw, overshoot
 from lipcore.excitation.searching import MARGIN, Goal, TorqueCheck, search
 from lipcore.posterior.exact import ExactPosterior
 from lipcore.robots.library import load_robot
@@ -66,11 +68,8 @@ def test_what_is_left_of_a_prior_is_what_the_exact_posterior_has(prior, limits):
     before = prior.kernel.variance(prior.params, query).diagonal(dim1=1, dim2=2)
     expected = (exact_variance(prior, seen, query, prior.noise_variance) / before).log().mean(0).exp()
     np.testing.assert_allclose(found, expected, rtol=1e-6)
-
-
-def test_a_sample_that_stands_for_four_tells_what_four_equal_ones_tell(prior, limits):
-    seen, information = draw(limits, 6, 3), Information.about(prior, draw(limits, 5, 4))
-    np.testing.assert_allclose(information.left(seen, 4.0), information.left(both(seen, seen, seen, seen)), rtol=1e-5)
+    information, four = Information.about(prior, query), both(seen, seen, seen, seen)
+    np.testing.assert_allclose(information.left(seen, 4.0), information.left(four), rtol=1e-5)
 
 
 def test_what_a_model_has_learnt_is_not_credited_again(model, samples, limits):
@@ -82,9 +81,13 @@ def test_what_a_model_has_learnt_is_not_credited_again(model, samples, limits):
     np.testing.assert_allclose(found, (after / before).log().mean(0).exp(), rtol=2e-3)
 
 
-@pytest.mark.parametrize("known", ["prior", "model"])
-def test_slopes_are_those_of_the_value(known, prior, model, limits):
-    belief = prior if known == "prior" else Belief.of_model(model)
+@pytest.mark.parametrize("known", ["prior", "model", "rigid-body"])
+def test_slopes_are_those_of_the_value(known, robot, prior, model, limits):
+    if known == "rigid-body":
+        bodies = RigidBody.from_profile("double-pendulum", robot.joint_names, robot.joint_types)
+        belief = Belief.prior(robot, limits, NOISE, known, bodies)
+    else:
+        belief = prior if known == "prior" else Belief.of_model(model)
     information, motion = Information.about(belief, draw(limits, 6, 7)), draw(limits, 5, 8)
     value, slope = information.slope(motion, 2.0)
     assert value == pytest.approx(float(information.left(motion, 2.0).log().mean()), rel=1e-9)
@@ -140,44 +143,19 @@ def test_the_table_keeps_all_limits_and_has_the_length_asked_for(robot, prior, l
     t, q, dq, ddq = made.table()
     assert len(t) == 81
     assert t[-1] == pytest.approx(8.0)
-    dense = np.linspace(0, 8.0, 20_000)
-    q, dq, ddq = made.series.at(dense)
-    assert (q >= tight.lower - 1e-9).all()
-    assert (q <= tight.upper + 1e-9).all()
-    assert (np.abs(dq) <= tight.speed * (1 + 1e-9)).all()
-    assert (np.abs(ddq) <= tight.acceleration * (1 + 1e-9)).all()
+    q, dq, ddq = made.series.at(np.linspace(0, 8.0, 20_000))
+    assert (made.series.used(tight) <= 1 + 1e-9).all()
     assert (np.abs(inverse_dynamics(robot, q, dq, ddq)) <= tight.torque).all()
     assert (made.used[3] <= MARGIN + 1e-9).all()
 
 
-def test_too_weak_a_robot_is_said(robot, prior, limits):
-    shifted = replace(limits, lower=limits.lower + 1.2, upper=limits.upper + 1.2, torque=np.array([1e-3, 1e-3]))
-    with pytest.raises(ValueError, match="to hold the robot still in the middle of its range"):
-        plan(prior, shifted, replace(SHORT, iterations=0), robot)
-
-
-def test_rigid_bodies_and_other_priors_can_be_planned_for(robot, limits):
-    bodies = RigidBody.from_profile("double-pendulum", robot.joint_names, robot.joint_types)
-    for estimator, given in (("rigid-body", bodies), ("se", None)):
-        belief = Belief.prior(robot, limits, NOISE, estimator, given)
-        made = plan(belief, limits, replace(SHORT, iterations=2, references=8))
-        assert ((made.left > 0) & (made.left < 1)).all()
-
-
-def test_the_budget_ends_a_search(prior, limits):
+def test_a_robot_too_weak_is_refused_and_a_budget_ends_a_search(robot, prior, limits):
     goal = Goal.build(Shape.build(limits, 5.0, 3), Information.about(prior, draw(limits, 5, 1)), None, 20)
     found = search(goal, 2, 50, 0, until=-np.inf)
     assert (found.iterations, found.out_of_time) == (0, True)
-    assert found.x.shape == goal.shape.size
-
-
-def test_references_keep_the_limits_and_reach_all_over_them(limits):
-    found = draw(limits, 500, 0)
-    assert len(found) == 500
-    for values, bound in ((found.q - torch.from_numpy(limits.middle), limits.half), (found.dq, limits.speed)):
-        share = (values.abs() / torch.from_numpy(bound)).numpy()
-        assert share.max() <= 1 + 1e-9
-        assert (share.max(0) > 0.9).all()
+    shifted = replace(limits, lower=limits.lower + 1.2, upper=limits.upper + 1.2, torque=np.array([1e-3, 1e-3]))
+    with pytest.raises(ValueError, match="to hold the robot still in the middle of its range"):
+        plan(prior, shifted, replace(SHORT, iterations=0), robot)
 
 
 @pytest.mark.parametrize(
@@ -185,7 +163,6 @@ def test_references_keep_the_limits_and_reach_all_over_them(limits):
     [
         ({"seconds": 0.0}, "seconds is 0.0, expected a positive number"),
         ({"rate": float("nan")}, "rate is nan"),
-        ({"budget_s": -1.0}, "budget_s is -1.0"),
         ({"harmonics": 1}, "harmonics is 1, expected a whole number from 2"),
         ({"starts": 0}, "starts is 0"),
         ({"seconds": 0.01, "rate": 1.0}, "0.01 s at 1.0 Hz are 1 samples"),
@@ -202,3 +179,103 @@ def test_joints_have_to_be_as_many_and_noise_positive(robot, prior, limits):
         plan(prior, one, SHORT)
     with pytest.raises(ValueError, match=r"noise_std is 0\.0, expected positive numbers"):
         Belief.prior(robot, limits, 0.0)
+
+
+ROUNDING = 1e-9
+
+
+def limits_of(rng: np.random.Generator, n: int) -> Limits:
+    middle, half = rng.uniform(-2, 2, n), rng.uniform(0.01, 3, n)
+    speed, acceleration = 10 ** rng.uniform(-2, 1.5, n), 10 ** rng.uniform(-2, 2, n)
+    return Limits(
+        tuple(f"j{k}" for k in range(n)), middle - half, middle + half, speed, acceleration, np.full(n, np.inf)
+    )
+
+
+@st.composite
+def shapes(draw: st.DrawFn) -> tuple[Shape, np.ndarray]:
+    """A shape of random limits, and a matrix of numbers of any size."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    limits = limits_of(rng, draw(st.integers(1, 4)))
+    shape = Shape.build(limits, draw(st.floats(0.5, 100)), draw(st.integers(2, 12)))
+    size = 10 ** draw(st.floats(-3, 6))
+    x = size * rng.standard_normal(shape.size)
+    x[rng.random(shape.size) < draw(st.floats(0, 0.9))] = 0.0
+    return shape, x
+
+
+@given(shapes())
+def test_no_limit_is_overshot_between_instants(problem):
+    shape, x = problem
+    series, limits = shape.series(x), shape.limits
+    # far denser than, and at other places than, whatever the code looks at
+    t = (np.arange(20_000) + 0.37) / 20_000 * shape.seconds
+    q, dq, ddq = series.at(t)
+    room = ROUNDING * limits.half
+    assert (q >= limits.lower - room).all()
+    assert (q <= limits.upper + room).all()
+    assert (np.abs(dq) <= limits.speed * (1 + ROUNDING)).all()
+    assert (np.abs(ddq) <= limits.acceleration * (1 + ROUNDING)).all()
+    ends, *still = series.at(np.array([0.0, shape.seconds]))  # at rest, at the same place
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-9 * (1 + np.abs(ends[0]).max()))
+    for values, most in zip(still, (limits.speed, limits.acceleration), strict=True):
+        assert (np.abs(values) <= 1e-9 * most).all()
+    used = series.used(limits)
+    assert (used <= 1 + ROUNDING).all()
+    peaks = np.array([np.abs(q - limits.middle).max(0), np.abs(dq).max(0), np.abs(ddq).max(0)])
+    shares = peaks / np.array([limits.half, limits.speed, limits.acceleration])
+    assert (shares <= used + ROUNDING).all()
+    assert (used <= 1.01 * shares + ROUNDING).all()
+
+
+def test_derivatives_of_a_series_are_those_of_its_positions():
+    rng = np.random.default_rng(4)
+    series = Series(3.0, rng.standard_normal(2), *rng.standard_normal((2, 6, 2)))
+    t, h = np.linspace(0.1, 2.9, 40), 1e-5
+    _, dq, ddq = series.at(t)
+    before, after = series.at(t - h), series.at(t + h)
+    np.testing.assert_allclose(dq, (after[0] - before[0]) / (2 * h), atol=1e-6)
+    np.testing.assert_allclose(ddq, (after[1] - before[1]) / (2 * h), atol=1e-5)
+    one = Series(2.0, np.array([0.5]), np.array([[0.0], [3.0]]), np.array([[1.0], [0.0]]))
+    # by hand: q = 0.5 + 3 sin(2 π t) / (2 π) − cos(π t) / π
+    np.testing.assert_allclose(
+        one.at(t)[0][:, 0], 0.5 + 3 * np.sin(2 * np.pi * t) / (2 * np.pi) - np.cos(np.pi * t) / np.pi, atol=1e-14
+    )
+
+
+def test_a_polynomial_that_reaches_the_bound_of_ehlich_and_zeller():
+    # cos(K t − π K / m) has its largest magnitudes just between m even instants
+    for harmonics, instants in ((3, 12), (5, 40)):
+        t = 2 * np.pi * np.arange(instants) / instants
+        seen = np.abs(np.cos(harmonics * t + np.pi * harmonics / instants)).max()
+        assert overshoot(harmonics, instants) * seen == pytest.approx(1.0, rel=1e-12)
+
+
+def test_unknown_limits_have_usual_ones_standing_in():
+    nan = np.array([np.nan, np.nan])
+    found = Limits.known(("a", "b"), ("revolute", "prismatic"), nan, nan, np.array([2.0, np.inf]), nan, np.zeros(2))
+    np.testing.assert_allclose(found.upper, [np.pi, 0.5])
+    np.testing.assert_allclose(found.speed, [2.0, 0.2])
+    np.testing.assert_allclose(found.acceleration, [8.0, 0.8])
+    assert np.isinf(found.torque).all()
+    share = found.within(0.5, 0.25)
+    np.testing.assert_allclose(share.half, found.half / 2)
+    np.testing.assert_allclose(share.acceleration, found.acceleration / 4)
+    np.testing.assert_allclose(found.within(reach=0.005).half, 0.005)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda limits: limits.within(0.0), "share of position is 0.0, expected a number above 0"),
+        (lambda limits: limits.within(1.0, 1.2), "share of motion is 1.2"),
+        (lambda limits: limits.within(reach=-1.0), "reach is -1.0"),
+        (lambda limits: Shape.build(limits, 1.0, 1), "harmonics is 1, expected at least 2"),
+        (lambda limits: Limits(("a",), *(np.ones(1) for _ in range(5))), "joint 'a' may move from 1.0 to 1.0"),
+        (lambda limits: Limits(("a",), *(np.ones(2) for _ in range(5))), "lower has shape"),
+        (lambda limits: Limits(("a",), -np.ones(1), np.ones(1), -np.ones(1), np.ones(1), np.ones(1)), "speed is"),
+    ],
+)
+def test_impossible_limits_are_named(change, message):
+    with pytest.raises(ValueError, match=message):
+        change(limits_of(np.random.default_rng(6), 2))

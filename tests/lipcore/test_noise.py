@@ -16,8 +16,7 @@ from lipcore.fitting import noise
 from lipcore.kernels.base import SumKernel
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.posterior.exact import negative_log_evidence, noisy_gram
-from lipcore.posterior.linalg import NotPositiveDefiniteError
-from tests.lipcore.problems import random_problem
+from tests.lipcore.oracles import random_problem
 
 JOINTS = ("revolute", "prismatic", "revolute")
 TRUE = np.array([0.02, 0.3, 0.08])
@@ -61,10 +60,6 @@ def refined(case: Draw, begin: np.ndarray, centre: np.ndarray | None = None, flo
 @pytest.mark.parametrize("seed", [0, 2, 3])
 def test_known_noise_is_recovered_from_a_wrong_start(seed: int, factor: float) -> None:
     assert np.allclose(refined(draw(200, seed), factor * TRUE), TRUE, rtol=0.15)
-
-
-def test_joints_that_start_too_low_and_too_high_do_not_disturb_each_other() -> None:
-    assert np.allclose(refined(draw(200, 0), np.array([3.0, 1 / 3, 1.0]) * TRUE), TRUE, rtol=0.15)
 
 
 def penalised(case: Draw, log_std: np.ndarray, centre: np.ndarray) -> float:
@@ -133,7 +128,6 @@ def test_noise_that_lasts_over_samples_is_not_taken_for_the_function() -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(noise, "TOLERATED", np.inf)
         first = refined(noisy, level) / level
-    print(f"\nwhite {found['white']}, lasting {found['lasting']}, first step alone {first}")  # noqa: T201
     assert (found["lasting"] >= first).all()
     assert found["lasting"].mean() > 1.2 * first.mean()
 
@@ -145,19 +139,6 @@ def test_noise_never_falls_below_its_floor() -> None:
         assert (refined(case, begin, floor=floor) >= np.exp(floor.numpy()) * (1 - 1e-12)).all()
     # the floor of the first joint lies above what the data say
     assert refined(case, np.array([2.0, 1.0, 1.0]) * TRUE, floor=floor)[0] == pytest.approx(2 * TRUE[0], rel=1e-12)
-
-
-def test_steps_are_bounded_where_the_start_is_absurd() -> None:
-    std = refined(draw(40, 0), 1e-4 * TRUE)
-    farthest = (noise.NEWTON_STEPS + noise.WIDENINGS) * noise.LARGEST_STEP
-    assert (std <= 1e-4 * TRUE * np.exp(farthest) * (1 + 1e-9)).all()
-    assert (std > 5e-4 * TRUE).all()
-
-
-def test_covariance_that_cannot_be_factored_is_reported() -> None:
-    case = draw(5, 0)
-    with pytest.raises(NotPositiveDefiniteError):
-        refined(case, np.full(3, np.nan))
 
 
 def table(tau: np.ndarray) -> Samples:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from lipcore.online.acceleration import MIN_RATE, RateError, derive, rate_of, window
-from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
+from lipcore.online.acceleration import RateError, derive, rate_of, window
 
 EPOCH = 1.8e9
 """Unix time, whose floats step by 2.4e-7 s."""
@@ -33,35 +31,6 @@ def test_gain_falls_as_stated_without_phase_shift(frequency: float, expected: fl
     assert abs(np.angle(gain(frequency, 100.0))) < 1e-9
 
 
-@pytest.mark.parametrize(
-    ("rate", "noise", "largest"),
-    [
-        (50.0, 0.0, 0.017),
-        (100.0, 0.0, 0.015),
-        (1000.0, 0.0, 0.013),
-        (50.0, 1e-3, 0.021),
-        (100.0, 1e-3, 0.018),
-        (200.0, 1e-3, 0.016),
-        (1000.0, 1e-3, 0.014),
-    ],
-)
-def test_error_on_a_panda_is_small_at_every_rate_with_noise_on_velocities(
-    rate: float, noise: float, largest: float
-) -> None:
-    robot = load_robot("panda")
-    samples = simulate(robot, Stream(n_samples=int(10 * rate), rate=rate, speed=10, noise=0.0), seed=0)
-    measured = samples.dq + noise * np.random.default_rng(1).standard_normal(samples.dq.shape)
-    derived = derive(EPOCH + samples.t, measured, window(rate))
-    rows = slice(derived.first, derived.first + len(derived.ddq))
-    truth = samples.ddq[rows]
-    relative = np.sqrt(((derived.ddq - truth) ** 2).mean(axis=0) / (truth**2).mean(axis=0))
-    assert relative.max() < largest
-    if rate == 100.0:
-        # and the torque that it costs is no more than a Panda's measurement noise of some 0.1 N·m
-        torque = inverse_dynamics(robot, samples.q[rows], samples.dq[rows], derived.ddq) - samples.tau[rows]
-        assert np.sqrt((torque**2).mean(axis=0)).max() < 0.1
-
-
 def test_noise_comes_out_as_stated() -> None:
     rng = np.random.default_rng(2)
     for rate, stated in ((1000.0, 4.8), (100.0, 13.0), (50.0, 16.0)):
@@ -73,9 +42,10 @@ def test_noise_comes_out_as_stated() -> None:
 @given(
     coefficients=st.tuples(*[st.floats(-10, 10)] * 3),
     half=st.integers(1, 6),
-    extra=st.integers(0, 5),
+    extra=st.integers(-1, 5),
     rate=st.integers(50, 1000),
 )
+@example(coefficients=(1.0, 1.0, 1.0), half=4, extra=-1, rate=100)
 @settings(deadline=None)
 def test_exact_on_quadratics_and_as_late_as_stated(
     coefficients: tuple[float, float, float], half: int, extra: int, rate: int
@@ -85,6 +55,7 @@ def test_exact_on_quadratics_and_as_late_as_stated(
     derived = derive(t, (a + b * t + c * t**2)[:, None], half)
     assert derived.first == half
     assert derived.delay_s == pytest.approx(half / rate)
+    assert derived.ddq.shape == (1 + extra, 1)
     assert np.allclose(derived.ddq[:, 0], (b + 2 * c * t)[half : half + 1 + extra], rtol=0, atol=1e-8)
 
 
@@ -100,21 +71,6 @@ def test_batches_that_carry_over_twice_half_rows_give_what_the_whole_gives(cut: 
     assert np.allclose(np.concatenate([first.ddq, second.ddq]), whole, rtol=0, atol=1e-9)
 
 
-def test_no_acceleration_depends_on_what_comes_after_its_delay() -> None:
-    rng = np.random.default_rng(3)
-    t, dq = np.arange(50) / 100.0, rng.standard_normal((50, 2))
-    other = dq.copy()
-    other[30:] += 1.0
-    one, two = derive(t, dq, 4), derive(t, other, 4)
-    changed = (one.ddq != two.ddq).any(axis=1)
-    assert np.flatnonzero(changed)[0] + one.first == 26  # 30 lies in the window of row 26, of half 4
-
-
-def test_too_few_rows_give_none() -> None:
-    derived = derive(np.arange(8) / 100.0, np.zeros((8, 3)), 4)
-    assert derived.ddq.shape == (0, 3)
-
-
 @pytest.mark.parametrize("rate", [50.0, 100.0, 333.0, 1000.0])
 def test_rate_is_read_off_unix_times_that_waver(rate: float) -> None:
     rng = np.random.default_rng(4)
@@ -122,27 +78,20 @@ def test_rate_is_read_off_unix_times_that_waver(rate: float) -> None:
     assert rate_of(t) == pytest.approx(rate, rel=2e-3)
 
 
-def test_missing_sample_is_named() -> None:
-    t = np.delete(np.arange(20) / 100.0, 7)
-    with pytest.raises(
-        ValueError, match=r"t\[7\] is 0.02 s after the time before it, expected steps of 0.01 s within 20%"
-    ):
+@pytest.mark.parametrize(
+    ("t", "message"),
+    [
+        (np.delete(np.arange(20) / 100, 7), r"t\[7\] is 0.02 s after the time before it, expected steps of 0.01 s"),
+        (np.zeros(5), "t has a median step of 0 s"),
+        (np.zeros(1), "t has 1 times"),
+        (np.arange(9) / 47.0, "the rate is 47 Hz, expected at least 50 Hz"),
+    ],
+)
+def test_times_without_a_rate_are_refused(t: np.ndarray, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         rate_of(t)
-
-
-def test_times_that_stand_are_refused() -> None:
-    with pytest.raises(ValueError, match="t has a median step of 0 s"):
-        rate_of(np.zeros(5))
-    with pytest.raises(ValueError, match="t has 1 times"):
-        rate_of(np.zeros(1))
-
-
-@pytest.mark.parametrize("rate", [1.0, 10.0, 47.0])
-def test_slow_streams_are_refused(rate: float) -> None:
-    assert MIN_RATE == 50.0
-    for attempt in (lambda: window(rate), lambda: rate_of(np.arange(9) / rate)):
-        with pytest.raises(RateError, match=f"the rate is {rate:.3g} Hz, expected at least 50 Hz"):
-            attempt()
+    with pytest.raises(RateError, match="the rate is 10 Hz, expected at least 50 Hz"):
+        window(10.0)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ import pytest
 from scipy.signal import lfilter
 
 from lipcore.online.change import Change, ChangeDetector, friction_share, suspect
-from lipcore.online.gates import is_contact
 from lipcore.online.record import Record
 from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import Payload, Stream, inverse_dynamics, simulate
@@ -61,26 +60,44 @@ def standard(scale: Scale, seed: int, seconds: float = 600.0, rate: float = 100.
     return t, z, 0 * z, 0 * z, np.ones(3)
 
 
-def constant(value: float) -> Scale:
-    return lambda t: np.full_like(t, value)
+QUIET: dict[str, tuple[Scale, dict[str, float]]] = {
+    "as stated": (lambda t: 1 + 0 * t, {}),
+    "three times what is stated": (lambda t: 3 + 0 * t, {}),
+    "at 10 Hz": (lambda t: 1 + 0 * t, {"rate": 10.0}),
+    "at 1 kHz": (lambda t: 1 + 0 * t, {"rate": 1000.0, "seconds": 60.0}),
+    "persisting for half a second": (lambda t: 3 + 0 * t, {"persist_s": 0.5}),
+    "shrinking": (lambda t: np.where(t >= 60, 0.3, 3.0), {"seconds": 200.0}),
+    "growing within what is stated": (lambda t: np.where(t >= 60, 1.0, 0.1), {"seconds": 200.0}),
+}
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("deviation", [1.0, 3.0])
-def test_ten_minutes_of_constant_innovations_raise_no_alarm(deviation: float, seed: int) -> None:
-    assert watch(*standard(constant(deviation), seed), rows=50)[1] == []
+@pytest.mark.parametrize("name", QUIET)
+def test_innovations_that_do_not_grow_raise_no_alarm(name: str, seed: int) -> None:
+    scale, how = QUIET[name]
+    detector, alarms = watch(*standard(scale, seed, **how), rows=100 if "kHz" in name else 50)
+    assert alarms == []
+    assert len(detector.buckets) <= 50  # memory is bounded
+    assert detector.acknowledged() is detector
 
 
-@pytest.mark.parametrize("rate", [10.0, 1000.0])
-def test_no_false_alarm_at_other_rates(rate: float) -> None:
-    data = standard(constant(1.0), 0, seconds=600.0 if rate < 100 else 60.0, rate=rate)
-    assert watch(*data, rows=max(5, int(rate / 10)))[1] == []
+def test_one_joint_is_named_alone_also_after_a_pause() -> None:
+    t, z, *rest = standard(lambda t: 1 + 0 * t, 0, seconds=70.0)
+    z[t >= 50, 1] *= 5
+    t = np.where(t >= 50, t + 3600, t)
+    [(change, found)] = watch(t, z, *rest)[1]
+    assert (change.joints, change.kind) == ((1,), "sudden")
+    assert change.at <= 3650 < found <= 3652
+    assert np.allclose(change.before.standardised, 1.0, atol=0.15)
+    assert change.after.standardised[1] > 10
 
 
-@pytest.mark.parametrize("deviation", [1.0, 3.0])
-@pytest.mark.parametrize("seed", SEEDS[:2])
-def test_errors_that_persist_for_half_a_second_are_no_change(deviation: float, seed: int) -> None:
-    assert watch(*standard(constant(deviation), seed, persist_s=0.5), rows=50)[1] == []
+def test_what_a_model_has_learnt_to_predict_counts_as_its_reference() -> None:
+    """A step too small for seconds is found as drift, though the errors were larger before it learnt."""
+    data = standard(lambda t: np.select([t < 30, t < 300], [3.0, 1.0], 1.8), 0, seconds=400.0)
+    [(change, _)] = watch(*data, rows=50)[1]
+    assert change.kind == "drift"
+    assert abs(change.at - 300) < 3
 
 
 @pytest.mark.parametrize("seed", SEEDS[:2])
@@ -94,24 +111,6 @@ def test_step_is_found_within_two_seconds_and_dated_to_half_a_second(size: float
     assert abs(change.at - 60.3) <= 0.5
 
 
-def test_one_joint_is_named_alone() -> None:
-    t, z, *rest = standard(constant(1.0), 0, seconds=100.0)
-    z[t >= 50, 1] *= 5
-    [(change, _)] = watch(t, z, *rest)[1]
-    assert change.joints == (1,)
-    assert np.allclose(change.before.standardised, 1.0, atol=0.15)
-    assert change.after.standardised[1] > 10
-
-
-@pytest.mark.parametrize("deviation", [1.0, 3.0])
-def test_step_that_is_too_small_for_seconds_is_found_as_drift(deviation: float) -> None:
-    data = standard(lambda t: deviation * np.where(t >= 60, 1.8, 1.0), 1, seconds=120.0)
-    [(change, found)] = watch(*data)[1]
-    assert change.kind == "drift"
-    assert 65 < found < 85
-    assert abs(change.at - 60) < 3
-
-
 @pytest.mark.parametrize("seed", SEEDS)
 def test_errors_that_grow_to_twice_in_five_minutes_are_a_drift(seed: int) -> None:
     data = standard(lambda t: np.sqrt(1 + 3 * np.maximum(t - 60, 0) / 300), seed, seconds=300.0)
@@ -121,20 +120,6 @@ def test_errors_that_grow_to_twice_in_five_minutes_are_a_drift(seed: int) -> Non
     assert 160 < found < 260
     assert change.before.rows >= 2000
     assert (change.after.standardised > 1.8 * change.before.standardised).all()
-
-
-def test_errors_that_shrink_or_stay_within_what_is_stated_are_none() -> None:
-    assert watch(*standard(lambda t: np.where(t >= 60, 0.3, 3.0), 0, seconds=200.0), rows=50)[1] == []
-    assert watch(*standard(lambda t: np.where(t >= 60, 1.0, 0.1), 0, seconds=200.0), rows=50)[1] == []
-
-
-def test_what_a_model_has_learnt_to_predict_counts_as_its_reference() -> None:
-    def learning(t: np.ndarray) -> np.ndarray:
-        return np.select([t < 30, t < 300], [3.0, 1.0], 1.8)
-
-    alarms = watch(*standard(learning, 0, seconds=400.0), rows=50)[1]
-    assert [alarm.change.kind for alarm in alarms] == ["drift"]
-    assert abs(alarms[0].change.at - 300) < 3
 
 
 def test_one_alarm_until_acknowledged_then_the_new_state_is_the_reference() -> None:
@@ -149,31 +134,8 @@ def test_one_alarm_until_acknowledged_then_the_new_state_is_the_reference() -> N
     assert change.before.standardised == pytest.approx([25.0] * 3, rel=0.2)
 
 
-def test_acknowledging_nothing_changes_nothing() -> None:
-    detector = watch(*standard(constant(1.0), 0, seconds=30.0))[0]
-    assert detector.acknowledged() is detector
-
-
-def test_tool_changed_in_a_pause_is_found() -> None:
-    t, z, *rest = standard(lambda t: np.where(t >= 60, 5.0, 1.0), 0, seconds=70.0)
-    t = np.where(t >= 60, t + 3600, t)
-    [(change, found)] = watch(t, z, *rest)[1]
-    assert change.kind == "sudden"
-    assert found - 3660 <= 2
-    assert change.at <= 3660
-
-
-def test_memory_is_bounded_and_the_past_does_not_change() -> None:
-    t, z, mean, std, noise = standard(constant(1.0), 0, seconds=100.0, rate=100.0)
-    detector, _ = watch(t, z, mean, std, noise)
-    size, before = len(detector.buckets), detector.buckets
-    following, _ = watch(t + 100, z, mean, std, noise, detector=detector)
-    assert len(following.buckets) == size <= 50
-    assert detector.buckets is before
-
-
 def test_records_of_other_times_and_of_no_rows_are_taken() -> None:
-    detector, _ = watch(*standard(constant(1.0), 0, seconds=30.0))
+    detector, _ = watch(*standard(lambda t: 1 + 0 * t, 0, seconds=30.0))
     assert detector.step(Record.empty(3), 99.0) == (detector, None)
     late, change = detector.step(Record.of(*(np.zeros((50, 3)),) * 3, np.ones(3)), 1.0)
     assert change is None
@@ -202,12 +164,6 @@ def judged(robot: Robot, stream: Stream, seed: int = 0) -> tuple[np.ndarray, ...
     samples.tau[:] += weight
     std = np.broadcast_to(np.sqrt((weight**2).mean(axis=0)), mean.shape)
     return samples.t, samples.dq, samples.tau, mean, std
-
-
-@pytest.mark.parametrize("seed", SEEDS[:2])
-def test_constant_ignorance_of_a_panda_raises_no_alarm(panda: Robot, seed: int) -> None:
-    t, _, tau, mean, std = judged(panda, replace(PLAIN, n_samples=15_000), seed)
-    assert watch(t, tau, mean, std, NOISE)[1] == []
 
 
 @pytest.mark.parametrize("mass", [0.5, 2.0])
@@ -247,23 +203,6 @@ def test_friction_that_grows_slowly_is_found_and_looks_like_friction(panda: Robo
     assert change.evidence(panda.joint_names, share)["suspect"] == "friction"
 
 
-def test_collision_of_half_a_second_is_no_change_whether_gated_or_too_soft_to_be(panda: Robot) -> None:
-    t, _, tau, mean, std = judged(panda, PLAIN)
-    push = (t >= 40) & (t < 40.5)
-    for force, passing in ((0.3, 24), (5.0, 0)):
-        pushed = tau.copy()
-        pushed[push, 2] += force
-        free = ~is_contact(pushed, mean, std, NOISE, 8.0)
-        assert free[push].sum() == passing
-        assert watch(t[free], pushed[free], mean[free], std[free], NOISE)[1] == []
-
-
-def test_single_glitch_is_no_change(panda: Robot) -> None:
-    t, _, tau, mean, std = judged(panda, PLAIN)
-    tau[2000] += 1000.0
-    assert watch(t, tau, mean, std, NOISE)[1] == []
-
-
 def test_friction_share_of_pure_friction_is_whole_and_of_weight_and_noise_none() -> None:
     rng = np.random.default_rng(0)
     dq = rng.uniform(-1, 1, (2000, 4))
@@ -278,11 +217,6 @@ def test_friction_share_of_pure_friction_is_whole_and_of_weight_and_noise_none()
     # half of the variance is noise
     mixed = np.sign(dq) + rng.normal(size=dq.shape)
     assert np.allclose(friction_share(dq, mixed), 0.5, atol=0.06)
-
-
-def test_a_standing_joint_shows_no_friction() -> None:
-    error = np.random.default_rng(1).normal(size=(200, 1))
-    assert friction_share(np.zeros((200, 1)), error)[0] < 0.05
 
 
 def test_evidence_without_friction_names_no_suspect_and_unknown_figures_are_null() -> None:

@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lipcore.data.samples import Samples
 from lipcore.online.gates import LARGEST_TORQUE, Limits, Patience, check_rows, is_contact, time_span
 from lipcore.robots.library import Robot, load_robot
-from lipcore.robots.simulation import Payload, Stream, inverse_dynamics, simulate
+from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
 from lipcore.vocabulary import CODES
 
 LIMITS = Limits(12.6, 50.0, 2000.0, None, 1.0, 1e-3)
@@ -42,25 +41,6 @@ def jumps(t: list[float], limits: Limits = LIMITS, **bounds) -> list[int]:
     return [place for place, code in enumerate(codes) if code == "time_jump"]
 
 
-def test_honest_motion_of_a_panda_is_learnt(panda: Robot) -> None:
-    samples = simulate(panda, Stream(n_samples=500, rate=50, speed=5, noise=0.05), seed=0)
-    limits = replace(LIMITS, torque=PANDA_TORQUE)
-    for t in (samples.t, None):
-        codes = check_rows(t, samples.q, samples.dq, samples.ddq, samples.tau, limits, derived=True)
-        assert codes.dtype == np.uint8
-        assert set(names(codes)) == {"learnt"}
-
-
-@pytest.mark.parametrize("field", ["t", "q", "dq", "ddq", "tau"])
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_number_that_is_not_finite_costs_its_row(field: str, value: float) -> None:
-    data = batch()
-    data[field][3, ...] = value
-    expected = ["learnt"] * N
-    expected[3] = "non_finite"
-    assert names(check_rows(**data, limits=LIMITS)) == expected
-
-
 @pytest.mark.parametrize(("field", "most"), [("q", 12.6), ("dq", 50.0), ("ddq", 2000.0), ("tau", LARGEST_TORQUE)])
 def test_magnitude_beyond_its_limit_costs_its_row_and_at_the_limit_it_does_not(field: str, most: float) -> None:
     data = batch()
@@ -70,19 +50,19 @@ def test_magnitude_beyond_its_limit_costs_its_row_and_at_the_limit_it_does_not(f
     assert set(codes) == {"learnt", "limit"}
 
 
-def test_saturated_torque_of_a_panda_is_kept_out_before_its_limit(panda: Robot) -> None:
-    samples = simulate(panda, Stream(n_samples=300, rate=50, speed=10, motion="full", noise=0.0), seed=1)
-    # a weaker drive than the motion needs, whose measured torque wavers about its limit
-    strongest = 0.9 * np.abs(samples.tau).max(axis=0)
-    noise = 0.003 * strongest * np.random.default_rng(0).standard_normal(samples.tau.shape)
-    cut_off = (np.abs(samples.tau) >= strongest).any(axis=1)
-    measured = np.clip(samples.tau, -strongest, strongest) + noise
+def test_honest_motion_of_a_panda_is_learnt_and_saturated_torque_is_not(panda: Robot) -> None:
+    samples = simulate(panda, Stream(n_samples=500, rate=50, speed=5, noise=0.05), seed=0)
+    q, dq, ddq, tau = samples.q, samples.dq, samples.ddq, samples.tau
+    for t, second in ((samples.t, ddq), (None, ddq), (samples.t, None)):
+        codes = check_rows(t, q, dq, second, tau, replace(LIMITS, torque=PANDA_TORQUE), derived=True)
+        assert codes.dtype == np.uint8
+        assert set(names(codes)) == {"learnt"}
+    # a weaker drive than the motion needs
+    strongest = 0.9 * np.abs(tau).max(axis=0)
+    cut_off, below = (np.abs(tau) >= strongest).any(axis=1), (np.abs(tau) < 0.96 * strongest).all(axis=1)
     limits = replace(LIMITS, torque=strongest)
-    codes = np.array(names(check_rows(samples.t, samples.q, samples.dq, samples.ddq, measured, limits)))
-    assert 3 < cut_off.sum() < 200
-    assert set(codes[cut_off]) == {"saturation", "limit"}
-    below = (np.abs(samples.tau) < 0.96 * strongest).all(axis=1)
-    assert below.sum() > 50
+    codes = np.array(names(check_rows(samples.t, q, dq, ddq, np.clip(tau, -strongest, strongest), limits)))
+    assert set(codes[cut_off]) == {"saturation"}
     assert set(codes[below]) == {"learnt"}
 
 
@@ -111,17 +91,6 @@ def test_first_code_that_applies_is_given() -> None:
     ]
 
 
-@pytest.mark.parametrize("place", range(6))
-@pytest.mark.parametrize("wrong", [-1e300, 0.0, 99.0, 103.4, 103.5, 1e300])
-def test_one_wrong_time_costs_one_row(place: int, wrong: float) -> None:
-    t = (103.0 + np.arange(6) / 10).tolist()
-    t[place] = wrong
-    rejected = jumps(t, after=102.0, before=104.0)
-    assert len(rejected) <= 1
-    if not 102 < wrong < 104:
-        assert rejected == [place]
-
-
 @given(
     honest=st.lists(st.integers(0, 1000), min_size=1, max_size=30, unique=True).map(sorted),
     wrong=st.lists(st.tuples(st.integers(0, 30), st.integers(-2000, 2000)), max_size=5),
@@ -139,12 +108,11 @@ def test_kept_times_increase_and_no_more_are_lost_than_are_wrong(
     assert len(rejected) <= len(wrong)
 
 
-def test_times_repeated_are_rejected_whether_within_a_batch_or_across() -> None:
+def test_times_outside_their_bounds_are_rejected() -> None:
     assert jumps([1.0, 2.0, 2.0, 3.0]) == [2]
-    assert jumps([1.0, 2.0, 3.0, 2.0, 3.0, 4.0, 5.0]) in ([3, 4], [1, 2])
     assert jumps([1.0, 2.0, 3.0, 4.0], after=2.0) == [0, 1]
     assert jumps([1.0, 2.0, 3.0, 4.0], before=3.0) == [2, 3]
-    assert jumps([1.0, 2.0], after=5.0) == [0, 1]
+    assert jumps([4.0, 5.0, 1e12], before=60.0) == [2]  # a leap into the future
 
 
 def test_gap_costs_the_row_beyond_it_only_where_accelerations_are_derived() -> None:
@@ -173,18 +141,6 @@ def test_wrong_time_at_the_end_of_a_batch_and_a_clock_set_back_cost_no_more_than
     assert after_each([[101, 102, 103], [1, 2, 3], [4, 5, 6]]) == [[], [0, 1, 2], []]
 
 
-def test_leap_into_the_future_is_stopped_by_the_time_of_arrival() -> None:
-    assert jumps([4.0, 5.0, 1e12], before=60.0) == [2]
-
-
-def test_time_span_counts_believed_times() -> None:
-    learnt, jump = CODES.index("learnt"), CODES.index("time_jump")
-    t = np.array([np.nan, 1.0, 9.0, 3.0])
-    assert time_span(t, np.array([1, learnt, jump, learnt], dtype=np.uint8)) == (1.0, 3.0)
-    assert time_span(t, np.array([1, jump, jump, jump], dtype=np.uint8)) == (1.0, 3.0)
-    assert time_span(t[:1], np.array([1], dtype=np.uint8)) is None
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -202,59 +158,37 @@ def test_shapes_that_differ_are_named(change: dict, message: str) -> None:
         check_rows(**{**batch(), "limits": LIMITS} | change)
 
 
-def test_acceleration_yet_to_be_derived_is_not_missed() -> None:
-    assert set(names(check_rows(**batch() | {"ddq": None}, limits=LIMITS))) == {"learnt"}
-
-
 def test_contact_is_any_joint_far_outside_its_interval() -> None:
     mean, std, noise = np.zeros((4, 2)), np.full((4, 2), 3.0), np.array([4.0, 4.0])  # 5 together
     tau = np.array([[39.9, 0.0], [40.1, 0.0], [0.0, -40.1], [0.0, 0.0]])
     assert is_contact(tau, mean, std, noise, 8.0).tolist() == [False, True, True, False]
 
 
-RATE = 50.0
-NOISE = np.full(7, 0.05)
-
-
-def contacts(robot: Robot, stream: Stream, push: tuple[float, float] | None = None) -> tuple[Samples, np.ndarray]:
-    """A stream judged by the unloaded robot's own dynamics; push: seconds in which a force of 5 N·m acts on joint 4."""
-    samples = simulate(robot, stream, seed=3)
-    mean = inverse_dynamics(robot, samples.q, samples.dq, samples.ddq)
-    if push:
-        samples.tau[(samples.t >= push[0]) & (samples.t < push[1]), 3] += 5.0
-    return samples, is_contact(samples.tau, mean, np.full_like(mean, 0.02), NOISE, 8.0)
-
-
-def follow(patience: Patience, time: np.ndarray, contact: np.ndarray, rows: int = 10) -> list[float]:
-    """Times at which patience was found exhausted, first one only, fed in batches of `rows`."""
+def exhausts(time: np.ndarray, contact: np.ndarray, rows: int = 10) -> float | None:
+    """When two seconds of patience, fed in batches of `rows`, were exhausted."""
+    patience = Patience(2.0)
     for k in range(0, len(time), rows):
         patience = patience.step(time[k : k + rows], contact[k : k + rows])
         if patience.exhausted:
-            return [float(time[min(k + rows, len(time)) - 1])]
-    return []
+            return float(time[min(k + rows, len(time)) - 1])
+    return None
 
 
-def test_half_second_collision_is_contact_and_does_not_exhaust_patience(panda: Robot) -> None:
-    samples, contact = contacts(panda, Stream(n_samples=500, rate=RATE, speed=5, noise=0.05), push=(4.0, 4.5))
-    assert contact.sum() == 25
-    assert not contact[(samples.t < 4.0) | (samples.t >= 4.5)].any()
-    assert follow(Patience(2.0), samples.t, contact) == []
-
-
-def test_payload_exhausts_patience_in_its_time_and_not_before(panda: Robot) -> None:
-    stream = Stream(n_samples=500, rate=RATE, speed=5, noise=0.05, payload=Payload(1.5, at=4.0))
-    samples, contact = contacts(panda, stream)
-    assert contact[samples.t >= 4.0].mean() > 0.9
-    [at] = follow(Patience(2.0), samples.t, contact, rows=1)
-    assert 6.0 <= at < 6.2
-
-
-def test_glitches_and_collisions_apart_do_not_exhaust_patience() -> None:
+def test_patience_is_exhausted_by_contact_that_lasts() -> None:
     time = np.arange(0, 600, 0.02)
-    assert follow(Patience(2.0), time, np.arange(len(time)) % 100 == 0) == []
-    assert follow(Patience(2.0), time, time % 60 < 0.5) == []
-    assert follow(Patience(2.0), time, time % 60 < 1.5) == []
-    assert follow(Patience(2.0), time, time % 0.1 < 0.04) == []
+    for passing in (np.arange(len(time)) % 100 == 0, time % 60 < 0.5, time % 60 < 1.5, time % 0.1 < 0.04):
+        assert exhausts(time, passing) is None
+    at = exhausts(time, time >= 4.0, rows=1)
+    assert at is not None
+    assert 6.0 <= at < 6.2
+    pause = np.concatenate([time[:25], 60 + time[:25]])  # is not time in contact
+    assert exhausts(pause, np.ones(50, dtype=bool)) is None
+    slow = 5.0 * np.arange(11)  # of rows few a second it takes ten
+    assert exhausts(slow[:10], np.ones(10, dtype=bool)) is None
+    assert exhausts(slow, np.ones(11, dtype=bool), rows=11) == 50.0
+    spent = Patience(1.0).step(time[:100], np.ones(100, dtype=bool))
+    assert spent.step(time[100:], np.zeros(len(time) - 100, dtype=bool)).exhausted
+    assert Patience(1.0).step(time[5::-1], np.ones(6, dtype=bool)).elapsed == 0.0  # time that goes back uses none
 
 
 @given(
@@ -271,22 +205,3 @@ def test_patience_is_the_same_however_the_stream_is_cut(seed: int, share: float,
     for a, b in zip([0, *sorted(cuts)], [*sorted(cuts), 300], strict=True):
         parts = parts.step(time[a:b], contact[a:b])
     assert parts == whole
-
-
-def test_pause_in_contact_is_not_time_in_contact() -> None:
-    time = np.concatenate([np.arange(0, 0.5, 0.02), 60 + np.arange(0, 0.5, 0.02)])
-    assert not Patience(2.0).step(time, np.ones(len(time), dtype=bool)).exhausted
-
-
-def test_few_rows_a_second_need_ten_of_them() -> None:
-    ones = np.ones(30, dtype=bool)
-    assert not Patience(2.0).step(5.0 * np.arange(10), ones[:10]).exhausted
-    assert Patience(2.0).step(5.0 * np.arange(11), ones[:11]).exhausted
-
-
-def test_exhausted_patience_stays_so_and_time_that_goes_back_uses_none() -> None:
-    spent = Patience(1.0).step(np.arange(0, 2, 0.05), np.ones(40, dtype=bool))
-    assert spent.exhausted
-    assert spent.step(np.arange(2, 9, 0.05), np.zeros(140, dtype=bool)).exhausted
-    back = np.array([5.0, 4.0, 3.0, 2.0, 1.0, 0.0])
-    assert Patience(1.0).step(back, np.ones(6, dtype=bool)).elapsed == 0.0

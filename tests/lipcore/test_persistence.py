@@ -1,4 +1,4 @@
-"""A model on disk: the same model back, and anything else refused by name."""
+"""A model on disk: the same model back, anything else refused by name; JSON of one meaning only."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
 from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, copy_model, load, save, train
 from lipcore.files import persistence
+from lipcore.files.strict_json import MAX_DEPTH, StrictJsonError, quote, read
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate
 from tests.choosing import slow
@@ -61,16 +64,7 @@ def test_loaded_model_answers_as_the_saved_one(model: TorqueModel, samples: Samp
     before, after = model.predict(*query, covariance=True), again.predict(*query, covariance=True)
     for name in ("tau", "tau_std", "noise_std", "covariance"):
         assert np.array_equal(getattr(before, name), getattr(after, name)), name
-    for name in (
-        "joint_names",
-        "joint_types",
-        "torque_convention",
-        "options",
-        "fit",
-        "compact",
-        "training_range",
-        "calibration",
-    ):
+    for name in ("joint_names", "joint_types", "torque_convention", "options", "fit", "compact", "training_range"):
         assert getattr(again, name) == getattr(model, name)
     assert again.estimator.name == model.estimator.name
 
@@ -89,15 +83,10 @@ def test_manifest_can_be_read_and_vouches_for_the_tensors(model: TorqueModel, fo
     assert sorted(path.name for path in folder.iterdir()) == ["manifest.json", "model.safetensors"]
 
 
-def test_copy_is_the_same_model(folder: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "deep" / "copy"
-    assert copy_model(folder, copy) == persistence.read_manifest(folder)
-    for name in ("manifest.json", "model.safetensors"):
-        assert (copy / name).read_bytes() == (folder / name).read_bytes()
-
-
-def test_existing_folder_is_never_overwritten(model: TorqueModel, folder: Path) -> None:
+def test_existing_folder_is_never_overwritten(model: TorqueModel, folder: Path, tmp_path: Path) -> None:
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert copy_model(folder, tmp_path / "deep" / "copy") == persistence.read_manifest(folder)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "deep" / "copy").iterdir()} == before
     with pytest.raises(FileExistsError, match="never overwritten"):
         save(model, folder)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
@@ -119,12 +108,6 @@ def test_failure_while_saving_leaves_nothing_behind(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_lineage_that_json_cannot_hold_leaves_nothing_behind(model: TorqueModel, tmp_path: Path) -> None:
-    with pytest.raises(TypeError):
-        save(model, tmp_path / "model", {"object": object()})
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_tampered_tensors_are_refused(folder: Path, tmp_path: Path) -> None:
     path = folder / "model.safetensors"
     content = bytearray(path.read_bytes())
@@ -137,24 +120,15 @@ def test_tampered_tensors_are_refused(folder: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "copy").exists()
 
 
-def test_truncated_tensors_are_refused(folder: Path) -> None:
-    path = folder / "model.safetensors"
-    path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(ModelFormatError, match="sha256"):
-        load(folder)
-
-
-@pytest.mark.parametrize("name", ["manifest.json", "model.safetensors"])
-def test_missing_file_is_named(folder: Path, name: str) -> None:
-    (folder / name).unlink()
-    with pytest.raises(ModelFormatError, match=f"{name} cannot be read"):
-        load(folder)
-
-
-def test_manifest_that_is_not_json_is_refused(folder: Path) -> None:
+def test_file_that_cannot_be_read_is_named(folder: Path) -> None:
     path = folder / "manifest.json"
-    path.write_bytes(path.read_bytes()[:-20])
+    content = path.read_bytes()
+    path.write_bytes(content[:-20])
     with pytest.raises(ModelFormatError, match=r"manifest\.json cannot be read"):
+        load(folder)
+    path.write_bytes(content)
+    (folder / "model.safetensors").unlink()
+    with pytest.raises(ModelFormatError, match=r"model\.safetensors cannot be read"):
         load(folder)
 
 
@@ -163,21 +137,16 @@ def test_manifest_that_is_not_json_is_refused(folder: Path) -> None:
     [
         ({"format": "zip"}, "not a manifest of format 'lipserve-model'"),
         ({"format_version": 2}, "format_version is 2, expected 3: train the model again"),
-        ({"estimator": 7}, "estimator is 7, expected 1 to 100 printable characters"),
         ({"estimator": "oracle"}, "estimator is 'oracle'"),
         ({"joint_names": "joint1"}, "joint_names is 'joint1', expected a list of 1 to 256 names"),
-        ({"joint_names": ["joint1"]}, "joint_types is a list of 2 entries, expected a list of 1"),
         ({"joint_types": ["revolute", "ball"]}, r"joint_types\[1\] is 'ball'"),
         ({"joint_types": ["revolute"]}, "joint_types is a list of 1 entries, expected a list of 2"),
-        ({"joint_types": ["revolute"] * 3}, "joint_types is a list of 3 entries, expected a list of 2"),
         ({"torque_convention": "unsaid"}, "torque_convention is 'unsaid'"),
         ({"options": []}, "options is a list of 0 entries, expected an object"),
-        ({"compact": 3}, "compact is 3, expected an object"),
         ({"compact": {}}, "compact.data_samples is None, expected a number"),
         ({"training_range": []}, "training_range is a list of 0 entries, expected an object"),
         ({"calibration": None}, "calibration is None, expected an object"),
         ({"calibration": {"function_std_factor": 0.9}}, "function_std_factor is 0.9, expected a number from 1 to 100"),
-        ({"calibration": {"function_std_factor": "2"}}, "calibration.function_std_factor is '2', expected a number"),
         ({"calibration": {"factor": 2.0}}, "calibration lacks function_std_factor"),
         ({"tensors": {}}, "tensors lacks file"),
     ],
@@ -193,26 +162,17 @@ def test_wrong_manifest_entry_is_named(folder: Path, changes: dict[str, Any], me
     ("name", "replacement", "message"),
     [
         ("params/kinetic.log_gap", torch.zeros(3).double(), r"'kinetic.log_gap' has shape \(3,\), expected \(2,\)"),
-        ("params/noise.log_std", torch.zeros(1).double(), r"'noise.log_std' has shape \(1,\), expected \(2,\)"),
         ("params/surprise", torch.zeros(1).double(), r"'surprise' has shape \(1,\), expected None"),
         ("params/kinetic.log_scale", None, r"'kinetic.log_scale' has shape None, expected \(\)"),
         ("params/noise.log_std", torch.full((2,), torch.nan).double(), "'params/noise.log_std' is not made of finite"),
         ("statistics/a", torch.full((6,), torch.inf).double(), "statistics/a has shape"),
         ("statistics/b", torch.zeros(40), "'statistics/b' is of type 'F32', expected float64"),
-        (
-            "statistics/b",
-            torch.zeros(3).double(),
-            r"statistics/a has shape \(\d+,\), expected M \(M \+ 1\) / 2 numbers, 6",
-        ),
-        ("statistics/a", torch.zeros(6).double(), r"statistics/a has shape \(6,\), expected M"),
         ("statistics/a", torch.zeros(5).double(), r"statistics/a has shape \(5,\), expected M \(M \+ 1\) / 2 numbers"),
         ("inducing/ddq", torch.zeros(59, 2).double(), r"inducing/ddq has shape \(59, 2\)"),
         ("inducing/q", None, "lacks the tensor 'inducing/q'"),
-        ("inducing/outputs", None, "lacks the tensor 'inducing/outputs'"),
         ("inducing/outputs", torch.zeros(2).double(), "'inducing/outputs' is of type float64, expected int64"),
         ("inducing/outputs", torch.tensor([0, 0]), "expected distinct places of torques"),
         ("inducing/outputs", torch.tensor([0, 5000]), "outputs reaches from 0 to 5000"),
-        ("inducing/outputs", torch.tensor([-1, 0]), "outputs reaches from -1 to 0"),
     ],
     ids=lambda value: value if isinstance(value, str) and "/" in value else "",
 )
@@ -225,7 +185,50 @@ def test_wrong_tensor_is_named(folder: Path, name: str, replacement: torch.Tenso
         load(folder)
 
 
-def test_jitter_that_was_needed_counts_as_noise(model: TorqueModel, folder: Path) -> None:
-    noise = np.sqrt(model.noise_std**2 - model.fit["jitter"] + 0.25)
-    edit_manifest(folder, fit={**model.fit, "jitter": 0.25}, noise_std=noise.tolist())
-    assert np.allclose(load(folder).noise_std ** 2, model.noise_std**2 - model.fit["jitter"] + 0.25, rtol=1e-12)
+VALUES = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**63 - 1)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=20,
+)
+
+
+@given(VALUES)
+def test_what_json_can_say_is_read(value: object) -> None:
+    assert read(json.dumps(value).encode(), 10**6) == value
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (b"NaN", "holds NaN"),
+        (b"-1e400", "'-1e400' is too large"),
+        (b"9223372036854775808", "too large"),
+        (b"-9223372036854775809", "too large"),
+        (b"1" * 5000, "too large"),
+        (b'{"a": 1, "a": 1}', "'a' is given twice"),
+        (b'{"a": {"b": 1, "\\u0062": 2}}', "'b' is given twice"),
+        (b'"\\udc00"', "half a character"),
+        (b'{"\\ud800x": 1}', "half a character"),
+        (b"\xff\xfe[\x00]\x00", "not UTF-8 at byte 0"),
+        (b"[1,]", "not JSON"),
+        (b"", "not JSON"),
+        (b"[" * (MAX_DEPTH + 1) + b"]" * (MAX_DEPTH + 1), f"nests more than {MAX_DEPTH} deep"),
+        (b"[" * 100_000, f"nests more than {MAX_DEPTH} deep"),
+        (b'{"a":' * 100_000, f"nests more than {MAX_DEPTH} deep"),
+        (b"[" + b"1," * 500 + b"1]", "1003 bytes, expected at most 1000"),
+    ],
+    ids=lambda each: repr(each)[:24],
+)
+def test_what_is_ambiguous_or_runs_away_is_refused(text: bytes, said: str) -> None:
+    with pytest.raises(StrictJsonError, match=said):
+        read(text, 1000 if b"1,1" in text else 10**6)
+
+
+def test_what_is_shown_of_a_value_is_short_and_escaped() -> None:
+    assert quote("\x1b[2J\u202e") == "'\\x1b[2J\\u202e'"
+    assert len(quote("x" * 1000)) < 100
+    assert quote([1, 2, 3]) == "a list of 3 entries"

@@ -1,22 +1,37 @@
-"""The exact posterior against a dense reference that shares nothing with it but the kernel of two samples."""
+"""Exact posterior and evidence against dense references, and the compact posterior against the exact one."""
 
 from __future__ import annotations
 
-from itertools import pairwise
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 import torch
+from scipy.stats import multivariate_normal
 
+from lipcore import FitOptions, Samples, TorqueModel, train
 from lipcore.data.motion import Motion
-from lipcore.kernels.base import SumKernel
+from lipcore.fitting.estimators import ESTIMATORS
+from lipcore.kernels.base import Params, SumKernel, TorqueKernel
 from lipcore.kernels.friction import FrictionKernel
-from lipcore.posterior.exact import ExactPosterior, noisy_gram
-from tests.lipcore.problems import KERNELS, Problem, random_problem
+from lipcore.model import dynamics
+from lipcore.model.parameters import weight_posterior
+from lipcore.posterior.basis import Basis
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.compression import Deviation, compress
+from lipcore.posterior.exact import ExactPosterior, negative_log_evidence
+from lipcore.posterior.linalg import NotPositiveDefiniteError
+from lipcore.posterior.statistics import collect
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.urdf import RigidBody
+from lipcore.vocabulary import ROBOT_ESTIMATORS
+from tests.lipcore.oracles import KERNELS, Problem, TorchForm, random_problem
 
 JOINTS = ("revolute", "prismatic", "revolute")
 N_JOINTS = len(JOINTS)
+STEP = 1e-4
 
 
 class Setting(NamedTuple):
@@ -31,9 +46,9 @@ class Setting(NamedTuple):
 
 @pytest.fixture(scope="module", params=KERNELS)
 def setting(request: pytest.FixtureRequest) -> Setting:
-    problem = random_problem(JOINTS, samples=12, seed=4, kernel=request.param)
+    problem = random_problem(JOINTS, samples=9, seed=4, kernel=request.param)
     kernel = SumKernel(problem.kernel, FrictionKernel(N_JOINTS))
-    tau = torch.from_numpy(np.random.default_rng(5).normal(size=(12, N_JOINTS)))
+    tau = torch.from_numpy(np.random.default_rng(5).normal(size=(9, N_JOINTS)))
     query = random_problem(JOINTS, samples=7, seed=6).motion
     return Setting(problem, kernel, tau, query, ExactPosterior.fit(kernel, problem.params, problem.motion, tau))
 
@@ -76,17 +91,6 @@ def test_covariance_is_symmetric_positive_semidefinite_and_below_the_prior(setti
     assert (answer.diagonal(dim1=1, dim2=2) <= prior.diagonal(dim1=1, dim2=2)).all()
 
 
-def test_std_shrinks_when_data_are_added(setting: Setting) -> None:
-    stds = []
-    for count in (2, 5, 12):
-        motion, tau = setting.problem.motion[:count], setting.tau[:count]
-        part = ExactPosterior.fit(setting.kernel, setting.problem.params, motion, tau)
-        stds.append(part.predict(setting.query).std)
-    for fewer, more in pairwise(stds):
-        assert (more <= fewer * (1 + 1e-9)).all()
-        assert more.mean() < 0.99 * fewer.mean()
-
-
 def test_terms_of_the_kernel_share_out_the_mean(setting: Setting) -> None:
     shares = [setting.posterior.mean(setting.query, term) for term in setting.kernel.terms]
     total = setting.posterior.mean(setting.query)
@@ -94,16 +98,174 @@ def test_terms_of_the_kernel_share_out_the_mean(setting: Setting) -> None:
     assert torch.allclose(sum(shares), total, rtol=0, atol=1e-11 * float(total.abs().max()))
 
 
-def test_predictions_do_not_depend_on_the_chunk_size(setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = setting.posterior.predict(setting.query)
-    monkeypatch.setattr("lipcore.posterior.exact.QUERIES_PER_CHUNK", 3)
-    parts = setting.posterior.predict(setting.query)
-    assert torch.allclose(parts.mean, whole.mean, rtol=1e-10, atol=1e-12)
-    assert torch.allclose(parts.covariance, whole.covariance, rtol=1e-9, atol=1e-11)
+def density(setting: Setting, params: Params) -> float:
+    """−log p(tau) by SciPy from the plain Gram matrix."""
+    motion = setting.problem.motion
+    noise = np.exp(params["noise.log_std"].numpy())
+    gram = setting.kernel.gram(params, motion, motion).numpy()
+    covariance = 0.5 * (gram + gram.T) + np.diag(np.tile(noise**2, len(motion)))
+    return -float(multivariate_normal.logpdf(setting.tau.numpy().ravel(), cov=covariance))
 
 
-def test_noise_is_added_per_joint_on_the_diagonal_only(setting: Setting) -> None:
-    params, motion = setting.problem.params, setting.problem.motion
-    added = noisy_gram(setting.kernel, params, motion) - setting.kernel.symmetric_gram(params, motion)
-    expected = torch.diag(torch.exp(2 * params["noise.log_std"]).repeat(len(motion)))
-    assert torch.allclose(added, expected, rtol=0, atol=1e-12)
+def evidence(setting: Setting):
+    return negative_log_evidence(setting.kernel, setting.problem.params, setting.problem.motion, setting.tau)
+
+
+def test_value_is_the_gaussian_density(setting: Setting) -> None:
+    assert evidence(setting).value == pytest.approx(density(setting, setting.problem.params), rel=1e-10)
+
+
+@pytest.mark.parametrize("pairs", [None, 4096, 30], ids=["compiled", "one chunk", "many chunks"])
+def test_gradient_equals_finite_differences_of_the_density(
+    setting: Setting, pairs: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    energies: TorqueKernel = setting.problem.kernel
+    if pairs is not None:
+        # with many chunks the pairs below the diagonal blocks are only counted, not computed
+        monkeypatch.setattr("lipcore.kernels.base.PAIRS_PER_CHUNK", pairs)
+        energies = TorchForm(setting.problem.kernel)
+    gradient = evidence(setting._replace(kernel=SumKernel(energies, FrictionKernel(3)))).gradient
+    params = setting.problem.params
+    assert gradient.keys() == params.keys()
+
+    for name, value in params.items():
+        expected = np.zeros(value.shape)
+        for index in np.ndindex(*value.shape):
+
+            def shifted(step: float, name: str = name, index: tuple[int, ...] = index) -> float:
+                moved = {key: tensor.clone() for key, tensor in params.items()}
+                moved[name][index] += step
+                return density(setting, moved)
+
+            # fourth order, so that the step may be long enough to drown rounding
+            near, far = shifted(STEP) - shifted(-STEP), shifted(2 * STEP) - shifted(-2 * STEP)
+            expected[index] = (8 * near - far) / (12 * STEP)
+        assert np.abs(expected).max() > 1e-3, f"{name} does not matter here"
+        assert np.allclose(gradient[name].numpy(), expected, rtol=1e-6, atol=1e-7), name
+
+
+def test_covariance_that_cannot_be_factored_is_reported() -> None:
+    problem = random_problem(("revolute",), samples=5, seed=0)
+    params = problem.params | {"noise.log_std": torch.tensor([float("nan")]).double()}
+    kernel = SumKernel(problem.kernel, FrictionKernel(1))
+    with pytest.raises(NotPositiveDefiniteError):
+        negative_log_evidence(kernel, params, problem.motion, torch.zeros(5, 1).double())
+
+
+ROBOT = "double-pendulum"
+OPTIONS = FitOptions(hyperparameter_samples=40, max_iterations=40, starts=1, device="cpu")
+STREAM = Stream(n_samples=120, speed=10, noise=0.02, viscous=0.1, coulomb=0.05)
+
+
+class Case(NamedTuple):
+    """A model, the exact posterior of the same samples, and motions that neither has seen."""
+
+    model: TorqueModel
+    exact: ExactPosterior
+    samples: Samples
+    unseen: Motion
+
+
+def fitted(name: str) -> Case:
+    samples = simulate(load_robot(ROBOT), STREAM, seed=1)
+    body = RigidBody.from_profile(ROBOT, samples.joint_names, ("revolute",) * 2) if name in ROBOT_ESTIMATORS else None
+    model = train(samples, ("revolute",) * 2, name, OPTIONS, robot=body)
+    posterior = model.posterior
+    kernel, params, motion = posterior.kernel, posterior.params, samples.motion()
+    exact = ExactPosterior.fit(kernel, params, motion, samples.torque(), posterior.std_factor)
+    return Case(model, exact, samples, simulate(load_robot(ROBOT), replace(STREAM, n_sinusoids=100), seed=2).motion())
+
+
+@pytest.fixture(scope="module", params=ESTIMATORS)
+def case(request: pytest.FixtureRequest) -> Case:
+    return fitted(request.param)
+
+
+@pytest.fixture(scope="module")
+def chain() -> Case:
+    return fitted("lip-chain")
+
+
+def deviation(case: Case, posterior: CompactPosterior) -> Deviation:
+    expected, answer = case.exact.predict(case.unseen), posterior.predict(case.unseen)
+    return Deviation.between(expected, answer.mean, answer.std, posterior.noise_variance.sqrt())
+
+
+def everything(case: Case) -> CompactPosterior:
+    """A compact posterior with all torques among its inducing outputs."""
+    exact, noise = case.exact, torch.exp(2 * case.exact.params["noise.log_std"])
+    count = len(exact.weights) if case.model.posterior.basis.term is not None else 0
+    basis = Basis.build(exact.kernel, exact.params, exact.motion, torch.arange(count))
+    residual = case.samples.torque() - exact.kernel.mean(exact.motion)
+    return CompactPosterior.build(
+        exact.kernel, basis, collect(basis, noise, exact.motion, residual), noise, exact.std_factor
+    )
+
+
+def test_it_keeps_its_tolerance_on_motion_it_was_not_chosen_on(case: Case) -> None:
+    report = case.model.compact
+    assert report["tolerance_reached"] is True
+    assert max(report["mean_max"], report["std_max"]) <= report["tolerance"] == 0.01
+    found = deviation(case, case.model.posterior)
+    assert max(found.mean_max, found.std_max) < 0.02
+
+
+def test_with_every_output_it_is_the_exact_posterior(case: Case) -> None:
+    found = deviation(case, everything(case))
+    assert max(found.mean_max, found.std_max) < 1e-3
+
+
+def test_components_and_energies(case: Case) -> None:
+    names = [name for name in dynamics.available(case.model.estimator) if name != "forward_dynamics"]
+    expected = dynamics.components(replace(case.model, posterior=case.exact), case.unseen[:20], names)
+    answer = dynamics.components(case.model, case.unseen[:20], names)
+    for name in names:
+        unit = expected[name].std.clamp_min(1e-3 * float(expected[name].std.max()))
+        assert ((answer[name].mean - expected[name].mean) / unit).abs().max() < 0.1, name
+        assert ((answer[name].std - expected[name].std) / unit).abs().max() < 0.05, name
+
+
+def test_weights_of_linear_terms(case: Case) -> None:
+    for term in case.model.posterior.basis.linear:
+        expected, answer = (weight_posterior(each, term) for each in (case.exact, case.model.posterior))
+        assert (np.abs(answer.mean - expected.mean) < 0.1 * expected.std).all()
+        np.testing.assert_allclose(answer.std, expected.std, rtol=0.05)
+
+
+def test_too_few_outputs_are_admitted_and_leave_the_interval_wide(chain: Case) -> None:
+    """With a tenth of the outputs the answer says that it knows less, and its intervals still hold the exact mean."""
+    enough = chain.model.compact["inducing_outputs"]
+    found = compress(chain.exact, chain.samples.torque(), 0.02, enough // 4)
+    assert not found.reached
+    assert len(found.posterior.basis.outputs) == enough // 4
+    assert max(found.deviation.mean_max, found.deviation.std_max) > 0.02
+    expected, answer = chain.exact.predict(chain.unseen), found.posterior.predict(chain.unseen)
+    assert (answer.std > 0.95 * expected.std).all()
+    assert ((answer.mean - expected.mean).abs() < 4 * answer.std).double().mean() > 0.98
+
+
+def test_its_size_does_not_follow_the_number_of_samples(chain: Case) -> None:
+    """Four times the samples of the same motion: hardly more outputs, so the answer costs the same."""
+    params, kernel = chain.exact.params, chain.exact.kernel
+    sizes = []
+    for count in (1, 4):
+        stream = replace(STREAM, n_samples=120 * count, rate=10.0 * count)
+        samples = simulate(load_robot(ROBOT), stream, seed=1)
+        exact = ExactPosterior.fit(kernel, params, samples.motion(), samples.torque())
+        sizes.append(len(compress(exact, samples.torque(), 0.02, 1500).posterior.basis))
+    assert sizes[1] < 1.25 * sizes[0]
+
+
+def test_statistics_that_no_samples_have_are_refused(chain: Case) -> None:
+    posterior = chain.model.posterior
+    broken = replace(posterior.statistics, a=posterior.statistics.a - 10 * torch.eye(len(posterior.basis)).double())
+    with pytest.raises(NotPositiveDefiniteError, match=r"statistics of size .* have the eigenvalue -"):
+        CompactPosterior.build(posterior.kernel, posterior.basis, broken, posterior.noise_variance)
+
+
+def test_terms_of_another_model_are_refused(chain: Case) -> None:
+    other = fitted("lip").model.estimator.terms
+    with pytest.raises(ValueError, match="none of this posterior"):
+        chain.model.posterior.mean(chain.unseen, other["energy"])
+    with pytest.raises(ValueError, match="none of this basis"):
+        chain.model.posterior.mean(chain.unseen, other["friction"])

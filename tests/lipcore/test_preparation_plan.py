@@ -69,11 +69,11 @@ def test_the_defaults_are_the_paper_s(names):
 
 def test_what_is_complete_is_left_as_it_is():
     t = np.cumsum(np.random.default_rng(0).uniform(0.5, 1.4, 1000)) / RATE
-    columns = motion(t)
-    made = plan(t, None, NONE_MISSING, ALL, Recipe())
-    assert made.steps == [] or [step["step"] for step in made.steps] == ["split"]
-    for name, values in made.apply(columns).items():
-        np.testing.assert_array_equal(values, columns[name])
+    for recipe, stamps in ((Recipe(), t), (Recipe(rate_hz=100.0), np.arange(1000) / 99.7)):
+        columns, made = motion(stamps), plan(stamps, None, NONE_MISSING, ALL, recipe)
+        assert [step["step"] for step in made.steps] in ([], ["split"])
+        for name, values in made.apply(columns).items():
+            np.testing.assert_array_equal(values, columns[name])
 
 
 def test_complete_columns_need_no_times():
@@ -127,14 +127,6 @@ def test_missing_rows_without_times_split_the_recording():
     np.testing.assert_array_equal(made.apply({name: np.arange(10.0) for name in ALL})["q"], [0, 1, 2, 5, 6, 7, 8])
 
 
-def test_missing_rows_of_complete_columns_split_the_recording():
-    t = np.arange(1000) / RATE
-    missing = NONE_MISSING.copy()
-    missing[500] = True
-    made = plan(t, None, missing, ALL, Recipe())
-    assert (made.gaps, made.missing, len(made), made.episodes) == (1, 1, 999, 2)
-
-
 def test_of_rows_with_the_same_stamp_the_first_is_kept():
     t = np.arange(1000) / RATE
     t[[11, 12, 40]] = t[[10, 10, 39]]
@@ -160,15 +152,6 @@ def test_uneven_stamps_are_put_on_an_even_clock(rate, spread):
     for name, tolerance in (("q", 0.001), ("dq", 0.01), ("ddq", 0.03), ("tau", 0.02)):
         wrong = found[name] - true[name]
         assert np.sqrt(np.mean(wrong**2)) < tolerance * true[name].std()
-
-
-def test_stamps_rounded_to_milliseconds_are_uneven():
-    """300 Hz in steps of 3 and 4 ms: the median step says 333 Hz."""
-    t = np.round(np.arange(6000) / 300, 3)
-    made = plan(t, None, np.zeros(6000, dtype=bool), ("q", "tau"), Recipe())
-    assert made.rate == pytest.approx(300, rel=1e-3)
-    found, true = made.apply(chosen(motion(t), ("q", "tau"))), motion(made.t)
-    assert np.sqrt(np.mean((found["dq"] - true["dq"]) ** 2)) < 0.01 * true["dq"].std()
 
 
 @pytest.mark.parametrize(("rate", "whole"), [(45.0, True), (18.0, True), (25.0, False), (64.0, False)])
@@ -199,13 +182,6 @@ def test_what_a_lower_rate_cannot_hold_is_filtered_out_even_where_all_is_given()
         assert np.abs(shaken[name] - smooth[name]).max() < 0.01
 
 
-def test_a_rate_that_is_the_recording_s_changes_nothing():
-    t = np.arange(1000) / 99.7
-    made = plan(t, None, NONE_MISSING, ALL, Recipe(rate_hz=100.0))
-    assert made.steps == []
-    assert len(made) == 1000
-
-
 def test_filtering_may_be_forced_or_left_out():
     t = np.arange(1000) / RATE
     columns = motion(t)
@@ -227,13 +203,6 @@ def test_ends_may_be_cut_off():
     assert texts(made)[-1] == "180 samples cut off at the ends of parts"
     kept = plan(t, None, NONE_MISSING, ("q", "tau"), Recipe(trim_s=0.0))
     assert len(kept) == 1000
-
-
-def test_parts_too_short_to_filter_are_left_out_and_counted():
-    t = np.arange(1000) / RATE
-    t[960:] += 1
-    made = plan(t, None, NONE_MISSING, ("q", "tau"), Recipe())
-    assert (made.episodes, len(made), made.edges) == (1, 914, 86)
 
 
 @pytest.mark.parametrize(
@@ -275,7 +244,7 @@ recipes = st.builds(
 
 
 @given(recipe=recipes, uneven=st.booleans(), names=st.sampled_from([ALL, ("q", "tau"), ("q", "dq", "tau")]))
-def test_every_recipe_is_linear_finite_consistent_and_repeatable_from_its_json(recipe, uneven, names):
+def test_every_recipe_is_homogeneous_finite_consistent_and_repeatable_from_its_json(recipe, uneven, names):
     rng = np.random.default_rng(7)
     t = np.arange(800) / RATE
     t[500:] += 0.7
@@ -285,18 +254,13 @@ def test_every_recipe_is_linear_finite_consistent_and_repeatable_from_its_json(r
     made = plan(t, None, missing, names, recipe)
     again = plan(t, None, missing, names, Recipe.from_json(json.loads(json.dumps(recipe.to_json()))))
     assert json.loads(json.dumps(made.steps)) == again.steps
-    one, two = (chosen(motion(t, seed), names) for seed in (1, 2))
-    first, second = made.apply(one), again.apply(two)
-    both = made.apply({name: one[name] for name in names})
+    one = chosen(motion(t, 1), names)
+    first, scaled = made.apply(one), again.apply({name: -2.5 * one[name] for name in names})
     for name in ALL:
         assert first[name].shape == made.t.shape == made.episode.shape
         assert np.isfinite(first[name]).all()
-        np.testing.assert_array_equal(first[name], both[name])
-    scaled = made.apply({name: -2.5 * one[name] for name in names})
-    for name in ALL:
-        size = np.abs(first[name]).max()
+        size = np.abs(scaled[name]).max()
         np.testing.assert_allclose(scaled[name], -2.5 * first[name], rtol=0, atol=1e-9 * size)
-    assert np.isfinite(second["ddq"]).all()
     within = np.diff(made.episode) == 0
     assert (np.diff(made.t)[within] > 0).all()
     assert made.episodes == made.episode[-1] + 1

@@ -1,4 +1,4 @@
-"""Sums over samples: their algebra, and what is solved from them against dense references in plain NumPy."""
+"""Sums over samples: their algebra, what is solved from them, and models that are given more samples than their fit."""
 
 from __future__ import annotations
 
@@ -11,13 +11,18 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+import lipcore
 from lipcore.data.motion import Motion
+from lipcore.fitting.options import FitOptions
 from lipcore.kernels.base import SumKernel
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.posterior.basis import Basis
 from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.posterior.statistics import Statistics, collect, decay, empty, merge, solve, subtract, update
-from tests.lipcore.problems import random_problem
+from lipcore.posterior.summing import Summing, Total
+from lipcore.training.conditioning import condition, should_condition
+from tests.lipcore.oracles import random_problem
+from tests.service.data import QUICK, stream
 
 TYPES = ("revolute", "prismatic", "revolute")
 NOISE = torch.tensor([0.04, 0.01, 0.09], dtype=torch.float64)
@@ -82,34 +87,22 @@ def test_what_is_added_can_be_taken_back_and_ages_factor(seed: int, first: float
     assert same(decay(decay(one, first), second), decay(one, first * second))
 
 
-def test_weights_are_repetitions() -> None:
-    basis, motion, residual = problem(3)
-    weights = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    rows = torch.tensor([0, 1, 1, 2, 2, 2])
-    assert same(
-        collect(basis, NOISE, motion[:3], residual[:3], weights), collect(basis, NOISE, motion[rows], residual[rows])
-    )
-
-
-def test_functions_leave_their_arguments_alone() -> None:
-    basis, motion, residual = problem(4)
-    statistics = collect(basis, NOISE, motion, residual)
-    a, b, asked = statistics.a.clone(), statistics.b.clone(), residual.clone()
-    merge(statistics, statistics), subtract(statistics, statistics), decay(statistics, 0.5), solve(statistics)
-    update(statistics, basis, NOISE, motion, residual)
-    assert torch.equal(statistics.a, a)
-    assert torch.equal(statistics.b, b)
-    assert torch.equal(residual, asked)
-
-
-def test_sums_are_those_of_every_sample_by_itself() -> None:
+def test_sums_are_those_of_every_sample_by_itself_and_their_solution_that_of_linear_regression() -> None:
     basis, motion, residual = problem(5)
     rows, variances, values = dense(basis, motion, residual)
-    found = collect(basis, NOISE, motion, residual)
+    counts = torch.arange(1, 13, dtype=torch.float64) / 6
+    variances = variances / np.repeat(counts.numpy(), 3)
+    found = collect(basis, NOISE, motion, residual, counts)
     assert np.allclose(found.a.numpy(), rows.T @ (rows / variances[:, None]), rtol=1e-10, atol=1e-10)
     assert np.allclose(found.b.numpy(), rows.T @ (values / variances), rtol=1e-10, atol=1e-10)
-    assert found.samples == 12
+    assert found.samples == pytest.approx(13.0)
     assert torch.equal(found.a, found.a.T)
+    centre = torch.randn(len(basis), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    solution = solve(found, centre)
+    # the dual form: conditioning on the N n values themselves
+    gain = rows.T @ np.linalg.inv(rows @ rows.T + np.diag(variances))
+    assert np.allclose(solution.mean.numpy(), centre.numpy() + gain @ (values - rows @ centre.numpy()), atol=1e-9)
+    assert np.allclose((solution.learnt.T @ solution.learnt).numpy(), gain @ rows, atol=1e-9)
 
 
 def test_large_products_are_symmetric_and_those_of_small_ones() -> None:
@@ -122,19 +115,6 @@ def test_large_products_are_symmetric_and_those_of_small_ones() -> None:
     )
     assert torch.allclose(whole.a, features @ features.T, rtol=1e-12, atol=1e-9)
     assert torch.equal(whole.a, whole.a.T)
-
-
-def test_solution_is_that_of_bayesian_linear_regression() -> None:
-    basis, motion, residual = problem(7)
-    rows, variances, values = dense(basis, motion, residual)
-    centre = torch.randn(len(basis), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    found = solve(collect(basis, NOISE, motion, residual), centre)
-    # the dual form: conditioning on the N n values themselves
-    gram = rows @ rows.T + np.diag(variances)
-    gain = rows.T @ np.linalg.inv(gram)
-    assert np.allclose(found.mean.numpy(), centre.numpy() + gain @ (values - rows @ centre.numpy()), atol=1e-9)
-    covariance = np.eye(len(basis)) - gain @ rows
-    assert np.allclose((found.learnt.T @ found.learnt).numpy(), np.eye(len(basis)) - covariance, atol=1e-9)
 
 
 @pytest.mark.parametrize(("told", "largest"), [(3, 1e2), (20, 1e2), (60, 1e2), (60, 1e5)])
@@ -156,12 +136,6 @@ def test_what_is_learnt_is_exact_and_triangular(told: int, largest: float) -> No
     assert torch.count_nonzero(found.learnt.triu(1)) == 0
 
 
-def test_without_data_the_prior_is_left() -> None:
-    found = solve(empty(5), torch.arange(5.0, dtype=torch.float64))
-    assert torch.equal(found.mean, torch.arange(5.0, dtype=torch.float64))
-    assert torch.equal(found.learnt, torch.zeros((5, 5), dtype=torch.float64))
-
-
 @pytest.mark.parametrize("factor", [-0.1, 1.1, float("nan")])
 def test_ages_that_are_none_are_refused(factor: float) -> None:
     with pytest.raises(ValueError, match="factor is"):
@@ -173,3 +147,92 @@ def test_statistics_of_no_samples_are_refused() -> None:
     statistics = collect(basis, NOISE, motion, residual)
     with pytest.raises(NotPositiveDefiniteError, match="none below zero"):
         solve(replace(statistics, a=statistics.a - torch.eye(len(basis), dtype=torch.float64)))
+
+
+TWO = ["revolute"] * 2
+SAME = 1e-6
+"""Share of the largest number by which two fits to the same samples may differ."""
+FEW = {"hyperparameter_samples": 20, "max_iterations": 4}
+
+
+@pytest.fixture(scope="module")
+def samples():
+    return stream(samples=200)
+
+
+@pytest.fixture(scope="module")
+def few(samples):
+    """A model that stands on 60 of 200 samples."""
+    return lipcore.train(samples, TWO, "lip-chain", FitOptions(**QUICK, statistics="chosen"))
+
+
+def test_a_conditioned_model_knows_all_samples(samples):
+    """A fit that takes all samples into its posterior knows no more, up to its own compression."""
+    few = lipcore.train(samples, TWO, "lip-chain", FitOptions(**FEW, posterior_samples=200))
+    again = condition(few, samples)
+    query = [getattr(stream(seed=3), name) for name in ("q", "dq", "ddq")]
+    np.testing.assert_allclose(again.predict(*query).tau, few.predict(*query).tau, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(again.predict(*query).tau_std, few.predict(*query).tau_std, rtol=1e-7)
+
+    half = condition(few, samples.rows(slice(0, 100)))
+    twice = condition(few, samples, np.r_[np.ones(100), np.zeros(100)])
+    np.testing.assert_allclose(twice.predict(*query).tau, half.predict(*query).tau, rtol=1e-9, atol=1e-9)
+    assert (half.predict(*query).tau_std > again.predict(*query).tau_std).all()
+    assert again.fit["samples_posterior"] == 200
+
+
+@pytest.mark.parametrize("estimator", ["lip-chain", "lip", "se", "gip", "lse"])
+def test_the_fast_sum_is_that_of_the_statistics(estimator, samples):
+    """Against the plain sum, sample by sample, with weights, over pieces that do not divide the whole."""
+    options = FitOptions(**{**QUICK, "posterior_samples": 40}, statistics="chosen", device="cpu")
+    posterior = lipcore.train(samples, TWO, estimator, options).posterior
+    weights = np.random.default_rng(1).uniform(0, 1, len(samples))
+    total, summing = Total.empty(len(posterior.basis)), Summing.of(posterior)
+    for part in (slice(0, 77), slice(77, 200)):
+        summing.add(total, samples.rows(part), weights[part])
+    motion, slow = samples.motion(), empty(len(posterior.basis))
+    residual = samples.torque() - posterior.kernel.mean(motion)
+    for row in range(len(samples)):
+        one, weight = slice(row, row + 1), torch.tensor(weights[row : row + 1])
+        slow = merge(slow, collect(posterior.basis, posterior.noise_variance, motion[one], residual[one], weight))
+    a = total.a + np.tril(total.a, -1).T
+    assert np.abs(a - slow.a.numpy()).max() <= 1e-8 * slow.a.abs().max()
+    assert np.abs(total.b - slow.b.numpy()).max() <= 1e-8 * slow.b.abs().max()
+    assert np.array_equal(total.packed(), total.a.T[np.triu_indices(len(a))])
+
+
+def test_the_form_of_other_devices_sums_alike(few, samples):
+    """Torch's form, which is for GPUs, here on the CPU."""
+    fast, slow = Total.empty(len(few.posterior.basis)), Total.empty(len(few.posterior.basis))
+    summing = Summing.of(few.posterior)
+    summing.add(fast, samples)
+    found = summing._elsewhere(slow, samples, np.ones(len(samples)))
+    np.testing.assert_allclose(np.tril(found.T @ found), fast.a, rtol=1e-8, atol=1e-8 * np.abs(fast.a).max())
+    np.testing.assert_allclose(slow.b, fast.b, rtol=1e-8, atol=1e-8 * np.abs(fast.b).max())
+
+
+@pytest.mark.parametrize(
+    ("statistics", "count", "worth", "expected"),
+    [
+        ("auto", 500, 500.0, False),
+        ("auto", 501, 500.0, False),
+        ("auto", 501, 501.0, True),
+        ("all", 501, 3.0, True),
+        ("all", 500, 500.0, False),
+        ("chosen", 10**6, 1e6, False),
+    ],
+)
+def test_when_all_samples_are_wanted(statistics, count, worth, expected):
+    assert should_condition(FitOptions(statistics=statistics), count, worth) is expected
+
+
+def test_what_is_worth_more_than_the_chosen_ones_is_learnt(samples):
+    faster = replace(samples, t=samples.t / 100)  # two tenths of a second: no more than the few that were chosen
+    for recorded, statistics, learnt in ((samples, "auto", 200), (faster, "auto", 60), (faster, "all", 200)):
+        options = FitOptions(**QUICK, statistics=statistics)
+        assert lipcore.train(recorded, TWO, "lip-chain", options).fit["samples_posterior"] == learnt
+
+
+def test_conditioning_can_be_cancelled(few, samples):
+    with pytest.raises(lipcore.FitCancelledError):
+        condition(few, samples, cancelled=lambda: True)

@@ -1,15 +1,23 @@
-"""Rigid bodies from a URDF: matched to the data's joints, and refused by name where they cannot be."""
+"""Rigid bodies from a URDF, refused by name where they cannot be, and a learnt arm as one, read by Pinocchio."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from xml.etree import ElementTree
+
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from lipcore import FitOptions
+from lipcore.files.urdf_writer import ArmJoints, rpy, urdf_of_parameters, urdf_text
 from lipcore.fitting.estimators import MissingRobotError, UnknownEstimatorError, check_estimator, make_estimator
 from lipcore.kernels.arm_prior import arm_of_robot
+from lipcore.kernels.compiled.arm import arm_torques
+from lipcore.kernels.geometry import rotation_of
 from lipcore.robots.library import ROBOTS, UnknownRobotError, load_robot, profile_urdf
 from lipcore.robots.urdf import MAX_LINKS, JointMismatchError, RigidBody, UrdfError, describe
+from tests.lipcore.arms import parameters, random_bodies, random_geometry
 
 TWO = ("revolute", "revolute")
 
@@ -36,18 +44,16 @@ def robot(*parts: str) -> str:
 ARM = robot(link("base"), link("upper"), link("lower"), joint("j1", "base", "upper"), joint("j2", "upper", "lower"))
 
 
-def test_what_a_urdf_says_of_itself() -> None:
-    said = describe(ARM)
-    assert (said.name, said.joint_names) == ("arm", ("j1", "j2"))
-    assert [j.kind for j in said.joints] == ["revolute", "revolute"]
-
-
 def test_joints_are_found_by_name_whatever_their_order() -> None:
     straight = RigidBody.from_urdf(ARM, ("j1", "j2"), TWO)
     crossed = RigidBody.from_urdf(ARM, ("j2", "j1"), TWO)
     assert (straight.order, straight.matched, crossed.order) == ((0, 1), "name", (1, 0))
     assert np.array_equal(crossed.parameters(), straight.parameters()[::-1])
     assert straight.sha256 == crossed.sha256
+    with pytest.raises(JointMismatchError, match=r"joint 'j2' is prismatic in the data, but 'j2' .* is revolute"):
+        RigidBody.from_urdf(ARM, ("j1", "j2"), ("revolute", "prismatic"))
+    text = robot(link("a"), link("b"), joint("j", "a", "b", "continuous"))
+    assert RigidBody.from_urdf(text, ("j",), ("revolute",)).model.nq == 2
 
 
 def test_explicit_list_names_the_joints_of_data_named_otherwise() -> None:
@@ -86,11 +92,9 @@ def test_profile_that_does_not_fit_names_both_lists(names: tuple[str, ...]) -> N
     with pytest.raises(JointMismatchError) as caught:
         RigidBody.from_profile("panda", names, ("revolute",) * len(names))
     assert all(name in str(caught.value) for name in (*names, *ROBOTS["panda"].free))
-
-
-def test_unknown_profile_lists_the_known() -> None:
-    with pytest.raises(UnknownRobotError, match=r"robot is 'r2d2', expected one of panda, ur3.*finger-edu"):
-        RigidBody.from_profile("r2d2", ("a",), ("revolute",))
+    for take in (load_robot, lambda name: RigidBody.from_profile(name, ("a",), ("revolute",))):
+        with pytest.raises(UnknownRobotError, match=r"robot is 'r2d2', expected one of panda, ur3.*finger-edu"):
+            take("r2d2")
 
 
 @pytest.mark.parametrize("names", [("a", "b"), ("j1", "b"), ("j1", "j2", "j3")])
@@ -106,31 +110,17 @@ def test_a_list_that_does_not_fit_is_shown(listed: tuple[str, ...]) -> None:
         RigidBody.from_urdf(ARM, ("a", "b"), TWO, joints=listed)
 
 
-def test_joint_of_another_type_is_named() -> None:
-    with pytest.raises(JointMismatchError, match=r"joint 'j2' is prismatic in the data, but 'j2' .* is revolute"):
-        RigidBody.from_urdf(ARM, ("j1", "j2"), ("revolute", "prismatic"))
-
-
-def test_continuous_joints_are_revolute() -> None:
-    text = robot(link("a"), link("b"), joint("j", "a", "b", "continuous"))
-    assert RigidBody.from_urdf(text, ("j",), ("revolute",)).model.nq == 2
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", "not well-formed XML"),
-        ("<robot>", "not well-formed XML: no element found"),
-        ("q1,q2\n1,2\n", "not well-formed XML"),
         ("<sdf/>", "root element is <sdf>, expected <robot>"),
         (robot(), "no joint that moves"),
-        (robot(link("a")), "no joint that moves"),
         (robot(link("a"), joint("j", "a", "b")), "Pinocchio cannot read"),
         (
             robot(link("a"), link("b"), joint("j", "a", "b", "floating")),
             "'j' is of type 'floating': expected a fixed base",
         ),
-        (robot(link("a"), link("b"), joint("j", "a", "b", "planar")), "'j' is of type 'planar'"),
         (robot(link("a"), link("b"), joint("j", "a", "b", "spherical")), "'j' is of type 'spherical'"),
         (robot(link("a"), link("b", -1), joint("j", "a", "b")), "'j' moves has mass -1 kg"),
         (
@@ -146,12 +136,6 @@ def test_continuous_joints_are_revolute() -> None:
 def test_text_that_cannot_be_used_is_refused_with_the_reason(text: str, message: str) -> None:
     with pytest.raises(UrdfError, match=message):
         describe(text)
-
-
-def test_the_longest_chain_admitted_is_read() -> None:
-    links = [link(f"l{i}") for i in range(MAX_LINKS)]
-    joints = [joint(f"j{i}", f"l{i}", f"l{i + 1}") for i in range(MAX_LINKS - 1)]
-    assert len(describe(robot(*links, *joints)).joints) == MAX_LINKS - 1
 
 
 def test_branching_joints_are_refused() -> None:
@@ -214,3 +198,114 @@ def test_energies_need_the_joints_from_base_to_tip() -> None:
         check_estimator("rigid-body+lip-chain", TWO, crossed)
     check_estimator("rigid-body", TWO, crossed)
     assert make_estimator("rigid-body", TWO, arm=arm_of_robot(crossed)).kernel.n_joints == 2
+
+
+def training_range(n: int) -> dict[str, dict[str, list[float]]]:
+    low = [-1.0 - 0.1 * joint for joint in range(n)]
+    return {name: {"min": low, "max": [2.0] * n} for name in ("q", "dq", "ddq")}
+
+
+def joints(names: list[str], **changed: object) -> ArmJoints:
+    n = len(names)
+    zero = np.zeros(n)
+    given = {"lower": zero - 1, "upper": zero + 1, "velocity": zero + 2, "viscous": zero, "coulomb": zero}
+    return ArmJoints(tuple(names), **{**given, "offset": zero, "rotor": zero, **changed})
+
+
+def drives(urdf: str, names: list[str]) -> dict[str, np.ndarray]:
+    """What the text says of friction and rotors, in the order of the names."""
+    root = ElementTree.fromstring(urdf)
+    dynamics = [root.find(f"joint[@name='{name}']/dynamics").attrib for name in names]
+    rotor = {
+        each.find("joint").get("name"): float(each.find("actuator/{http://drake.mit.edu}rotor_inertia").get("value"))
+        for each in root.findall("transmission")
+    }
+    terms = {key: np.array([float(each[key]) for each in dynamics]) for key in ("damping", "friction")}
+    return {**terms, "rotor": np.array([rotor[name] for name in names])}
+
+
+def torque_of_urdf(urdf: str, names: list[str], motions: np.ndarray, gravity: bool) -> np.ndarray:
+    """Recursive Newton–Euler of Pinocchio, with the rotors and the friction that the text names; data's order."""
+    model = pin.buildModelFromXML(urdf)
+    if not gravity:
+        model.gravity.setZero()
+    data, place = model.createData(), [model.names[1:].tolist().index(name) for name in names]
+    out, drive = np.empty((len(motions), len(names))), drives(urdf, names)
+    for row, (q, dq, ddq) in enumerate(motions):
+        chain = np.empty((3, len(names)))
+        chain[:, place] = q, dq, ddq
+        out[row] = pin.rnea(model, data, *chain)[place] + drive["rotor"] * ddq
+        out[row] += drive["damping"] * dq + drive["friction"] * np.sign(dq)
+    return out
+
+
+@pytest.mark.parametrize("kinds", ["R", "PR", "RRP", "RPPR", "RRRRRR", "RPRRRRR"])
+@pytest.mark.parametrize("gravity", [True, False])
+def test_its_torque_is_the_arms(kinds: str, gravity: bool) -> None:
+    n, seed = len(kinds), len(kinds) + gravity
+    rng = np.random.default_rng(seed)
+    geometry, bodies = random_geometry(kinds, seed, gravity), random_bodies(n, seed)
+    order, names = rng.permutation(n), [f"joint {letter}" for letter in "edcbagf"[:n]]
+    report = parameters(geometry, bodies, names, order.tolist())
+    urdf = urdf_of_parameters(report, names, training_range(n))
+    assert (pin.buildModelFromXML(urdf).effortLimit > 0).all()
+    motions = rng.normal(0, 1.5, (20, 3, n))
+    expected = np.empty((20, n))
+    arm_torques(geometry.constants, geometry.gravity, bodies, order, motions, expected)
+    expected += np.array(report["rotor"]["mean"]) * motions[:, 2]
+    for term, feature in (("viscous", motions[:, 1]), ("coulomb", np.sign(motions[:, 1]))):
+        expected += np.array(report["friction"][term]["mean"]) * feature
+    np.testing.assert_allclose(torque_of_urdf(urdf, names, motions, gravity), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_names_and_numbers_are_kept_as_they_are() -> None:
+    names = ['a<b>&"c"', "base", "base_link", "world_to_base", "größe -- 1"]
+    geometry = random_geometry("RPRRR", 3)
+    words = tuple(("mass", "shift 1") if k == 2 else () for k in range(5))
+    numbers = np.arange(5.0)
+    given = joints(names, lower=-numbers, upper=numbers, offset=numbers, undetermined=words)
+    urdf = urdf_text(geometry, random_bodies(5, 3), given, 'my "arm"')
+    model = pin.buildModelFromXML(urdf)
+    assert model.names[1:].tolist() == names
+    assert model.name == 'my "arm"'
+    np.testing.assert_array_equal(model.lowerPositionLimit, -numbers)
+    np.testing.assert_array_equal(model.upperPositionLimit, numbers)
+    np.testing.assert_array_equal(model.velocityLimit, 2.0)
+    assert describe(urdf).joint_names == tuple(names)
+    assert "torque does not tell: mass, shift 1" in urdf
+    assert "offset torque 4.0" in urdf
+
+
+def test_negative_friction_is_written_as_none_with_a_comment() -> None:
+    urdf = urdf_text(random_geometry("R", 1), random_bodies(1, 1), joints(["a"], viscous=np.array([-0.5])))
+    weak = replace(random_geometry("R", 1), gravity=random_geometry("R", 1).gravity / 6)
+    assert "set it in the simulator" in urdf_text(weak, random_bodies(1, 1), joints(["a"]))
+    assert 'damping="0.0"' in urdf
+    assert "learnt damping is -0.5" in urdf
+
+
+@pytest.mark.parametrize("pitch", [0.0, 0.3, np.pi / 2, -np.pi / 2])
+def test_angles_give_the_rotation(pitch: float) -> None:
+    roll, yaw = 0.7, -2.1
+    turns = [rotation_of(angle * axis) for angle, axis in zip((yaw, pitch, roll), np.eye(3)[::-1], strict=True)]
+    rotation = turns[0] @ turns[1] @ turns[2]
+    np.testing.assert_allclose(pin.rpy.rpyToMatrix(rpy(rotation)), rotation, atol=1e-15)
+
+
+def test_what_has_no_urdf_is_refused() -> None:
+    report, names = parameters(random_geometry("RR", 1), random_bodies(2, 1), ["a", "b"], [0, 1]), ["a", "b"]
+    with pytest.raises(ValueError, match="no rigid bodies"):
+        urdf_of_parameters({"friction": report["friction"]}, names, training_range(2))
+    with pytest.raises(ValueError, match="where its joints lie"):
+        urdf_of_parameters({key: report[key] for key in ("friction", "inertia")}, names, training_range(2))
+    report["inertia"]["bodies"][1]["plausible"]["mass"] = -1.0
+    with pytest.raises(ValueError, match="joint 'b' moves is -1 kg"):
+        urdf_of_parameters(report, names, training_range(2))
+    with pytest.raises(ValueError, match=r"names\[1\] is 'a'"):
+        joints(["a", "a"])
+    with pytest.raises(ValueError, match="lower is"):
+        joints(["a"], lower=np.array([3.0]))
+    with pytest.raises(ValueError, match="rotor is"):
+        joints(["a"], rotor=np.array([np.nan]))
+    with pytest.raises(ValueError, match="bodies has shape"):
+        urdf_text(random_geometry("RR", 1), random_bodies(3, 1), joints(["a", "b"]))

@@ -1,4 +1,4 @@
-"""How much the rows of a fast stream count for."""
+"""How much the rows of a fast stream count for, and those whose errors last."""
 
 from __future__ import annotations
 
@@ -7,7 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lipcore.data.independence import INDEPENDENT_HZ, even_weights, stream_weights
+from lipcore.data.independence import (
+    INDEPENDENT_HZ,
+    even_weights,
+    recording_weights,
+    residual_correlation,
+    stream_weights,
+)
+from lipcore.data.samples import Samples
 
 
 @pytest.mark.parametrize("rate", [100.0, 250.0, 1000.0])
@@ -57,3 +64,35 @@ def test_time_that_goes_backwards_counts_nothing() -> None:
 def test_weights_belong_to_rows_and_not_to_places(order: list[int]) -> None:
     time = np.cumsum([0.001, 0.002, 0.001, 0.05, 0.003, 0.001, 0.001, 0.01])
     np.testing.assert_allclose(stream_weights(time[order], 0.0), stream_weights(time, 0.0)[order])
+
+
+@pytest.mark.parametrize("rate", [1000.0, 100.0, 8.0])
+def test_rows_of_a_recording_count_for_their_time(rate: float) -> None:
+    time = np.r_[np.arange(50) / rate, 5 + np.arange(50) / rate, 9.0]
+    episode = np.r_[np.zeros(50), np.ones(50), 2].astype(np.int64)
+    found = recording_weights(time, episode)
+    np.testing.assert_allclose(found, np.r_[np.full(100, min(1.0, 10 / rate)), 1.0], rtol=1e-9)
+    # a piece with one more row at both ends knows what the whole knows
+    np.testing.assert_array_equal(recording_weights(time[29:72], episode[29:72])[1:-1], found[30:71])
+    assert len(recording_weights(np.empty(0), np.empty(0, np.int64))) == 0
+
+
+def noisy(size: int, memory: float, seed: int, episodes: int = 1) -> tuple[np.ndarray, Samples]:
+    """An autoregression e_k = φ e_{k−1} + white, in each of several recordings."""
+    rng = np.random.default_rng(seed)
+    white = rng.standard_normal((size, 2))
+    episode = np.arange(size) * episodes // size
+    for k in range(1, size):
+        if episode[k] == episode[k - 1]:
+            white[k] += memory * white[k - 1]
+    nothing = np.zeros((size, 2))
+    return white, Samples(("a", "b"), np.arange(size) * 0.01, episode, nothing, nothing, nothing, white)
+
+
+@pytest.mark.parametrize("episodes", [1, 5])
+def test_rows_that_an_independent_one_stands_for(episodes: int) -> None:
+    assert residual_correlation(*noisy(5000, 0.0, 1, episodes)) == pytest.approx(1.0, abs=0.1)
+    for memory in (0.5, 0.8):  # 1 + 2 Σ φ^k
+        expected = (1 + memory) / (1 - memory)
+        assert residual_correlation(*noisy(20_000, memory, 2, episodes)) == pytest.approx(expected, rel=0.2)
+    assert residual_correlation(np.zeros((3, 2)), noisy(3, 0.0, 3)[1]) == 1.0

@@ -1,0 +1,139 @@
+"""The table of samples, motion, and signals: filtered, differentiated, their noise."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lipcore.data.motion import Motion, check_joint_types
+from lipcore.data.samples import Samples
+from lipcore.data.signals import differentiate, low_pass, noise_level
+
+RATE = 100.0
+SECONDS = 20
+INTERIOR = slice(300, -300)
+"""Away from the ends, over whole periods of every frequency used here."""
+
+
+def phasor(signal: np.ndarray, frequency: float) -> complex:
+    """Gain and phase against sin(2π f t), from whole periods."""
+    t = np.arange(len(signal)) / RATE
+    return complex(2 * np.mean(signal[INTERIOR] * np.exp(-2j * np.pi * frequency * t[INTERIOR])) * 1j)
+
+
+def sinusoid(frequency: float) -> np.ndarray:
+    return np.sin(2 * np.pi * frequency * np.arange(int(SECONDS * RATE)) / RATE)[:, None]
+
+
+def table(rows: int = 6, episode: tuple[int, ...] | None = None, names: tuple[str, ...] = ("a", "b")) -> Samples:
+    values = np.arange(4.0 * rows * len(names)).reshape(4, rows, len(names))
+    numbers = np.array(episode if episode is not None else [0] * rows, dtype=np.int64)
+    return Samples(names, np.arange(rows) / 10, numbers, *values)
+
+
+@pytest.mark.parametrize("name", ["q", "dq", "ddq", "tau"])
+def test_array_of_another_shape_is_named(name: str) -> None:
+    with pytest.raises(ValueError, match=rf"^{name} has shape \(6, 3\), expected \(6, 2\)"):
+        replace(table(), **{name: np.zeros((6, 3))})
+    with pytest.raises(ValueError, match=re.escape("episode has shape (5,), expected (6,)")):
+        replace(table(), episode=np.zeros(5, dtype=np.int64))
+
+
+def test_rows_are_chosen_from_every_column() -> None:
+    samples = table()
+    for index in (slice(1, 5, 2), np.array([1, 3]), np.isin(np.arange(6), [1, 3])):
+        part = samples.rows(index)
+        assert part.joint_names == samples.joint_names
+        assert part.t.tolist() == [0.1, 0.3]
+        assert part.tau.tolist() == samples.tau[[1, 3]].tolist()
+        assert len(part.episode) == 2
+
+
+def test_episodes_are_contiguous_runs() -> None:
+    assert table(6, (4, 4, 1, 1, 1, 4)).episodes() == [slice(0, 2), slice(2, 5), slice(5, 6)]
+    assert table(0).episodes() == []
+
+
+def test_concatenation_keeps_rows_in_order_and_episodes_apart() -> None:
+    joined = Samples.concatenate([table(3, (7, 7, 9)), table(2, (7, 7)), table(1, (0,))])
+    assert joined.episode.tolist() == [0, 0, 1, 2, 2, 3]
+    assert np.array_equal(joined.q, np.concatenate([table(3).q, table(2).q, table(1).q]))
+    assert len(joined.episodes()) == 4
+
+
+def test_concatenation_of_other_joints_or_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"joint names differ: \['a', 'c'\]"):
+        Samples.concatenate([table(), table(names=("a", "c"))])
+    with pytest.raises(ValueError, match="no samples"):
+        Samples.concatenate([])
+
+
+def test_what_is_no_motion_and_no_robot_is_refused() -> None:
+    with pytest.raises(ValueError, match="q has shape"):
+        Motion.from_arrays(*np.zeros((3, 4, 2, 2)))
+    with pytest.raises(ValueError, match="joint_types is empty"):
+        check_joint_types([])
+
+
+def test_one_instant_and_many_are_accepted() -> None:
+    assert Motion.from_arrays([1, 2], [3, 4], [5, 6]).q.shape == (1, 2)
+    motion = Motion.from_arrays(*np.arange(24.0).reshape(3, 4, 2))
+    assert (len(motion), motion.n_joints) == (4, 2)
+    assert motion[1:3].dq.tolist() == [[10.0, 11.0], [12.0, 13.0]]
+
+
+@pytest.mark.parametrize("name", ["q", "dq", "ddq"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_value_that_is_not_finite_is_located(name: str, value: float) -> None:
+    arrays = {key: np.zeros((3, 2)) for key in ("q", "dq", "ddq")}
+    arrays[name][2, 1] = value
+    with pytest.raises(ValueError, match=rf"^{name}\[2, 1\] is {value}, expected a finite number"):
+        Motion.from_arrays(**arrays)
+    with pytest.raises(ValueError, match=rf"has shape .*{'' if name == 'q' else '3, 1'}"):
+        Motion.from_arrays(**(arrays | {name: np.zeros((3, 1))}))
+
+
+def test_low_pass_keeps_what_is_slow_halves_the_cut_off_and_removes_what_is_fast() -> None:
+    gain = {f: phasor(low_pass(sinusoid(f), RATE, cutoff=4.0)[:, 0], f) for f in (1.0, 4.0, 8.0, 16.0)}
+    assert max(map(abs, np.angle([gain[1.0], gain[4.0]]))) < 1e-3  # without delay
+    gain = {f: abs(value) for f, value in gain.items()}
+    assert gain[1.0] == pytest.approx(1.0, abs=1e-3)
+    # each of the two passes leaves 1/√2 at the cut-off
+    assert gain[4.0] == pytest.approx(0.5, abs=1e-3)
+    assert gain[8.0] < 0.01
+    assert gain[16.0] < 1e-4
+
+
+def test_signals_too_short_and_impossible_cut_offs_are_refused() -> None:
+    for cutoff in (0.0, 50.0, float("nan")):
+        with pytest.raises(ValueError, match=r"cutoff is .* Hz, expected between 0 and half the sampling rate, 50 Hz"):
+            low_pass(sinusoid(1.0), RATE, cutoff)
+    with pytest.raises(ValueError, match="signal has 15 samples, expected at least 16"):
+        low_pass(np.zeros((15, 2)), RATE)
+    assert low_pass(np.zeros((16, 2)), RATE).shape == (16, 2)
+    with pytest.raises(ValueError, match="signal has 2 samples, expected at least 3"):
+        differentiate(np.zeros((2, 1)), RATE)
+
+
+def test_differentiate_is_exact_on_quadratics_up_to_both_ends() -> None:
+    t = np.arange(7)[:, None] / RATE
+    signal = np.hstack([3 - 2 * t + 5 * t**2, 7 * t, np.ones_like(t)])
+    expected = np.hstack([-2 + 10 * t, np.full_like(t, 7), np.zeros_like(t)])
+    assert np.allclose(differentiate(signal, RATE), expected, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("std", [1e-3, 0.05, 1.0])
+def test_noise_level_of_a_noisy_sinusoid(std: float) -> None:
+    rng = np.random.default_rng(0)
+    clean = np.hstack([5 * sinusoid(0.5), 0.1 * sinusoid(1.5), 0 * sinusoid(1.0)])
+    noisy = clean + std * rng.standard_normal(clean.shape)
+    level = noise_level([noisy[:700], 50 + noisy[700:]])  # a jump between episodes is no noise
+    assert np.allclose(level, std, rtol=0.15)
+
+
+def test_noise_level_of_recordings_too_short_to_tell_is_a_tenth_of_the_spread() -> None:
+    episodes = [np.array([[0.0], [1.0]]), np.array([[2.0]])]
+    assert noise_level(episodes)[0] == pytest.approx(0.1 * np.std([0.0, 1.0, 2.0]))

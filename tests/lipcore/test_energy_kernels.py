@@ -1,0 +1,173 @@
+"""The energy kernels against automatic differentiation of the energies they stand for, and what they know of arms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lipcore import FitOptions, train
+from lipcore.data.metrics import evaluate
+from lipcore.data.motion import Motion
+from lipcore.kernels import weights
+from lipcore.kernels.lip import shares
+from lipcore.kernels.weights import initial_weights, velocity_weights
+from lipcore.robots.simulation import Stream, simulate
+from tests.choosing import slow
+from tests.lipcore.arm_oracles import arm
+from tests.lipcore.oracles import (
+    KERNELS,
+    RELATIVE,
+    Problem,
+    base_kernel,
+    chain_base_kernel,
+    chain_shapes,
+    lip_shapes,
+    opposite,
+    pooled_weight,
+    problems,
+    random_problem,
+    shares_of,
+    weight_shapes,
+    worst_block_error,
+    worst_energy_error,
+)
+
+MIXED = ("revolute", "prismatic", "revolute")
+ROBOTS = [("revolute",) * 7, ("prismatic", "revolute", "revolute", "prismatic"), MIXED, ("revolute",), ("prismatic",)]
+kernels = pytest.mark.parametrize("kernel", KERNELS)
+
+
+@given(problems())
+def test_blocks_equal_automatic_differentiation_for_drawn_robots(problem: Problem) -> None:
+    assert worst_block_error(problem) < RELATIVE
+
+
+@given(problems(max_joints=3))
+def test_energies_equal_automatic_differentiation_for_drawn_robots(problem: Problem) -> None:
+    assert worst_energy_error(problem) < RELATIVE
+
+
+@kernels
+@pytest.mark.parametrize("joint_types", ROBOTS, ids=lambda kinds: "".join(kind[0] for kind in kinds))
+def test_blocks_equal_automatic_differentiation(joint_types: tuple[str, ...], kernel: str) -> None:
+    assert worst_block_error(random_problem(joint_types, 2, seed=len(joint_types), kernel=kernel)) < RELATIVE
+
+
+@pytest.mark.parametrize("kernel", ["tied", "chain"])
+@pytest.mark.parametrize("offset", [0.0, 1e-8, *map(slow, (1e-14, 1e-11, 1e-5, 1e-2))])
+@pytest.mark.parametrize("zero_joints", [(0,), (2,), (1, 2), (0, 1, 2, 3)], ids=str)
+@pytest.mark.parametrize(
+    "joint_types", [("revolute",) * 4, ("prismatic", "revolute", "prismatic", "revolute")], ids=["rrrr", "prpr"]
+)
+def test_all_stays_exact_where_base_kernels_pass_through_zero(
+    joint_types: tuple[str, ...], zero_joints: tuple[int, ...], offset: float, kernel: str
+) -> None:
+    rng, n = np.random.default_rng(4), len(joint_types)
+    problem = random_problem(joint_types, 1, seed=n, kernel=kernel)
+    if kernel == "chain":  # σ < α: p changes sign
+        problem.params["chain.logits"] = torch.tensor(rng.uniform(0.3, 1.5, n))
+        alpha = torch.sigmoid(problem.params["chain.logits"])
+        beta = torch.tensor([float(kind == "revolute") for kind in joint_types]) * alpha
+        share = torch.stack([1 - alpha, alpha, beta], dim=1)
+    else:
+        logits = torch.tensor([[0.9, 1.3]]).double().expand(n, 2)
+        problem.params["potential.logits"] = problem.params["kinetic.logits"] = logits
+        share = shares_of(logits)
+    q, q2 = rng.uniform(0.3, 1.2, (2, n))
+    for joint in zero_joints:
+        kind, at = joint_types[joint], torch.tensor(q[joint])
+        q2[joint] = opposite(kind, share[joint].tolist(), q[joint])
+        there = torch.tensor(q2[joint])
+        chain = kernel == "chain"
+        p = (chain_base_kernel if chain else base_kernel)(kind, share[joint, 1] if chain else share[joint], at, there)
+        assert abs(float(p)) < 1e-15
+        q2[joint] += offset
+    v, v2, a, a2 = rng.uniform(-2, 2, (4, n))
+    motion = Motion.from_arrays(np.stack([q, q2]), np.stack([v, v2]), np.stack([a, a2]))
+    crossing = Problem(problem.kernel, problem.params, motion)
+    assert worst_block_error(crossing, [(0, 1)]) < RELATIVE
+    if kernel == "chain":  # of the other, energies of such a pair are zero themselves: nothing to be relative to
+        assert worst_energy_error(crossing, [(0, 1)]) < RELATIVE
+
+
+@pytest.mark.parametrize("joint", [0, 2, 3])
+def test_zero_of_a_revolute_joint_of_a_chain_is_of_no_account(joint: int) -> None:
+    problem = random_problem((*MIXED, "revolute"), 6, seed=1, kernel="chain")
+    kernel, params, motion = problem.kernel, problem.params, problem.motion
+    offset = torch.zeros(4, dtype=torch.float64)
+    offset[joint] = 1.234
+    moved = Motion(motion.q + offset, motion.dq, motion.ddq)
+    before, after = (kernel.gram(params, m, m) for m in (motion, moved))
+    assert (after - before).abs().max() < 1e-12 * before.abs().max()
+
+
+@kernels
+def test_initial_hyperparameters_have_the_documented_names_and_shapes(kernel: str) -> None:
+    problem = random_problem(MIXED, samples=20, seed=0, kernel=kernel)
+    shapes = chain_shapes(3) if kernel == "chain" else lip_shapes(3, kernel == "tied")
+    for tau in (problem.motion.q, 0 * problem.motion.q):
+        initial = problem.kernel.initial(problem.motion, tau)
+        assert {name: tuple(value.shape) for name, value in initial.items()} == shapes
+        assert all(value.isfinite().all() for value in initial.values())
+
+
+@kernels
+def test_unknown_joint_type_is_named(kernel: str) -> None:
+    with pytest.raises(ValueError, match=r"joint_types\[1\] is 'planar'"):
+        KERNELS[kernel][0](("revolute", "planar"))
+
+
+def test_shares_sum_to_one_and_equal_their_definition() -> None:
+    logits = torch.tensor([[0.0, 0.0], [3.0, -50.0], [700.0, 1.0]]).double()
+    assert torch.allclose(shares(logits).sum(1), torch.ones(3).double(), rtol=0, atol=1e-15)
+    assert torch.allclose(shares(logits), shares_of(logits), rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize("kinds", ["RR", "RPR", *map(slow, ("RRR", "PRR"))])
+def test_dynamics_of_a_true_chain_lie_in_the_space_of_the_kernel(kinds: str) -> None:
+    """Enough noise-free torques of an arm pin down all that it ever does, whatever the hyperparameters."""
+    _, _, robot = arm(kinds, seed=len(kinds))
+    options = FitOptions(hyperparameter_samples=80, posterior_samples=400, max_iterations=30, device="cpu")
+    training = simulate(robot, Stream(400, speed=10, noise=0.0, motion="full"), seed=1)
+    model = train(training, robot.joint_types, "lip-chain", options)
+    unseen = simulate(robot, Stream(100, n_sinusoids=100, speed=10, noise=0.0, motion="full"), seed=2)
+    answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
+    nmse = evaluate(unseen.tau, answer.tau, answer.tau_std, answer.noise_std).nmse
+    assert (nmse < 1e-6).all(), nmse
+
+
+# the velocity weights of both
+
+
+@given(st.integers(1, 8), st.integers(0, 99))
+def test_weights_are_five_logarithms_added_up(n: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    params = {name: torch.tensor(rng.uniform(-2, 2, shape)) for name, shape in weight_shapes(n).items()}
+    found = velocity_weights(params, n)
+    assert found.shape == (n, n)
+    assert torch.count_nonzero(found.triu(1)) == 0
+    for link in range(n):
+        for joint in range(link + 1):
+            assert float(found[link, joint]) == pytest.approx(float(pooled_weight(params, link, joint)), rel=1e-13)
+
+
+@kernels
+def test_every_energy_kernel_uses_them(kernel: str) -> None:
+    problem = random_problem(MIXED, 1, seed=1, kernel=kernel)
+    assert torch.equal(problem.kernel.weights(problem.params), velocity_weights(problem.params, 3))
+    for name in weight_shapes(3):
+        assert problem.kernel.prior_std()[name] == weights.PRIOR_STD[name]
+
+
+@pytest.mark.parametrize("n", [1, 3, 7])
+def test_start_is_the_inertia_that_the_torques_hint_at(n: int) -> None:
+    tau = torch.zeros((50, n), dtype=torch.float64)
+    tau[:, 0] = 40.0
+    found = velocity_weights(initial_weights(tau), n)
+    # a torque of 40 N·m: an arm of about a metre with about 4 kg·m², to which every link contributes alike
+    assert float(found.sum(0)[0]) == pytest.approx(4.0)
+    assert len(set(found[torch.tril_indices(n, n).unbind()].tolist())) == 1
+    torch.testing.assert_close(velocity_weights(initial_weights(100 * tau), n), 100 * found)
