@@ -18,7 +18,7 @@ from service.foundation.settings import Settings
 from service.storage.database import DatasetRow
 from service.storage.files import Files, new_id
 from service.storage.sample_file import Reader
-from service.training.rows import Part, Table, opened
+from service.training.rows import CANDIDATES, STRETCHES, Part, Table, opened
 from service.training.summing import Context, packed, read, shard_statistics
 from tests.service.data import QUICK, stream
 
@@ -81,6 +81,13 @@ def test_a_table_is_its_parts_in_order(parts):
     # a new episode begins where rows are left out
     assert len(Table([masked(parts[0])]).thinned(10**6).episodes()) == 35
     assert len(Table([parts[0]]).thinned(10**6).episodes()) == 2
+
+
+def test_stretches_are_contiguous(parts):
+    found = Table(parts).stretches()
+    assert len(found) <= min(2 * ROWS, STRETCHES * 500) < CANDIDATES + 1
+    for each in found.episodes():
+        np.testing.assert_allclose(np.diff(found.t[each]), 0.01, rtol=1e-6)
 
 
 def test_shards_weigh_rows_as_the_whole_does(settings, parts):

@@ -267,6 +267,13 @@ def test_who_verifies_reads_no_copies_and_one_file_at_a_time(one, url, tmp_path,
     assert not list(one._place._drafts.iterdir())
 
 
+def test_a_store_can_be_tried_out_and_nothing_is_left(one):
+    one.check()
+    one.try_out()
+    assert list(one._place.objects.list("probes/")) == []
+    assert list(one._place._drafts.iterdir()) == []
+
+
 @ANY_STORE
 def test_drafts_of_an_earlier_run_go_at_the_next_start(one, tmp_path):
     old, new = (Path(one._place._drafts, new_id("mv")) for _ in range(2))

@@ -12,7 +12,7 @@ from lipcore.fitting.hyperparameters import FitProgress
 from service.foundation.settings import Settings
 from service.storage.database import Database, JobRow
 from service.training import pulse
-from service.training.pulse import POSTERIOR_ITERATIONS, Pulse, Remaining, SupersededError
+from service.training.pulse import LEAST_FRACTION, POSTERIOR_ITERATIONS, Pulse, Remaining, SupersededError
 from tests.service.data import eventually
 from tests.service.jobs.conftest import new_row
 
@@ -115,6 +115,14 @@ def test_a_steady_search_counts_down_to_the_end(ratio):
             assert left.seconds(10.0 + 2.0 * iteration) == pytest.approx(2.0 * (50 - iteration + after))
     left.step(at(50, "posterior"), 110.0)
     assert left.seconds(111.0) == pytest.approx(2.0 * after - 1.0)
+
+
+def test_the_time_that_is_left_of_several_fits_is_that_of_their_share():
+    left = Remaining(100, 500)
+    left.step(FitProgress("geometry", 1, 150, 0.0, LEAST_FRACTION / 2, 1.0, "rigid-body"), 11.0)
+    assert left.seconds(11.0) is None
+    left.step(FitProgress("hyperparameters", 3, 150, 0.0, 0.25, 20.0, "lip-chain"), 30.0)
+    assert left.seconds(30.0) == pytest.approx(60.0)
 
 
 def test_what_was_told_too_low_is_no_longer_told():
