@@ -35,8 +35,7 @@ SHARED := models/test_aliases.py models/test_deletion.py access/test_keys.py tes
 	test_dataset_listing.py test_training.py test_cancelling.py test_evaluating.py test_robots.py \
 	test_upload_transport.py bad_requests client/test_idempotency.py archives/test_round_trip.py \
 	observability/test_metrics_of_service.py learning/test_observations.py learning/test_learning_routes.py \
-	learning/test_rollback.py learning/test_unlearning.py learning/test_inspection.py learning/test_alarm_routes.py \
-	learning/test_log.py
+	learning/test_undoing.py learning/test_inspection.py learning/test_log.py
 
 # (pytest's own tracebacks run into a limit of Python's parser on rewritten assertions of this depth)
 test-all: install

@@ -1,15 +1,18 @@
-"""The queue of one of several services, and what a test does with its jobs."""
+"""The queues of several services, and what a test does with their jobs."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
 from sqlalchemy import select
 
-from service.foundation.states import ACTIVE
 from service.storage.database import JobRow
 from service.storage.storage import Storage
 from service.training import jobs
-from tests.service.data import eventually
-from tests.service.jobs.conftest import new_row
+from tests.cluster.servers import Shared
+from tests.service.jobs.conftest import Seen, new_row
 
 LOST = {"replica_beat_s": 0.2, "replica_lost_s": 1.0}
 
@@ -18,7 +21,7 @@ def _request(do, options=None):
     return {"do": do, "estimator": "none", "datasets": [], "options": options or {}}
 
 
-class Jobs:
+class Jobs(Seen):
     """For a queue: its own database, and the versions that it was told of."""
 
     def __init__(self, settings):
@@ -35,27 +38,27 @@ class Jobs:
         with self.database.transaction() as session:
             session.scalar(select(JobRow).where(JobRow.id == job)).request = _request(do)
 
-    def row(self, job):
-        with self.database.session() as session:
-            return session.scalar(select(JobRow).where(JobRow.id == job))
-
-    def running(self, job, attempt=1):
-        """Wait for an attempt's first sign of life."""
-        return eventually(
-            lambda: (
-                (row := self.row(job)).state == "running"
-                and row.attempts == attempt
-                and "process" in row.progress
-                and row
-            )
-        )
-
-    def ended(self, job):
-        return eventually(lambda: (row := self.row(job)).state not in ACTIVE and row)
-
     def cancel(self, job):
         jobs.cancel(self, job)
 
 
-def said(row):
-    return [entry["message"] for entry in row.history]
+@contextmanager
+def queues(kind: type, shared: Shared, **usual: Any) -> Iterator[Callable[..., Any]]:
+    """Makes queues of a kind: of services with a home of that name and these settings."""
+
+    class Queue(Jobs, kind):
+        pass
+
+    made = []
+
+    def new(name: str, **settings: Any) -> Queue:
+        made.append(Queue(shared.settings(name, **LOST | usual | settings)))
+        made[-1].recover()
+        return made[-1]
+
+    try:
+        yield new
+    finally:
+        for each in made:
+            each.close()
+            each.database.close()

@@ -9,25 +9,16 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import lipcore
-from service.models import registry
 from service.storage.database import Database
-from service.storage.files import Files, new_id
+from service.storage.files import Files
 from tests.cluster.servers import Shared
-from tests.service.data import QUICK, service_of, stream
-from tests.service.learning.lessons import QUERIES, Pupil
+from tests.service.data import service_of
+from tests.service.learning.lessons import QUERIES, Pupil, publish
+from tests.service.learning.pendulums import trained
 
 Result = TypeVar("Result")
 HARMLESS = {"contact_threshold": 1e6, "on_change": "learn", "auto_refresh": False}
 """How a model learns for which contacts are far off."""
-
-
-def publish(database: Database, files: Files, trained: Path, model: str, **how: Any) -> int:
-    """Add a version to a model, as trained; how: as in `registry.publish`. Return its number."""
-    folder = new_id("mv")
-    with files.new_version(folder) as target:
-        manifest = lipcore.copy_model(trained, target)
-    with database.transaction() as session:
-        return registry.publish(session, model, folder, manifest, None, **how)
 
 
 def folder_store(shared: Shared) -> str:
@@ -48,7 +39,7 @@ def made(shared: Shared, trained: Path, *models: str) -> None:
 
 def train(folder: Path) -> Path:
     """A model of a double pendulum, saved below a folder."""
-    lipcore.save(lipcore.train(stream(), ("revolute", "revolute"), "lip-chain", lipcore.FitOptions(**QUICK)), folder)
+    lipcore.save(trained(), folder)
     return folder
 
 

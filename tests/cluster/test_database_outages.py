@@ -13,21 +13,14 @@ from sqlalchemy import select
 from service.app import create_app
 from service.storage.database import Database, EventRow
 from service.storage.files import Files
-from tests.cluster.pairs import Pair, publish, train
+from tests.cluster.pairs import Pair, train
 from tests.service.data import ADDRESS, ENDLESS, arrays, ended, error, eventually, npz, queue, running, stream, upload
 from tests.service.data import job as looked
 from tests.service.data import train as train_job
-from tests.service.learning.lessons import Pupil, lesson
+from tests.service.learning.lessons import Pupil, lesson, publish
 from tests.service.server import Server
 
 ARM = "arm"
-
-
-@pytest.fixture
-def away(postgres) -> Iterator[None]:
-    """The server is not there for the while of a test, unless it starts it itself."""
-    yield postgres.stop()
-    postgres.start()
 
 
 @pytest.fixture
@@ -77,15 +70,6 @@ def test_while_the_server_is_away_clients_are_told_to_come_again(service, postgr
         assert client.request(method, path, **request).is_success, path
     assert pupil.settled(1)["revision"] == 1
     eventually(lambda: client.get("/health/ready").status_code == 200)
-
-
-@pytest.mark.slow
-def test_a_service_does_not_notice_that_the_server_was_restarted_between_two_requests(service, postgres):
-    (pupil,) = service.enrol(ARM)
-    pupil.teach(0)
-    postgres.restart()
-    assert service.clients[0].get("/v1/models").is_success
-    assert pupil.teach(1)["revision"] == 2
 
 
 def test_restarts_under_load_lose_nothing_that_was_acknowledged(shared, postgres):

@@ -18,7 +18,6 @@ from service.models import registry
 from service.models.archive import MEDIA_TYPE
 from service.storage.database import Database, VersionRow
 from service.storage.files import Files, FilesUnreachableError
-from service.storage.home import HomeError, check_home
 from tests.cluster.servers import BUCKET, Shared
 from tests.service.data import ADDRESS, arrays, error, npz, post, service_of, stream, upload
 
@@ -124,11 +123,3 @@ def test_all_that_is_shared_is_verified(shared):
     assert (found.kind, found.name) == ("dataset", dataset["id"])
     with outage(shared), pytest.raises(FilesUnreachableError):  # which says nothing of what is stored
         verify_home(settings)
-
-
-def test_no_service_starts_while_its_bucket_is_away(shared):
-    check_home(shared.settings())
-    with outage(shared), pytest.raises(HomeError, match=rf"files_url is '{shared.files_url}'.*does not answer"):
-        check_home(shared.settings())
-    check_home(shared.settings())
-    assert shared.stored() == []

@@ -1,24 +1,23 @@
-"""Jobs on a Dask cluster of real processes: workers, schedulers and services come and go; every job ends once.
-
-The queues are those of services, the training processes do light work instead of a fit.
-"""
+"""Jobs of several services, on a Dask cluster or each with its own processes: all come and go, each job ends once."""
 
 from __future__ import annotations
 
 import pytest
 
+from service.storage.database import ReplicaRow
+from service.storage.replicas import alive, identity
+from service.training import worker
 from service.training.cluster import ClusterQueue
-from tests.cluster.jobs import LOST, Jobs, said
+from service.training.queue import JobQueue
+from tests.cluster import light
+from tests.cluster.jobs import queues
 from tests.cluster.workers import cluster
 from tests.service.data import eventually
+from tests.service.jobs.conftest import messages_of
 from tests.service.server import command
 
 WAITS = "waits for a worker of the cluster"
 LOST_WORKER = "the worker that ran it is gone: queued again"
-
-
-class Queue(Jobs, ClusterQueue):
-    """The queue of one service, on a cluster."""
 
 
 @pytest.fixture
@@ -29,28 +28,8 @@ def workers(shared, tmp_path):
 
 @pytest.fixture
 def services(shared, workers):
-    """Makes the queue of a service with a home of that name."""
-    made = []
-
-    def new(name, **settings):
-        made.append(Queue(shared.settings(name, cluster=workers.address, **LOST, **settings)))
-        made[-1].recover()
-        return made[-1]
-
-    yield new
-    for each in made:
-        each.close()
-        each.database.close()
-
-
-@pytest.mark.slow
-def test_jobs_run_one_after_the_other_and_the_one_that_ends_is_told(services):
-    first = services("a")
-    names = [first.add(f"n{number}", "finish") for number in range(3)]
-    rows = [first.ended(job) for job in names]
-    assert [(row.state, row.attempts, row.owner) for row in rows] == [("succeeded", 1, first.replicas.id)] * 3
-    assert said(rows[0]) == [WAITS, "started", "done"]
-    assert sorted(eventually(lambda: len(first.made) == 3 and first.made)) == [("n0", 1), ("n1", 1), ("n2", 1)]
+    with queues(ClusterQueue, shared, cluster=workers.address) as new:
+        yield new
 
 
 @pytest.mark.slow
@@ -61,20 +40,12 @@ def test_a_cancel_ends_a_process_that_does_not_obey_and_another_service_may_ask(
     other.cancel(deaf)
     row = one.ended(deaf)
     assert (row.state, row.attempts) == ("cancelled", 1)
-    assert "did not stop within 1 s and was ended" in said(row)[-1]
+    assert "did not stop within 1 s and was ended" in messages_of(row)[-1]
     eventually(lambda: command(process) == "")
     waiting = one.add("obedient", "wait")
     one.running(waiting)
     other.cancel(waiting)
-    assert said(one.ended(waiting))[-1] == "obeyed"
-
-
-@pytest.mark.slow
-def test_a_process_that_dies_or_hangs_is_an_attempt(services):
-    queue = services("a")
-    row = queue.ended(queue.add("dies", "die"))
-    assert (row.state, row.attempts, row.error["code"]) == ("failed", 3, "interrupted")
-    assert "exit code 3" in row.error["message"]
+    assert messages_of(one.ended(waiting))[-1] == "obeyed"
 
 
 def test_the_job_of_a_killed_worker_is_finished_by_another_one(services, workers):
@@ -88,7 +59,7 @@ def test_the_job_of_a_killed_worker_is_finished_by_another_one(services, workers
     queue.tell(job, "finish")
     row = queue.ended(job)
     assert (row.state, row.attempts) == ("succeeded", 2)
-    assert LOST_WORKER in said(row)
+    assert LOST_WORKER in messages_of(row)
     eventually(lambda: command(process) == "")
 
 
@@ -98,7 +69,7 @@ def test_a_worker_that_is_told_to_stop_hands_its_job_back(services, workers):
     job = queue.add("handed", "wait")
     queue.running(job)
     assert workers.terminate("one") == 0
-    assert "its worker was stopped while it ran: queued again" in said(queue.row(job))
+    assert "its worker was stopped while it ran: queued again" in messages_of(queue.row(job))
     assert queue.row(job).attempts == 0
     workers.start("two")
     queue.running(job)
@@ -130,7 +101,7 @@ def test_a_job_that_needs_a_gpu_waits_for_a_worker_that_has_one(services, worker
     job, plain = queue.add("gpu", "wait", device="cuda"), queue.add("plain", "finish")
     assert queue.ended(plain).state == "succeeded"
     row = queue.row(job)
-    assert (row.state, said(row)) == ("queued", [f"{WAITS} with a GPU"])
+    assert (row.state, messages_of(row)) == ("queued", [f"{WAITS} with a GPU"])
     assert queue.cluster.gpus == 0
     workers.start("two", "--gpus", "1")
     process = queue.running(job).progress["process"]
@@ -160,4 +131,82 @@ def test_another_service_follows_the_job_of_one_that_stops_or_dies(services):
     third = services("c")
     eventually(lambda: third.row(job).owner == third.replicas.id)
     third.cancel(job)
-    assert said(third.ended(job))[-1] == "obeyed"
+    assert messages_of(third.ended(job))[-1] == "obeyed"
+
+
+@pytest.fixture
+def neighbours(shared, monkeypatch):
+    """Services with training processes of their own."""
+    monkeypatch.setattr(worker, "run", light.run)
+    with queues(JobQueue, shared) as new:
+        yield new
+
+
+def test_a_job_is_anybodys_until_one_hands_it_out(neighbours):
+    one, other = neighbours("a"), neighbours("b")
+    first = one.add("first", "wait")
+    assert one.running(first).owner == one.replicas.id
+    second = one.add("second", "wait")  # the one process of the first service has something to do
+    assert one.running(second).owner == other.replicas.id
+    other.cancel(first)  # whom it is asked of does not matter
+    one.cancel(second)
+    assert [messages_of(one.ended(job))[-1] for job in (first, second)] == ["obeyed", "obeyed"]
+
+
+def test_a_job_of_a_service_that_is_gone_is_started_again_by_one_other(neighbours):
+    one, other, third = neighbours("a"), neighbours("b", training_workers=2), neighbours("c", training_workers=2)
+    job = one.add("orphan", "wait")
+    process = one.running(job).progress["process"]
+    one.replicas._beat = lambda: 1 / 0  # gives no more signs of life
+    row = one.running(job, 2)
+    assert row.owner in {other.replicas.id, third.replicas.id}
+    assert "the service that had it run is gone: queued again" in messages_of(row)
+    eventually(lambda: command(process) == "" or not one._hands)  # which learns that it is not its own any more
+    one.tell(job, "finish")
+    row = one.ended(job)
+    assert (row.state, row.attempts) == ("succeeded", 2)
+    assert len(eventually(lambda: [*other.made, *third.made])) == 1
+
+
+def test_a_service_that_stops_hands_back_its_own_jobs_alone(neighbours):
+    one, other = neighbours("a"), neighbours("b")
+    first = one.add("first", "wait")
+    one.running(first)
+    second = one.add("second", "wait")
+    process = one.running(second).progress["process"]
+    one.close()
+    waiting = other.row(first)
+    assert (waiting.state, waiting.attempts, waiting.owner) == ("queued", 0, None)
+    assert other.row(second).progress["process"] == process
+    other.tell(second, "finish")
+    assert other.ended(second).attempts == 1
+    other.running(first)
+    other.tell(first, "finish")
+    assert other.ended(first).state == "succeeded"
+
+
+def test_a_service_knows_its_own_jobs_after_a_restart_and_others_know_that_it_lives(neighbours, shared):
+    one = neighbours("a")
+    assert identity(one.settings.home) == one.replicas.id
+    with one.database.session() as session:
+        assert alive(session, 5.0) == {one.replicas.id}
+    one.replicas.close()
+    with one.database.session() as session:
+        assert session.get(ReplicaRow, one.replicas.id) is None
+
+
+def test_who_could_give_no_sign_itself_takes_nobody_for_lost(neighbours):
+    one, other = neighbours("a"), neighbours("b", replica_lost_s=30.0)
+    job = one.add("kept", "wait")
+    one.running(job)
+    one.replicas._beat = lambda: 1 / 0
+    eventually(lambda: one.replicas.id not in _living(other, 1.0))
+    with other.database.session() as session:
+        assert one.replicas.id not in other.replicas.free(session)  # it lives too short a time to judge
+    one.cancel(job)
+    one.ended(job)
+
+
+def _living(queue, lost_s):
+    with queue.database.session() as session:
+        return alive(session, lost_s)

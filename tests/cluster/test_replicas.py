@@ -1,7 +1,8 @@
-"""Two services of one database: what one takes, moves or deletes, the other answers with."""
+"""Two services of one database: what one takes, moves or deletes, the other answers with; and one of them dies."""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from functools import partial
 from itertools import count
@@ -16,13 +17,13 @@ from service.app import create_app
 from service.learning import refresh
 from service.learning.learner.publication import Contested
 from service.replication import replication
-from service.storage.database import AlarmRow, EventRow, LearnerRow, ServingRow
-from tests.cluster.pairs import Pair, answers, both, publish, train
+from service.storage.database import AlarmRow, Database, EventRow, LearnerRow, ServingRow
+from tests.cluster.pairs import HARMLESS, Pair, answers, both, folder_store, made, train
 from tests.cluster.servers import S3, Postgres, Shared, sharing
-from tests.service.data import ADDRESS, error, eventually, service_of
-from tests.service.learning.lessons import QUERIES, Pupil, lesson
-from tests.service.learning.test_changes import PUSH, WATCHFUL, drive
-from tests.service.learning.test_following_monitor import state
+from tests.service.data import ADDRESS, eventually, service_of
+from tests.service.learning.lessons import QUERIES, Pupil, lesson, publish
+from tests.service.learning.test_changes import PUSH, WATCHFUL, drive, state
+from tests.service.server import Server
 
 QUICK_PUBLISHING = {"publish_every_s": 0.02, "min_revision_wait_s": 20.0}
 NAMES = (f"shared-{number}" for number in count())
@@ -91,17 +92,6 @@ def test_a_batch_that_both_get_at_once_is_learnt_once(pair, arm):
         assert said[0]["revision"] == said[1]["revision"] == number + 1
     assert batches(pair, arm[0].model) == list(range(6))
     one, two = answers(arm, 6)
-    assert one == two
-
-
-def test_different_batches_at_both_at_once_are_numbered_one_after_the_other(pair, arm):
-    work = [
-        lambda s=stream, p=pupil: [p.post("observations", lesson(n, s))["revision"] for n in range(8)]
-        for stream, pupil in zip(("left", "right"), arm, strict=True)
-    ]
-    revisions = both(*work)
-    assert sorted(revisions[0] + revisions[1]) == list(range(1, 17))
-    one, two = answers(arm, 16)
     assert one == two
 
 
@@ -233,9 +223,65 @@ def test_without_any_notice_a_service_looks_for_itself(pair, arm, monkeypatch):
     eventually(lambda: second.client.post(second.url("predict"), json=QUERIES | {"alias": "late"}).is_success)
 
 
-def test_a_revision_that_nobody_has_taught_is_refused_in_time(pair, arm, monkeypatch):
-    monkeypatch.setitem(vars(service_of(pair.clients[0]).settings), "min_revision_wait_s", 0.1)
-    answer = arm[0].client.post(arm[0].url("predict"), json=QUERIES | {"min_revision": 7})
-    body = error(answer, 503, "revision_not_reached")
-    assert "revision 0 and has not learnt up to revision 7" in body["message"]
-    assert answer.headers["retry-after"] == "1"
+MODEL = "arm"
+BATCHES = 30
+
+
+@pytest.fixture
+def servers(shared: Shared) -> Iterator[list[Server]]:
+    """Two services of one model, in processes of their own."""
+    made(shared, train(shared.folder / "trained"), MODEL)
+    with started(shared, "one") as one, started(shared, "two") as two:
+        pupil(one).put("learning", HARMLESS)
+        yield [one, two]
+
+
+def started(shared: Shared, name: str) -> Server:
+    """A service with a home of its own."""
+    return Server(shared.home(name), **(shared.env() | {"LIPSERVE_FILES_URL": folder_store(shared)}))
+
+
+def pupil(server: Server) -> Pupil:
+    """The model as a service shows it."""
+    return Pupil(server.client, MODEL)
+
+
+def sent(servers: list[Server], number: int, rng: np.random.Generator) -> int:
+    """Send a lesson to one service after the other until one acknowledges it; return the revision."""
+    while True:
+        server = servers[rng.integers(len(servers))]
+        try:
+            answer = server.client.post(f"/v1/models/{MODEL}/observations", json=lesson(number))
+        except httpx.TransportError:
+            continue
+        if answer.is_success:
+            return int(answer.json()["revision"])
+        assert answer.status_code == httpx.codes.SERVICE_UNAVAILABLE, answer.text
+
+
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
+def test_a_service_that_is_killed_in_the_middle_of_batches_loses_nothing(shared, servers, seed):
+    rng = np.random.default_rng(seed)
+    victim, other = servers
+    acknowledged: list[int] = []
+    killed = threading.Event()
+
+    def kill() -> None:
+        victim.kill()
+        killed.set()
+
+    timer = threading.Timer(rng.uniform(0.0, 0.3), kill)
+    for number in range(BATCHES):
+        if number == 5:
+            timer.start()
+        acknowledged.append(sent(servers, number, rng))
+    killed.wait()
+    assert acknowledged == list(range(1, BATCHES + 1))  # each once: none lost, none twice
+    database = Database.of(shared.settings("looking"))
+    with database.session() as session:
+        rows = session.query(EventRow.sequence, EventRow.number).filter(EventRow.kind == "batch")
+        assert dict(rows.all()) == {number: number + 1 for number in range(BATCHES)}
+    database.close()
+    with started(shared, victim.home.name) as again:
+        one, two = answers([pupil(again), pupil(other)], BATCHES)
+        assert one == two

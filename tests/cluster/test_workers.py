@@ -1,37 +1,25 @@
-"""Shards on this process, on processes of this host and on workers of a Dask cluster: the same sum, to the last bit."""
+"""Shards and fits on processes of this host and on workers of a Dask cluster, which outlive the service that asked."""
 
 from __future__ import annotations
 
 from functools import partial
 
-import numpy as np
 import pytest
 
 from lipcore.fitting.hyperparameters import FitCancelledError
-from service.compute.executors import ClusterUnavailableError, Processes, lost, sent, shard_executor
+from service.compute.executors import ClusterUnavailableError, lost, sent, shard_executor
 from service.compute.shards import summed
 from service.foundation.settings import Settings
-from tests.cluster.sums import home, once_lost, told
 from tests.cluster.workers import cluster
+from tests.service.compute.work import dying, home, numbers
+from tests.service.data import ended, job, queue, running, stream, upload
+from tests.service.server import Server
 
-SHARDS = range(21)
+SHARDS = range(20)
 
 
-def summed_by(executor, work=told):
+def summed_by(executor, work=numbers):
     return summed(executor, work, SHARDS, lambda: False)
-
-
-def test_a_sum_does_not_depend_on_who_computes_it_nor_on_losses(tmp_path):
-    with shard_executor(Settings(home=tmp_path)) as inline:
-        once = summed_by(inline)
-    settings = Settings(home=tmp_path, statistics_workers=2)
-    with shard_executor(settings) as processes:
-        assert isinstance(processes, Processes)
-        assert summed_by(processes).tobytes() == once.tobytes()
-        assert summed_by(processes, partial(once_lost, tmp_path / "lost")).tobytes() == once.tobytes()
-    assert sent(settings) == settings
-    plain = sum(told(shard) for shard in SHARDS)
-    np.testing.assert_allclose(once, plain, rtol=1e-12)
 
 
 def test_workers_of_a_cluster_come_to_the_same_sum_and_a_lost_one_costs_nothing(shared, tmp_path):
@@ -44,10 +32,10 @@ def test_workers_of_a_cluster_come_to_the_same_sum_and_a_lost_one_costs_nothing(
             assert summed_by(executor).tobytes() == once.tobytes()
             lengths = {len(str(shared.home(name))) for name in ("one", "two")}
             assert summed_by(executor, home)[0] in {len(SHARDS) * length for length in lengths}
-            assert summed_by(executor, partial(once_lost, tmp_path / "lost")).tobytes() == once.tobytes()
+            assert summed_by(executor, partial(dying, str(tmp_path))).tobytes() == once.tobytes()
             assert summed_by(executor).tobytes() == once.tobytes()  # by the one that is left
             with pytest.raises(FitCancelledError):
-                summed(executor, told, SHARDS, lambda: True)
+                summed(executor, numbers, SHARDS, lambda: True)
 
 
 @pytest.mark.slow
@@ -56,3 +44,27 @@ def test_without_a_scheduler_there_is_no_executor(shared):
     with pytest.raises(ClusterUnavailableError, match="cannot be reached"), shard_executor(settings):
         pass
     assert not lost(ValueError("wrong"))
+
+
+LOST_SOON = {"LIPSERVE_REPLICA_BEAT_S": "0.3", "LIPSERVE_REPLICA_LOST_S": "2"}
+LONG = {"hyperparameter_samples": 150, "posterior_samples": 60, "max_iterations": 200}
+
+
+@pytest.mark.slow
+def test_another_service_answers_by_the_model_that_a_killed_one_was_asked_for(shared, tmp_path):
+    with cluster(shared, tmp_path / "cluster", "one") as workers:
+        env = {**shared.env(), **LOST_SOON, "LIPSERVE_CLUSTER": workers.address}
+        with Server(shared.home("b"), **env) as other:
+            with Server(shared.home("a"), **env) as asked:
+                data = upload(asked.client, stream(samples=300))
+                seen = queue(asked.client, "away", data["id"], options=LONG)
+                running(asked.client, seen["id"])
+                asked.kill()
+            assert job(other.client, seen["id"])["state"] in {"running", "succeeded"}
+            now = ended(other.client, seen["id"])
+            assert (now["state"], now["attempts"], now["version"]) == ("succeeded", 1, 1), now
+            query = {"q": [[0.1, 0.2]], "dq": [[0, 0]], "ddq": [[0, 0]]}
+            answer = other.client.post("/v1/models/away/predict", json=query)
+            assert answer.status_code == 200, answer.text
+            checks = {each["name"]: each for each in other.client.get("/health/ready").json()["checks"]}
+            assert "the cluster takes 1 at a time" in checks["training"]["message"]

@@ -31,10 +31,6 @@ class Workers:
         self.scheduler = self._start("scheduler", ["-m", "distributed.cli.dask_scheduler", *given])
         eventually(lambda: "Scheduler at" in self.log("scheduler"))
 
-    def stop_scheduler(self) -> None:
-        """Kill it."""
-        self.kill("scheduler")
-
     def start(self, name: str, *options: str, **settings: str) -> None:
         """Start a worker."""
         env = {**self.shared.env(), "LIPSERVE_CLUSTER": self.address, "LIPSERVE_HOME": str(self.shared.home(name))}

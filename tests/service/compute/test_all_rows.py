@@ -136,7 +136,3 @@ def test_the_pass_is_the_same_in_processes_and_here(settings, parts, model):
     a = plain.a.numpy()[np.triu_indices(len(plain.a))]
     assert np.abs(here.a - a).max() <= 1e-8 * np.abs(a).max()
     assert np.abs(here.b - plain.b.numpy()).max() <= 1e-8 * np.abs(plain.b.numpy()).max()
-
-
-def test_a_packed_model_is_small(model):
-    assert sum(map(len, packed(model).values())) < 100_000

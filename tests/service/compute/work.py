@@ -21,3 +21,10 @@ def dying(folder: str, shard: int) -> np.ndarray:
         open(mark, "w").close()
         os.kill(os.getpid(), signal.SIGKILL)
     return numbers(shard)
+
+
+def home(shard: int) -> np.ndarray:
+    """The length of the name of the home of whoever does it."""
+    from service.compute.executors import placed
+
+    return np.array([len(str(placed(None).home))])

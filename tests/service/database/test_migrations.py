@@ -9,10 +9,10 @@ import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import inspect, select, text
+from sqlalchemy import inspect, select
 
 from service.storage.database import Base, Database, JobRow, ModelRow, SnapshotRow, VersionRow, migrations
-from service.storage.database.migrations import HEAD, DatabaseVersionError
+from service.storage.database.migrations import HEAD
 from tests.service.database.starting import check_starts_together
 
 BEFORE = (Path(__file__).parent / "before_migrations.sql").read_text()
@@ -54,21 +54,6 @@ def test_what_an_earlier_release_stored_is_kept(earlier):
     database.close()
 
 
-def test_only_tables_that_are_missing_are_made(home):
-    """A home of a release that knew fewer tables."""
-    home.mkdir()
-    connection = sqlite3.connect(home / FILE)
-    connection.executescript(BEFORE)
-    for table in ("events", "streams", "alarms"):
-        connection.execute(f"DROP TABLE {table}")
-    connection.close()
-    database = Database(home)
-    with database.engine.connect() as opened:
-        assert compare_metadata(MigrationContext.configure(opened), Base.metadata) == []
-        assert opened.scalar(text("SELECT COUNT(*) FROM versions")) == 3
-    database.close()
-
-
 def test_a_migration_that_fails_leaves_everything_as_it_was(earlier):
     connection = sqlite3.connect(earlier / FILE)
     connection.execute("CREATE TABLE api_keys (something TEXT)")  # in the way of a later step
@@ -81,15 +66,6 @@ def test_a_migration_that_fails_leaves_everything_as_it_was(earlier):
     assert "aliases" not in tables
     assert connection.execute("SELECT COUNT(*) FROM versions").fetchone() == (3,)
     connection.close()
-
-
-def test_a_database_of_a_later_release_is_refused(home):
-    database = Database(home)
-    with database.transaction() as session:
-        session.execute(text("UPDATE alembic_version SET version_num = '9999'"))
-    database.close()
-    with pytest.raises(DatabaseVersionError, match=r"'9999'.*a later release"):
-        Database(home)
 
 
 def test_processes_that_start_together_migrate_once(earlier):

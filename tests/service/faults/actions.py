@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
 
 import numpy as np
 
@@ -17,134 +16,152 @@ from tests.service.test_robots import urdf
 ALIAS = "production"
 
 
-@dataclass
-class Action:
-    """One thing that is asked for. `ask` enters it in the ledger where it is answered; `settle` looks whether what was
-    not answered has taken effect, enters it then, and says so."""
+class Action(ABC):
+    """One thing that is asked for. name: of what it is about, as soon as that is known."""
 
-    ask: Callable[[House], None]
-    settle: Callable[[House], bool]
+    name = ""
+
+    @abstractmethod
+    def ask(self, house: House) -> None:
+        """Ask for it; enter it in the ledger where it is answered."""
+
+    @abstractmethod
+    def settle(self, house: House) -> bool:
+        """Whether it has taken effect though it was not answered: look, and enter it then."""
 
 
-def upload() -> Action:
+class Upload(Action):
     """Upload a recording."""
-    name = []
 
-    def ask(house: House) -> None:
-        name.append(f"recording {house.number()}")
+    path, kind = "/v1/datasets", "application/x-npz"
+
+    def entries(self, house: House) -> dict[str, dict]:
+        """Where the ledger has them, by id."""
+        return house.ledger.datasets
+
+    def body(self, house: House) -> bytes:
+        """What is uploaded."""
         samples = stream(samples=60, seed=100 + len(house.ledger.datasets))
-        body = npz(**arrays(samples), joint_names=np.array(samples.joint_names))
-        kind = {"content-type": "application/x-npz"}
-        answer = house.client.post("/v1/datasets", content=body, headers=kind, params={"name": name[-1]})
-        assert answer.status_code == 201, answer.text
-        house.ledger.datasets[answer.json()["id"]] = answer.json()
+        return npz(**arrays(samples), joint_names=np.array(samples.joint_names))
 
-    def settle(house: House) -> bool:
-        found = [each for each in listed(house.client, "/v1/datasets") if each["name"] == name[-1]]
-        house.ledger.datasets |= {each["id"]: each for each in found}
+    def ask(self, house: House) -> None:
+        self.name = f"upload-{house.number()}"
+        headers, params = {"content-type": self.kind}, {"name": self.name}
+        answer = house.client.post(self.path, content=self.body(house), headers=headers, params=params)
+        assert answer.status_code == 201, answer.text
+        self.entries(house)[answer.json()["id"]] = answer.json()
+
+    def settle(self, house: House) -> bool:
+        found = [each for each in listed(house.client, self.path) if each["name"] == self.name]
+        self.entries(house).update({each["id"]: each for each in found})
         return len(found) == 1
 
-    return Action(ask, settle)
 
-
-def upload_robot() -> Action:
+class UploadRobot(Upload):
     """Upload a URDF."""
-    name = []
 
-    def ask(house: House) -> None:
-        name.append(f"robot-{house.number()}")
-        kind = {"content-type": "application/xml"}
-        answer = house.client.post("/v1/robots", content=urdf(name[-1]), headers=kind, params={"name": name[-1]})
-        assert answer.status_code == 201, answer.text
-        house.ledger.robots[answer.json()["id"]] = answer.json()
+    path, kind = "/v1/robots", "application/xml"
 
-    def settle(house: House) -> bool:
-        found = [each for each in listed(house.client, "/v1/robots") if each["name"] == name[-1]]
-        house.ledger.robots |= {each["id"]: each for each in found}
-        return len(found) == 1
+    def entries(self, house: House) -> dict[str, dict]:
+        return house.ledger.robots
 
-    return Action(ask, settle)
+    def body(self, house: House) -> bytes:
+        return urdf(self.name)
 
 
-def delete_dataset() -> Action:
+class DeleteDataset(Action):
     """Delete a data set that was uploaded before."""
-    doomed = []
 
-    def ask(house: House) -> None:
-        upload().ask(house)
-        doomed.append(list(house.ledger.datasets)[-1])
-        assert house.client.delete(f"/v1/datasets/{doomed[0]}").status_code == 204
-        del house.ledger.datasets[doomed[0]]
+    def ask(self, house: House) -> None:
+        Upload().ask(house)
+        self.name = list(house.ledger.datasets)[-1]
+        assert house.client.delete(f"/v1/datasets/{self.name}").status_code == 204
+        del house.ledger.datasets[self.name]
 
-    def settle(house: House) -> bool:
-        if house.client.get(f"/v1/datasets/{doomed[0]}").status_code != 404:
-            return False
-        del house.ledger.datasets[doomed[0]]
-        return True
-
-    return Action(ask, settle)
+    def settle(self, house: House) -> bool:
+        gone = house.client.get(f"/v1/datasets/{self.name}").status_code == 404
+        if gone:
+            del house.ledger.datasets[self.name]
+        return gone
 
 
-def train() -> Action:
+class Train(Action):
     """Train a model of a name of its own."""
-    model = []
 
-    def ask(house: House) -> None:
+    def ask(self, house: House) -> None:
         if not house.ledger.datasets:
-            upload().ask(house)
-        model.append(f"model-{house.number()}")
-        wanted = {"model": model[0], "datasets": [next(iter(house.ledger.datasets))], "options": QUICK}
-        wanted["estimator"] = "lip-chain"
-        answer = house.client.post("/v1/jobs", json=wanted)
-        assert answer.status_code == 202, answer.text
-        house.ledger.jobs[answer.json()["id"]] = "succeeded"
-        house.ledger.models.add(model[0])
+            Upload().ask(house)
+        self.name = f"model-{house.number()}"
+        self.enter(house, _queued(house, self.name, next(iter(house.ledger.datasets)), QUICK))
 
-    def settle(house: House) -> bool:
-        found = [each["id"] for each in listed(house.client, "/v1/jobs") if each["model"] == model[0]]
+    def settle(self, house: House) -> bool:
+        found = [each["id"] for each in listed(house.client, "/v1/jobs") if each["model"] == self.name]
         assert len(found) <= 1
-        if found:
-            house.ledger.jobs |= dict.fromkeys(found, "succeeded")
-            house.ledger.models.add(model[0])
+        for job in found:
+            self.enter(house, job)
         return len(found) == 1
 
-    return Action(ask, settle)
+    def enter(self, house: House, job: str) -> None:
+        """Expect a job to make its model."""
+        house.ledger.jobs[job] = "succeeded"
+        house.ledger.models.add(self.name)
 
 
-def observe() -> Action:
+class Cancel(Action):
+    """Cancel a job that runs."""
+
+    def ask(self, house: House) -> None:
+        body, headers = npz(**arrays(stream("panda", 150))), {"content-type": Upload.kind}
+        dataset = house.client.post(Upload.path, content=body, headers=headers).json()
+        house.ledger.datasets[dataset["id"]] = dataset
+        self.name = _queued(house, f"cancelled-{house.number()}", dataset["id"], ENDLESS)
+        house.ledger.jobs[self.name] = "cancelled"
+        running(house.client, self.name)
+        self.cancel(house)
+
+    def settle(self, house: House) -> bool:
+        done = house.client.get(f"/v1/jobs/{self.name}").json()["state"] == "cancelled"
+        if not done:
+            self.cancel(house)
+        return done
+
+    def cancel(self, house: House) -> None:
+        """Ask for it once."""
+        assert house.client.post(f"/v1/jobs/{self.name}/cancel").status_code == 200
+
+
+def _queued(house: House, model: str, dataset: str, options: dict) -> str:
+    wanted = {"model": model, "datasets": [dataset], "options": options, "estimator": "lip-chain"}
+    answer = house.client.post("/v1/jobs", json=wanted)
+    assert answer.status_code == 202, answer.text
+    return answer.json()["id"]
+
+
+class Observe(Action):
     """Teach a batch."""
-    sequence = []
 
-    def ask(house: House) -> None:
-        sequence.append(max(house.ledger.batches, default=-1) + 1)
-        answer = house.client.post(f"/v1/models/{ARM}/observations", json=batch(sequence[-1]))
-        assert answer.status_code == 200, answer.text
-        assert not answer.json()["duplicate"]
-        house.ledger.batches[sequence[-1]] = "learnt"
+    def ask(self, house: House) -> None:
+        self.sequence = max(house.ledger.batches, default=-1) + 1
+        assert not self.sent(house)
 
-    def settle(house: House) -> bool:
-        answer = house.client.post(f"/v1/models/{ARM}/observations", json=batch(sequence[-1]))  # as a robot would
+    def settle(self, house: House) -> bool:
+        return self.sent(house)  # again, as a robot would
+
+    def sent(self, house: House) -> bool:
+        """Send it; return whether it was known."""
+        answer = house.client.post(f"/v1/models/{ARM}/observations", json=batch(self.sequence))
         assert answer.status_code == 200, answer.text
-        house.ledger.batches[sequence[-1]] = "learnt"
+        house.ledger.batches[self.sequence] = "learnt"
         return answer.json()["duplicate"]
 
-    return Action(ask, settle)
 
-
-def observe_on() -> Action:
+class ObserveOn(Observe):
     """Teach batches, each once the one before is stored, until the fault happens."""
-    latest = []
 
-    def ask(house: House) -> None:
+    def ask(self, house: House) -> None:
         while house.injector.happened() is None:
-            latest.append(observe())
-            latest[-1].ask(house)
+            super().ask(house)
             eventually(lambda: house.injector.happened() or _stored(house), PATIENCE)
-
-    def settle(house: House) -> bool:
-        return latest[-1].settle(house)
-
-    return Action(ask, settle)
 
 
 def _stored(house: House) -> bool:
@@ -153,165 +170,113 @@ def _stored(house: House) -> bool:
     return rows(house.home, newest.format("snapshots"), ARM) == rows(house.home, newest.format("events"), ARM)
 
 
-def unlearn() -> Action:
+class Unlearn(Action):
     """Take a batch back that was learnt before."""
-    path = []
 
-    def ask(house: House) -> None:
-        observe().ask(house)
-        path.append(max(house.ledger.batches))
-        answer = house.client.delete(f"/v1/models/{ARM}/observations/{SOURCE}/{path[0]}")
+    def ask(self, house: House) -> None:
+        Observe().ask(house)
+        self.sequence = max(house.ledger.batches)
+        answer = house.client.delete(f"/v1/models/{ARM}/observations/{SOURCE}/{self.sequence}")
         assert answer.status_code == 200, answer.text
-        house.ledger.batches[path[0]] = "unlearnt"
+        house.ledger.batches[self.sequence] = "unlearnt"
 
-    def settle(house: House) -> bool:
-        found = house.client.get(f"/v1/models/{ARM}/observations/{SOURCE}/{path[0]}").json()["state"]
-        house.ledger.batches[path[0]] = found
+    def settle(self, house: House) -> bool:
+        found = house.client.get(f"/v1/models/{ARM}/observations/{SOURCE}/{self.sequence}").json()["state"]
+        house.ledger.batches[self.sequence] = found
         return found == "unlearnt"
 
-    return Action(ask, settle)
 
-
-def serve() -> Action:
+class Serve(Action):
     """Let the other version answer."""
-    wanted = []
 
-    def ask(house: House) -> None:
-        wanted.append(3 - house.ledger.serving)
-        answer = house.client.post(f"/v1/models/{ARM}/rollback", json={"version": wanted[0]})
+    def ask(self, house: House) -> None:
+        self.version = 3 - house.ledger.serving
+        answer = house.client.post(f"/v1/models/{ARM}/rollback", json={"version": self.version})
         assert answer.status_code == 200, answer.text
-        house.ledger.serving = wanted[0]
+        house.ledger.serving = self.version
 
-    def settle(house: House) -> bool:
-        found = house.client.get(f"/v1/models/{ARM}").json()["serving_version"]
-        done = found == wanted[0]
-        house.ledger.serving = found
-        return done
-
-    return Action(ask, settle)
+    def settle(self, house: House) -> bool:
+        house.ledger.serving = house.client.get(f"/v1/models/{ARM}").json()["serving_version"]
+        return house.ledger.serving == self.version
 
 
-def cancel() -> Action:
-    """Cancel a job that runs."""
-    job = []
-
-    def ask(house: House) -> None:
-        body, kind = npz(**arrays(stream("panda", 150))), {"content-type": "application/x-npz"}
-        dataset = house.client.post("/v1/datasets", content=body, headers=kind).json()
-        house.ledger.datasets[dataset["id"]] = dataset
-        wanted = {"model": f"cancelled-{house.number()}", "datasets": [dataset["id"]], "options": ENDLESS}
-        wanted["estimator"] = "lip-chain"
-        job.append(house.client.post("/v1/jobs", json=wanted).json()["id"])
-        house.ledger.jobs[job[0]] = "cancelled"
-        running(house.client, job[0])
-        assert house.client.post(f"/v1/jobs/{job[0]}/cancel").status_code == 200
-
-    def settle(house: House) -> bool:
-        if house.client.get(f"/v1/jobs/{job[0]}").json()["state"] == "cancelled":
-            return True
-        assert house.client.post(f"/v1/jobs/{job[0]}/cancel").status_code == 200
-        return False
-
-    return Action(ask, settle)
-
-
-def point_alias() -> Action:
+class PointAlias(Action):
     """Let an alias point to the other version; the first time it is new."""
-    wanted = []
 
-    def ask(house: House) -> None:
-        wanted.append(3 - house.ledger.aliases.get(ALIAS, 1))
-        answer = house.client.put(f"/v1/models/{ARM}/aliases/{ALIAS}", json={"version": wanted[0]})
+    def ask(self, house: House) -> None:
+        self.version: int | None = 3 - house.ledger.aliases.get(ALIAS, 1)
+        answer = house.client.put(f"/v1/models/{ARM}/aliases/{ALIAS}", json={"version": self.version})
         assert answer.status_code == 200, answer.text
-        house.ledger.aliases[ALIAS] = wanted[0]
+        house.ledger.aliases[ALIAS] = self.version
 
-    def settle(house: House) -> bool:
-        return _find_alias(house) == wanted[0]
+    def settle(self, house: House) -> bool:
+        found = {each["alias"]: each["version"] for each in listed(house.client, f"/v1/models/{ARM}/aliases")}
+        house.ledger.aliases = {name: version for name, version in found.items() if name != "serving"}
+        return found.get(ALIAS) == self.version
 
-    return Action(ask, settle)
 
-
-def remove_alias() -> Action:
+class RemoveAlias(PointAlias):
     """Remove that alias."""
 
-    def ask(house: House) -> None:
-        point_alias().ask(house)
+    def ask(self, house: House) -> None:
+        super().ask(house)
+        self.version = None
         assert house.client.delete(f"/v1/models/{ARM}/aliases/{ALIAS}").status_code == 204
         del house.ledger.aliases[ALIAS]
 
-    def settle(house: House) -> bool:
-        return _find_alias(house) is None
 
-    return Action(ask, settle)
-
-
-def _find_alias(house: House) -> int | None:
-    """Where the alias points, entered in the ledger."""
-    found = {each["alias"]: each["version"] for each in listed(house.client, f"/v1/models/{ARM}/aliases")}
-    house.ledger.aliases = {name: version for name, version in found.items() if name != "serving"}
-    return house.ledger.aliases.get(ALIAS)
-
-
-def import_model() -> Action:
+class ImportModel(Action):
     """Import an archive of a version as a model of its own."""
-    name = []
 
-    def ask(house: House) -> None:
-        name.append(f"imported-{house.number()}")
-        _import(house, name[0])
+    def ask(self, house: House) -> None:
+        self.name = f"imported-{house.number()}"
+        self.imported(house)
 
-    def settle(house: House) -> bool:
-        found = house.client.get(f"/v1/models/{name[0]}").status_code == 200
+    def settle(self, house: House) -> bool:
+        found = self.is_there(house)
         if found:
-            house.ledger.imported[name[0]] = [1]
+            house.ledger.imported[self.name] = [1]
         return found
 
-    return Action(ask, settle)
+    def imported(self, house: House) -> None:
+        """Import another version."""
+        archive = house.client.get(f"/v1/models/{ARM}/export", params={"version": 2, "learnt": False})
+        assert archive.status_code == 200, archive.text
+        headers, params = {"content-type": MEDIA_TYPE}, {"name": self.name}
+        answer = house.client.post("/v1/models/import", content=archive.content, headers=headers, params=params)
+        assert answer.status_code == 201, answer.text
+        house.ledger.imported.setdefault(self.name, []).append(answer.json()["version"])
+
+    def is_there(self, house: House, path: str = "") -> bool:
+        """Whether the model, or something of it, is known."""
+        return house.client.get(f"/v1/models/{self.name}{path}").status_code == 200
 
 
-def delete_version() -> Action:
+class DeleteVersion(ImportModel):
     """Delete the second version of an imported model."""
-    name = []
 
-    def ask(house: House) -> None:
-        name.append(f"imported-{house.number()}")
-        _import(house, name[0])
-        _import(house, name[0])
-        assert house.client.delete(f"/v1/models/{name[0]}/versions/2").status_code == 204
-        house.ledger.imported[name[0]] = [1]
+    def ask(self, house: House) -> None:
+        super().ask(house)
+        self.imported(house)
+        assert house.client.delete(f"/v1/models/{self.name}/versions/2").status_code == 204
+        house.ledger.imported[self.name] = [1]
 
-    def settle(house: House) -> bool:
-        gone = house.client.get(f"/v1/models/{name[0]}/versions/2").status_code == 404
-        house.ledger.imported[name[0]] = [1] if gone else [1, 2]
-        return gone
-
-    return Action(ask, settle)
+    def settle(self, house: House) -> bool:
+        left = self.is_there(house, "/versions/2")
+        house.ledger.imported[self.name] = [1, 2] if left else [1]
+        return not left
 
 
-def delete_model() -> Action:
+class DeleteModel(ImportModel):
     """Delete an imported model."""
-    name = []
 
-    def ask(house: House) -> None:
-        name.append(f"imported-{house.number()}")
-        _import(house, name[0])
-        assert house.client.delete(f"/v1/models/{name[0]}").status_code == 204
-        del house.ledger.imported[name[0]]
+    def ask(self, house: House) -> None:
+        super().ask(house)
+        assert house.client.delete(f"/v1/models/{self.name}").status_code == 204
+        del house.ledger.imported[self.name]
 
-    def settle(house: House) -> bool:
-        if house.client.get(f"/v1/models/{name[0]}").status_code == 200:
-            return False
-        del house.ledger.imported[name[0]]
-        return True
-
-    return Action(ask, settle)
-
-
-def _import(house: House, name: str) -> None:
-    archive = house.client.get(f"/v1/models/{ARM}/export", params={"version": 2, "learnt": False})
-    assert archive.status_code == 200, archive.text
-    answer = house.client.post(
-        "/v1/models/import", content=archive.content, headers={"content-type": MEDIA_TYPE}, params={"name": name}
-    )
-    assert answer.status_code == 201, answer.text
-    house.ledger.imported.setdefault(name, []).append(answer.json()["version"])
+    def settle(self, house: House) -> bool:
+        left = self.is_there(house)
+        if not left:
+            del house.ledger.imported[self.name]
+        return not left

@@ -11,14 +11,14 @@ import httpx
 import pytest
 
 import lipcore
-from lipcore import FitOptions
 from service.learning.schema import LearningOptions
 from service.models import registry
 from service.storage.database import Database, LearningRow
 from service.storage.files import Files
-from tests.service.data import DEADLINE, QUICK, eventually, stream
+from tests.service.data import DEADLINE, eventually
 from tests.service.faults.injection import PATIENCE, Fault, Injector
 from tests.service.faults.ledger import ARM, Ledger
+from tests.service.learning.pendulums import trained
 from tests.service.server import Server, children, command
 
 SETTINGS = {
@@ -36,9 +36,8 @@ SETTINGS = {
 def furnish(home: Path) -> None:
     """Put a model of a double pendulum with two equal versions into a new home; the first one serves and learns."""
     database, files = Database(home), Files(home)
-    trained = lipcore.train(stream(), ["revolute", "revolute"], "lip-chain", FitOptions(**QUICK))
     for number, candidate in ((1, False), (2, True)):
-        manifest = lipcore.save(trained, files.versions / f"mv_arm{number}")
+        manifest = lipcore.save(trained(), files.versions / f"mv_arm{number}")
         with database.transaction() as session:
             registry.publish(session, ARM, f"mv_arm{number}", manifest, None, candidate=candidate)
             if candidate:
@@ -58,7 +57,7 @@ class House:
     """A home, the service that runs on it, and what that has acknowledged. Use it as a context manager.
 
     targets: functions at which faults may strike; furnished: whether there is a model that learns; settings: of the
-    service, names in capitals; starts: how often it was started; has_own_disk: whether its disk can be filled.
+    service, names in capitals; has_own_disk: whether its disk can be filled.
     """
 
     def __init__(self, folder: Path, targets: set[str], furnished: bool = True, **settings: str) -> None:
@@ -68,7 +67,7 @@ class House:
             furnish(self.home)
         self.injector = Injector(folder / "faults", targets)
         self.settings = {f"LIPSERVE_{name}": value for name, value in (SETTINGS | settings).items()}
-        self.starts, self._numbers = 0, 0
+        self._numbers = 0
         self.has_own_disk = False
 
     def __enter__(self) -> Self:
@@ -91,7 +90,6 @@ class House:
     def start(self) -> None:
         """Start the service and wait until it is ready."""
         self.server = _Patient(self.home, **self.settings, **self.injector.environment)
-        self.starts += 1
 
     def verify(self) -> None:
         """See that the service knows all that was acknowledged, and nothing half."""

@@ -10,6 +10,8 @@ from tests.service.faults import actions
 from tests.service.faults.actions import Action
 from tests.service.faults.injection import COMMIT, FSYNC, RENAME, Fault
 
+FILES = "service.storage.files.store:Files"
+LEARNER = "service.learning.learner"
 Left = Literal["all", "nothing"]
 
 
@@ -39,111 +41,109 @@ def _both(name: str, action: Callable[[], Action], fault: Fault) -> list[Point]:
 
 
 UPLOADS = [
-    Point("upload: body received", actions.upload, Fault("service.datasets.store:add"), "nothing"),
+    Point("upload: body received", actions.Upload, Fault("service.datasets.store:add"), "nothing"),
     Point(
         "upload: half of the file written",
-        actions.upload,
-        Fault(RENAME, within="service.storage.files.store:Files.write_samples"),
+        actions.Upload,
+        Fault(RENAME, within=f"{FILES}.write_samples"),
         "nothing",
     ),
     Point(
         "upload: file complete, no row",
-        actions.upload,
-        Fault("service.storage.files.store:Files.write_samples", "after"),
+        actions.Upload,
+        Fault(f"{FILES}.write_samples", "after"),
         "nothing",
     ),
-    *_around_commit("upload", actions.upload, "service.datasets.store:add"),
-    *_around_commit("upload of a robot", actions.upload_robot, "service.robots.store:add"),
-    *_around_commit("deletion of a data set", actions.delete_dataset, "service.datasets.store:delete"),
+    *_around_commit("upload", actions.Upload, "service.datasets.store:add"),
+    *_around_commit("upload of a robot", actions.UploadRobot, "service.robots.store:add"),
+    *_around_commit("deletion of a data set", actions.DeleteDataset, "service.datasets.store:delete"),
     Point(
         "deletion of a data set: before its file goes",
-        actions.delete_dataset,
-        Fault("service.storage.files.store:Files.delete_samples"),
+        actions.DeleteDataset,
+        Fault(f"{FILES}.delete_samples"),
         "all",
     ),
 ]
 WORK = "service.training.worker:_train"
 JOBS = [
-    *_around_commit("job queued", actions.train, "service.training.jobs:create"),
-    Point("job queued: before it is handed on", actions.train, Fault("service.training.queue:JobQueue.submit"), "all"),
-    *_both("job claimed", actions.train, Fault(COMMIT, "after", "service.training.worker:_claim")),
-    *_both("job at work: fit begun", actions.train, Fault("lipcore.fitting.hyperparameters:fit", "before", WORK)),
-    *_both("job at work: fit ended", actions.train, Fault("service.training.worker:_fit", "after")),
-    *_both("version: half of its files", actions.train, Fault(FSYNC, "before", WORK)),
-    *_both("version: files complete, no row", actions.train, Fault(RENAME, "after", WORK)),
-    *_both("version: row made", actions.train, Fault("service.models.registry:publish", "after", WORK)),
-    *_both("version: before the commit", actions.train, Fault(COMMIT, "before", WORK)),
-    *_both("version: after the commit", actions.train, Fault(COMMIT, "after", WORK)),
+    *_around_commit("job queued", actions.Train, "service.training.jobs:create"),
+    Point("job queued: before it is handed on", actions.Train, Fault("service.training.queue:JobQueue.submit"), "all"),
+    *_both("job claimed", actions.Train, Fault(COMMIT, "after", "service.training.worker:_claim")),
+    *_both("job at work: fit begun", actions.Train, Fault("lipcore.fitting.hyperparameters:fit", "before", WORK)),
+    *_both("job at work: fit ended", actions.Train, Fault("service.training.worker:_fit", "after")),
+    *_both("version: half of its files", actions.Train, Fault(FSYNC, "before", WORK)),
+    *_both("version: files complete, no row", actions.Train, Fault(RENAME, "after", WORK)),
+    *_both("version: row made", actions.Train, Fault("service.models.registry:publish", "after", WORK)),
+    *_both("version: before the commit", actions.Train, Fault(COMMIT, "before", WORK)),
+    *_both("version: after the commit", actions.Train, Fault(COMMIT, "after", WORK)),
     Point(
         "job at work: its process stands still",
-        actions.train,
+        actions.Train,
         Fault("lipcore.fitting.hyperparameters:fit", "before", WORK, victim="frozen"),
         "all",
     ),
-    *_around_commit("job cancelled while it runs", actions.cancel, "service.training.jobs:cancel"),
+    *_around_commit("job cancelled while it runs", actions.Cancel, "service.training.jobs:cancel"),
 ]
 POINTED = "service.models.loaded:LoadedModels.point"
 APPEND = "service.learning.ingest.intake:Intake.append"
 STORE = "service.journal.snapshots:save"
 LEARNING = [
-    Point("observation: row made", actions.observe, Fault("service.journal.log:append_batch", "after"), "nothing"),
-    *_around_commit("observation", actions.observe, APPEND),
-    *_around_commit("unlearning", actions.unlearn, "service.learning.control.undoing:unlearn"),
-    *_both("learner: page read", actions.observe, Fault("service.learning.learner.restore:advance", "before")),
-    *_both(
-        "learner: publication written", actions.observe, Fault("service.learning.learner.publication:write", "after")
-    ),
-    Point("publication: before it is read", actions.observe, Fault("service.learning.learner.publication:read"), "all"),
-    *_both("snapshot: half of the file", actions.observe, Fault(RENAME, "before", STORE)),
+    Point("observation: row made", actions.Observe, Fault("service.journal.log:append_batch", "after"), "nothing"),
+    *_around_commit("observation", actions.Observe, APPEND),
+    *_around_commit("unlearning", actions.Unlearn, "service.learning.control.undoing:unlearn"),
+    *_both("learner: page read", actions.Observe, Fault(f"{LEARNER}.restore:advance", "before")),
+    *_both("learner: publication written", actions.Observe, Fault(f"{LEARNER}.publication:write", "after")),
+    Point("publication: before it is read", actions.Observe, Fault(f"{LEARNER}.publication:read"), "all"),
+    *_both("snapshot: half of the file", actions.Observe, Fault(RENAME, "before", STORE)),
     *_both(
         "snapshot: file complete, no row",
-        actions.observe,
-        Fault("service.storage.files.store:Files.write_snapshot", "after"),
+        actions.Observe,
+        Fault(f"{FILES}.write_snapshot", "after"),
     ),
-    *_both("snapshot: before the commit", actions.observe, Fault(COMMIT, "before", STORE)),
-    *_both("snapshot: after the commit", actions.observe, Fault(COMMIT, "after", STORE)),
+    *_both("snapshot: before the commit", actions.Observe, Fault(COMMIT, "before", STORE)),
+    *_both("snapshot: after the commit", actions.Observe, Fault(COMMIT, "after", STORE)),
     *_both(
         "snapshot: older ones still there",
-        actions.observe_on,
-        Fault("service.storage.files.store:Files.delete_snapshot", "before"),
+        actions.ObserveOn,
+        Fault(f"{FILES}.delete_snapshot", "before"),
     ),
 ]
 MOVE = "service.models.aliases:_move"
 MOVES = [
     Point(
-        "other version serves: pointer moved", actions.serve, Fault("service.models.registry:serve", "after"), "nothing"
+        "other version serves: pointer moved", actions.Serve, Fault("service.models.registry:serve", "after"), "nothing"
     ),
-    *_around_commit("other version serves", actions.serve, "service.learning.control.undoing:_to_version"),
+    *_around_commit("other version serves", actions.Serve, "service.learning.control.undoing:_to_version"),
     Point(
         "other version serves: before it answers",
-        actions.serve,
+        actions.Serve,
         Fault("service.models.loaded:LoadedModels.adopt"),
         "all",
     ),
-    *_around_commit("alias moved", actions.point_alias, MOVE),
-    Point("alias moved: before it answers", actions.point_alias, Fault(POINTED, within=MOVE), "all"),
-    *_around_commit("alias removed", actions.remove_alias, "service.models.aliases:remove"),
+    *_around_commit("alias moved", actions.PointAlias, MOVE),
+    Point("alias moved: before it answers", actions.PointAlias, Fault(POINTED, within=MOVE), "all"),
+    *_around_commit("alias removed", actions.RemoveAlias, "service.models.aliases:remove"),
 ]
 IMPORT = "service.models.archive_import:add"
 ARCHIVES = [
-    Point("import: archive received", actions.import_model, Fault(IMPORT), "nothing"),
-    Point("import: half of the files", actions.import_model, Fault(FSYNC, within=IMPORT, skip=1), "nothing"),
-    Point("import: files complete, no name", actions.import_model, Fault(RENAME, within=IMPORT), "nothing"),
-    Point("import: files complete, no row", actions.import_model, Fault(RENAME, "after", IMPORT), "nothing"),
-    *_around_commit("import", actions.import_model, "service.models.archive_import:_publish"),
+    Point("import: archive received", actions.ImportModel, Fault(IMPORT), "nothing"),
+    Point("import: half of the files", actions.ImportModel, Fault(FSYNC, within=IMPORT, skip=1), "nothing"),
+    Point("import: files complete, no name", actions.ImportModel, Fault(RENAME, within=IMPORT), "nothing"),
+    Point("import: files complete, no row", actions.ImportModel, Fault(RENAME, "after", IMPORT), "nothing"),
+    *_around_commit("import", actions.ImportModel, "service.models.archive_import:_publish"),
 ]
 REMOVE = "service.models.deletion:_remove_files"
 DELETIONS = [
-    *_around_commit("deletion of a version", actions.delete_version, "service.models.deletion:delete_version"),
-    Point("deletion of a version: before its files go", actions.delete_version, Fault(REMOVE), "all"),
-    *_around_commit("deletion of a model", actions.delete_model, "service.models.deletion:delete_model"),
-    Point("deletion of a model: before its files go", actions.delete_model, Fault(REMOVE), "all"),
+    *_around_commit("deletion of a version", actions.DeleteVersion, "service.models.deletion:delete_version"),
+    Point("deletion of a version: before its files go", actions.DeleteVersion, Fault(REMOVE), "all"),
+    *_around_commit("deletion of a model", actions.DeleteModel, "service.models.deletion:delete_model"),
+    Point("deletion of a model: before its files go", actions.DeleteModel, Fault(REMOVE), "all"),
 ]
 POINTS = [*UPLOADS, *JOBS, *LEARNING, *MOVES, *ARCHIVES, *DELETIONS]
 RECOVER = "service.training.queue:JobQueue.recover"
 STARTS = {
     "the home is held": Fault("service.app:_open", victim="itself"),
-    "all is swept": Fault("service.storage.files.store:Files.sweep", "after", victim="itself"),
+    "all is swept": Fault(f"{FILES}.sweep", "after", victim="itself"),
     "before jobs are queued again": Fault(COMMIT, "before", RECOVER, "itself"),
     "jobs are queued again": Fault(COMMIT, "after", RECOVER, "itself"),
 }

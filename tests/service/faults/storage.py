@@ -1,8 +1,7 @@
-"""Storage that fails for a while: full disks, largest files, locks of other processes. All of it undone at the end."""
+"""Storage that fails for a while: full disks, locks of other processes. All of it undone at the end."""
 
 from __future__ import annotations
 
-import resource
 import shutil
 import subprocess
 import sys
@@ -11,7 +10,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from tests.service.data import DEADLINE
-from tests.service.server import children
 
 LOCK = """
 import sqlite3, sys
@@ -36,21 +34,6 @@ def locked(database: Path) -> Iterator[None]:
         finally:
             holder.communicate(timeout=DEADLINE)
     assert holder.returncode == 0
-
-
-@contextmanager
-def largest_file(service: int, size: int) -> Iterator[None]:
-    """No process of a service writes beyond so many bytes of any file meanwhile."""
-    processes = [service, *children(service)]
-    for pid in processes:
-        with suppress(ProcessLookupError):
-            resource.prlimit(pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
-    try:
-        yield
-    finally:
-        for pid in {*processes, *children(service)}:
-            with suppress(ProcessLookupError):
-                resource.prlimit(pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
 
 
 @contextmanager

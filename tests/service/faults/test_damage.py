@@ -8,7 +8,6 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
@@ -17,7 +16,7 @@ from service.app import create_app
 from service.foundation.settings import Settings
 from service.storage.database.sqlite import FILE
 from service.storage.home import HomeError, check_home
-from tests.service.data import ended, error, eventually, queue, stream, upload
+from tests.service.data import error, eventually, stream, upload
 from tests.service.faults.damage import HARM, cut, empty, flip, zero
 from tests.service.faults.house import furnish
 from tests.service.faults.ledger import ARM, Ledger, batch, listed, predicted, rows, verify_database
@@ -79,34 +78,6 @@ def powerless(lived, tmp_path):
     return Path(shutil.copytree(lived.powerless, tmp_path / "home"))
 
 
-def evaluated(api, dataset):
-    """The answer to the question how well the model predicts a data set."""
-    return api.post(f"/v1/models/{ARM}/evaluate", json={"dataset": dataset})
-
-
-@harm
-def test_a_damaged_data_set_is_said_to_be_and_can_be_deleted(lived, home, harm):
-    damaged, sound = lived.datasets
-    harm(home / "datasets" / f"{damaged}.safetensors")
-    with running(home) as api:
-        assert api.get("/health/ready").status_code == 200
-        said = error(evaluated(api, damaged), 500, "damaged_data")
-        assert damaged in said["message"]
-        assert evaluated(api, sound).status_code == 200
-        assert api.get(f"/v1/datasets/{damaged}").status_code == 200
-        assert api.delete(f"/v1/datasets/{damaged}").status_code == 204
-        error(evaluated(api, damaged), 404, "not_found")
-
-
-def test_a_job_on_a_damaged_data_set_fails_and_says_why(lived, home):
-    flip(home / "datasets" / f"{lived.datasets[0]}.safetensors")
-    with running(home) as api:
-        seen = ended(api, queue(api, "late", lived.datasets[0])["id"])
-        assert (seen["state"], seen["attempts"]) == ("failed", 1)
-        assert lived.datasets[0] in seen["error"]["message"]
-        assert ended(api, queue(api, "late", lived.datasets[1])["id"])["state"] == "succeeded"
-
-
 @pytest.mark.parametrize("file", [MANIFEST, TENSORS])
 @harm
 def test_a_damaged_version_does_not_keep_others_from_answering(lived, home, file, harm):
@@ -130,17 +101,6 @@ def test_where_the_version_that_serves_is_damaged_other_models_answer(lived, hom
         assert api.post("/v1/models/panda-sim/predict", json=zeros).status_code == 200
         assert api.post(f"/v1/models/{ARM}/rollback", json={"version": 2}).status_code == 200
         assert predicted(api, ARM)["version"] == 2
-
-
-@harm
-def test_what_was_learnt_does_not_depend_on_a_damaged_snapshot(lived, home, harm):
-    newest = rows(home, "SELECT id FROM snapshots WHERE model = ? ORDER BY number DESC", ARM)
-    harm(home / "learning" / f"{newest[0][0]}.safetensors")
-    if harm in (cut, zero):  # and none of them is left
-        for (name,) in newest:
-            flip(home / "learning" / f"{name}.safetensors")
-    with running(home) as api:
-        lived.ledger._verify_learning(api, home)
 
 
 def test_rows_of_the_log_that_are_damaged_are_not_learnt_and_stop_nothing_else(lived, home):
@@ -170,12 +130,6 @@ def test_no_service_starts_on_a_damaged_database_and_it_says_what_would_help(hom
     assert path.stat().st_size in (size, size // 2)  # it is left as it was found, for who may save something
 
 
-def test_no_service_starts_on_what_is_no_database(home):
-    (home / FILE).write_bytes(np.random.default_rng(1).bytes(10_000))
-    with pytest.raises(HomeError, match="file is not a database"):
-        check_home(Settings(home=home))
-
-
 @pytest.mark.parametrize("part", [0.0, 0.3, 0.7, 0.95, 0.999])
 def test_a_power_cut_in_the_middle_of_a_commit_loses_the_end_of_the_log_at_most(lived, powerless, part):
     """A disk that broke its promise: the last transactions are gone as a whole, and all before are there."""
@@ -188,10 +142,3 @@ def test_a_power_cut_in_the_middle_of_a_commit_loses_the_end_of_the_log_at_most(
     assert left == list(range(len(left)))
     known = {row[0] for row in rows(powerless, "SELECT id FROM datasets")}
     assert known <= set(lived.datasets)
-
-
-@harm
-def test_the_index_of_uncommitted_pages_can_be_lost(lived, powerless, harm):
-    harm(powerless / f"{FILE}-shm")
-    check_home(Settings(home=powerless))
-    assert len(rows(powerless, "SELECT 1 FROM events WHERE kind = 'batch'")) == BATCHES

@@ -11,17 +11,11 @@ from unittest.mock import patch
 import pytest
 
 from service.storage.files import Files
+from tests.cluster import conftest as cluster
 from tests.cluster.servers import BUCKET, S3
 
+s3 = cluster.s3
 _prefixes = count(1)
-
-
-@pytest.fixture(scope="session")
-def s3() -> Iterator[S3]:
-    """An S3 endpoint; a test that stops it starts it again."""
-    server = S3()
-    yield server
-    server.close()
 
 
 @pytest.fixture

@@ -5,10 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import pickle
-import shutil
 import threading
 from functools import partial
-from pathlib import Path
 
 import pytest
 
@@ -82,17 +80,6 @@ def test_a_folder_that_is_not_mounted_is_not_made(tmp_path):
     assert not root.exists()
 
 
-def test_a_folder_that_was_unmounted_is_found(tmp_path):
-    root = tmp_path / "mounted"
-    root.mkdir()
-    files = Files(tmp_path / "home", root.as_uri())
-    digest = put(files)
-    shutil.move(root, tmp_path / "away")
-    refused(files)
-    shutil.move(tmp_path / "away", root)
-    assert Files(tmp_path / "other", root.as_uri()).samples_file("ds_one", digest).exists()
-
-
 @pytest.mark.parametrize(
     ("raised", "said"),
     [
@@ -158,22 +145,8 @@ def test_who_has_patience_gets_what_comes_back(tmp_path, monkeypatch):
     assert Files(tmp_path / "other", root.as_uri()).samples_file("ds_one", digest).exists()
 
 
-def test_patience_ends(tmp_path, monkeypatch):
-    monkeypatch.setattr(objects, "FIRST_PAUSE_S", 0.01)
-    with pytest.raises(FilesUnreachableError):
-        put(Files(tmp_path / "home", (tmp_path / "gone").as_uri(), patience_s=0.05))
-
-
 @pytest.mark.parametrize("url", ["s3://nobody-has-this/files", "file:///nobody/has/this"])
 def test_no_service_starts_without_its_store(url, s3, bucket, tmp_path, quick):
     settings = Settings(home=tmp_path, database_url="postgresql://nowhere/none", files_url=url)
     with pytest.raises(HomeError, match=f"files_url is '{url}'"):
         check_home(settings)
-
-
-def test_a_service_alone_loads_nothing_of_stores(tmp_path):
-    files = Files(tmp_path)
-    files.check()
-    files.try_out()
-    assert not files.shared
-    assert not Path(tmp_path, "cache").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from functools import partial
 
@@ -9,30 +10,22 @@ import pytest
 from sqlalchemy import select
 from typer.testing import CliRunner
 
+import lipcore
 from lipcore import ModelFormatError
-from lipcore.online import transfer
 from service import cli
 from service.cli.verify import verify_home
 from service.foundation.errors import DamagedDataError
 from service.foundation.settings import Settings
-from service.journal import snapshots
-from service.learning.learner.restore import restore
 from service.models import registry
 from service.storage.database import DatasetRow, EventRow, RobotRow, SnapshotRow, VersionRow
-from service.storage.files import DamagedFileError, Files
+from service.storage.files import Files
 from service.training.material import recorded
 from tests.service.data import error, service_of, stream, upload
+from tests.service.faults.damage import empty, flip, remove
 from tests.service.learning.pendulums import ARM, Arm
 
 
-def flip(path):
-    """Change one bit in the middle of a file."""
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.write_bytes(content)
-
-
-@pytest.mark.parametrize("spoil", [flip, lambda path: path.unlink(), lambda path: path.write_bytes(b"")])
+@pytest.mark.parametrize("spoil", [flip, remove, empty])
 def test_damaged_data_set_is_not_evaluated_and_not_trained_on(api, trained, spoil):
     dataset = upload(api, stream(samples=40, seed=31))
     service = service_of(api)
@@ -52,20 +45,10 @@ def arm(home):
     arm.database.close()
 
 
-def row_of(arm):
-    return registry.find(arm.database, ARM, 1)
-
-
-def test_checksums_of_every_file_are_kept(arm):
-    assert set(row_of(arm).checksums) == {"manifest.json", "model.safetensors"}
-
-
 @pytest.mark.parametrize("name", ["manifest.json", "model.safetensors"])
 def test_version_that_is_whole_but_another_one_is_not_loaded(arm, name):
     """The manifest itself may be exchanged, and vouch for other tensors."""
-    import lipcore
-
-    row = row_of(arm)
+    row = registry.find(arm.database, ARM, 1)
     folder = arm.files.versions / row.folder
     if name == "manifest.json":
         manifest = json.loads((folder / name).read_text())
@@ -78,35 +61,11 @@ def test_version_that_is_whole_but_another_one_is_not_loaded(arm, name):
         lipcore.load(folder, row.checksums)
 
 
-def snapshot(arm, number):
-    known = restore(arm.database, arm.files, ARM, 1, arm.base, number)
-    return snapshots.save(arm.database, arm.files, ARM, 1, number, transfer.dump(known.online), most=20)
-
-
-def test_damaged_snapshot_gives_way_to_the_one_before(arm, caplog):
-    for number in range(4):
-        arm.batch(number)
-    snapshot(arm, 2)
-    newest = snapshot(arm, 4)
-    expected = restore(arm.database, arm.files, ARM, 1, arm.base).online.model()
-    path = arm.files.learning / f"{newest}.safetensors"
-    flip(path)
-    with arm.database.session() as session:
-        row = session.scalar(select(SnapshotRow).where(SnapshotRow.id == newest))
-    with pytest.raises(DamagedFileError, match="sha256"):
-        snapshots.read(arm.files, row)
-    found = restore(arm.database, arm.files, ARM, 1, arm.base)
-    assert (found.number, newest in caplog.text) == (4, True)
-    query = stream(seed=3, samples=10)
-    one, other = (model.predict(query.q, query.dq, query.ddq) for model in (expected, found.online.model()))
-    assert abs(one.tau - other.tau).max() < 1e-8
-
-
 def test_snapshot_of_an_earlier_release_has_no_checksum_and_is_read(arm):
     arm.batch(0)
-    name = snapshot(arm, 1)
+    arm.snapshot()
     with arm.database.transaction() as session:
-        session.scalar(select(SnapshotRow).where(SnapshotRow.id == name)).sha256 = None
+        session.scalar(select(SnapshotRow)).sha256 = None
     assert verify_home(arm.settings).damages == []
 
 
@@ -114,18 +73,14 @@ def test_snapshot_of_an_earlier_release_has_no_checksum_and_is_read(arm):
 def store(arm):
     """A home with one of everything."""
     arm.batch(0)
-    snapshot(arm, 1)
+    arm.snapshot()
     samples = stream(samples=40, seed=32)
     digest = arm.files.write_samples("ds_one", len(samples), samples.n_joints, partial(getattr, samples))
     with arm.database.transaction() as session:
         dataset = {"torque_convention": "gravity_included", "joint_names": list(samples.joint_names), "report": {}}
         session.add(DatasetRow(id="ds_one", name="one", created_at="", sha256=digest, rows=len(samples), **dataset))
-        robot = {"sha256": "b05c5ddf5ae7e0a0ba28a2e3bb5c7c9c8b2ae6d0f5b8e4e0f1b7d4c0a9d8e7f6", "joints": []}
+        robot = {"sha256": hashlib.sha256(b"<robot/>").hexdigest(), "joints": []}
         session.add(RobotRow(id="rb_one", name="one", created_at="", urdf="<robot/>", **robot))
-        session.flush()
-        import hashlib
-
-        session.scalar(select(RobotRow)).sha256 = hashlib.sha256(b"<robot/>").hexdigest()
     return arm
 
 

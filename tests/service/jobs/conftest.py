@@ -23,7 +23,36 @@ from tests.service.data import eventually
 DATABASE_TIMEOUT_S = 0.2
 
 
-class Bench:
+class Seen:
+    """Looks at the jobs of its `database`."""
+
+    database: Database
+
+    def row(self, job: str) -> JobRow:
+        """A job as it is now."""
+        with self.database.session() as session:
+            return session.scalar(select(JobRow).where(JobRow.id == job))
+
+    def running(self, job: str, attempt: int = 1) -> JobRow:
+        """Wait for an attempt's first sign of life."""
+
+        def look() -> JobRow | None:
+            row = self.row(job)
+            return row if (row.state, row.attempts) == ("running", attempt) and "process" in row.progress else None
+
+        return eventually(look)
+
+    def ended(self, job: str) -> JobRow:
+        """Wait for the end of a job."""
+        return eventually(lambda: (row := self.row(job)).state not in ACTIVE and row)
+
+
+def messages_of(row: JobRow) -> list[str]:
+    """What has happened to a job, in words."""
+    return [entry["message"] for entry in row.history]
+
+
+class Bench(Seen):
     """A queue with a database of its own."""
 
     def __init__(self, settings: Settings) -> None:
@@ -44,18 +73,6 @@ class Bench:
         job = self.add(name)
         self.queue.submit(job)
         return job
-
-    def row(self, job: str) -> JobRow:
-        with self.database.session() as session:
-            return session.scalar(select(JobRow).where(JobRow.id == job))
-
-    def running(self, job: str, attempt: int = 1) -> JobRow:
-        """Wait until an attempt at a job has begun."""
-        return eventually(lambda: (row := self.row(job)).attempts == attempt and row.state == "running" and row)
-
-    def ended(self, job: str) -> JobRow:
-        """Wait for the end of a job."""
-        return eventually(lambda: (row := self.row(job)).state not in ACTIVE and row)
 
     def cancel(self, job: str) -> None:
         """Wish a running job to end, as the service does."""

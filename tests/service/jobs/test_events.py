@@ -9,14 +9,13 @@ from itertools import pairwise
 import pytest
 from sqlalchemy import select
 
-from service.foundation.errors import BusyError
 from service.foundation.settings import Settings
 from service.storage.database import Database, JobRow
 from service.training import feed
 from service.training.feed import Feed
-from tests.service.data import ENDLESS, error, eventually, queue, service_of, stream, upload
+from tests.service.data import error, queue, service_of, stream, upload
 from tests.service.jobs.conftest import new_row
-from tests.service.server import Server
+from tests.service.learning.following import followed
 
 
 def read(text):
@@ -51,11 +50,6 @@ def test_a_job_is_followed_from_its_start_to_its_end(api, pendulum):
     assert service_of(api).jobs.feed.open == 0
 
 
-def test_an_unknown_job_is_not_followed(api):
-    error(api.get("/v1/jobs/job_nowhere/events"), 404, "not_found")
-    assert service_of(api).jobs.feed.open == 0
-
-
 def test_no_more_readers_than_may_be(no_worker, monkeypatch):
     name = queue(no_worker, "many", upload(no_worker, stream())["id"], options={**FEW})["id"]
     many = service_of(no_worker).jobs.feed
@@ -70,43 +64,10 @@ FEW = {"hyperparameter_samples": 20, "posterior_samples": 30, "max_iterations": 
 
 
 def test_a_reader_that_leaves_is_forgotten(no_worker):
-    """The application itself, whose client hangs up after the first event."""
     name = queue(no_worker, "left", upload(no_worker, stream())["id"], options=FEW)["id"]
-    sent = []
-
-    async def talk():
-        first = asyncio.Event()
-
-        async def receive():
-            await first.wait()
-            return {"type": "http.disconnect"}
-
-        async def send(message):
-            sent.append(message)
-            if message.get("body"):
-                first.set()
-
-        scope = {
-            "type": "http",
-            "method": "GET",
-            "path": f"/v1/jobs/{name}/events",
-            "raw_path": b"",
-            "query_string": b"",
-            "headers": [(b"host", b"127.0.0.1")],
-            "client": ("127.0.0.1", 1),
-            "server": ("127.0.0.1", 80),
-            "scheme": "http",
-            "root_path": "",
-            "http_version": "1.1",
-            "asgi": {"version": "3.0", "spec_version": "2.3"},  # in which the server says that the client has left
-            "app": no_worker.app,
-            "state": {},
-        }
-        await no_worker.app(scope, receive, send)
-
-    no_worker.portal.call(talk)
-    assert sent[0]["status"] == 200
-    assert b'"state":"queued"' in sent[1]["body"]
+    with followed(no_worker, f"/v1/jobs/{name}/events") as listener:
+        assert listener.status == 200
+        assert listener.of("state")[0]["state"] == "queued"
     assert service_of(no_worker).jobs.feed.open == 0
     assert not service_of(no_worker).jobs.feed._followers
     no_worker.post(f"/v1/jobs/{name}/cancel")
@@ -183,25 +144,3 @@ def test_readers_end_when_the_service_closes(job_row):
         assert all(states[0] == "queued" for states in await asyncio.gather(*tasks))
 
     asyncio.run(story())
-
-
-def test_a_feed_counts_its_readers():
-    following = Feed(None)
-    with following.one_more(1):
-        with pytest.raises(BusyError, match="1 times"), following.one_more(1):
-            pass
-        assert following.open == 1
-    assert following.open == 0
-
-
-@pytest.mark.slow
-def test_a_service_that_is_told_to_stop_ends_the_events(home):
-    with Server(home) as server:
-        name = queue(server.client, "long", upload(server.client, stream("panda", 200))["id"], options=ENDLESS)["id"]
-        with server.client.stream("GET", f"/v1/jobs/{name}/events") as answer:
-            lines = answer.iter_lines()
-            assert next(lines) == "event: state"
-            server.process.terminate()
-            rest = list(lines)
-        assert rest
-        eventually(lambda: server.process.poll() is not None)

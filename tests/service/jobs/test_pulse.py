@@ -1,4 +1,4 @@
-"""A training process's talk with the database: it goes on whatever the fit does."""
+"""A training process's talk with the database, which goes on whatever the fit does; the remaining time of a fit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lipcore.fitting.hyperparameters import FitProgress
 from service.foundation.settings import Settings
 from service.storage.database import Database, JobRow
 from service.training import pulse
-from service.training.pulse import Pulse, SupersededError
+from service.training.pulse import LEAST_FRACTION, POSTERIOR_ITERATIONS, Pulse, Remaining, SupersededError
 from tests.service.data import eventually
 from tests.service.jobs.conftest import new_row
 
@@ -48,12 +48,6 @@ def change(database, **values):
             setattr(found, name, value)
 
 
-def test_signs_of_life_come_while_the_fit_is_busy_with_one_step(beating):
-    database, _ = beating
-    first = eventually(lambda: row(database).heartbeat_at)
-    eventually(lambda: row(database).heartbeat_at != first)
-
-
 def test_progress_is_written_without_the_fit_waiting_for_it(beating):
     database, talk = beating
     with database.transaction():  # nobody else can write: the fit does not notice
@@ -67,21 +61,6 @@ def test_progress_is_written_without_the_fit_waiting_for_it(beating):
         "fraction": 0.133,
         "remaining_s": None,
     }
-
-
-def test_the_wish_to_cancel_arrives(beating):
-    database, talk = beating
-    eventually(lambda: row(database).heartbeat_at)
-    assert not talk.cancelled()
-    change(database, cancel_requested=True)
-    eventually(talk.cancelled)
-
-
-def test_an_attempt_that_was_superseded_stops(beating):
-    database, talk = beating
-    change(database, attempts=2)
-    with pytest.raises(SupersededError):
-        eventually(talk.cancelled)
 
 
 def test_a_database_that_fails_for_a_while_stops_nothing(beating, monkeypatch, caplog):
@@ -110,3 +89,46 @@ def test_nothing_is_written_after_the_end(beating):
     talk.stage("saving")
     assert not talk._thread.is_alive()
     assert row(database).progress == {"stage": "done"}
+
+
+def at(iteration, stage="hyperparameters", most=50):
+    return FitProgress(stage, iteration, most, 0.0, 0.95 * iteration / most, 0.0)
+
+
+def test_it_is_not_told_before_the_pace_is_known():
+    left = Remaining(100, 100)
+    assert left.seconds(0.0) is None
+    for iteration in (1, 2):
+        left.step(at(iteration), 2.0 * iteration)
+        assert left.seconds(2.0 * iteration) is None
+    left.step(at(3), 6.0)
+    assert left.seconds(6.0) is not None
+
+
+@pytest.mark.parametrize("ratio", [1, 2, 4])
+def test_a_steady_search_counts_down_to_the_end(ratio):
+    """The steps that follow the search cost as the cube of their samples."""
+    left, after = Remaining(100, 100 * ratio), POSTERIOR_ITERATIONS * ratio**3
+    for iteration in range(1, 51):
+        left.step(at(iteration), 10.0 + 2.0 * iteration)
+        if iteration >= 3:
+            assert left.seconds(10.0 + 2.0 * iteration) == pytest.approx(2.0 * (50 - iteration + after))
+    left.step(at(50, "posterior"), 110.0)
+    assert left.seconds(111.0) == pytest.approx(2.0 * after - 1.0)
+
+
+def test_the_time_that_is_left_of_several_fits_is_that_of_their_share():
+    left = Remaining(100, 500)
+    left.step(FitProgress("geometry", 1, 150, 0.0, LEAST_FRACTION / 2, 1.0, "rigid-body"), 11.0)
+    assert left.seconds(11.0) is None
+    left.step(FitProgress("hyperparameters", 3, 150, 0.0, 0.25, 20.0, "lip-chain"), 30.0)
+    assert left.seconds(30.0) == pytest.approx(60.0)
+
+
+def test_what_was_told_too_low_is_no_longer_told():
+    left = Remaining(100, 100)
+    for iteration in range(1, 5):
+        left.step(at(iteration), float(iteration))
+    left.step(at(4, "posterior"), 4.0)
+    assert left.seconds(4.0) == pytest.approx(POSTERIOR_ITERATIONS)
+    assert left.seconds(4.0 + POSTERIOR_ITERATIONS) is None

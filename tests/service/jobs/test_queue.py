@@ -5,11 +5,8 @@ from __future__ import annotations
 from service.training import queue
 from tests.service.data import eventually
 from tests.service.jobs import workers
+from tests.service.jobs.conftest import messages_of
 from tests.service.server import command
-
-
-def said(row):
-    return [entry["message"] for entry in row.history]
 
 
 def test_a_process_that_does_not_obey_a_cancel_is_ended_and_no_other_one(bench):
@@ -19,7 +16,7 @@ def test_a_process_that_does_not_obey_a_cancel_is_ended_and_no_other_one(bench):
     jobs.cancel(stubborn)
     seen = jobs.ended(stubborn)
     assert (seen.state, seen.version, seen.attempts) == ("cancelled", None, 1)
-    assert "did not stop within 0.1 s" in said(seen)[-1]
+    assert "did not stop within 0.1 s" in messages_of(seen)[-1]
     assert seen.finished_at
     eventually(lambda: command(first.progress["process"]) == "")
 
@@ -43,7 +40,7 @@ def test_a_process_without_a_sign_of_life_is_ended_and_its_job_started_again_but
     seen = jobs.ended(jobs.submit("frozen"))
     assert (seen.state, seen.attempts, seen.error["code"]) == ("failed", 2, "interrupted")
     silent = "the training process gave no sign of life for 0.3 s and was ended"
-    assert said(seen)[:3] == ["started", f"{silent}: queued again", "started"]
+    assert messages_of(seen)[:3] == ["started", f"{silent}: queued again", "started"]
     assert seen.error["message"].startswith(silent)
     assert "2 times" in seen.error["message"]
 
@@ -72,7 +69,7 @@ def test_where_the_system_starts_no_process_the_job_waits_for_one(bench, monkeyp
     monkeypatch.setattr(slot, "start", sometimes)
     seen = jobs.ended(jobs.submit("patient"))
     assert (seen.state, seen.attempts) == ("succeeded", 1)
-    assert "temporarily unavailable: it waits for another one" in said(seen)[0]
+    assert "temporarily unavailable: it waits for another one" in messages_of(seen)[0]
 
 
 def test_what_becomes_of_a_job_is_written_once_the_database_can_be(bench, monkeypatch):
@@ -90,7 +87,7 @@ def test_what_becomes_of_a_job_is_written_once_the_database_can_be(bench, monkey
         assert jobs.row(job).state == "running"
     seen = jobs.ended(job)
     assert (seen.state, seen.attempts) == ("succeeded", 2)
-    assert "the training process ended with exit code 1: queued again" in said(seen)
+    assert "the training process ended with exit code 1: queued again" in messages_of(seen)
     assert list((jobs.settings.home / "versions").iterdir()) == []  # what it had begun to write
     eventually(lambda: jobs.made == [("frail", 1)])
 
@@ -103,7 +100,7 @@ def test_jobs_that_nobody_has_are_found(bench, monkeypatch):
     assert jobs.ended(forgotten).state == "succeeded"
     seen = jobs.ended(orphan)
     assert (seen.state, seen.attempts) == ("succeeded", 2)
-    assert said(seen)[0] == "no process runs it: queued again"
+    assert messages_of(seen)[0] == "no process runs it: queued again"
 
 
 def test_jobs_are_handed_out_once_and_in_their_order(bench, monkeypatch):
@@ -136,5 +133,5 @@ def test_a_queue_that_closes_hands_its_jobs_back_and_keeps_the_wish_to_cancel(be
     assert all(command(pid) == "" for pid in pids)
     seen = jobs.row(back)
     assert (seen.state, seen.attempts, seen.progress) == ("queued", 0, {"stage": "waiting"})
-    assert said(seen)[-1] == "the service was stopped while it ran: queued again"
+    assert messages_of(seen)[-1] == "the service was stopped while it ran: queued again"
     assert jobs.row(unwanted).state == "cancelled"

@@ -49,20 +49,6 @@ def test_a_job_that_succeeded_is_not_repeated(api, trained):
     assert "is succeeded" in error(retry(api, made), 409, "conflict")["message"]
 
 
-def test_an_unknown_job_is_not_found(no_worker):
-    assert "job_nowhere" in error(retry(no_worker, "job_nowhere"), 404, "not_found")["message"]
-
-
-def test_a_full_queue_says_when_to_come_again(no_worker, cancelled):
-    name, _ = cancelled
-    waiting = [retry(no_worker, name).json()["id"] for _ in range(2)]
-    answer = retry(no_worker, name)
-    error(answer, 429, "busy")
-    assert int(answer.headers["retry-after"]) > 0
-    for each in waiting:
-        no_worker.post(f"/v1/jobs/{each}/cancel")
-
-
 def test_a_job_knows_the_request_that_queued_it_and_what_happened(no_worker, cancelled):
     name, _ = cancelled
     answer = no_worker.post(f"/v1/jobs/{name}/retry", headers={"X-Request-ID": "who-asked-7"}).json()

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 
 import pytest
 
 from service.learning.learner import course
 from service.models import registry
+from service.storage.database import Database
 from tests.service.conftest import Trained
 from tests.service.data import service_of
-from tests.service.learning.lessons import School
+from tests.service.learning import batches
+from tests.service.learning.lessons import Pupil, School
 from tests.service.learning.lessons import school as opened
 from tests.service.learning.pendulums import Arm
 
@@ -23,6 +26,23 @@ def school(api: object, trained: Trained, tmp_path_factory: pytest.TempPathFacto
     folder = service.files.version_folder(registry.find(service.database, trained.name, 1).folder)
     with opened(tmp_path_factory.mktemp("school"), folder) as started:
         yield started
+
+
+NUMBERS = count()
+
+
+@pytest.fixture
+def pupil(school: School) -> Pupil:
+    """A model that nobody else uses, whose data set the service does not have."""
+    return school.enrol(f"own-{next(NUMBERS)}")
+
+
+@pytest.fixture
+def database(home: Path) -> Iterator[Database]:
+    """Two models, whose log a test writes."""
+    opened = batches.opened(home)
+    yield opened
+    opened.close()
 
 
 @pytest.fixture

@@ -1,11 +1,11 @@
-"""A reader of a model's live events, inside the process of the service."""
+"""A reader of server-sent events, inside the process of the service."""
 
 from __future__ import annotations
 
 import asyncio
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 from tests.service.data import eventually
@@ -55,15 +55,15 @@ class Listener:
 
 
 @contextmanager
-def following(client: Any, model: str) -> Iterator[Listener]:
-    """Follow a model until the end of the block; its first status is there."""
+def followed(client: Any, path: str) -> Iterator[Listener]:
+    """Follow events until the end of the block, where the reader leaves; the first one is there."""
     listener = client.portal.call(_listener)
 
     async def talk() -> None:
         scope = {
             "type": "http",
             "method": "GET",
-            "path": f"/v1/models/{model}/live",
+            "path": path,
             "raw_path": b"",
             "query_string": b"",
             "headers": [(b"host", b"127.0.0.1")],
@@ -88,6 +88,11 @@ def following(client: Any, model: str) -> Iterator[Listener]:
     finally:
         client.portal.call(listener.leave.set)
         task.result(30)
+
+
+def following(client: Any, model: str) -> AbstractContextManager[Listener]:
+    """Follow a model."""
+    return followed(client, f"/v1/models/{model}/live")
 
 
 async def _listener() -> Listener:

@@ -15,7 +15,8 @@ import lipcore
 from service.app import create_app
 from service.foundation.settings import Settings
 from service.models import registry
-from service.storage.files import new_id
+from service.storage.database import Database
+from service.storage.files import Files, new_id
 from tests.service.data import ADDRESS, Parts, error, eventually, service_of, stream
 
 LESSON = 10
@@ -23,6 +24,15 @@ LESSON = 10
 RATE = 100.0
 """Rows a second of the streams that tests send."""
 QUERIES = {name: getattr(stream(seed=11, samples=20), name).tolist() for name in ("q", "dq", "ddq")}
+
+
+def publish(database: Database, files: Files, trained: Path, model: str, **how: Any) -> int:
+    """Add a version to a model, as trained; how: as in `registry.publish`. Return its number."""
+    folder = new_id("mv")
+    with files.new_version(folder) as target:
+        manifest = lipcore.copy_model(trained, target)
+    with database.transaction() as session:
+        return registry.publish(session, model, folder, manifest, None, **how)
 
 
 @dataclass(frozen=True)
@@ -44,13 +54,9 @@ class School:
         pupil.put("learning", {"contact_threshold": 1e6, "on_change": "learn", "auto_refresh": False, **options})
         return pupil
 
-    def publish(self, model: str, **how: Any) -> None:
-        """Add a version to a model, which is the same as trained; how: as in `registry.publish`."""
-        folder = new_id("mv")
-        with self.service.files.new_version(folder) as target:
-            manifest = lipcore.copy_model(self.trained, target)
-        with self.service.database.transaction() as session:
-            registry.publish(session, model, folder, manifest, None, **how)
+    def publish(self, model: str, **how: Any) -> int:
+        """Add a version to a model; return its number."""
+        return publish(self.service.database, self.service.files, self.trained, model, **how)
 
 
 @dataclass(frozen=True)

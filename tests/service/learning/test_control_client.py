@@ -1,12 +1,16 @@
-"""The client's methods say what their routes say."""
+"""The client's methods say what their routes say, and what a model has learnt goes with it to another service."""
 
 from __future__ import annotations
 
+import json
+
+import numpy as np
 import pytest
 
 from service.client import ApiError, Client
 from service.learning import owner
-from tests.service.learning.lessons import LESSON
+from tests.service.archives.packing import exported, send, unpack
+from tests.service.learning.lessons import LESSON, QUERIES, answered
 
 
 @pytest.fixture
@@ -60,3 +64,37 @@ def test_what_is_decided(school, client):
         with pytest.raises(ApiError) as caught:
             refused()
         assert (caught.value.status, caught.value.code) == (409, "conflict")
+
+
+@pytest.fixture(scope="module")
+def pupil(school):
+    pupil = school.enrol("travels")
+    pupil.teach(0, 1, 2)
+    return pupil
+
+
+def close(one, other):
+    for name in ("tau", "tau_std"):
+        np.testing.assert_allclose(one[name], other[name], rtol=1e-9, atol=1e-12)
+
+
+def test_imported_version_answers_as_the_one_that_has_learnt(school, pupil):
+    archive = exported(school.client, pupil.model)
+    about = json.loads(unpack(archive)["export.json"])
+    assert (about["learnt"], about["revision"]) == (True, pupil.predict()["revision"])
+    version = send(school.client, archive, name="arrived").json()
+    assert version["lineage"]["learnt"]["revision"] == about["revision"]
+    answer = answered(school.client.post("/v1/models/arrived/predict", json=QUERIES))
+    assert answer["revision"] == 0
+    close(answer, pupil.predict())
+
+
+def test_version_as_trained_is_exported_where_asked(school, pupil):
+    archive = exported(school.client, pupil.model, learnt=False)
+    about = json.loads(unpack(archive)["export.json"])
+    assert (about["learnt"], about["revision"]) == (False, 0)
+    assert send(school.client, archive, name="untaught").status_code == 201
+    answer = answered(school.client.post("/v1/models/untaught/predict", json=QUERIES))
+    fresh = school.enrol("fresh").predict()
+    close(answer, fresh)
+    assert np.abs(np.array(fresh["tau"]) - np.array(pupil.predict()["tau"])).max() > 1e-6

@@ -24,7 +24,7 @@ def pieces(cuts, rows=None):
     return [part(rows, a, b, without=("ddq",)) for a, b in pairwise(edges)]
 
 
-def whole(rows=None):
+def all_at_once(rows=None):
     """What the rows that have an acceleration teach, derived from the whole recording at once."""
     rows = recording(samples=ROWS) if rows is None else rows
     found = derive(rows.t, rows.dq, HALF)
@@ -32,34 +32,16 @@ def whole(rows=None):
     return {**inner, "ddq": found.ddq.tolist()}
 
 
-def test_how_it_was_derived_is_told(school):
-    (body,) = pieces([])
-    said = send(school.enrol("derived"), 0, body)
-    assert (said["rows"], said["accepted"], said["rejected"]) == (ROWS, ROWS - 2 * HALF, {"edge": 2 * HALF})
-    derived = said["derived"]["ddq"]
-    assert derived == pytest.approx({"delay_s": HALF / RATE, "window": HALF, "rate_hz": RATE, "carried": 0}, rel=1e-9)
-
-
-def test_derived_accelerations_are_near_the_true_ones(school):
-    pupil, rows = school.enrol("near-truth"), recording(samples=ROWS)
-    send(pupil, 0, pieces([])[0])
-    (found,) = logged(school, pupil)
-    learnt = found.code == 0
-    wrong = found.ddq[learnt] - rows.ddq[learnt]
-    assert np.abs(wrong).max() < 0.05 * np.abs(rows.ddq).max()
-    assert np.isnan(found.ddq[~learnt]).all()
-
-
 @pytest.mark.parametrize(
     "cuts",
     [
         pytest.param([], id="one"),
         pytest.param([30], id="two"),
-        pytest.param([20, 40], id="three"),
         pytest.param(range(5, 48, 5), id="smaller than the window"),
         pytest.param([2, 30, 33, 36], id="of any size"),
     ],
 )
+@pytest.mark.each_once
 @pytest.mark.parametrize("order", ["forward", "backward", "shuffled"])
 def test_a_stream_teaches_the_same_however_it_is_cut_and_ordered(school, request, cuts, order):
     parts = pieces(cuts)
@@ -74,37 +56,22 @@ def test_a_stream_teaches_the_same_however_it_is_cut_and_ordered(school, request
     for each in said:
         carried = each["derived"]["ddq"]["carried"]
         assert each["rows"] + carried == each["accepted"] + sum(each["rejected"].values())
-    assert apart(pupil.settled(len(parts)), learnt_from(school, whole())) < EXACT
+    assert apart(pupil.settled(len(parts)), learnt_from(school, all_at_once())) < EXACT
 
 
-def test_each_row_is_learnt_once(school):
-    pupil = school.enrol("each-row-once")
-    for place in (3, 0, 2, 1):
-        send(pupil, place, pieces([15, 30, 45])[place])
-    learnt = np.concatenate([rows.q[rows.code == 0] for rows in logged(school, pupil)])
-    expected = recording(samples=ROWS).q[HALF : ROWS - HALF]
-    np.testing.assert_array_equal(learnt[np.argsort(learnt[:, 0])], expected[np.argsort(expected[:, 0])])
-
-
-def test_a_missing_batch_leaves_edges(school):
+def test_a_missing_batch_or_a_pause_leaves_edges(school):
+    paused = school.enrol("with-a-pause")
+    first, second = pieces([30])
+    send(paused, 0, first)
+    said = send(paused, 1, second | {"t": [value + 0.5 for value in second["t"]]})
+    assert (said["rejected"], said["derived"]["ddq"]["carried"]) == ({"edge": 2 * HALF}, 0)
     pupil = school.enrol("with-a-hole")
     parts = pieces([20, 40])
     assert send(pupil, 0, parts[0])["rejected"] == {"edge": 2 * HALF}
     assert send(pupil, 2, parts[2])["rejected"] == {"edge": 2 * HALF}
 
 
-def test_a_pause_leaves_edges(school):
-    pupil = school.enrol("with-a-pause")
-    parts = pieces([30])
-    send(pupil, 0, parts[0])
-    late = parts[1] | {"t": [value + 0.5 for value in parts[1]["t"]]}
-    said = send(pupil, 1, late)
-    assert (said["rejected"], said["derived"]["ddq"]["carried"]) == ({"edge": 2 * HALF}, 0)
-
-
-@pytest.mark.parametrize(
-    ("name", "row", "code"), [("dq", [None, 0.1], "non_finite"), ("t", None, "non_finite"), ("t", 0.0, "time_jump")]
-)
+@pytest.mark.parametrize(("name", "row", "code"), [("dq", [None, 0.1], "non_finite"), ("t", 0.0, "time_jump")])
 def test_a_row_without_velocity_or_time_takes_its_neighbours_accelerations(school, name, row, code):
     pupil = school.enrol(f"broken-{name}-{code.replace('_', '-')}")
     (body,) = pieces([])
@@ -115,13 +82,6 @@ def test_a_row_without_velocity_or_time_takes_its_neighbours_accelerations(schoo
         expected[place] = "edge"
     expected[30] = code
     assert codes(school, pupil) == expected
-
-
-def test_a_row_whose_torque_alone_is_wrong_still_serves_its_neighbours(school):
-    pupil = school.enrol("broken-torque")
-    (body,) = pieces([])
-    body["tau"][30] = [None, 0.0]
-    assert send(pupil, 0, body)["rejected"] == {"edge": 2 * HALF, "non_finite": 1}
 
 
 def test_rows_that_waited_are_checked_once_their_acceleration_is_known(school, monkeypatch):
@@ -148,15 +108,6 @@ def test_a_batch_that_was_taken_out_lends_no_rows(school):
     assert send(pupil, 1, parts[1])["derived"]["ddq"]["carried"] == 0
 
 
-def test_measured_accelerations_are_not_touched_by_derived_neighbours(school):
-    pupil = school.enrol("mixed")
-    rows = recording(samples=ROWS)
-    send(pupil, 0, part(rows, 0, 16))
-    said = send(pupil, 1, part(rows, 16, 32, without=("ddq",)))
-    assert said["rejected"] == {"edge": 2 * HALF}
-    assert send(pupil, 2, part(rows, 32, 48))["rejected"] == {}
-
-
 def test_a_stream_keeps_its_window(school):
     """The rate that is read off a batch wavers; a window that did too would learn rows twice, or not at all."""
     rows = recording(samples=3 * ROWS, rate=104.0)
@@ -170,7 +121,7 @@ def test_a_stream_keeps_its_window(school):
     assert {each["derived"]["ddq"]["window"] for each in said} == {window(104.0)}
 
 
-@pytest.mark.parametrize("rate", [1.0, 10.0, 40.0])
+@pytest.mark.parametrize("rate", [1.0, 40.0])
 def test_slow_streams_are_refused_with_the_rate_found_and_needed(school, rate):
     pupil = school.enrol(f"slow-{rate:g}")
     body = part(recording(samples=30, rate=rate), 0, 30, without=("ddq",))
@@ -182,18 +133,11 @@ def test_slow_streams_are_refused_with_the_rate_found_and_needed(school, rate):
     assert send(pupil, 0, part(recording(samples=30, rate=rate), 0, 30))["accepted"] == 30
 
 
-def test_fifty_rows_a_second_suffice(school):
-    body = part(recording(samples=30, rate=50.0), 0, 30, without=("ddq",))
-    assert send(school.enrol("just-fast-enough"), 0, body)["accepted"] == 30 - 2 * window(50.0)
-
-
 @pytest.mark.parametrize(
     "times",
     [
-        pytest.param([0.0], id="one row"),
         pytest.param([None, None, 0.3], id="one time"),
         pytest.param([0.0, 0.0, 0.0], id="standing still"),
-        pytest.param([0.02, 0.01, 0.0], id="backwards"),
         pytest.param([0.0, None, 0.01, None, 0.02], id="every other"),
         pytest.param([0.0, 0.01, 0.023, 0.04, 0.063, 0.093, 0.133], id="uneven"),
     ],

@@ -139,6 +139,7 @@ def tell(pieces, page_rows: int, start: int) -> None:
 
 
 TWO_CHANGES = [("batch", 0), ("change", 3), ("batch", 5), ("change", 20), ("batch", 9)]
+TWICE = [("batch", 0), ("unlearn", 0), ("unlearn", 0), ("batch", 2), ("rollback", 3), ("batch", 3), ("rollback", 1)]
 REWEIGHED = [("batch", 1), ("settings", 2.0), ("batch", 2)]
 
 
@@ -146,6 +147,7 @@ REWEIGHED = [("batch", 1), ("settings", 2.0), ("batch", 2)]
 @given(st.lists(piece, min_size=1, max_size=4), st.sampled_from([1, 6, 500]), st.sampled_from([0, 0, 4]))
 @example([(TWO_CHANGES, 2, True), ([("unlearn", 0), ("batch", 11)], 9, False)], 3, 0)
 @example([(TWO_CHANGES, 3, True), ([("unlearn", 0), ("unlearn", 1), ("batch", 11), ("rollback", 3)], 3, True)], 3, 0)
+@example([(TWICE, 9, True)], 500, 0)
 @example([(REWEIGHED, 9, False), ([("unlearn", 0), ("rollback", 3)], 9, True)], 3, 0)
 def test_the_state_is_a_function_of_the_log_to_the_last_bit(pieces, page_rows, start):
     tell(pieces, page_rows, start)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from itertools import count
 from typing import Any
 
 import numpy as np
@@ -11,10 +10,10 @@ import pytest
 
 from lipcore.data.independence import INDEPENDENT_HZ, stream_weights
 from lipcore.online.record import Record
-from service.foundation.errors import BusyError, ConflictError
+from service.foundation.errors import ConflictError
 from service.journal import log, retention
 from service.learning.ingest.frames import Frames, FramesResult
-from service.learning.schema import ExpiredError, LearningDisabledError
+from service.learning.schema import ExpiredError
 from tests.service.learning.lessons import apart
 from tests.service.learning.recordings import codes, learnt_from, logged, part, recording, send
 
@@ -30,15 +29,6 @@ def frames(school: Any, pupil: Any, sequences: Any, stream_id: str = "socket", *
     now = time.time() + 1e-3 * np.arange(len(places))
     whole = {"time": now, **given, "mean": answer.tau, "std": answer.tau_std, **changes}
     return Frames(pupil.model, stream_id, served, places, **whole)
-
-
-COUNT = count()
-
-
-@pytest.fixture
-def pupil(school):
-    """A model of the test's own."""
-    return school.enrol(f"frames-{next(COUNT)}")
 
 
 @pytest.fixture
@@ -78,12 +68,11 @@ def test_sequences_may_leave_gaps(school, pupil, observe):
     assert apart(pupil.settled(2), learnt_from(school, _picked([0, 1, 5, 9, 12]), _weights(school, pupil))) < EXACT
 
 
-@pytest.mark.parametrize("sequence", [2, 4, 10])
-def test_a_frame_that_was_skipped_cannot_come_later(school, pupil, observe, sequence):
+def test_a_frame_that_was_skipped_cannot_come_later(school, pupil, observe):
     observe([0, 1, 5, 9])
     observe([11])
-    with pytest.raises(ConflictError, match=f"frame {sequence} of stream 'socket' comes after one of a higher"):
-        observe([sequence])
+    with pytest.raises(ConflictError, match="frame 4 of stream 'socket' comes after one of a higher"):
+        observe([4])
     assert len(logged(school, pupil)) == 2
 
 
@@ -98,7 +87,7 @@ def test_frames_that_are_repeated_after_a_lost_connection_are_applied_once(schoo
     assert apart(pupil.settled(3), learnt_from(school, part(recording(), 0, 26), _weights(school, pupil))) < EXACT
 
 
-@pytest.mark.parametrize("name", ["q", "dq", "ddq", "tau"])
+@pytest.mark.parametrize("name", ["q", "tau"])
 def test_a_sequence_used_for_another_frame_is_refused_and_nothing_is_logged(school, pupil, observe, name):
     observe(range(10))
     other = getattr(frames(school, pupil, range(8, 14)), name).copy()
@@ -109,43 +98,21 @@ def test_a_sequence_used_for_another_frame_is_refused_and_nothing_is_logged(scho
     assert observe(range(8, 14)) == FramesResult(13, 4, 2, {}, 2)
 
 
-def test_times_and_answers_are_no_part_of_a_frame(observe, school, pupil):
-    observe(range(10))
-    again = frames(school, pupil, range(10))
-    assert observe(range(10), time=again.time + 50.0, mean=again.mean + 1.0).duplicates == 10
-
-
 def test_bad_frames_are_kept_out_by_code_and_known_again(school, pupil, observe):
     given = frames(school, pupil, range(10))
     tau, dq, mean = given.tau.copy(), given.dq.copy(), given.mean.copy()
-    tau[2, 1], dq[4], tau[7, 0] = np.nan, 0.0, 1e7
+    tau[2, 1], dq[4], tau[7, 0], mean[8, 0] = np.nan, 0.0, 1e7, np.inf
     bad = {"tau": tau, "dq": dq, "mean": mean}
-    expected = {"non_finite": 1, "stationary": 1, "limit": 1}
-    assert observe(range(10), **bad) == FramesResult(9, 7, 0, expected, 1)
+    expected = {"non_finite": 1, "stationary": 1, "limit": 2}
+    assert observe(range(10), **bad) == FramesResult(9, 6, 0, expected, 1)
     assert codes(school, pupil)[2::1][:6] == ["non_finite", "learnt", "stationary", "learnt", "learnt", "limit"]
     assert observe(range(10), **bad) == FramesResult(9, 0, 10, {}, 1)
-    assert apart(pupil.settled(1), learnt_from(school, _picked([0, 1, 3, 5, 6, 8, 9]), _weights(school, pupil))) < EXACT
+    assert apart(pupil.settled(1), learnt_from(school, _picked([0, 1, 3, 5, 6, 9]), _weights(school, pupil))) < EXACT
 
 
-def test_contacts_are_kept_out(school):
-    pupil = school.enrol("frames-contact", contact_threshold=8.0)
-    given = frames(school, pupil, range(10))
-    tau = given.tau.copy()
-    tau[6] += 1.0
-    found = school.service.learners.observe_frames(frames(school, pupil, range(10), tau=tau))
-    assert found.rejected == {"contact": 1}
-
-
-def test_an_answer_that_is_not_finite_keeps_its_frame_out(school, pupil, observe):
-    mean = frames(school, pupil, range(4)).mean.copy()
-    mean[1, 0] = np.inf
-    assert observe(range(4), mean=mean).rejected == {"limit": 1}
-
-
-@pytest.mark.parametrize("sequences", [[3, 3], [3, 2], [0, 1, 1, 2]])
-def test_sequences_rise(school, pupil, observe, sequences):
+def test_sequences_rise(school, pupil, observe):
     with pytest.raises(ConflictError, match="sequences must rise"):
-        observe(sequences)
+        observe([0, 1, 1, 2])
     assert logged(school, pupil) == []
 
 
@@ -159,12 +126,6 @@ def test_a_stream_carries_frames_or_batches(school, pupil, observe):
     assert "carries frames, not batches" in said["message"]
 
 
-def test_a_model_whose_learning_is_switched_off_takes_no_frames(pupil, observe):
-    pupil.put("learning", {"enabled": False})
-    with pytest.raises(LearningDisabledError, match="switched off"):
-        observe(range(3))
-
-
 def test_frames_that_are_no_longer_kept_are_not_taken_for_new(school, pupil, observe):
     for first in (0, 5, 10):
         observe(range(first, first + 5))
@@ -175,14 +136,6 @@ def test_frames_that_are_no_longer_kept_are_not_taken_for_new(school, pupil, obs
     with pytest.raises(ExpiredError, match="whether batch 3 of stream"):
         observe([3])
     assert observe(range(5, 16)) == FramesResult(15, 1, 10, {}, 4)
-
-
-def test_there_are_no_more_streams_than_a_model_may_have(school, pupil, observe, monkeypatch):
-    intake = school.service.learners._intake
-    monkeypatch.setattr(intake, "settings", intake.settings.model_copy(update={"max_observation_streams": 1}))
-    observe(range(3))
-    with pytest.raises(BusyError, match="sources of observations"):
-        observe(range(3), stream_id="another")
 
 
 def _picked(places):

@@ -9,7 +9,6 @@ from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES
 from service.journal import log
 from service.journal.log import NewBatch
-from tests.service.data import error
 from tests.service.learning.lessons import LESSON, lesson
 
 
@@ -97,14 +96,6 @@ def test_what_has_not_come_is_not_found(pupil, path):
     pupil.refused("POST", f"{path}/replay", 404, "not_found", json={})
 
 
-@pytest.mark.parametrize(
-    ("path", "field"),
-    [("observations/arm/-1", "sequence"), ("observations/arm/x", "sequence"), ("observations/.arm/0", "stream_id")],
-)
-def test_what_cannot_be_a_batch_is_refused(pupil, path, field):
-    assert pupil.refused("GET", path, 422, "invalid_request")["detail"][0]["field"] == field
-
-
 def test_a_batch_that_is_no_longer_kept_is_said_to_be_gone(school):
     pupil = school.enrol("forgetful")
     pupil.teach(0, 1)
@@ -112,11 +103,6 @@ def test_a_batch_that_is_no_longer_kept_is_said_to_be_gone(school):
         session.delete(log.find_batch(session, "forgetful", "arm", 0))
         log.stream(session, "forgetful", "arm").forgotten = 0
     assert "no longer kept" in pupil.refused("GET", "observations/arm/0", 404, "not_found")["message"]
-
-
-def test_a_model_that_does_not_exist_has_no_log(school):
-    for path in ("observations", "observations/arm/0"):
-        error(school.client.get(f"/v1/models/nobody/{path}"), 404, "not_found")
 
 
 def _with(rows, row, column, value):

@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 from sqlalchemy import select
 
-from service.learning.learner import process as processes
 from service.learning.learner import publication
 from service.learning.learner.learnt import LearntVersions
 from service.learning.learner.process import LearnerProcess, learner_place
@@ -115,16 +114,6 @@ def test_a_killed_learner_comes_back_and_catches_up(serving, caplog):
     assert revisions[-1] == 4
 
 
-@pytest.mark.slow
-def test_one_that_is_killed_again_and_again_loses_nothing_and_learns_nothing_twice(serving, monkeypatch):
-    monkeypatch.setattr(processes, "LONGEST_PAUSE", 0.0)  # as if it had lived long each time
-    for number in range(4):
-        serving.teach(2 * number, 2 * number + 1)
-        if number < 3:
-            os.kill(eventually(lambda: serving.learner.pid), signal.SIGKILL)
-    same(serving.answering(8), at_once(range(8)))
-
-
 def test_what_it_knows_is_stored_when_the_service_ends(alone):
     assert alone.learner.pid is None  # not before there is something to learn
     alone.teach(0, 1, 2)
@@ -139,26 +128,10 @@ def test_what_it_knows_is_stored_when_the_service_ends(alone):
     assert alone.learner.pid is None
 
 
-def test_one_that_was_never_needed_ends_at_once(alone):
-    alone.learner.close()
-    assert alone.learner.pid is None
-
-
 def test_ending_while_it_starts_does_not_wait_for_it(alone):
     alone.learner.wake(ARM)
     alone.learner.close()
     assert alone.learner.pid is None
-
-
-@pytest.mark.slow
-def test_one_that_does_not_end_is_killed(alone, monkeypatch, caplog):
-    alone.teach(0)
-    alone.answering(1)
-    monkeypatch.setattr(processes, "END_SECONDS", 0.1)
-    os.kill(alone.learner.pid, signal.SIGSTOP)
-    alone.learner.close()
-    assert alone.learner.pid is None
-    assert "the learner process does not end: killed" in caplog.text
 
 
 def test_waking_one_that_is_busy_does_not_wait(serving):
@@ -207,37 +180,3 @@ def test_it_takes_its_place_before_numerics_are_imported():
     said = "import sys, service.learning.learner.process; print(sorted({'numpy', 'torch', 'scipy'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", said], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
-
-
-@linux
-def test_it_ends_with_the_service(serving, tmp_path):
-    script = (
-        "import sys, time\n"
-        "from pathlib import Path\n"
-        "from service.foundation.settings import Settings\n"
-        "from service.learning.learner.process import LearnerProcess\n"
-        "if __name__ == '__main__':\n"
-        "    learner = LearnerProcess(Settings(home=Path(sys.argv[1])), print)\n"
-        "    learner.wake('arm')\n"
-        "    while not learner.pid: time.sleep(0.01)\n"
-        "    print(learner.pid, flush=True)\n"
-        "    time.sleep(600)\n"
-    )
-    path = tmp_path / "parent.py"
-    path.write_text(script)
-    env = {**os.environ, "PYTHONPATH": str(Path(processes.__file__).parents[3])}
-    parent = subprocess.Popen(
-        [sys.executable, str(path), str(serving.arm.settings.home)], stdout=subprocess.PIPE, text=True, env=env
-    )
-    pid = int(parent.stdout.readline())
-    parent.kill()
-    parent.wait()
-    eventually(lambda: not alive(pid))
-
-
-def alive(pid):
-    """Whether a process runs, and is not only waiting to be buried."""
-    try:
-        return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except (FileNotFoundError, ProcessLookupError):
-        return False

@@ -1,4 +1,4 @@
-"""How a model learns is set and seen, and a hold ends by a decision."""
+"""How a model learns is set and seen, a hold ends by a decision, and its owner is told."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import time
 
 import pytest
 
+from service.foundation.errors import NotFoundError
 from service.journal import log, snapshots
 from service.learning import owner
 from service.learning.control import decisions
+from service.learning.schema import LearningOptions
 from service.storage.database import LearnerRow
-from tests.service.data import error
-from tests.service.learning.lessons import LESSON, apart
+from tests.service.learning.batches import MODEL, batch, everything, write
+from tests.service.learning.lessons import LESSON, Pupil, apart, lesson
 
 EQUAL = 1e-8
 DEFAULTS = {
@@ -51,18 +53,12 @@ def changes(school, pupil):
 
 
 def test_a_model_that_nothing_was_set_for_has_the_defaults(school):
-    seen = answered(school, "panda-sim")
+    seen = Pupil(school.client, "panda-sim").get("learning")
     assert (seen["model"], seen["options"]) == ("panda-sim", DEFAULTS)
     status = seen["status"]
     assert (status["version"], status["revision"], status["published"], status["events"]) == (1, 0, 0, 0)
     assert (status["held"], status["candidate"], status["streams"], status["snapshots"]) == (None, None, [], [])
     assert (status["novel_share"], status["failure"], status["reachable"]) == (None, None, [[0, 0]])
-
-
-def answered(school, model):
-    answer = school.client.get(f"/v1/models/{model}/learning")
-    assert answer.status_code == 200, answer.text
-    return answer.json()
 
 
 def test_options_are_set_as_a_whole(school):
@@ -71,31 +67,6 @@ def test_options_are_set_as_a_whole(school):
     assert pupil.put("learning", wanted)["options"] == DEFAULTS | wanted
     assert pupil.put("learning", {"contact_threshold": 4.0})["options"] == DEFAULTS | {"contact_threshold": 4.0}
     assert pupil.get("learning")["options"] == DEFAULTS | {"contact_threshold": 4.0}
-
-
-def test_a_new_time_of_forgetting_is_an_event(school):
-    pupil = school.enrol("forgets")
-    pupil.teach(0)
-    seen = pupil.put("learning", {"forgetting_s": 30.0})["status"]
-    assert (seen["events"], seen["revision"]) == (2, 2)
-    pupil.settled(2)
-    assert pupil.put("learning", {"forgetting_s": 30.0})["status"]["events"] == 2
-
-
-@pytest.mark.parametrize(
-    ("options", "field"),
-    [
-        ({"torque_limits": [1.0]}, "torque_limits"),
-        ({"torque_limits": [1.0, -1.0]}, "torque_limits[1]"),
-        ({"forgetting_s": 0.5}, "forgetting_s"),
-        ({"on_change": "panic"}, "on_change"),
-        ({"speed": 1}, "speed"),
-    ],
-)
-def test_wrong_options_are_named(school, options, field):
-    answer = school.client.put("/v1/models/panda-sim/learning", json=options)
-    assert error(answer, 422, "invalid_request")["detail"][0]["field"] == field
-    assert answered(school, "panda-sim")["options"] == DEFAULTS
 
 
 def test_where_learning_stands(school):
@@ -189,7 +160,75 @@ def test_there_is_nothing_to_decide_without_a_hold(school):
     assert pupil.get("learning")["status"]["events"] == 1
 
 
-def test_a_model_that_does_not_exist_does_not_learn(school):
-    for method, path, body in (("GET", "", None), ("PUT", "", {}), ("POST", "/change", {"decision": "adapt"})):
-        answer = school.client.request(method, f"/v1/models/nobody/learning{path}", json=body)
-        error(answer, 404, "not_found")
+def given(database, model=MODEL):
+    with database.session() as session:
+        return owner.options(session, model)
+
+
+def put(database, model=MODEL, **fields):
+    owner.set_options(database, model, LearningOptions(**fields), 2, 500.0)
+
+
+def logged(database, model=MODEL):
+    return [(event.number, event.kind, event.detail) for event in everything(database, model) if event.kind != "batch"]
+
+
+def test_only_another_forgetting_is_an_event(database):
+    put(database, contact_threshold=5.0)
+    assert logged(database) == []
+    put(database, forgetting_s=60.0)
+    write(database, batch(0))
+    put(database, forgetting_s=60.0, enabled=False)
+    put(database, forgetting_s=30.0)
+    put(database)
+    assert logged(database) == [
+        (1, "settings", {"forgetting_s": 60.0}),
+        (3, "settings", {"forgetting_s": 30.0}),
+        (4, "settings", {"forgetting_s": None}),
+    ]
+    assert everything(database)[0].received == 500.0
+    with pytest.raises(NotFoundError, match="no model 'nobody'"):
+        put(database, model="nobody")
+
+
+def test_alarms_are_listed_newest_first(school):
+    pupil = school.enrol("alarmed")
+    assert pupil.get("alarms") == {"items": [], "next_cursor": None}
+    with school.service.database.transaction() as session:
+        for number, kind in enumerate(("change", "novelty", "refresh", "promotion")):
+            owner.raise_alarm(session, "alarmed", kind, f"message {number}", {"number": number, "joints": ["joint1"]})
+        owner.raise_alarm(session, "panda-sim", "change", "of another model", {})
+    first = pupil.get("alarms", limit=3)
+    rest = pupil.get("alarms", limit=3, cursor=first["next_cursor"])
+    items = first["items"] + rest["items"]
+    assert [item["kind"] for item in items] == ["promotion", "refresh", "novelty", "change"]
+    assert [item["message"] for item in items] == [f"message {number}" for number in (3, 2, 1, 0)]
+    assert items[0]["evidence"] == {"number": 3, "joints": ["joint1"]}
+    assert [item["at"] for item in items] == sorted((item["at"] for item in items), reverse=True)
+    assert len({item["id"] for item in items}) == 4
+    assert rest["next_cursor"] is None
+
+
+NOBODY = (
+    "GET learning",
+    "PUT learning",
+    "POST learning/change",
+    "GET quality",
+    "GET alarms",
+    "GET observations",
+    "POST observations",
+    "GET observations/arm/0",
+    "POST rollback",
+    "POST refresh",
+)
+
+
+@pytest.mark.parametrize("request_line", NOBODY)
+def test_a_model_that_does_not_exist_has_nothing_of_it(school, request_line):
+    method, path = request_line.split()
+    body = {
+        "observations": lesson(0),
+        "rollback": {"revision": 0},
+        "learning/change": {"decision": "adapt"},
+    }.get(path, {})
+    Pupil(school.client, "nobody").refused(method, path, 404, "not_found", json=body)

@@ -1,38 +1,37 @@
-"""The event log: its numbers, what it keeps of a batch, how batches are found and listed."""
+"""The event log: its numbers, its rows, how batches are found and taken back, and which of a stream have not come."""
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import threading
 from contextlib import suppress
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
+from lipcore.online.batch import Rows
+from lipcore.vocabulary import CODES
+from service.foundation.errors import ConflictError
 from service.journal import log
-from service.journal.log import decode, encode
-from service.storage.database import LearnerRow
-from service.web.pagination import Page
-from tests.service.learning.batches import MODEL, OTHER, batch, everything, note, opened, rows, take_back, write
-
-
-@pytest.fixture
-def database(home):
-    database = opened(home)
-    yield database
-    database.close()
-
-
-def test_a_batch_is_kept_with_all_that_was_said_of_it(database):
-    item = batch(7, rows=rows(5, codes=("contact", "limit")), report={"accepted": 3}, record={"rows": 5})
-    write(database, item)
-    with database.session() as session:
-        [event] = log.events(session, MODEL, 0, 10)
-    said = {name: getattr(event, name) for name in ("kind", "stream_id", "sequence", "last_sequence", "digest")}
-    assert said == {"kind": "batch", "stream_id": "robot-1", "sequence": 7, "last_sequence": 7, "digest": item.digest}
-    assert (event.version, event.revision, event.received, event.void) == (1, 0, 1007.0, False)
-    assert (event.rows, event.learnt, event.report, event.record) == (5, 3, {"accepted": 3}, {"rows": 5})
-    assert (event.first, event.last) == (item.rows.time[0], item.rows.time[-1])
-    assert event.payload == encode(item.rows)
+from service.journal.log import Gaps, decode, encode
+from service.storage.database import SnapshotRow, now
+from tests.service.learning.batches import (
+    MODEL,
+    OTHER,
+    batch,
+    everything,
+    live,
+    note,
+    roll_back,
+    rows,
+    source,
+    take_back,
+    write,
+)
 
 
 def test_each_model_counts_its_own_events_without_a_hole(database):
@@ -67,78 +66,142 @@ def test_times_of_rows_that_have_none_are_left_out(database):
     assert spans == [(leaps.time[2], leaps.time[3]), (None, None)]
 
 
-def test_events_come_in_order_in_parts_and_without_void_ones(database):
-    write(database, *(batch(k) for k in range(5)))
-    take_back(database, 2)
-    with database.session() as session:
-        assert [event.number for event in log.events(session, MODEL, 0, 3)] == [1, 3, 4]
-        assert [event.number for event in log.events(session, MODEL, 4, 10)] == [5, 6]
-        assert [event.number for event in log.events(session, MODEL, 0, 3, void=True)] == [1, 2, 3]
+def test_unlearning_takes_out_a_batch_with_its_replays_and_nothing_else(database):
+    write(database, batch(0), batch(1), batch(2))
+    replays = [note(database, "replay", {"event": number}, rows=rows()) for number in (2, 1, 2)]
+    assert replays == [4, 5, 6]
+    write(database, *(batch(k) for k in range(7)), model=OTHER)
+    assert take_back(database, 2) == 7
+    assert live(database) == [1, 3, 5, 7]
+    assert live(database, OTHER) == [1, 2, 3, 4, 5, 6, 7]
+    last = everything(database)[-1]
+    assert (last.kind, last.detail, last.received, last.rows) == ("unlearn", {"event": 2}, 3000.0, 0)
 
 
-def test_batches_are_found_by_their_sequence(database):
-    write(database, batch(3), batch(8), batch(5), batch(6, stream_id="robot-2"))
-    write(database, batch(4), model=OTHER)
-    with database.session() as session:
-
-        def at(event):
-            return event and event.sequence
-
-        assert at(log.find_batch(session, MODEL, "robot-1", 5)) == 5
-        assert log.find_batch(session, MODEL, "robot-1", 4) is None
-        assert log.find_batch(session, MODEL, "robot-1", 6) is None
-        found = {s: tuple(map(at, log.neighbours(session, MODEL, "robot-1", s))) for s in (2, 3, 6, 8, 9)}
-        assert found == {2: (None, 3), 3: (None, 5), 6: (5, 8), 8: (5, None), 9: (8, None)}
-        before, _ = log.neighbours(session, MODEL, "robot-1", 4)
-        assert decode(before.payload).tau.tolist() == rows(seed=3).tau.tolist()
+def test_a_rollback_takes_out_what_came_later_and_leaves_what_was_unlearnt(database):
+    write(database, batch(0), batch(1), batch(2))  # 1, 2, 3
+    note(database, "change", {"t": 5.0})  # 4
+    note(database, "replay", {"event": 1}, rows=rows())  # 5
+    take_back(database, 1)  # 6: takes out 1 and 5
+    write(database, batch(3), batch(0), model=OTHER)
+    assert roll_back(database, 2) == 7
+    assert live(database) == [2, 6, 7]
+    assert live(database, OTHER) == [1, 2]
+    last = everything(database)[-1]
+    assert (last.kind, last.detail) == ("rollback", {"to": 2})
+    assert write(database, batch(3)) == [8]  # learning goes on
+    assert live(database) == [2, 6, 7, 8]
 
 
-def test_frames_are_found_in_the_batch_they_lie_in(database):
-    write(database, batch(10, 14), batch(20, 29))
-    with database.session() as session:
-        found = {s: log.covering(session, MODEL, "robot-1", s) for s in (9, 10, 14, 15, 19, 25, 29, 30)}
-    starts = {sequence: event and event.sequence for sequence, event in found.items()}
-    assert starts == {9: None, 10: 10, 14: 10, 15: None, 19: None, 25: 20, 29: 20, 30: None}
-
-
-def test_lists_are_paged_newest_first_and_filtered(database):
-    write(database, batch(0), batch(1, rows=rows(codes=("contact",))), batch(0, stream_id="robot-2"))
-    note(database, "change", {"t": 5.0})
-    write(database, batch(0), model=OTHER)
-
-    def numbers(limit=10, after=None, **filters):
-        with database.session() as session:
-            found, cursor = log.page(session, MODEL, Page(after=after, limit=limit), **filters)
-        return [event.number for event in found], cursor
-
-    assert numbers() == ([4, 3, 2, 1], None)
-    assert numbers(stream_id="robot-1") == ([2, 1], None)
-    assert numbers(rejected=True) == ([2], None)
-    assert numbers(kinds=["change", "settings"]) == ([4], None)
-    first, cursor = numbers(limit=3)
-    assert first == [4, 3, 2]
-    assert numbers(limit=3, after=int(cursor)) == ([1], None)
-
-
-def test_a_version_starts_where_its_row_says(database):
+def test_a_rollback_removes_later_snapshots_of_all_versions_of_the_model(database):
+    write(database, *(batch(k) for k in range(4)))
     with database.transaction() as session:
-        session.add(LearnerRow(model=MODEL, version=2, start=17, role="serving"))
+        for model, version, number in ((MODEL, 1, 2), (MODEL, 1, 3), (MODEL, 2, 4), (OTHER, 1, 4)):
+            name = f"snap_{model}_{number}"
+            session.add(SnapshotRow(id=name, model=model, version=version, number=number, created_at=now()))
+    roll_back(database, 2)
     with database.session() as session:
-        assert [log.start_of(session, MODEL, version) for version in (1, 2)] == [0, 17]
+        left = {(row.model, row.number) for row in session.query(SnapshotRow)}
+    assert left == {(MODEL, 2), (OTHER, 4)}
 
 
-def test_it_is_known_whether_events_have_gone(database):
-    write(database, *(batch(k) for k in range(5)))
+def test_a_stream_goes_on_as_it_began_and_takes_nothing_twice(database):
+    write(database, batch(2), batch(5), batch(0, 4, stream_id="robot-2"), batch(7, 9, stream_id="robot-2"))
+    assert source(database, "robot-2").missing["ranges"] == [[5, 6]]
     with database.transaction() as session:
-        session.delete(log.find_batch(session, MODEL, "robot-1", 1))
-    with database.session() as session:
-        spans = ((0, 1), (0, 2), (1, 2), (2, 5), (1, 5), (3, 3), (2, 9))
-        assert [log.is_complete(session, MODEL, *span) for span in spans] == [
-            True,
-            False,
-            False,
-            True,
-            False,
-            True,
-            False,
-        ]
+        log.stream(session, MODEL, "robot-1").forgotten = 4
+    for refused, reason in (
+        (batch(2, 3), "'robot-1' of model 'arm' carries batches, not frames: use another"),
+        (batch(5, stream_id="robot-2"), "'robot-2' of model 'arm' carries frames, not batches"),
+        (batch(9, 10, stream_id="robot-2"), "has come to frame 9, frame 9 does not go on from there"),
+        (batch(2), "batch 2 of stream 'robot-1' of model 'arm' may have come before"),
+    ):
+        with pytest.raises(ConflictError, match=reason):
+            write(database, refused)
+    assert write(database, batch(3), batch(1)) == [5, 6]  # known not to have come
+
+
+def misses(seen):
+    """Ranges that are missing, by looking at every number."""
+    out = []
+    for number in range(min(seen), max(seen)):
+        if number not in seen:
+            if out and out[-1][1] == number - 1:
+                out[-1][1] = number
+            else:
+                out.append([number, number])
+    return out
+
+
+SEQUENCES = st.lists(st.integers(0, 25), min_size=1, max_size=15, unique=True)
+
+
+@given(SEQUENCES)
+def test_the_gaps_are_right_after_every_arrival_in_any_order(sequences):
+    known = Gaps(sequences[0], sequences[0])
+    for count, sequence in enumerate(sequences, start=1):
+        known = Gaps.from_json(known.arrived(sequence, sequence).to_json(), known.arrived(sequence, sequence).last)
+        seen = set(sequences[:count])
+        assert known.to_json() == {"first": min(seen), "ranges": misses(seen)}
+        assert [s for s in range(-1, 27) if known.may_hold(s)] == sorted(seen)
+
+
+@given(st.lists(st.tuples(st.integers(0, 30), st.integers(0, 5)), min_size=1, max_size=10))
+def test_the_gaps_of_ranges_are_right_even_where_they_overlap(spans):
+    known = Gaps(spans[0][0], sum(spans[0]))
+    seen = set()
+    for first, more in spans:
+        known = known.arrived(first, first + more)
+        seen |= set(range(first, first + more + 1))
+    assert (known.first, known.last, [list(pair) for pair in known.ranges]) == (min(seen), max(seen), misses(seen))
+
+
+def test_only_the_newest_of_very_many_gaps_are_remembered():
+    known = Gaps(0, 0)
+    for sequence in range(2, 2 * log.MOST_RANGES + 6, 2):
+        known = known.arrived(sequence, sequence)
+    assert len(known.ranges) == log.MOST_RANGES
+    assert (known.ranges[0], known.ranges[-1]) == ((5, 5), (2003, 2003))
+    assert known.may_hold(3)  # it may have, for all that is known
+
+
+ANY = st.floats(width=64, allow_nan=True, allow_infinity=True)
+
+
+@st.composite
+def any_rows(draw):
+    count, n = draw(st.integers(0, 6)), draw(st.integers(1, 4))
+    code = draw(arrays(np.uint8, count, elements=st.integers(0, len(CODES) - 1)))
+    return Rows(
+        draw(arrays(float, count, elements=ANY)),
+        *(draw(arrays(float, (count, n), elements=ANY)) for _ in range(4)),
+        code,
+        draw(arrays(float, count, elements=ANY)),
+    )
+
+
+def same(one: Rows, other: Rows) -> bool:
+    pairs = [(getattr(one, f.name), getattr(other, f.name)) for f in dataclasses.fields(Rows)]
+    return all(a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in pairs)
+
+
+@given(any_rows())
+def test_every_bit_comes_back(given_rows):
+    assert same(decode(encode(given_rows)), given_rows)
+
+
+def test_any_reader_of_safetensors_understands_it():
+    data = encode(rows(3))
+    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+    assert {name: (entry["dtype"], entry["shape"]) for name, entry in header.items() if name != "__metadata__"} == {
+        "time": ("F64", [3]),
+        **dict.fromkeys(("q", "dq", "ddq", "tau"), ("F64", [3, 2])),
+        "code": ("U8", [3]),
+        "weight": ("F64", [3]),
+    }
+
+
+@pytest.mark.parametrize("length", [0, 7, 40, -1])
+def test_what_is_cut_off_is_refused(length):
+    with pytest.raises(ValueError, match="cannot be read"):
+        decode(encode(rows())[:length])

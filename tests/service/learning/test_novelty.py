@@ -3,23 +3,46 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from itertools import count
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 import lipcore
-from service.journal import log
-from service.learning.learner import learnt
-from service.learning.learner.restore import restore
+from lipcore.data.samples import Samples
 from service.models import registry
-from tests.service.data import DEADLINE, ended, eventually, train, upload
-from tests.service.learning.lessons import Pupil, School, answered
+from tests.service.data import DEADLINE, ended, eventually, stream, train, upload
+from tests.service.learning.lessons import Pupil, answered
 from tests.service.learning.lessons import school as opened
-from tests.service.learning.motions import OPTIONS, batch, fast, slow
+
+ROWS = 50
+"""Rows of a batch."""
+RATE = 100.0
+OPTIONS = {"hyperparameter_samples": 30, "posterior_samples": 60, "max_iterations": 10}
+"""Of a fit of about a second that gets both motions right."""
+
+
+def slow() -> Samples:
+    """What a version is trained on: at most 0.2 rad/s."""
+    return stream(samples=120, speed=1.0, seed=1, n_sinusoids=20)
+
+
+def fast(seed: int = 2) -> Samples:
+    """What is observed: up to 0.7 rad/s, most of it beyond what the slow motion tells."""
+    return stream(samples=20_000, speed=15.0, seed=seed, rate=RATE, n_sinusoids=20)
+
+
+def batch(number: int) -> dict[str, Any]:
+    """The batch of a number: ROWS rows of the fast motion."""
+    rows = slice(number * ROWS, (number + 1) * ROWS)
+    body = {name: getattr(fast(), name)[rows].tolist() for name in ("q", "dq", "ddq", "tau")}
+    times = (np.arange(ROWS) + number * ROWS) / RATE
+    return {"stream_id": "arm", "sequence": number, "t": times.tolist(), **body}
+
 
 pytestmark = pytest.mark.slow
 PAUSE_S = 0.01
@@ -27,46 +50,27 @@ PAUSE_S = 0.01
 SETTINGS = {"novelty_rows": 400, "promotion_rows": 600, "refresh_pause_s": 0.0}
 
 
-@dataclass
-class Watcher:
-    """Asks the same query again and again in a thread of its own; keeps every answer."""
+@contextmanager
+def watched(pupil: Pupil, queries: dict[str, Any]) -> Iterator[list[Any]]:
+    """Ask the same again and again in a thread of its own; all answers so far."""
+    answers, end = [], threading.Event()
 
-    pupil: Pupil
-    queries: dict[str, Any]
-    answers: list[Any] = field(default_factory=list)
+    def watch() -> None:
+        while not end.wait(PAUSE_S):
+            answers.append(pupil.client.post(pupil.url("predict"), json=queries))
 
-    def __post_init__(self) -> None:
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._watch)
-
-    def _watch(self) -> None:
-        while not self._end.wait(PAUSE_S):
-            self.answers.append(self.pupil.client.post(self.pupil.url("predict"), json=self.queries))
-
-    def __enter__(self) -> Watcher:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._end.set()
-        self._thread.join(DEADLINE)
-
-
-@dataclass(frozen=True)
-class Story:
-    """What was seen from the first fast batch to the promotion."""
-
-    pupil: Pupil
-    school: School
-    dataset: dict[str, Any]
-    job: dict[str, Any]
-    before: dict[str, Any]
-    answers: list[Any]
-    alarms: list[dict[str, Any]]
+    thread = threading.Thread(target=watch)
+    thread.start()
+    try:
+        yield answers
+    finally:
+        end.set()
+        thread.join(DEADLINE)
 
 
 @pytest.fixture(scope="module")
 def story(tmp_path_factory):
+    """What was seen from the first fast batch to the promotion."""
     with opened(tmp_path_factory.mktemp("novel"), tmp_path_factory.mktemp("unused"), **SETTINGS) as school:
         api, pupil = school.client, Pupil(school.client, "arm")
         dataset = upload(api, slow(), name="slow")
@@ -74,39 +78,34 @@ def story(tmp_path_factory):
         queries = {name: getattr(fast(), name)[-5:].tolist() for name in ("q", "dq", "ddq")}
         sent = _teacher(pupil)
 
-        def told(kind: str) -> list[dict[str, Any]]:
+        def alarms_of(kind: str) -> list[dict[str, Any]]:
             return [each for each in pupil.get("alarms")["items"] if each["kind"] == kind]
 
-        with Watcher(pupil, queries) as watcher:
-            eventually(lambda: sent() and told("novelty"))
-            job = ended(api, told("novelty")[0]["evidence"]["job"])
+        with watched(pupil, queries) as answers:
+            eventually(lambda: sent() and alarms_of("novelty"))
+            job = ended(api, alarms_of("novelty")[0]["evidence"]["job"])
             before = answered(api.get("/v1/models/arm"))
-            eventually(lambda: sent() and told("promotion"))
-            eventually(lambda: sent() and watcher.answers[-1].json()["version"] == 2)
-        yield Story(pupil, school, dataset, job, before, watcher.answers, pupil.get("alarms")["items"])
+            eventually(lambda: sent() and alarms_of("promotion"))
+            eventually(lambda: sent() and answers[-1].json()["version"] == 2)
+        alarms = pupil.get("alarms")["items"]
+        yield SimpleNamespace(
+            pupil=pupil, school=school, dataset=dataset, job=job, before=before, answers=answers, alarms=alarms
+        )
 
 
-def test_novel_motion_is_told_with_its_share(story):
+def test_novel_motion_is_told_and_a_candidate_trained_on_data_and_log(story):
     [alarm] = [each for each in story.alarms if each["kind"] == "novelty"]
     assert alarm["evidence"]["novel_share"] > alarm["evidence"]["threshold"] == 0.2
     assert alarm["evidence"]["version"] == 1
     assert f"{alarm['evidence']['novel_share']:.0%} of the last 400 samples" in alarm["message"]
-
-
-def test_a_refresh_is_queued_and_makes_a_candidate_that_does_not_answer_yet(story):
-    assert (story.job["state"], story.job["version"]) == ("succeeded", 2)
-    assert story.job["refresh"]["version"] == 1
-    assert story.job["refresh"]["trigger"] == "novelty"
-    assert story.job["datasets"] == [story.dataset["id"]]
+    refresh = story.job["refresh"]
+    assert (story.job["state"], story.job["version"], refresh["version"]) == ("succeeded", 2, 1)
+    assert refresh["trigger"] == "novelty"
     assert (story.before["latest_version"], story.before["serving_version"]) == (2, 1)
-
-
-def test_the_lineage_names_data_and_log(story):
     lineage = answered(story.pupil.client.get("/v1/models/arm/versions/2"))["lineage"]
-    assert [each["id"] for each in lineage["datasets"]] == [story.dataset["id"]]
-    assert lineage["refresh"] == {**story.job["refresh"], "left_out": []}
-    through = story.job["refresh"]["through"]
-    assert (lineage["log"]["through"], lineage["log"]["rows"]) == (through, 50 * through)
+    assert [each["id"] for each in lineage["datasets"]] == story.job["datasets"] == [story.dataset["id"]]
+    assert lineage["refresh"] == {**refresh, "left_out": []}
+    assert (lineage["log"]["through"], lineage["log"]["rows"]) == (refresh["through"], 50 * refresh["through"])
 
 
 def test_the_candidate_predicts_better_and_is_promoted(story):
@@ -134,45 +133,6 @@ def test_no_answer_fails_and_versions_never_go_back(story):
     assert {version for version, _ in seen} == {1, 2}
 
 
-def test_every_answer_is_whole_one_version_and_revision(story):
-    """Against states made anew from the log, at the turn from one version to the other and evenly elsewhere."""
-    answers = [answer.json() for answer in story.answers]
-    turn = next(index for index, answer in enumerate(answers) if answer["version"] == 2)
-    chosen = {turn - 1, turn, len(answers) - 1, *range(0, len(answers), max(1, len(answers) // 10))}
-    service, queries = story.school.service, _queries()
-    for answer in (answers[index] for index in sorted(chosen)):
-        version = answer["version"]
-        base = lipcore.load(_folder(story, version))
-        with service.database.session() as session:
-            number = log.start_of(session, "arm", version) + answer["revision"]
-        online = restore(service.database, service.files, "arm", version, base, number).online
-        expected = online.model(learnt.floor(service.database, "arm", version, number, 2)).predict(*queries)
-        np.testing.assert_allclose(answer["tau"], expected.tau, rtol=1e-6, atol=1e-8)
-        np.testing.assert_allclose(answer["tau_std"], expected.tau_std, rtol=1e-5, atol=1e-8)
-
-
-def test_a_worse_candidate_is_not_promoted(story):
-    """The one that serves knows the fast motion, the other one the slow one alone; both learn on."""
-    service, pupil = story.school.service, Pupil(story.pupil.client, "steady")
-    for number, samples in enumerate((fast(seed=7).rows(slice(0, 4000, 40)), slow()), start=1):
-        model = lipcore.train(samples, ["revolute"] * 2, "lip-chain", lipcore.FitOptions(**OPTIONS))
-        with service.files.new_version(f"mv_steady{number}") as target:
-            manifest = lipcore.save(model, target, {})
-        with service.database.transaction() as session:
-            registry.publish(session, pupil.model, f"mv_steady{number}", manifest, None, candidate=number == 2)
-    pupil.put("learning", {"contact_threshold": 1e6, "on_change": "learn", "auto_refresh": False})
-    sent = _teacher(pupil)
-    [alarm] = eventually(lambda: sent() and pupil.get("alarms")["items"], 2 * DEADLINE)
-    assert (alarm["kind"], alarm["evidence"]["verdict"], alarm["evidence"]["promoted"]) == (
-        "promotion",
-        "dismiss",
-        False,
-    )
-    assert alarm["evidence"]["gain"] < 0
-    assert alarm["evidence"]["rows"] >= 2 * SETTINGS["promotion_rows"]
-    assert answered(pupil.client.get("/v1/models/steady"))["serving_version"] == 1
-
-
 def _teacher(pupil: Pupil) -> Callable[[], bool]:
     """Sends the next batch and waits until it is learnt: the motion must not end before a slow machine has seen it."""
     numbers = count()
@@ -184,10 +144,6 @@ def _teacher(pupil: Pupil) -> Callable[[], bool]:
     return sent
 
 
-def _queries() -> list[np.ndarray]:
-    return [getattr(fast(), name)[-5:] for name in ("q", "dq", "ddq")]
-
-
-def _folder(story: Story, version: int) -> Any:
+def _folder(story: SimpleNamespace, version: int) -> Any:
     service = story.school.service
     return service.files.version_folder(registry.find(service.database, "arm", version).folder)

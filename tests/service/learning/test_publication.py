@@ -1,10 +1,12 @@
-"""What has been learnt reaches answers: through files, by one assignment, whole, and never backwards."""
+"""What has been learnt reaches answers: through files, by one assignment, whole, never backwards; and is waited for."""
 
 from __future__ import annotations
 
+import asyncio
 import gc
 import threading
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -16,8 +18,12 @@ from service.learning.learner import learnt, publication
 from service.learning.learner.learnt import LearntVersions
 from service.learning.learner.publication import Published
 from service.models.loaded import LoadedModels
+from service.models.served import Waiting
 from service.storage.files import Files
-from tests.service.learning.pendulums import ARM, QUERIES, adopt, at_once, differ, predicted, rows, same, trained
+from tests.service.data import error, service_of
+from tests.service.learning.lessons import QUERIES as ASKED
+from tests.service.learning.lessons import lesson
+from tests.service.learning.pendulums import ARM, QUERIES, adopt, at_once, differ, rows, same, trained
 
 
 @pytest.fixture
@@ -44,9 +50,6 @@ def published(arm, batches, number=None, **fields):
     return Published(**usual | {"novel_rows": 0, "novel_share": 0.0, "seconds": 0.1, "at": 0.0} | fields)
 
 
-# files
-
-
 def test_arrays_come_back_as_they_were_and_their_files_are_gone(arm):
     written = revision(3, floor=np.array([0.5, 0.0]))
     path = publication.write(publication.clear(arm.files), written)
@@ -55,24 +58,6 @@ def test_arrays_come_back_as_they_were_and_their_files_are_gone(arm):
     for name in publication.NAMES:
         np.testing.assert_array_equal(getattr(found, name), getattr(written, name))
     assert found.floor[0] == 0.5
-
-
-def test_what_nobody_has_read_is_removed_at_the_next_start(arm):
-    folder = publication.clear(arm.files)
-    publication.write(folder, revision(1))
-    assert publication.clear(arm.files) == folder
-    assert list(folder.iterdir()) == []
-
-
-def test_arrays_that_are_gone_are_said_to_be(arm, loaded):
-    message = published(arm, 3)
-    publication.clear(arm.files)
-    with pytest.raises(FileNotFoundError):
-        adopt(loaded, message)
-    assert loaded.hot(ARM, None).revision == 0
-
-
-# answers
 
 
 def test_a_revision_is_answered_with_from_then_on(arm, loaded):
@@ -101,21 +86,6 @@ def test_only_higher_revisions_are_adopted(arm, loaded):
     assert loaded.hot(ARM, None).revision == 4
 
 
-def test_a_revision_is_the_business_of_its_version_alone(arm, loaded):
-    arm.publish(candidate=True)
-    loaded.get(ARM, 2)
-    adopt(loaded, published(arm, 3, version=2))
-    assert [loaded.hot(ARM, version).revision for version in (1, 2)] == [0, 3]
-    assert loaded.hot(ARM, None).version == 1
-
-
-def test_a_revision_of_other_arrays_is_refused(arm, loaded):
-    wrong = Revision(np.zeros(3), np.zeros((3, 3)), np.zeros(9), np.zeros(2))
-    with pytest.raises(ValueError, match="weights has shape"):
-        loaded.revise(ARM, 1, 5, wrong)
-    assert loaded.hot(ARM, None).revision == 0
-
-
 def test_a_version_dropped_from_memory_has_what_it_had_learnt_when_it_is_loaded_again(arm, loaded):
     adopt(loaded, published(arm, 3))
     drop(arm, loaded)
@@ -126,15 +96,6 @@ def test_a_version_dropped_from_memory_has_what_it_had_learnt_when_it_is_loaded_
     same(loaded.hot(ARM, None).model, at_once(range(5)))
 
 
-def test_what_is_learnt_while_a_version_is_not_in_memory_is_there_when_it_is(arm, loaded):
-    drop(arm, loaded)
-    assert not adopt(loaded, published(arm, 4))
-    assert loaded.hot(ARM, None) is None
-    again = loaded.get(ARM, None)
-    assert again.revision == 4
-    same(again.model, at_once(range(4)))
-
-
 def test_a_version_dropped_from_memory_that_a_stream_holds_learns_on(arm, loaded):
     held = loaded.get(ARM, None)
     drop(arm, loaded)
@@ -142,6 +103,16 @@ def test_a_version_dropped_from_memory_that_a_stream_holds_learns_on(arm, loaded
     assert loaded.hot(ARM, None).revision == 4
     assert loaded.hot(ARM, None).base is held.base
     assert len(loaded._snapshot.served) == loaded.capacity
+
+
+def test_a_service_that_starts_has_what_the_log_says(arm):
+    arm.batches(*range(4))
+    started = LoadedModels(arm.storage, LearntVersions(arm.database, arm.files), capacity=2)
+    assert started.preload() == 1
+    found = started.hot(ARM, None)
+    assert found.revision == 4
+    same(found.model, at_once(range(4)))
+    same(found.base, at_once())
 
 
 def test_what_is_learnt_while_a_version_is_being_loaded_is_not_lost(arm, loaded, monkeypatch):
@@ -156,16 +127,6 @@ def test_what_is_learnt_while_a_version_is_being_loaded_is_not_lost(arm, loaded,
     monkeypatch.setattr(Files, "load_version", meanwhile)
     assert loaded.get(ARM, None).revision == 4
     assert loaded.hot(ARM, None).revision == 4
-
-
-def test_a_service_that_starts_has_what_the_log_says(arm):
-    arm.batches(*range(4))
-    started = LoadedModels(arm.storage, LearntVersions(arm.database, arm.files), capacity=2)
-    assert started.preload() == 1
-    found = started.hot(ARM, None)
-    assert found.revision == 4
-    same(found.model, at_once(range(4)))
-    same(found.base, at_once())
 
 
 def test_a_learner_is_woken_for_what_was_loaded_without_all_of_its_log(arm, monkeypatch):
@@ -251,5 +212,63 @@ def drop(arm, loaded):
     assert loaded.hot(ARM, None) is None
 
 
-def test_the_oracle_tells_revisions_apart():
-    assert differ(predicted(revision(1).apply(trained())), at_once(), 1e-6)
+SINGLE = {name: rows[0] for name, rows in ASKED.items()}
+
+
+def test_what_was_taught_is_in_the_answer(pupil):
+    pupil.predict()
+    said = pupil.post("observations", lesson(0))
+    with ThreadPoolExecutor(2) as threads:  # through the event loop, which goes on, and through a thread
+        asked = [
+            threads.submit(pupil.client.post, pupil.url("predict"), json=query | {"min_revision": said["revision"]})
+            for query in (SINGLE, ASKED)
+        ]
+        answers = [each.result() for each in asked]
+    # a learner that is only started may take longer than they wait
+    assert all(each.status_code in (200, 503) for each in answers)
+    pupil.settled(said["revision"])
+    for query in (SINGLE, ASKED):
+        assert pupil.post("predict", query | {"min_revision": said["revision"]})["revision"] == said["revision"]
+
+
+def test_a_revision_that_does_not_come_is_refused(pupil, monkeypatch):
+    woken = []
+    monkeypatch.setattr(service_of(pupil.client).loaded, "_wake", woken.append)
+    monkeypatch.setitem(vars(service_of(pupil.client).settings), "min_revision_wait_s", 0.05)
+    for query in (SINGLE, ASKED):
+        woken.clear()
+        answer = pupil.client.post(pupil.url("predict"), json=query | {"min_revision": 3})
+        (item,) = error(answer, 503, "revision_not_reached")["detail"]
+        assert item == {"field": "min_revision", "value": "3", "expected": "0 or less now, of version 1"}
+        assert answer.headers["retry-after"] == "1"
+        assert woken == [pupil.model]  # once: who has logged it may have told nobody
+
+
+def test_a_data_set_is_compared_with_what_was_taught(pupil, monkeypatch):
+    monkeypatch.setitem(vars(service_of(pupil.client).settings), "min_revision_wait_s", 0.05)
+    body = {"dataset": "ds_0", "min_revision": 1}
+    error(pupil.client.post(pupil.url("evaluate"), json=body), 503, "revision_not_reached")
+    pupil.refused("POST", "evaluate", 404, "not_found", json=body | {"min_revision": 0})
+
+
+def test_what_is_not_there_is_not_waited_for(school, pupil):
+    pupil.refused("POST", "predict", 404, "not_found", json=ASKED | {"min_revision": 1, "version": 9})
+    answer = school.client.post("/v1/models/nobody/predict", json=ASKED | {"min_revision": 1})
+    error(answer, 404, "not_found")
+
+
+def test_a_waiter_misses_nothing_and_leaves_nothing():
+    waiting = Waiting()
+
+    async def wait() -> None:
+        with waiting.waiter("arm") as first, waiting.waiter("arm") as second:
+            waiting.wake("other")
+            thread = threading.Thread(target=waiting.wake, args=("arm",))
+            thread.start()
+            thread.join()
+            await asyncio.gather(first.wait(60.0), second.wait(60.0))  # told before they wait
+            await first.wait(0.0)  # told once
+
+    asyncio.run(wait())
+    assert waiting._waiters == {}
+    waiting.wake("arm")

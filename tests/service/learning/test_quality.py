@@ -1,4 +1,4 @@
-"""Prequential quality: what was said of rows before they were learnt, against what was measured."""
+"""Prequential quality: what was predicted of rows before they were learnt, as a route and for Prometheus."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import math
 
 import numpy as np
 import pytest
+from prometheus_client.parser import text_string_to_metric_families as parse
 
 from lipcore.online.record import Record
+from lipcore.vocabulary import CODES
+from service.journal import log
 from service.learning.control import status
 from service.learning.ingest.monitor import Window
-from tests.service.data import error
 from tests.service.learning.lessons import lesson
 
 FIGURES = ("nmse", "rmse", "coverage", "nlpd")
@@ -52,33 +54,6 @@ def test_rows_are_predicted_before_they_are_learnt(school):
     assert late < early  # which would have flattered
 
 
-def test_without_rows_nothing_is_known(school):
-    for window in school.enrol("silent").get("quality")["windows"]:
-        assert (window["rows"], window["accepted"], window["rejected"]) == (0, 0, {})
-        assert all(window[name] == [None, None] for name in FIGURES)
-
-
-def test_a_torque_that_does_not_vary_has_no_nmse(school):
-    pupil = school.enrol("constant")
-    tau = [[row[0], 0.25] for row in lesson(0)["tau"]]
-    pupil.teach(0, tau=tau)
-    for window in pupil.get("quality")["windows"]:
-        assert window["nmse"][0] is not None
-        assert window["nmse"][1] is None
-        assert None not in window["rmse"] + window["coverage"] + window["nlpd"]
-
-
-def test_rows_that_are_kept_out_are_counted_by_code(school):
-    pupil = school.enrol("counted")
-    batch = lesson(0)
-    q, dq = [[*row] for row in batch["q"]], [[*row] for row in batch["dq"]]
-    q[2][0], q[5][1], dq[7][0] = None, 1000.0, 1000.0
-    pupil.teach(0, q=q, dq=dq)
-    for window in pupil.get("quality")["windows"]:
-        assert (window["accepted"], window["rejected"]) == (7, {"non_finite": 1, "limit": 2})
-        assert window["rows"] == 7
-
-
 def test_windows_slide():
     seen = Window(60.0, 1)
     for at, value in ((1000.0, 1.0), (1050.0, 3.0)):
@@ -91,5 +66,55 @@ def test_windows_slide():
     assert (none.rows, none.accepted, none.rejected, none.rmse) == (0, 0, {}, [None])
 
 
-def test_a_model_that_does_not_exist_has_no_quality(school):
-    error(school.client.get("/v1/models/nobody/quality"), 404, "not_found")
+def scraped(school, model):
+    """Samples of one model, {(name, the other labels): value}."""
+    answer = school.client.get("/metrics")
+    assert answer.status_code == 200
+    assert answer.headers["content-type"].startswith("text/plain")
+    samples = {}
+    for family in parse(answer.text):
+        assert family.documentation
+        for sample in family.samples:
+            if sample.labels.pop("model", None) == model:
+                samples[sample.name, *sorted(sample.labels.items())] = sample.value
+    return samples
+
+
+def test_quality_is_that_of_the_other_route(school):
+    pupil = school.enrol("scraped")
+    pupil.teach(0, 1)
+    samples, seen = scraped(school, "scraped"), pupil.get("quality")
+    for window in seen["windows"]:
+        for name in ("nmse", "coverage", "nlpd"):
+            for joint, value in zip(seen["joint_names"], window[name], strict=True):
+                key = (f"lipserve_quality_{name}", ("joint", joint), ("window", f"{window['seconds']:g}"))
+                assert samples[key] == pytest.approx(value, rel=1e-12)
+    assert samples["lipserve_revision", ("version", "1")] == 2
+    assert samples["lipserve_learning_lag_events",] == 0
+    assert samples["lipserve_novel_share",] == pupil.get("learning")["status"]["novel_share"]
+
+
+def test_what_became_of_rows_is_counted_and_what_is_not_known_left_out(school):
+    pupil = school.enrol("rows")
+    body = lesson(0)
+    body["tau"] = [[row[0], 0.25] for row in body["tau"]]  # which has no NMSE
+    body["q"][2][0], body["q"][5][1], body["dq"][7][0] = None, 1000.0, 1000.0
+    pupil.teach(0, **{name: body[name] for name in ("q", "dq", "tau")})
+    pupil.post("observations", body)  # again, which counts no row
+    for window in pupil.get("quality")["windows"]:
+        assert (window["rows"], window["accepted"], window["rejected"]) == (7, 7, {"non_finite": 1, "limit": 2})
+        assert [value is None for value in window["nmse"]] == [False, True]
+        assert None not in window["rmse"] + window["coverage"] + window["nlpd"]
+    samples = scraped(school, "rows")
+    counted = {
+        dict(key[1:])["outcome"]: value for key, value in samples.items() if key[0] == "lipserve_observations_total"
+    }
+    assert counted == dict.fromkeys(CODES, 0) | {"learnt": 7, "non_finite": 1, "limit": 2}
+    assert {dict(key[1:])["joint"] for key in samples if key[0] == "lipserve_quality_nmse"} == {"joint1"}
+
+
+def test_what_is_not_learnt_yet_is_the_lag(school):
+    school.enrol("lagging").teach(0)
+    with school.service.database.transaction() as session:  # which the learner is not told of
+        log.append(session, "lagging", "settings", {"forgetting_s": None}, 0.0)
+    assert scraped(school, "lagging")["lipserve_learning_lag_events",] == 1

@@ -1,30 +1,24 @@
-"""Refreshing a version: what it learns from, what it becomes, and where it is refused."""
+"""Refreshing a version: when it is, what it learns from, what it becomes, and when its owner is told instead."""
 
 from __future__ import annotations
 
-from itertools import count
+import time
+from datetime import UTC, datetime
 
-import numpy as np
 import pytest
 
-from service.foundation.states import RUNNING
+from service.foundation.states import CANCELLED, FAILED, RUNNING
 from service.journal import log
-from service.storage.database import JobRow
+from service.learning import refresh
+from service.learning.learner.publication import Published
+from service.storage.database import AlarmRow, JobRow, now
 from service.training import worker
-from service.training.material import observed
 from tests.service.data import QUICK, arrays, ended, running, stream, train, upload
-from tests.service.learning.lessons import LESSON, Pupil, answered, lesson
+from tests.service.learning.lessons import LESSON, Pupil, answered
 from tests.service.server import Server
 
-NAMES = (f"refreshed-{number}" for number in count())
 LONG = {"hyperparameter_samples": 40, "posterior_samples": 40, "max_iterations": 30, "starts": 1}
 """A fit of a few seconds, on seven joints."""
-
-
-@pytest.fixture
-def pupil(school):
-    """A model that nobody else uses, whose data set the service does not have."""
-    return school.enrol(next(NAMES))
 
 
 @pytest.fixture
@@ -80,15 +74,6 @@ def test_a_refresh_trains_as_the_version_was_trained(school, refreshed):
     assert new["fit"]["samples_given"] == new["fit"]["samples_posterior"] == 80 + 4 * LESSON
 
 
-def test_a_version_that_a_user_trains_learns_from_the_newest_event_on(school, pupil):
-    pupil.teach(0, 1)
-    dataset = upload(school.client, stream())["id"]
-    train(school.client, pupil.model, dataset)
-    assert (start_of(school, pupil.model, 1), start_of(school, pupil.model, 2)) == (0, 2)
-    assert pupil.predict()["version"] == 2
-    assert pupil.predict()["revision"] == 0
-
-
 def test_a_second_refresh_waits_for_the_first(waiting, pupil):
     pupil.teach(0, 1, 2)
     job = answered_202(pupil)
@@ -112,14 +97,6 @@ def test_without_data_there_is_nothing_to_refresh_from(pupil):
     assert "it has been deleted" in said["message"]
 
 
-def test_requests_that_are_refused(school, pupil):
-    assert (
-        pupil.refused("POST", "refresh", 422, "invalid_request", json={"version": 1})["detail"][0]["field"] == "version"
-    )
-    pupil.refused("POST", "refresh", 422, "invalid_request")
-    Pupil(school.client, "nobody").refused("POST", "refresh", 404, "not_found", json={})
-
-
 def test_what_is_taken_back_while_it_is_trained_on_fails_the_job(waiting, pupil, monkeypatch):
     pupil.teach(0, 1, 2, 3)
     job, service = answered_202(pupil), waiting.service
@@ -134,18 +111,6 @@ def test_what_is_taken_back_while_it_is_trained_on_fails_the_job(waiting, pupil,
     seen = answered(pupil.client.get(f"/v1/jobs/{job['id']}"))
     assert (seen["state"], seen["error"]["code"]) == ("failed", "observations_taken_back")
     assert answered(pupil.client.get(f"/v1/models/{pupil.model}"))["latest_version"] == 1
-
-
-def test_unlearnt_rows_are_not_trained_on(waiting, pupil):
-    pupil.teach(0, 1, 2, 3)
-    pupil.delete("observations/arm/1")
-    job, service = answered_202(pupil), waiting.service
-    with service.database.session() as session:
-        request = session.query(JobRow).filter_by(id=job["id"]).one().request
-    found = observed(service.settings, service.database, service.files, pupil.model, request)
-    expected = np.concatenate([lesson(number)["tau"] for number in (0, 2, 3)])
-    np.testing.assert_array_equal(found.samples.tau, expected)
-    cancel(pupil, job)
 
 
 def test_a_repeated_refresh_starts_from_what_is_known_now(waiting, pupil):
@@ -183,3 +148,121 @@ def test_a_refresh_goes_on_after_the_service_was_killed(tmp_path):
         assert ([each["version"] for each in shown["versions"]], shown["serving_version"]) == ([1, 2], 1)
         lineage = answered(server.client.get("/v1/models/arm/versions/2"))["lineage"]
         assert lineage["log"]["rows"] == 40
+
+
+def published(pupil, share=0.5, version=1, errors=None):
+    return Published(pupil.model, version, 3, 3, None, 30.0, 900, share, 0.1, time.time(), errors)
+
+
+def consider(school, pupil, **changes):
+    service = school.service
+    settings = service.settings.model_copy(update={"refresh_pause_s": changes.pop("pause", 0.0)})
+    return refresh.consider(settings, service.database, service.jobs, published(pupil, **changes))
+
+
+def alarms(pupil):
+    return [(each["kind"], each["message"]) for each in pupil.get("alarms")["items"]]
+
+
+@pytest.fixture
+def ready(waiting, pupil):
+    """A model that can be refreshed, whose owner wants it to be."""
+    pupil.teach(0, 1, 2)
+    pupil.put("learning", {})
+    yield waiting, pupil
+    for job in pupil.client.get("/v1/jobs", params={"limit": 100}).json()["items"]:
+        if job["model"] == pupil.model and job["state"] == "queued":
+            cancel(pupil, job)
+
+
+def test_much_novel_motion_leads_to_one_refresh_and_one_alarm(ready):
+    job = consider(*ready)
+    assert job.refresh.model_dump() == {"version": 1, "through": log_end(*ready), "trigger": "novelty"}
+    [(kind, message)] = alarms(ready[1])
+    assert kind == "novelty"
+    assert "50% of the last 2000 samples" in message
+    assert consider(*ready) is None
+    assert len(alarms(ready[1])) == 1
+
+
+def log_end(school, pupil):
+    with school.service.database.session() as session:
+        return log.newest(session, pupil.model)
+
+
+@pytest.mark.parametrize("changes", [{"share": 0.2}, {"version": 2}])
+def test_little_novelty_or_another_version_leads_to_nothing(ready, changes):
+    assert consider(*ready, **changes) is None
+    assert alarms(ready[1]) == []
+
+
+def test_an_arm_that_has_left_its_linearisation_is_refreshed(ready):
+    assert consider(*ready, share=0.0, errors=(0.1, 0.4)) is None
+    job = consider(*ready, share=0.0, errors=(0.1, 0.8))
+    assert job.refresh.trigger == "linearisation"
+    [alarm] = ready[1].get("alarms")["items"]
+    assert alarm["kind"] == "linearisation"
+    assert "80% of the stated error" in alarm["message"]
+    assert alarm["evidence"]["linearisation_error"] == [0.1, 0.8]
+    assert alarm["evidence"]["job"] == job.id
+
+
+def test_a_model_that_is_held_is_not_refreshed(ready):
+    school, pupil = ready
+    with school.service.database.transaction() as session:
+        refresh.owner.hold(session, pupil.model, {"at": 0.0, "event": 1})
+    assert consider(school, pupil) is None
+    with school.service.database.transaction() as session:
+        refresh.owner.release(session, pupil.model)
+    assert consider(school, pupil) is not None
+
+
+def test_a_candidate_in_contest_is_waited_for(ready):
+    school, pupil = ready
+    school.publish(pupil.model, candidate=True)
+    assert consider(school, pupil) is None
+
+
+def test_refreshes_pause_and_each_longer_than_the_one_before(ready):
+    school, pupil = ready
+
+    def passed(job, state, seconds):
+        at = datetime.fromtimestamp(time.time() - seconds, UTC).isoformat()
+        with school.service.database.transaction() as session:
+            row = session.query(JobRow).filter_by(id=job.id).one()
+            row.state, row.finished_at = state, at
+
+    passed(consider(school, pupil), FAILED, 500.0)
+    assert consider(school, pupil, pause=600.0) is None
+    second = consider(school, pupil, pause=400.0)
+    passed(second, CANCELLED, 500.0)
+    assert consider(school, pupil, pause=400.0) is None
+    assert consider(school, pupil, pause=240.0) is not None
+
+
+def test_an_impossible_refresh_is_told_once(waiting, pupil):
+    pupil.teach(0)
+    pupil.put("learning", {})
+    for _ in range(2):
+        assert consider(waiting, pupil) is None
+    [(kind, message)] = alarms(pupil)
+    assert kind == "refresh"
+    assert "10 rows" in message
+
+
+def test_every_reason_is_told_once_where_refreshes_are_not_wanted(waiting, pupil):
+    pupil.teach(0, 1, 2)
+    for _ in range(2):
+        assert consider(waiting, pupil, errors=(0.6, 0.0)) is None
+    assert sorted(kind for kind, _ in alarms(pupil)) == ["linearisation", "novelty"]
+
+
+def test_an_owner_who_was_told_of_a_better_version_is_not_offered_more(ready):
+    school, pupil = ready
+    pupil.put("learning", {"auto_promote": False})
+    with school.service.database.transaction() as session:
+        told = {"serving": 1, "candidate": 2, "verdict": "promote"}
+        session.add(AlarmRow(model=pupil.model, kind="promotion", at=now(), message="", evidence=told))
+    assert consider(school, pupil) is None
+    pupil.put("learning", {"auto_promote": True})
+    assert consider(school, pupil) is not None

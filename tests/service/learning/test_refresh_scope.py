@@ -12,14 +12,7 @@ from service.storage.database import DatasetRow, now
 from service.training import refresh_data
 from service.training.refresh_data import Scope
 from tests.service.learning import batches
-from tests.service.learning.batches import MODEL, everything, note, opened, roll_back, rows, take_back, write
-
-
-@pytest.fixture
-def database(tmp_path):
-    opened_here = opened(tmp_path)
-    yield opened_here
-    opened_here.close()
+from tests.service.learning.batches import MODEL, everything, note, roll_back, rows, take_back, write
 
 
 def found_scope(database, through=None):
@@ -43,20 +36,6 @@ def test_all_rows_that_teach_are_in_scope(database):
     assert len(found.samples.episodes()) == 4
     with database.session() as session:
         assert refresh_data.rows_within(session, MODEL, within) == 16
-
-
-def test_only_rows_up_to_an_event_are_in_scope(database):
-    write(database, *(batches.batch(number) for number in range(4)))
-    found = read(database, found_scope(database, through=2))
-    np.testing.assert_array_equal(found.samples.tau, np.concatenate([rows(seed=0).tau, rows(seed=1).tau]))
-
-
-def test_streams_are_told_apart(database):
-    mixed = [batches.batch(number // 2, stream_id=f"robot-{number % 2}", rows=rows(seed=number)) for number in range(4)]
-    write(database, *mixed)
-    found = read(database, found_scope(database))
-    expected = np.concatenate([rows(seed=number).tau for number in (0, 2, 1, 3)])
-    np.testing.assert_array_equal(found.samples.tau, expected)
 
 
 @pytest.mark.parametrize("most", [7, 50, 99, 400])

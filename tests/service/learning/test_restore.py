@@ -1,21 +1,21 @@
-"""What is learnt is a function of the log: from a snapshot or not, in pages or at once."""
+"""What is learnt is a function of the log: from a snapshot or not, in pages or at once, whatever was taken back."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from lipcore.vocabulary import CODES
+from lipcore.online.learner import OnlineModel
 from service.journal import snapshots
 from service.learning.learner import course, learnt
 from service.learning.learner import restore as restoring
 from service.learning.learner.course import RewoundError
 from service.learning.learner.learnt import LearntVersions
 from service.learning.learner.restore import advance
+from tests.service.faults.damage import cut, flip, remove
 from tests.service.learning.pendulums import (
     ARM,
+    BEGIN,
     QUERIES,
     at_once,
     differ,
@@ -25,43 +25,6 @@ from tests.service.learning.pendulums import (
     same,
     trained,
 )
-
-# learning
-
-
-def test_the_rows_of_a_log_are_learnt_as_if_there_had_been_one_batch(arm, pages):
-    arm.batches(*range(12))
-    known = arm.restored()
-    assert known.number == 12
-    assert known.online.samples == pytest.approx(120)
-    same(known.online, at_once(range(12)))
-    assert differ(at_once(range(12)), at_once())
-
-
-def test_nothing_is_learnt_from_an_empty_log(arm):
-    known = arm.restored()
-    assert known.number == 0
-    same(known.online, predicted(trained()))
-
-
-def test_rows_that_were_kept_out_teach_nothing_until_they_are_replayed(arm):
-    told = rows(1)
-    code = told.code.copy()
-    code[3:6] = CODES.index("contact")
-    arm.batch(0)
-    arm.batch(1, rows=replace(told, code=code))
-    same(arm.restored().online, at_once([0], [replace(told, code=code)]))
-    arm.event("replay", replace(told, code=np.where(code == 0, 8, 0).astype(np.uint8)), event=2)
-    same(arm.restored().online, at_once([0, 1]))
-
-
-def test_a_version_learns_what_came_after_its_training(arm):
-    arm.batches(0, 1, 2)
-    arm.publish(candidate=True, start=2)
-    arm.batches(3)
-    found = restoring.restore(arm.database, arm.files, ARM, 2, arm.base)
-    assert found.number == 4
-    same(found.online, at_once([2, 3]))
 
 
 def test_a_page_takes_no_more_rows_than_it_may_and_at_least_a_batch(arm, monkeypatch):
@@ -75,51 +38,31 @@ def test_a_page_takes_no_more_rows_than_it_may_and_at_least_a_batch(arm, monkeyp
     assert advance(arm.database, known) is known
 
 
-def test_restoring_can_stop_after_some_rows_and_go_on(arm, monkeypatch):
-    monkeypatch.setattr(course, "PAGE_ROWS", 10)
-    arm.batches(*range(6))
-    known = arm.restored(most_rows=25)
-    assert known.number == 3
-    same(known.online, at_once(range(3)))
-    same(arm.followed(known).online, at_once(range(6)))
-
-
-# snapshots
-
-
-@pytest.mark.parametrize("at", [1, 7, 12])
+@pytest.mark.parametrize("at", [0, 7, 12])
 def test_a_snapshot_changes_nothing_but_the_time_it_takes(arm, pages, at, monkeypatch):
+    """Twelve batches are learnt as one would be."""
     arm.batches(*range(12))
-    assert arm.snapshot(at_most=at) == at
+    assert not at or arm.snapshot(at_most=at) == at
     decoded, decode = [], restoring.decode
     monkeypatch.setattr(restoring, "decode", lambda payload: decoded.append(1) or decode(payload))
     found = arm.restored()
     assert (found.number, len(decoded)) == (12, 12 - at)
     same(found.online, at_once(range(12)))
     assert found.online.samples == pytest.approx(120)
+    assert differ(at_once(range(12)), at_once())
 
 
-def test_a_damaged_snapshot_gives_way_to_the_one_before(arm, caplog):
+@pytest.mark.parametrize("harm", [flip, cut, remove], ids=lambda each: each.__name__)
+def test_a_damaged_snapshot_gives_way_to_the_one_before(arm, caplog, harm):
     arm.batches(0, 1)
     arm.snapshot()
     arm.batches(2, 3)
     arm.snapshot()
     with arm.database.session() as session:
         newest = snapshots.latest(session, ARM, 1, None)
-    path = arm.files.learning / f"{newest.id}.safetensors"
-    path.write_bytes(path.read_bytes()[:1000])
+    harm(arm.files.learning / f"{newest.id}.safetensors")
     same(arm.restored().online, at_once(range(4)))
     assert f"snapshot {newest.id} of version 1 of model 'arm' cannot be used" in caplog.text
-    path.unlink()
-    same(arm.restored().online, at_once(range(4)))
-
-
-def test_a_snapshot_of_another_version_is_not_taken(arm):
-    arm.batches(0, 1)
-    arm.snapshot()
-    arm.publish(candidate=True, start=1)
-    found = restoring.restore(arm.database, arm.files, ARM, 2, arm.base)
-    same(found.online, at_once([1]))
 
 
 def test_who_is_overtaken_by_retention_goes_on_from_the_newest_snapshot(arm):
@@ -148,9 +91,6 @@ def test_where_that_snapshot_is_lost_what_is_left_of_the_log_is_learnt(arm):
     same(found.online, at_once([4, 5]))
 
 
-# for the process that serves
-
-
 def test_little_is_learnt_where_a_version_is_loaded_and_the_rest_is_left_to_the_learner(arm, monkeypatch):
     assert LearntVersions(arm.database, arm.files).find(ARM, 1, arm.base) is None
     arm.batches(*range(6))
@@ -166,21 +106,13 @@ def test_little_is_learnt_where_a_version_is_loaded_and_the_rest_is_left_to_the_
 
 def test_a_version_that_learns_no_more_has_learnt_what_its_last_snapshot_says(arm):
     arm.batches(0, 1, 2)
-    arm.snapshot(at_most=2)
     arm.publish()
+    assert LearntVersions(arm.database, arm.files).find(ARM, 1, arm.base) is None
+    arm.snapshot(at_most=2)
     arm.batches(3)
     found = LearntVersions(arm.database, arm.files).find(ARM, 1, arm.base)
     assert (found.revision, found.behind) == (2, False)
     same(found.model, at_once(range(2)))
-
-
-def test_without_a_snapshot_such_a_version_is_as_trained(arm):
-    arm.batches(0, 1)
-    arm.publish()
-    assert LearntVersions(arm.database, arm.files).find(ARM, 1, arm.base) is None
-
-
-# the errors of the last seconds
 
 
 def test_the_stated_uncertainty_is_not_below_the_errors_of_the_last_seconds(arm):
@@ -202,3 +134,113 @@ def test_slow_streams_are_judged_by_enough_rows(arm):
         arm.batch(number, received=100.0 + 60 * number, record=record(1.0 if number < 2 else 0.0))
     assert learnt.floor(arm.database, ARM, 1, 4, 2)[0] == 0.0  # 200 rows without error
     assert learnt.floor(arm.database, ARM, 1, 3, 2)[0] > 0.1
+
+
+@pytest.mark.parametrize("at", [None, 3, 5], ids="snapshot at {}".format)
+def test_a_batch_that_was_unlearnt_leaves_nothing_behind(arm, pages, at):
+    arm.batches(*range(6))
+    if at is not None:
+        arm.snapshot(at_most=at)
+    known = arm.restored()
+    assert arm.unlearn(3) == 7
+    expected = at_once([0, 1, 3, 4, 5])
+    assert differ(expected, at_once(range(6)))
+    same(arm.restored().online, expected)
+    same(arm.followed(known).online, expected)
+    arm.batches(6)
+    same(arm.restored().online, at_once([0, 1, 3, 4, 5, 6]))
+    same(arm.followed(known).online, at_once([0, 1, 3, 4, 5, 6]))
+
+
+def test_a_rollback_leads_back(arm, pages):
+    arm.batches(*range(4))
+    arm.snapshot()
+    arm.batches(4, 5, 6)
+    arm.snapshot()
+    known = arm.restored()
+    assert arm.rollback(5) == 8
+    same(arm.restored().online, at_once(range(5)))
+    with pytest.raises(RewoundError) as rewound:
+        arm.followed(known)
+    assert rewound.value.number == 5
+    arm.batches(7)
+    same(arm.restored().online, at_once([0, 1, 2, 3, 4, 7]))
+    assert arm.restored().number == 9
+
+
+def test_a_rollback_between_two_pages_of_a_restart_is_followed(arm, monkeypatch):
+    monkeypatch.setattr(course, "PAGE_ROWS", 10)
+    arm.batches(*range(6))
+    calls, real = [], restoring.advance
+
+    def disturbed(*arguments):
+        calls.append(arguments)
+        if len(calls) == 5:
+            arm.rollback(2)
+        return real(*arguments)
+
+    monkeypatch.setattr(restoring, "advance", disturbed)
+    found = arm.restored()
+    assert found.number == 7
+    same(found.online, at_once(range(2)))
+
+
+def test_the_state_of_an_earlier_event_is_told_with_or_without_what_has_been_unlearnt_since(arm):
+    arm.batches(*range(5))
+    arm.snapshot(at_most=3)
+    arm.unlearn(2)
+    same(arm.restored(at_most=3).online, at_once(range(3)))
+    found = arm.restored(at_most=3, taken_back=True)
+    assert found.number == 3
+    same(found.online, at_once([0, 2]))
+
+
+def changed_twice(arm):
+    """Two batches, then a change before each of two more; return the state after the last."""
+    arm.batches(0, 1)
+    arm.event("change", t=BEGIN + 0.2)
+    arm.batches(2)
+    arm.event("change", t=BEGIN + 0.3)
+    arm.batches(3)
+    return arm.restored()
+
+
+def test_a_change_begins_a_regime_where_the_log_says(arm, pages):
+    arm.batches(0, 1, 2)
+    arm.event("change", t=BEGIN + 0.3)
+    arm.batches(3, 4)
+    expected = OnlineModel.start(arm.base, None, 0.0)
+    expected = expected.learn(_together(0, 1, 2)).change(BEGIN + 0.3).learn(_together(3, 4))
+    same(arm.restored().online, predicted(expected.model()))
+    arm.snapshot(at_most=4)
+    same(arm.restored().online, predicted(expected.model()))
+    assert differ(predicted(expected.model()), at_once(range(5)))
+
+
+def test_where_the_log_reaches_back_no_more_such_a_batch_stays_and_that_is_said(arm, caplog):
+    known = changed_twice(arm)
+    arm.unlearn(2)
+    with arm.database.transaction() as session:
+        session.connection().exec_driver_sql("DELETE FROM events WHERE number = 1")
+    same(arm.followed(known).online, predicted(known.online.model()))
+    assert "events 2 of model 'arm' stay in what is learnt" in caplog.text
+
+
+@pytest.mark.parametrize("at", [None, 2, 5])
+def test_forgetting_is_that_of_the_log(arm, pages, at):
+    arm.event("settings", forgetting_s=2.0)
+    arm.batches(0, 1, 2)
+    arm.event("settings", forgetting_s=0.5)
+    arm.batches(3, 4)
+    if at is not None:
+        arm.snapshot(at_most=at)
+    expected = OnlineModel.start(arm.base, 2.0, BEGIN + 0.09).learn(_together(0, 1, 2))
+    expected = expected.with_forgetting(0.5).learn(_together(3, 4))
+    found = arm.restored()
+    same(found.online, predicted(expected.model()))
+    assert found.online.forgetting_s == 0.5
+    assert differ(predicted(expected.model()), at_once(range(5)))
+
+
+def _together(*numbers):
+    return rows(0).concatenate([rows(number) for number in numbers])

@@ -1,22 +1,20 @@
-"""Which version answers where none is named: the newest, a promoted one, an older one that was chosen."""
+"""Which version answers where none is named: the newest, a promoted one, an older one; and what a verdict leads to."""
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
-from sqlalchemy import delete
+from sqlalchemy import delete, select
 
-from service.app import create_app
 from service.foundation.errors import NotFoundError
+from service.learning import refresh
 from service.learning.learner.learnt import LearntVersions
+from service.learning.learner.publication import Contested
 from service.models import registry
 from service.models.loaded import LoadedModels
 from service.models.registry import Serving
 from service.storage.database import LearnerRow, ServingRow
-from tests.service.data import ADDRESS
+from tests.service.learning.lessons import answered
 from tests.service.learning.pendulums import ARM
-
-QUERY = {"q": [0.1, 0.2], "dq": [0.0, 0.0], "ddq": [0.0, 0.0]}
 
 
 @pytest.fixture
@@ -47,14 +45,6 @@ def earlier_release(arm):
         session.execute(delete(LearnerRow))
 
 
-def test_a_trained_version_serves_and_the_one_before_learns_no_more(arm):
-    assert serving(arm) == Serving(1, 1)
-    arm.batches(0, 1, 2)
-    assert arm.publish() == 2
-    assert serving(arm) == Serving(2, 2)
-    assert roles(arm) == {1: (0, "dismissed"), 2: (3, "serving")}
-
-
 def test_a_candidate_does_not_serve_until_it_is_promoted(arm):
     arm.batches(0, 1, 2)
     assert arm.publish(candidate=True, start=1) == 2
@@ -69,29 +59,16 @@ def test_a_candidate_does_not_serve_until_it_is_promoted(arm):
     assert registry.show(arm.database, ARM).serving_version == 2
 
 
-def test_an_older_version_can_be_chosen_again_and_learns_again(arm):
-    arm.publish()
-    assert serve(arm, 1) == 3
-    assert serving(arm) == Serving(1, 3)
-    assert roles(arm) == {1: (0, "serving"), 2: (0, "dismissed")}
-    assert arm.publish() == 3
-    assert serving(arm) == Serving(3, 4)
-
-
-def test_choosing_what_serves_changes_nothing(arm):
-    assert serve(arm, 1) == 1
-    assert serving(arm) == Serving(1, 1)
-
-
-def test_a_version_that_is_not_there_cannot_be_chosen(arm):
-    with pytest.raises(NotFoundError, match="no version '7'"):
-        serve(arm, 7)
-    assert serving(arm) == Serving(1, 1)
-
-
 def test_the_first_version_serves_though_it_was_meant_as_a_candidate(arm):
     arm.publish("fresh", candidate=True)
     assert registry.serving(arm.database, ["fresh"]) == {"fresh": Serving(1, 1)}
+
+
+def test_what_serves_or_is_not_there_cannot_be_chosen(arm):
+    assert serve(arm, 1) == 1
+    with pytest.raises(NotFoundError, match="no version '7'"):
+        serve(arm, 7)
+    assert serving(arm) == Serving(1, 1)
 
 
 def test_a_home_of_an_earlier_release_is_served_by_its_newest_versions(arm):
@@ -105,11 +82,6 @@ def test_a_home_of_an_earlier_release_is_served_by_its_newest_versions(arm):
     assert serve(arm, 3) == 2
 
 
-def test_models_without_a_version_have_none_that_serves(arm):
-    assert registry.serving(arm.database, ["nobody"]) == {}
-    assert registry.serving(arm.database, []) == {}
-
-
 def test_the_models_that_changed_last_are_loaded_first(arm):
     arm.publish("other")
     arm.publish(candidate=True)
@@ -120,7 +92,13 @@ def test_the_models_that_changed_last_are_loaded_first(arm):
     assert loaded.hot(ARM, None).version == 1
 
 
-# in memory
+def test_a_version_that_cannot_be_read_leaves_the_one_before_answering(arm, loaded, caplog):
+    loaded.get(ARM, None)
+    arm.publish()
+    (arm.files.versions / registry.find(arm.database, ARM, 2).folder / "model.safetensors").write_bytes(b"")
+    loaded.adopt(ARM)
+    assert loaded.hot(ARM, None).version == 1
+    assert "version 2 of model 'arm' cannot be loaded" in caplog.text
 
 
 def test_answers_follow_the_version_that_serves_forwards_and_back(arm, loaded):
@@ -146,38 +124,77 @@ def test_a_decision_that_is_heard_of_late_does_not_undo_a_later_one(arm, loaded)
     assert loaded.hot(ARM, None).version == 1
 
 
-def test_a_version_asked_for_by_number_does_not_become_the_one_that_serves(arm, loaded):
-    loaded.get(ARM, None)
-    arm.publish(candidate=True)
-    assert loaded.get(ARM, 2).version == 2
-    assert loaded.hot(ARM, None).version == 1
+EVIDENCE = {"rows": 700, "gain": 0.5, "standard_error": 0.1}
 
 
-def test_a_model_without_an_answer_yet_is_not_loaded_by_an_announcement(arm, loaded):
-    loaded.announce([ARM])
-    assert loaded.hot(ARM, None) is None
-    assert loaded.newest(ARM) is None
+def decide(school, pupil, candidate=2, verdict="promote", serving=1):
+    """Act on a verdict; return whether the candidate answers, and which models the learner was told of."""
+    service, woken = school.service, []
+    said = Contested(pupil.model, serving, candidate, verdict, EVIDENCE)
+    return refresh.decide(service.database, service.loaded, woken.append, said), woken
 
 
-def test_a_version_that_cannot_be_read_leaves_the_one_before_answering(arm, loaded, caplog):
-    loaded.get(ARM, None)
-    arm.publish()
-    (arm.files.versions / registry.find(arm.database, ARM, 2).folder / "model.safetensors").write_bytes(b"")
-    loaded.adopt(ARM)
-    assert loaded.hot(ARM, None).version == 1
-    assert "version 2 of model 'arm' cannot be loaded" in caplog.text
+def roles_of(school, pupil):
+    """Role of each version."""
+    with school.service.database.session() as session:
+        rows = session.scalars(select(LearnerRow).where(LearnerRow.model == pupil.model))
+        return {row.version: row.role for row in rows}
 
 
-def test_the_service_answers_from_the_version_that_serves(arm):
-    from fastapi.testclient import TestClient
+def answering(pupil):
+    """Which version is said to answer, and which one does."""
+    said = answered(pupil.client.get(f"/v1/models/{pupil.model}"))["serving_version"]
+    return said, pupil.predict()["version"]
 
-    arm.publish(candidate=True)
-    with TestClient(create_app(arm.settings), ADDRESS) as api:
-        shown = api.get(f"/v1/models/{ARM}").json()
-        assert (shown["latest_version"], shown["serving_version"]) == (2, 1)
-        assert api.post(f"/v1/models/{ARM}/predict", json=QUERY).json()["version"] == 1
-        serve(arm, 2)
-        assert api.get("/v1/models").json()["items"][0]["serving_version"] in (1, 2)
-        found = api.post(f"/v1/models/{ARM}/predict", json=QUERY).json()
-        assert found["version"] == 2
-        assert np.isfinite(found["tau"]).all()
+
+def test_a_better_candidate_answers_and_learns_from_then_on(school, pupil):
+    assert answering(pupil) == (1, 1)
+    school.publish(pupil.model, candidate=True)
+    assert answering(pupil) == (1, 1)
+    assert decide(school, pupil) == (True, [pupil.model])
+    assert school.service.loaded.hot(pupil.model, None).version == 2
+    assert answering(pupil) == (2, 2)
+    assert roles_of(school, pupil) == {1: "dismissed", 2: "serving"}
+    [alarm] = pupil.get("alarms")["items"]
+    assert alarm["kind"] == "promotion"
+    assert alarm["evidence"] == {"serving": 1, "candidate": 2, "verdict": "promote", "promoted": True, **EVIDENCE}
+
+
+def test_one_that_is_not_better_is_dismissed_for_good(school, pupil):
+    school.publish(pupil.model, candidate=True)
+    assert decide(school, pupil, verdict="dismiss") == (False, [pupil.model])
+    assert answering(pupil) == (1, 1)
+    assert roles_of(school, pupil) == {1: "serving", 2: "dismissed"}
+    [alarm] = pupil.get("alarms")["items"]
+    assert (alarm["evidence"]["verdict"], alarm["evidence"]["promoted"]) == ("dismiss", False)
+    assert decide(school, pupil) == (False, [])
+    assert answering(pupil) == (1, 1)
+
+
+def test_the_owner_may_decide_alone(school, pupil):
+    pupil.put("learning", {"auto_promote": False})
+    school.publish(pupil.model, candidate=True)
+    assert decide(school, pupil) == (False, [pupil.model])
+    assert answering(pupil) == (1, 1)
+    [alarm] = pupil.get("alarms")["items"]
+    assert alarm["evidence"] == {"serving": 1, "candidate": 2, "verdict": "promote", "promoted": False, **EVIDENCE}
+    assert "rollback to version 2" in alarm["message"]
+    pupil.post("rollback", {"version": 2})
+    assert answering(pupil) == (2, 2)
+
+
+def test_a_verdict_on_a_version_that_serves_no_more_is_void(school, pupil):
+    school.publish(pupil.model, candidate=True)
+    school.publish(pupil.model)
+    assert decide(school, pupil) == (False, [])
+    assert answering(pupil) == (3, 3)
+    assert pupil.get("alarms")["items"] == []
+
+
+def test_one_that_knows_what_has_been_taken_back_is_dismissed(school, pupil):
+    pupil.teach(0, 1)
+    school.publish(pupil.model, candidate=True)
+    pupil.delete("observations/arm/0")
+    assert decide(school, pupil) == (False, [pupil.model])
+    assert answering(pupil) == (1, 1)
+    assert "taken back" in pupil.get("alarms")["items"][0]["message"]

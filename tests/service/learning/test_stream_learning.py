@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +20,7 @@ from service.journal import log
 from service.storage.database import Database, EventRow
 from tests.service.data import DEADLINE, eventually, stream, train, upload
 from tests.service.server import Server
-from tests.service.streams import STREAM, TAU, dial, frame, hello, read, saved_model
+from tests.service.streams import STREAM, dial, frame, hello, read, saved_model
 
 
 @dataclass(frozen=True)
@@ -120,96 +119,6 @@ def test_nothing_is_acknowledged_before_it_is_in_the_database(learning, measured
     sent_once(rows(learning, "locked"), measured, list(range(5)))
 
 
-def test_frames_sent_again_are_known_and_other_content_is_refused(learning, measured):
-    def send(client, numbers, scale=1.0):
-        for k in numbers:
-            client.ask(*measured.motions[k], tau=scale * measured.tau[k])
-        return client.flush()
-
-    with client_of(learning, "again", first_sequence=0) as client:
-        assert send(client, range(30)).through == 29
-    with client_of(learning, "again", first_sequence=20) as client:  # ten are known, ten are new
-        found = send(client, range(20, 40))
-    assert (found.through, found.duplicates) == (39, 10)
-    assert found.accepted + sum(found.rejected.values()) == 10
-    with client_of(learning, "again", first_sequence=35) as client:
-        send(client, range(35, 37), scale=2.0)
-        assert {refusal.code for refusal in client.refusals} == {"conflict"}
-        assert (client.refusals[0].first, client.refusals[-1].through) == (35, 36)
-    sent_once(rows(learning, "again"), measured, list(range(40)))
-
-
-def test_torques_that_cannot_be_learnt_are_counted(learning, measured):
-    with client_of(learning, "odd") as client:
-        for k in range(6):
-            tau = [np.nan, 0.0] if k in (2, 3) else measured.tau[k]
-            assert client.ask(*measured.motions[k], tau=tau).tau_std is not None
-        found = client.flush()
-    assert found.rejected["non_finite"] == 2
-    assert found.accepted + sum(found.rejected.values()) == 6
-
-
-def test_a_stream_of_batches_takes_no_frames(learning, measured):
-    q, dq, ddq = measured.motions[0].tolist()
-    body = {"stream_id": "http", "sequence": 0, "q": q, "dq": dq, "ddq": ddq, "tau": measured.tau[0].tolist()}
-    assert learning.client.post("/v1/models/pendulum/observations", json=body).status_code == 200
-    with client_of(learning, "http") as client:
-        client.ask(*measured.motions[1], tau=measured.tau[1])
-        found = client.flush()
-        (refusal,) = client.refusals
-    assert (found.through, refusal.first, refusal.through, refusal.code) == (0, 1, 1, "conflict")
-    assert "batches" in refusal.message
-
-
-def test_learning_that_is_switched_off_is_said_and_may_be_switched_on_again(learning, measured):
-    def enable(enabled):
-        answer = learning.client.put("/v1/models/pendulum/learning", json={"enabled": enabled})
-        assert answer.status_code == 200, answer.text
-
-    with client_of(learning, "switched") as client:
-        enable(False)
-        client.ask(*measured.motions[0], tau=measured.tau[0])
-        assert client.flush().through == 0
-        enable(True)
-        client.ask(*measured.motions[1], tau=measured.tau[1])
-        assert client.flush().through == 2
-        (refusal,) = client.refusals
-    assert (refusal.first, refusal.through, refusal.code) == (1, 1, "learning_disabled")
-    assert "switched off" in refusal.message
-    sent_once(rows(learning, "switched"), measured, [1])
-
-
-def test_a_pinned_stream_only_asks(learning, measured):
-    with client_of(learning, "pinned", version=1) as client:
-        with pytest.raises(StreamError, match="a stream pinned to a version only asks"):
-            client.ask(*measured.motions[0], tau=measured.tau[0])
-        assert client.ask(*measured.motions[0]).version == 1
-        assert client.flush().through == 0
-    assert batches(learning, "pinned") == []
-
-
-@pytest.mark.slow
-def test_what_was_gathered_is_logged_when_the_stream_ends(home):
-    measured = measured_on("panda", 10)
-    with Server(home, LIPSERVE_STREAM_FLUSH_S="3600", LIPSERVE_STREAM_FLUSH_ROWS="4") as server:
-        clients = {name: client_of(server, name, "panda-sim") for name in ("closed", "lost", "stopped")}
-        for client in clients.values():
-            for motion, tau in zip(measured.motions, measured.tau, strict=True):
-                client.ask(*motion, tau=tau)
-        clients["closed"].close()
-        clients["lost"]._socket.socket.close()
-        for name in ("closed", "lost"):
-            eventually(lambda name=name: sum(event.rows for event in batches(server, name)) == 10)
-        assert server.terminate() == -signal.SIGTERM  # uvicorn ends in good order, and then as it was told to
-        for name, client in clients.items():
-            sent_once(rows(server, name), measured, list(range(10)))
-            with suppress(StreamError):
-                client.flush()
-            assert client.learnt.through in (0, 4, 8)  # the last two are not told
-            client.close()
-        assert "ERROR" not in server.log.read_text()
-
-
 @pytest.mark.slow
 def test_no_acknowledged_frame_is_lost_or_learnt_twice_when_the_service_is_killed(home):
     measured, known, count = measured_on("panda", 800), 0, 800
@@ -234,10 +143,3 @@ def test_no_acknowledged_frame_is_lost_or_learnt_twice_when_the_service_is_kille
             assert len(durable) >= known > 0
             sent_once(durable, measured, list(range(len(durable))))
     assert known == len(durable) == count
-
-
-def test_the_flag_needs_a_stream_id_in_the_address(learning):
-    with dial(learning, STREAM) as connection:
-        hello(connection)
-        connection.send(frame(tau=TAU))
-        assert "stream_id is missing" in read(connection.recv(DEADLINE)).error["message"]

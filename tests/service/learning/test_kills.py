@@ -1,4 +1,4 @@
-"""A process that is killed while it logs: what it has acknowledged is there, and nothing is there twice."""
+"""Kills while batches come: what was acknowledged is there, and nothing is there, or learnt, twice."""
 
 from __future__ import annotations
 
@@ -9,7 +9,11 @@ import threading
 from contextlib import suppress
 
 import numpy as np
+import pytest
 
+from benchmarks.online import durability
+from benchmarks.online.durability import VICTIMS, open_trials
+from benchmarks.online.trials import Tally
 from service.foundation.settings import Settings
 from service.journal import log
 from service.journal.log import encode
@@ -73,3 +77,26 @@ def test_a_kill_at_any_moment_loses_no_acknowledged_batch_and_leaves_none_twice(
             assert event.payload == encode(rows(ROWS, seed=event.sequence))
     assert (source(database).last, source(database).missing["ranges"]) == (sequences[-1], [])
     database.close()
+
+
+TRIALS = 6
+"""Kills, of the service and of its learner in turn."""
+
+
+@pytest.fixture(scope="module")
+def tally(tmp_path_factory) -> Tally:
+    with open_trials(tmp_path_factory.mktemp("trials"), TRIALS, seed=5, batches=20) as trials:
+        for number in range(TRIALS):
+            trials.trial(VICTIMS[number % 2], batches=20)
+        trials.weigh()
+    return trials.tally
+
+
+@pytest.mark.slow
+def test_no_acknowledged_batch_is_lost_nor_applied_twice(tally):
+    assert tally.kills == {"service": TRIALS // 2, "learner": TRIALS // 2}
+    assert tally.batches == 20 * TRIALS
+    assert min(tally.repeated, tally.late) > 0
+    assert (tally.lost, tally.twice, tally.refused) == (0, 0, 0)
+    # a single batch more or less would show
+    assert tally.largest <= durability.TOLERANCE < 0.1 * tally.one_batch

@@ -1,0 +1,159 @@
+"""When a training process is ended, and what becomes of its job: judged from rows and a clock, without any process."""
+
+from __future__ import annotations
+
+import pytest
+from sqlalchemy import select
+
+from service.foundation.settings import Settings
+from service.storage.database import Database, JobRow
+from service.storage.files import Files
+from service.training import lifecycle
+from service.training.lifecycle import LINGER_S, Ended, Facts, Hand, Settled, Settler
+from tests.service.jobs.conftest import new_row
+
+SETTINGS = Settings(job_cancel_grace_s=1.0, job_heartbeat_s=60.0, job_start_s=120.0, max_job_s=1000.0)
+
+
+def hand():
+    return Hand("job_x", slot=None, future=None, since=100.0)
+
+
+def facts(state="running", heartbeat="a", cancel=False):
+    return Facts(state, heartbeat, cancel)
+
+
+def verdict(given, clock):
+    found = given.judge(SETTINGS, clock)
+    return None if found is None else found.why
+
+
+def test_a_process_may_take_its_time_to_start():
+    given = hand()
+    given.see(facts("queued", None), 150.0)
+    assert verdict(given, 219.9) is None
+    assert verdict(given, 220.0) == "not_started"
+
+
+def test_signs_of_life_count_when_they_come_not_by_what_they_say():
+    """The clocks of rows may be set, and machines sleep: only that the sign has changed matters."""
+    given = hand()
+    for beat in range(5):
+        clock = 101.0 + 50 * beat
+        given.see(facts(heartbeat=f"1970-01-01T00:00:0{beat}"), clock)
+        assert verdict(given, clock + 49) is None
+    given.see(facts(heartbeat="1970-01-01T00:00:04"), 340.0)
+    assert verdict(given, 360.9) is None
+    assert verdict(given, 361.0) == "silent"
+
+
+def test_a_cancel_has_to_be_obeyed_from_when_it_was_first_seen():
+    given = hand()
+    given.see(facts(), 101.0)
+    given.see(facts(heartbeat="b", cancel=True), 110.0)
+    given.see(facts(heartbeat="c", cancel=True), 110.9)
+    assert verdict(given, 110.99) is None
+    assert verdict(given, 111.0) == "cancelled"
+
+
+def test_a_wish_to_stop_before_the_process_has_begun_ends_nothing():
+    """The row of such a job says that it is cancelled: there is nothing that the process would do."""
+    given = hand()
+    given.stop(101.0)
+    assert verdict(given, 110.0) is None
+
+
+def test_a_job_may_not_run_for_ever():
+    given = hand()
+    for clock in range(101, 1102, 50):
+        given.see(facts(heartbeat=str(clock)), float(clock))
+    assert verdict(given, 1100.9) is None
+    assert verdict(given, 1101.0) == "too_long"
+
+
+@pytest.mark.parametrize("state", ["succeeded", "failed", "cancelled"])
+def test_a_process_that_does_not_go_on_after_its_job_is_ended(state):
+    given = hand()
+    given.see(facts(), 101.0)
+    given.see(facts(state, cancel=True), 110.0)
+    assert verdict(given, 110.0 + LINGER_S - 0.1) is None
+    assert verdict(given, 110.0 + LINGER_S) == "lingering"
+
+
+@pytest.fixture
+def store(home):
+    database = Database(home)
+    yield database, Files(home)
+    database.close()
+
+
+def settle(store, why="ended", message="the training process ended", **values):
+    """Settle a job that has these values; what becomes of it, and its row."""
+    database, files = store
+    with database.transaction() as session:
+        session.add(new_row("x", **{"state": "running", "attempts": 1, **values}))
+    settled = Settler(Settings(home=files.versions.parent, max_job_attempts=2), database, files).settle(
+        Ended("job_x", why, message)
+    )
+    with database.session() as session:
+        return settled, session.scalar(select(JobRow).where(JobRow.id == "job_x"))
+
+
+@pytest.mark.parametrize(
+    ("values", "settled", "state", "code"),
+    [
+        ({}, Settled(again=True), "queued", None),
+        ({"attempts": 2}, Settled(), "failed", "interrupted"),
+        ({"why": "too_long"}, Settled(), "failed", "too_long"),
+        ({"why": "cancelled"}, Settled(), "cancelled", None),
+        ({"cancel_requested": True}, Settled(), "cancelled", None),
+        ({"why": "too_long", "cancel_requested": True}, Settled(), "cancelled", None),
+    ],
+)
+def test_what_becomes_of_a_job_that_ran(store, values, settled, state, code):
+    found, row = settle(store, **values)
+    assert (found, row.state, row.error and row.error["code"]) == (settled, state, code)
+    last = row.history[-1]
+    assert "the training process ended" in last["message"]
+    assert state == "queued" or row.finished_at == last["at"]
+    assert state != "queued" or (row.progress, last["message"][-14:]) == ({"stage": "waiting"}, ": queued again")
+
+
+@pytest.mark.parametrize(
+    ("values", "settled"),
+    [
+        ({"state": "succeeded", "version": 3}, Settled(made=("x", 3))),  # before its process died
+        ({"why": "cancelled", "state": "failed", "finished_at": "then"}, Settled()),
+        ({"why": "cancelled", "state": "cancelled", "finished_at": "then"}, Settled()),
+        ({"why": "returned", "state": "queued"}, Settled(again=True)),  # meanwhile, and without blame
+    ],
+)
+def test_a_job_that_does_not_run_stays_as_it_is(store, values, settled):
+    found, row = settle(store, **values)
+    assert (found, row.state, row.finished_at, row.history) == (settled, values["state"], values.get("finished_at"), [])
+
+
+def test_one_that_is_not_there_is_nobody_s(store):
+    database, files = store
+    assert (
+        Settler(Settings(home=files.versions.parent), database, files).settle(Ended("job_y", "ended", "")) == Settled()
+    )
+
+
+def test_what_a_job_did_not_publish_is_deleted_and_nothing_else(store):
+    database, files = store
+    own, others = lifecycle.new_folder("job_x1x"), lifecycle.new_folder("job_y2y")
+    for name in (own, others, f".draft-{own}-abc", "mv_published"):
+        (files.versions / name).mkdir()
+    assert lifecycle.remove_leftovers(database, files, "job_x1x") == 2
+    assert {path.name for path in files.versions.iterdir()} == {others, "mv_published"}
+    assert lifecycle.remove_leftovers(database, files, "job_x1x") == 0
+
+
+def test_a_history_keeps_its_first_and_its_newest_entries():
+    row = new_row("x")
+    for number in range(lifecycle.MOST_ENTRIES + 5):
+        lifecycle.enter(row, "queued", str(number))
+    messages = [entry["message"] for entry in row.history]
+    assert len(messages) == lifecycle.MOST_ENTRIES
+    assert (messages[0], messages[1], messages[-1]) == ("0", "6", str(lifecycle.MOST_ENTRIES + 4))
