@@ -72,20 +72,6 @@ def test_frames_sent_ahead_are_answered_one_by_one_in_order(streaming):
         agrees(answer, streaming.model, motion)
 
 
-def test_streams_side_by_side_have_their_own_answers(streaming):
-    queries = motions(5, seed=2)
-    with dial(streaming.server) as one, dial(streaming.server, f"{STREAM}?version=1") as other:
-        hello(one), hello(other)
-        for number, motion in enumerate(queries):
-            one.send(frame(motion, number))
-            other.send(frame(-motion, 100 + number))
-        for number, motion in enumerate(queries):
-            agrees(read(one.recv(DEADLINE)), streaming.model, motion)
-            second = read(other.recv(DEADLINE))
-            agrees(second, streaming.model, -motion)
-            assert second.sequence == 100 + number
-
-
 def test_a_message_in_fragments_is_one_frame(streaming):
     whole = frame()
     with dial(streaming.server) as connection:
@@ -105,36 +91,29 @@ def test_missed_deadlines_are_flagged_and_counted(streaming):
 
 
 @pytest.mark.parametrize(
-    ("path", "status", "code", "said"),
+    ("path", "status", "message"),
     [
-        ("/v1/models/nobody/stream", 404, "not_found", "no model 'nobody'"),
-        ("/v1/models/Nobody%20%C3%B6/stream", 404, "not_found", "no model 'Nobody ö'"),
-        (f"{STREAM}?version=7", 404, "not_found", "no version '7'"),
-        (f"{STREAM}?version=x", 422, "invalid_request", "version is x, expected the number of a version"),
-        (f"{STREAM}?version=0", 422, "invalid_request", "version is 0, expected the number of a version"),
-        (f"{STREAM}?version=9999999999", 422, "invalid_request", "version is 9999999999, expected the number"),
-        (f"{STREAM}?version={'9' * 5000}", 422, "invalid_request", "expected the number of a version"),
-        (f"{STREAM}?version=%D9%A1", 422, "invalid_request", "expected the number of a version"),
-        (f"{STREAM}?version=", 422, "invalid_request", "expected the number of a version"),
-        (f"{STREAM}?std=yes", 422, "invalid_request", "std is yes, expected 0 or 1"),
-        (f"{STREAM}?verison=1", 422, "invalid_request", "verison is 1, expected no parameter but version, alias"),
-        (f"{STREAM}?min_revision=x", 422, "invalid_request", "min_revision is x, expected a revision of the version"),
-        (f"{STREAM}?min_revision=2147483648", 422, "invalid_request", "expected a revision of the version"),
-        (f"{STREAM}?stream_id=", 422, "invalid_request", "stream_id is , expected a name that matches [A-Za-z0-9]"),
-        (f"{STREAM}?stream_id=-arm", 422, "invalid_request", "stream_id is -arm, expected a name that matches"),
-        (f"{STREAM}?stream_id=arm%0A", 422, "invalid_request", "expected a name that matches"),
-        (f"{STREAM}?stream_id={'a' * 65}", 422, "invalid_request", "expected a name that matches"),
+        ("/v1/models/Nobody%20%C3%B6/stream", 404, "no model 'Nobody ö'"),
+        (f"{STREAM}?version=7", 404, "no version '7'"),
+        (f"{STREAM}?version=0", 422, "version is 0, expected the number of a version"),
+        (f"{STREAM}?version=9999999999", 422, "version is 9999999999, expected the number"),
+        (f"{STREAM}?version={'9' * 5000}", 422, "expected the number of a version"),
+        (f"{STREAM}?version=%D9%A1", 422, "expected the number of a version"),
+        (f"{STREAM}?std=yes", 422, "std is yes, expected 0 or 1"),
+        (f"{STREAM}?verison=1", 422, "verison is 1, expected no parameter but version, alias"),
+        (f"{STREAM}?min_revision=2147483648", 422, "expected a revision of the version"),
+        (f"{STREAM}?stream_id=-arm", 422, "stream_id is -arm, expected a name that matches [A-Za-z0-9]"),
     ],
 )
-def test_a_wrong_address_is_refused_in_http(streaming, path, status, code, said):
+def test_a_wrong_address_is_refused_in_http(streaming, path, status, message):
     with pytest.raises(InvalidStatus) as refused, dial(streaming.server, path):
         pass
     response = refused.value.response
     assert response.status_code == status
     body = json.loads(response.body)
     assert set(body) == {"error"}
-    assert body["error"]["code"] == code
-    assert said in body["error"]["message"]
+    assert body["error"]["code"] == {404: "not_found", 422: "invalid_request"}[status]
+    assert message in body["error"]["message"]
     assert body["error"]["detail"]
 
 
