@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 
 import lipcore
-from lipcore.kernels.se import SquaredExponentialKernel
-from service.oip.query import shapes
 from service.storage.files import Files
 from tests.service.data import service_of
 from tests.service.oip import refused
@@ -25,20 +21,11 @@ def test_health(api):
     assert api.get("/v2/health/ready").json() == {"ready": True}
 
 
-def test_not_ready_while_the_database_does_not_answer(api, monkeypatch, fresh_looks):
-    def broken():
-        raise OSError("disk on fire")
-
-    monkeypatch.setattr(service_of(api).database, "session", broken)
-    assert "disk on fire" in refused(api.get("/v2/health/ready"), 503)
-    assert api.get("/v2/health/live").status_code == 200
-
-
 @pytest.mark.parametrize("version", ["", "/versions/1"])
 def test_a_model_describes_its_tensors(api, trained, version):
-    found = api.get(f"/v2/models/{trained.name}{version}").json()
-    inputs, outputs = found.pop("inputs"), found.pop("outputs")
-    assert found == {
+    result = api.get(f"/v2/models/{trained.name}{version}").json()
+    inputs, outputs = result.pop("inputs"), result.pop("outputs")
+    assert result == {
         "name": trained.name,
         "versions": ["1"],
         "platform": "lipserve_lip-chain",
@@ -56,36 +43,14 @@ def test_a_model_describes_its_tensors(api, trained, version):
     assert {each["datatype"] for each in outputs} == {"FP64"}
 
 
-def test_a_model_without_energies_offers_friction_alone(trained):
-    terms = {"torque": SquaredExponentialKernel(2), "friction": trained.model.estimator.terms["friction"]}
-    black_box = replace(trained.model, estimator=replace(trained.model.estimator, name="se", terms=terms))
-    offered = ("tau", "tau_std", "noise_std", "covariance", "tau_friction", "tau_friction_std")
-    assert tuple(shapes(black_box)) == offered
-
-
-@pytest.mark.parametrize("version", ["", "/versions/1"])
-def test_a_model_is_ready(api, trained, version):
-    answer = api.get(f"/v2/models/{trained.name}{version}/ready")
-    assert (answer.status_code, answer.json()) == (200, {"name": trained.name, "ready": True})
-
-
-def test_asking_for_readiness_loads_what_was_dropped(api, trained):
-    loaded = service_of(api).loaded
-    empty = type(loaded)(loaded.storage, loaded.learnt, loaded.capacity)
-    loaded._snapshot = empty._snapshot
-    assert loaded.hot(trained.name, 1) is None
-    assert api.get(f"/v2/models/{trained.name}/versions/1/ready").status_code == 200
-    assert loaded.hot(trained.name, 1) is not None
-
-
 def test_a_version_that_cannot_be_loaded_is_not_ready(api, trained, monkeypatch):
     def broken(*_):
         raise lipcore.ModelFormatError("the manifest is missing")
 
     monkeypatch.setattr(Files, "load_version", broken)
     monkeypatch.setattr(service_of(api).loaded, "_snapshot", type(service_of(api).loaded._snapshot)())
-    said = refused(api.get(f"/v2/models/{trained.name}/ready"), 503)
-    assert said == f"version 1 of model {trained.name!r} cannot be loaded: the manifest is missing"
+    reply = refused(api.get(f"/v2/models/{trained.name}/ready"), 503)
+    assert reply == f"version 1 of model {trained.name!r} cannot be loaded: the manifest is missing"
 
 
 @pytest.mark.parametrize("path", ["", "/ready", "/versions/1", "/versions/1/ready"])
@@ -97,6 +62,6 @@ def test_unknown_models(api, model, path):
 @pytest.mark.parametrize("path", ["", "/ready"])
 @pytest.mark.parametrize("version", ["2", "0", "01", "x", "9" * 30, "%00", "%C2%B2"])
 def test_unknown_versions_are_answered_with_those_there_are(api, trained, version, path):
-    said = refused(api.get(f"/v2/models/{trained.name}/versions/{version}{path}"), 404)
-    assert said.endswith("expected one of 1, of model 'pendulum'")
-    assert said.startswith("version is ")
+    reply = refused(api.get(f"/v2/models/{trained.name}/versions/{version}{path}"), 404)
+    assert reply.endswith("expected one of 1, of model 'pendulum'")
+    assert reply.startswith("version is ")

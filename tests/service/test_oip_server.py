@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import socket
 from collections.abc import Iterator
 
 import numpy as np
@@ -14,7 +12,7 @@ from tritonclient.utils import InferenceServerException
 
 from service import __version__
 from tests.service.data import DEADLINE
-from tests.service.oip import HEADER, announced, message, packed, path_of, tensors
+from tests.service.oip import message, path_of, tensors
 
 MOTION = {"q": [0.0, -0.5, 0.0, -2.0, 0.0, 1.5, 0.7], "dq": [0.1] * 7, "ddq": [0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0]}
 BATCH = {name: np.linspace(values, np.array(values) + 0.3, 4) for name, values in MOTION.items()}
@@ -41,29 +39,6 @@ def inputs(motion, binary=True):
     return made
 
 
-def test_one_connection_answers_many_requests(server):
-    """Errors between them too: whatever is wrong with a request, the next one is read from where it begins."""
-    asked = [announced(name, values) for name, values in MOTION.items()]
-    text = json.dumps({"inputs": asked, "parameters": {"binary_data_output": True}}).encode()
-    body = text + b"".join(packed(values) for values in MOTION.values())
-    head = f"POST {PATH} HTTP/1.1\r\nHost: localhost\r\nContent-Length: {len(body)}\r\n{HEADER}: "
-    right, wrong = (f"{head}{length}\r\n\r\n".encode() + body for length in (len(text), len(text) - 1))
-    expected = plain(server, MOTION)
-    with socket.create_connection(("127.0.0.1", server.port), DEADLINE) as connection:
-        answers = connection.makefile("rb")
-        for request, status in ((right, b"200"), (wrong, b"400"), (right, b"200")):
-            connection.sendall(request)
-            assert answers.readline().split()[1] == status
-            headers = dict(line.strip().lower().split(b": ") for line in iter(answers.readline, b"\r\n"))
-            answer = answers.read(int(headers[b"content-length"]))
-            if status == b"400":
-                assert set(json.loads(answer)) == {"error"}
-                continue
-            length = int(headers[HEADER.lower().encode()])
-            assert len(json.loads(answer[:length])["outputs"]) == 2
-            assert answer[length:] == packed(expected["tau"]) + packed(expected["tau_std"])
-
-
 def test_the_client_sees_server_and_model(server, client):
     assert client.is_server_live()
     assert client.is_server_ready()
@@ -71,11 +46,8 @@ def test_the_client_sees_server_and_model(server, client):
     assert client.is_model_ready("panda-sim", "1")
     assert not client.is_model_ready("panda-sim", "2")
     assert not client.is_model_ready("nobody")
-    assert client.get_server_metadata() == {
-        "name": "lipserve",
-        "version": __version__,
-        "extensions": ["binary_tensor_data"],
-    }
+    server_ = {"name": "lipserve", "version": __version__, "extensions": ["binary_tensor_data"]}
+    assert client.get_server_metadata() == server_
     assert client.get_model_metadata("panda-sim") == server.client.get("/v2/models/panda-sim").json()
 
 

