@@ -72,15 +72,15 @@ def binary_tensors(answer: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     assert answer.headers["content-type"] == "application/octet-stream"
     length = int(answer.headers[HEADER])
     head, rest = json.loads(answer.content[:length]), answer.content[length:]
-    found = {}
+    result = {}
     for each in head["outputs"]:
         values = each.get("data")
         if values is None:
             size = each["parameters"]["binary_data_size"]
             values, rest = struct.unpack(f"<{size // 8}d", rest[:size]), rest[size:]
-        found[each["name"]] = np.array(values).reshape(each["shape"])
+        result[each["name"]] = np.array(values).reshape(each["shape"])
     assert rest == b""
-    return head, found
+    return head, result
 
 
 def refused(answer: Any, status: int = 400) -> str:

@@ -72,17 +72,17 @@ def read(data: bytes) -> Answer:
     sequence, flags, n, version, late, revision, seconds = struct.unpack_from("<IHHIIQd", data)
     assert flags & ~(STD | LATE | ERROR | UNREAD) == 0
     assert seconds >= 0
-    said = Answer(sequence, flags, version, late, revision, seconds)
+    reply = Answer(sequence, flags, version, late, revision, seconds)
     if flags & ERROR:
         assert n == 0
         body = json.loads(data[32:])
         assert set(body) == {"error"}
         assert set(body["error"]) == {"code", "message", "detail"}
-        return Answer(**{**vars(said), "error": body["error"]})
+        return Answer(**{**vars(reply), "error": body["error"]})
     vectors = 2 if flags & STD else 1
     assert len(data) == 32 + 8 * n * vectors
     numbers = np.frombuffer(data, "<f8", offset=32).reshape(vectors, n)
-    return Answer(**{**vars(said), "tau": numbers[0], "std": numbers[1] if vectors == 2 else None})
+    return Answer(**{**vars(reply), "tau": numbers[0], "std": numbers[1] if vectors == 2 else None})
 
 
 def dial(server: Server, path: str = STREAM, **options: Any) -> connect:
@@ -95,9 +95,9 @@ def dial(server: Server, path: str = STREAM, **options: Any) -> connect:
 
 def hello(connection: ClientConnection) -> dict[str, Any]:
     """The next message, which has to be text: what the service says of the version that answers."""
-    said = connection.recv(DEADLINE)
-    assert isinstance(said, str)
-    return json.loads(said)
+    reply = connection.recv(DEADLINE)
+    assert isinstance(reply, str)
+    return json.loads(reply)
 
 
 def ask(connection: ClientConnection, request: bytes | str) -> Answer:

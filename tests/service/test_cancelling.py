@@ -70,8 +70,3 @@ def test_an_ended_job_cannot_be_cancelled(api, pendulum, monkeypatch, end):
     assert before["state"] == end
     assert end in error(api.post(f"/v1/jobs/{name}/cancel"), 409, "conflict")["message"]
     assert job(api, name) == before
-
-
-def test_unknown_job_is_not_found(api):
-    for answer in (api.get("/v1/jobs/job_x"), api.post("/v1/jobs/job_x/cancel")):
-        assert "job_x" in error(answer, 404, "not_found")["message"]

@@ -35,11 +35,3 @@ def test_demo_learns_a_panda_and_predicts_unseen_trajectories(tmp_path):
             assert float(nmse) < 0.02
         assert float(coverage) > 80
     assert (tmp_path / "demo.png").stat().st_size > 10_000
-
-
-@pytest.mark.slow
-def test_demo_on_a_home_in_use_says_so_without_a_traceback(server):
-    ended = demo(server.home)
-    assert ended.returncode == 1
-    assert "another service uses" in ended.stdout + ended.stderr
-    assert "Traceback" not in ended.stdout + ended.stderr

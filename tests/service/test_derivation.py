@@ -1,4 +1,4 @@
-"""Velocities and accelerations that were not recorded are derived, close to the true ones, and said to be derived."""
+"""What was not recorded is derived, close to the true, within episodes only, and said to be derived."""
 
 from __future__ import annotations
 
@@ -7,13 +7,10 @@ import pytest
 
 from tests.service.data import arrays, csv, error, npz, post, stream
 from tests.service.data import columns as table_of
-from tests.service.test_upload_formats import created, stored
+from tests.service.test_uploads import created, stored
 
-RATES = (30.0, 50.0, 100.0)
-
-
-def fine(rate, noise=0.0):
-    return stream(samples=int(12 * rate), rate=rate, noise=noise)
+SMOOTH = stream(samples=300, rate=50.0, noise=0.0)
+FINE = stream(samples=600, rate=50.0, noise=0.0)
 
 
 def relative_error(derived, true, name):
@@ -24,9 +21,9 @@ def relative_error(derived, true, name):
     return float((np.sqrt(np.mean(wrong**2, axis=0)) / getattr(true, name).std(axis=0)).max())
 
 
-@pytest.mark.parametrize("rate", RATES)
+@pytest.mark.parametrize("rate", [30.0, 100.0])
 def test_both_are_close_to_the_true_ones(api, rate):
-    true = fine(rate)
+    true = stream(samples=int(12 * rate), rate=rate, noise=0.0)
     dataset = created(post(api, npz(**arrays(true, "t", "q", "tau"))))
     derived = stored(api, dataset)
     assert dataset["report"]["derived"] == ["dq", "ddq"]
@@ -34,84 +31,74 @@ def test_both_are_close_to_the_true_ones(api, rate):
         assert relative_error(derived, true, name) < tolerance
 
 
-def test_acceleration_alone_is_derived_from_the_recorded_velocity(api):
-    true = fine(50.0)
-    dataset = created(post(api, npz(**arrays(true, "t", "q", "dq", "tau"))))
-    assert dataset["report"]["derived"] == ["ddq"]
-    assert relative_error(stored(api, dataset), true, "ddq") < 0.02
-
-
-def test_recorded_acceleration_is_kept_where_velocity_is_derived(api):
-    true = fine(50.0)
-    dataset = created(post(api, npz(**arrays(true, "t", "q", "ddq", "tau"))))
-    derived = stored(api, dataset)
-    assert dataset["report"]["derived"] == ["dq"]
-    assert relative_error(derived, true, "dq") < 0.01
-    np.testing.assert_array_equal(derived.ddq, true.ddq[13:-13])
-
-
-def test_csv_without_them_gives_the_samples_that_npz_gives(api):
-    true = fine(50.0)
-    table = {name: values for name, values in table_of(true).items() if name.strip("0123456789") not in ("dq", "ddq")}
-    from_csv = created(post(api, csv(table), "text/csv"))
-    from_npz = created(post(api, npz(**arrays(true, "t", "q", "tau"))))
-    assert from_csv["sha256"] == from_npz["sha256"]
+@pytest.mark.parametrize(("given", "name", "tolerance"), [("dq", "ddq", 0.02), ("ddq", "dq", 0.01)])
+def test_only_what_was_not_recorded_is_derived(api, given, name, tolerance):
+    dataset = created(post(api, npz(**arrays(FINE, "t", "q", given, "tau"))))
+    assert dataset["report"]["derived"] == [name]
+    assert relative_error(stored(api, dataset), FINE, name) < tolerance
 
 
 def test_every_step_is_reported(api):
-    report = created(post(api, npz(**arrays(fine(50.0), "t", "q", "tau")), cutoff=5))["report"]
+    table = {name: values for name, values in table_of(FINE).items() if name.strip("0123456789") not in ("dq", "ddq")}
+    report = created(post(api, csv(table), "text/csv", cutoff=5))["report"]
     assert report["preparation"] == [
         "q, tau low-passed at 5 Hz without delay",
         "dq and ddq derived by central differences",
         "20 samples cut off at the filter's edges",
     ]
-    assert report["rows_uploaded"] == 600
-    assert report["rows"] == 580
+    assert (report["rows_uploaded"], report["rows"]) == (600, 580)
 
 
-def test_a_lower_cutoff_keeps_more_noise_out(api):
-    true = fine(100.0)
-    noisy = {**arrays(true, "t", "tau"), "q": true.q + 1e-4 * np.random.default_rng(3).standard_normal(true.q.shape)}
-    errors = [
-        relative_error(stored(api, created(post(api, npz(**noisy), cutoff=cutoff))), true, "ddq") for cutoff in (2, 20)
-    ]
-    assert errors[0] < 0.2 * errors[1]
+def test_gaps_split_a_recording(api):
+    t = SMOOTH.t.copy()
+    t[100:] += 2.0
+    t[220:] += 0.5
+    dataset = created(post(api, npz(**arrays(SMOOTH) | {"t": t})))
+    report = dataset["report"]
+    assert (report["gaps"], report["episodes"], report["preparation"]) == (2, 3, ["split at 2 gaps in time"])
+    assert report["rate_hz"] == pytest.approx(50.0)
+    assert [part.start for part in stored(api, dataset).episodes()] == [0, 100, 220]
 
 
-def test_jitter_of_the_clock_is_tolerated(api):
-    true = fine(50.0)
-    t = true.t + np.random.default_rng(1).uniform(-0.1, 0.1, len(true)) / 50
-    assert created(post(api, npz(**arrays(true, "q", "tau"), t=t)))["report"]["derived"] == ["dq", "ddq"]
+@pytest.mark.parametrize("clock", [{"t": np.tile(np.arange(150) / 50, 2)}, {"dt": 0.02}])
+def test_time_may_start_anew_with_an_episode(api, clock):
+    body = npz(**arrays(SMOOTH, "q", "dq", "ddq", "tau"), **clock, episode=np.repeat([5, 2], 150))
+    dataset = created(post(api, body))
+    assert dataset["report"]["rate_hz"] == pytest.approx(50.0)
+    kept = stored(api, dataset)
+    assert [part.start for part in kept.episodes()] == [0, 150]
+    np.testing.assert_allclose(kept.t, np.tile(np.arange(150), 2) * 0.02, atol=1e-12)
 
 
-def test_uneven_steps_are_put_on_an_even_clock_where_something_is_derived(api):
-    true = fine(50.0)
-    t = true.t.copy()
-    t[41:] += 0.4 / 50
-    report = created(post(api, npz(**arrays(true, "q", "tau"), t=t)))["report"]
-    assert report["preparation"][0].startswith("put on an even clock")
-    untouched = created(post(api, npz(**arrays(true, "q", "dq", "ddq", "tau"), t=t)))["report"]
-    assert (untouched["derived"], untouched["preparation"]) == ([], [])
+def test_derived_samples_do_not_mix_episodes(api):
+    """Each half alone gives the samples that both give together."""
+    first, second = SMOOTH.rows(slice(0, 150)), SMOOTH.rows(slice(150, 300))
+    episode = np.repeat([0, 1], 150)
+    both = stored(api, created(post(api, npz(**arrays(SMOOTH, "q", "tau", "t"), episode=episode))))
+    alone = [stored(api, created(post(api, npz(**arrays(half, "q", "tau", "t"))))) for half in (first, second)]
+    assert len(both) == len(alone[0]) + len(alone[1]) > 200
+    for name in ("t", "q", "dq", "ddq", "tau"):
+        expected = np.concatenate([getattr(half, name) for half in alone])
+        np.testing.assert_allclose(getattr(both, name), expected, rtol=1e-9, atol=1e-12)
 
 
-def test_missing_times_are_refused_where_something_is_derived(api):
-    said = error(post(api, npz(**arrays(fine(50.0), "q", "tau"))), 422, "invalid_data")
-    assert said["detail"] == [
-        {"field": "t", "value": "missing", "expected": "times, since dq and ddq must be derived"},
-    ]
-
-
-def test_a_cutoff_above_half_the_rate_is_refused(api):
-    said = error(post(api, npz(**arrays(fine(30.0), "t", "q", "tau")), cutoff=16), 422, "invalid_data")
-    assert said["detail"][0]["field"] == "cutoff"
-    assert "30 Hz" in said["message"]
-
-
-def test_too_few_samples_after_trimming_are_refused(api):
-    short = stream(samples=50, rate=50.0, noise=0.0)
-    said = error(post(api, npz(**arrays(short, "t", "q", "tau"))), 422, "invalid_data")
-    assert said["detail"][0] == {
-        "field": "rows",
-        "value": "24",
-        "expected": "at least 30 samples after trimming the filter's edges",
-    }
+@pytest.mark.parametrize(
+    ("body", "cutoff", "field", "message"),
+    [
+        (npz(**arrays(FINE, "q", "tau")), 4, "t", "missing, expected times, since dq and ddq must be derived"),
+        (npz(**arrays(FINE, "t", "q", "tau")), 26, "cutoff", "50 Hz"),
+        (
+            npz(**arrays(SMOOTH.rows(slice(0, 50)), "t", "q", "tau")),
+            4,
+            "rows",
+            "24, expected at least 30 samples",
+        ),
+        (npz(**arrays(SMOOTH, "q", "tau", "t"), episode=np.arange(300) // 20), 4, "rows", "enough to filter at 4 Hz"),
+        (npz(**arrays(SMOOTH), episode=np.arange(300)), 4, "episode", ""),
+    ],
+    ids=["no times", "cutoff", "too short", "fragments", "episodes of one sample"],
+)
+def test_recordings_that_do_not_suffice_are_refused(api, body, cutoff, field, message):
+    problem = error(post(api, body, cutoff=cutoff), 422, "invalid_data")
+    assert problem["detail"][0]["field"] == field
+    assert message in problem["message"]

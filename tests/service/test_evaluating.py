@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import lipcore
 from lipcore.data.metrics import evaluate
+from service.inference.evaluating import stretches
 from service.models import registry
-from tests.service.data import arrays, error, npz, post, service_of, stream, upload
+from tests.service.data import error, service_of, stream, upload
 
 FIGURES = ("nmse", "rmse", "coverage", "nlpd")
 
@@ -50,25 +53,8 @@ def test_the_answer_says_what_was_compared(api, trained, unseen):
     assert (answer["model"], answer["version"], answer["revision"]) == (trained.name, 1, 0)
     assert (answer["dataset"], answer["samples"], answer["samples_used"]) == (unseen, 80, 80)
     assert answer["joint_names"] == ["joint1", "joint2"]
-
-
-def test_coverage_is_told_at_four_levels_and_as_a_reliability_curve(api, trained, unseen):
-    answer = ask(api, trained.name, unseen).json()
-    assert [interval["level"] for interval in answer["coverages"]] == [0.5, 0.8, 0.95, 0.99]
-    assert answer["coverages"][2]["coverage"] == answer["coverage"]
-    assert answer["coverages"][2]["interval_width"] == answer["interval_width"]
-    widths = np.array([interval["interval_width"] for interval in answer["coverages"]])
-    assert (np.diff(widths, axis=0) > 0).all()
-    curve = answer["reliability"]
-    np.testing.assert_allclose(curve["nominal"], [*np.arange(5, 100, 5) / 100, 0.99])
-    assert np.shape(curve["observed"]) == (2, 20)
-    assert [observed[-1] for observed in curve["observed"]] == answer["coverages"][3]["coverage"]
-    assert (np.diff(curve["observed"]) >= 0).all()
-
-
-def test_data_of_the_training_are_told_from_others(api, trained, unseen):
-    assert ask(api, trained.name, trained.dataset).json()["in_training"] is True
-    assert ask(api, trained.name, unseen).json()["in_training"] is False
+    assert (answer["stretches"]["kind"], answer["stretches"]["samples"]) == ("equal", [8] * 10)
+    np.testing.assert_allclose(np.mean(answer["stretches"]["nmse"], axis=1), answer["nmse"], rtol=1e-9)
 
 
 @pytest.fixture
@@ -94,36 +80,25 @@ def test_the_shipped_model_is_good_and_honest(strict, panda):
 
 
 def test_a_joint_whose_torque_does_not_vary_has_no_nmse(api, trained):
-    samples = stream(seed=7)
-    still = type(samples)(
-        samples.joint_names,
-        samples.t,
-        samples.episode,
-        samples.q,
-        samples.dq,
-        samples.ddq,
-        samples.tau * [1, 0],
-    )
+    still = replace(stream(seed=7), tau=stream(seed=7).tau * [1, 0])
     answer = ask(api, trained.name, upload(api, still)["id"]).json()
     assert answer["nmse"][0] > 0
     assert answer["nmse"][1] is None
     assert np.isfinite(answer["rmse"]).all()
 
 
-def test_data_of_other_joints_are_refused(api, trained):
-    other = upload(api, stream("asr-twodof"))["id"]
-    said = error(ask(api, trained.name, other), 422, "invalid_request")
-    assert said["detail"][0]["field"] == "dataset"
-    assert "['joint1', 'joint2']" in said["message"]
-    assert "['J1', 'J2']" in said["message"]
-
-
-def test_data_of_another_torque_convention_are_refused(api, trained):
-    other = upload(api, stream(), torque_convention="gravity_compensated")["id"]
-    said = error(ask(api, trained.name, other), 422, "invalid_request")
-    assert said["detail"][0]["field"] == "dataset"
-    assert "gravity_compensated" in said["message"]
-    assert "gravity_included" in said["message"]
+@pytest.mark.parametrize(
+    ("robot", "convention", "words"),
+    [
+        ("asr-twodof", "gravity_included", ("['joint1', 'joint2']", "['J1', 'J2']")),
+        ("double-pendulum", "gravity_compensated", ("gravity_compensated", "gravity_included")),
+    ],
+)
+def test_data_of_other_joints_or_torques_are_refused(api, trained, robot, convention, words):
+    other = upload(api, stream(robot), torque_convention=convention)["id"]
+    problem = error(ask(api, trained.name, other), 422, "invalid_request")
+    assert problem["detail"][0]["field"] == "dataset"
+    assert all(word in problem["message"] for word in words)
 
 
 def test_unknown_names_are_not_found(api, trained, unseen):
@@ -132,26 +107,24 @@ def test_unknown_names_are_not_found(api, trained, unseen):
     error(ask(api, trained.name, unseen, version=99), 404, "not_found")
 
 
-@pytest.mark.parametrize(
-    ("body", "field"),
-    [
-        ({}, "dataset"),
-        ({"dataset": 5}, "dataset"),
-        ({"dataset": "x" * 41}, "dataset"),
-        ({"dataset": "x", "version": 0}, "version"),
-        ({"dataset": "x", "level": 0.9}, "level"),
-    ],
-)
-def test_bad_requests_are_named(api, trained, body, field):
-    answer = api.post(f"/v1/models/{trained.name}/evaluate", json=body)
-    assert error(answer, 422, "invalid_request")["detail"][0]["field"] == field
+def cut(counts):
+    """Samples in episodes of so many rows, and a mean that is wrong by another amount in each."""
+    samples = stream(samples=sum(counts), seed=3)
+    episode = np.repeat(np.arange(len(counts)), counts)
+    mean = samples.tau + 0.1 * (1 + episode[:, None]) * [1.0, -2.0]
+    return replace(samples, episode=episode), mean
 
 
-def test_derived_samples_are_what_is_compared(api, trained):
-    """A data set without velocities is evaluated on the derived ones."""
-    fine = stream(samples=300, rate=50.0, seed=6)
-    service = service_of(api)
-    dataset = post(api, npz(**arrays(fine, "t", "q", "tau"))).json()
-    kept = service.files.read_samples(dataset["id"], dataset["joint_names"], dataset["sha256"])
-    assert len(kept) < len(fine)
-    compare(ask(api, trained.name, dataset["id"]).json(), expected(trained.model, kept))
+def test_episodes_are_stretches_and_share_one_denominator():
+    samples, mean = cut([10, 20, 30, 40, 50])
+    result = stretches(samples, mean)
+    assert (result.kind, result.samples) == ("episodes", [10, 20, 30, 40, 50])
+    errors = np.outer([1.0, 4.0], (0.1 * np.arange(1, 6)) ** 2)
+    np.testing.assert_allclose(result.nmse, errors / samples.tau.var(axis=0)[:, None], rtol=1e-12)
+
+
+@pytest.mark.parametrize("counts", [[26] * 4, [3] * 201])
+def test_too_few_or_too_many_episodes_make_ten_equal_stretches(counts):
+    result = stretches(*cut(counts))
+    assert (result.kind, len(result.samples), sum(result.samples)) == ("equal", 10, sum(counts))
+    assert max(result.samples) - min(result.samples) <= 1

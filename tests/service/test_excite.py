@@ -8,10 +8,10 @@ from typer.testing import CliRunner
 
 import lipcore
 from lipcore.profiles import profile
-from lipcore.robots.library import load_robot, profile_urdf
+from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
 from service.cli import excite as command
-from service.cli.excite import fetch, find_model
+from service.cli.excite import fetch
 from service.cli.excite_robot import find
 from tests.service.data import QUICK, stream, train, upload
 from tests.service.server import free_port
@@ -46,7 +46,7 @@ def read(path):
 
 def test_a_motion_for_a_saved_model_is_written_drawn_and_told(folder, tmp_path):
     out, plot = tmp_path / "motion.csv", tmp_path / "motion.png"
-    said = excite("--model", folder, "--robot", "double-pendulum", *SHORT, "--out", out, "--plot", plot)
+    reply = excite("--model", folder, "--robot", "double-pendulum", *SHORT, "--out", out, "--plot", plot)
     header, t, q, dq, ddq = read(out)
     assert header == ["t", "q1", "q2", "dq1", "dq2", "ddq1", "ddq2"]
     assert len(t) == 121
@@ -56,14 +56,14 @@ def test_a_motion_for_a_saved_model_is_written_drawn_and_told(folder, tmp_path):
     np.testing.assert_allclose(np.gradient(q, t, axis=0)[1:-1], dq[1:-1], atol=0.02)
     assert plot.read_bytes().startswith(b"\x89PNG")
     for words in ("joint1", "joint2", "geometric mean", "for what the model does not know", "2 iterations", str(out)):
-        assert words in said
-    assert "obstacles" in said
+        assert words in reply
+    assert "obstacles" in reply
 
 
 def test_without_a_model_a_prior_is_planned_for_within_shares_of_the_limits(tmp_path):
     out = tmp_path / "motion.csv"
-    said = excite("--robot", "asr-twodof", *SHORT, "--range", "0.5", "--scale", "0.4", "--noise", "0.1", "--out", out)
-    assert "for what a rigid-body prior does not know" in said
+    reply = excite("--robot", "asr-twodof", *SHORT, "--range", "0.5", "--scale", "0.4", "--noise", "0.1", "--out", out)
+    assert "for what a rigid-body prior does not know" in reply
     _, _, q, dq, ddq = read(out)
     known = profile("asr-twodof")
     assert (np.abs(q - (known.lower + known.upper) / 2) <= 0.5 * (known.upper - known.lower) / 2 * (1 + 1e-9)).all()
@@ -72,37 +72,23 @@ def test_without_a_model_a_prior_is_planned_for_within_shares_of_the_limits(tmp_
     assert (np.abs(inverse_dynamics(load_robot("asr-twodof"), q, dq, ddq)) <= 0.4 * known.torque).all()
 
 
-def test_reach_keeps_the_motion_near_the_middle(tmp_path):
-    out = tmp_path / "motion.csv"
-    excite("--robot", "double-pendulum", *SHORT, "--reach", "0.2", "--out", out)
-    assert (np.abs(read(out)[2]) <= 0.2 + 1e-9).all()
-
-
-def test_a_urdf_file_and_another_estimator(tmp_path):
-    path, out = tmp_path / "arm.urdf", tmp_path / "motion.csv"
-    path.write_text(profile_urdf("double-pendulum"))
-    said = excite("--robot", path, *SHORT, "--estimator", "rigid-body", "--out", out)
-    assert "a rigid-body prior" in said
-    assert len(read(out)[0]) == 7
-
-
 def test_a_served_model_is_fetched_as_it_is(server):
     dataset = upload(server.client, stream())["id"]
     train(server.client, "to-excite", dataset)
-    found = fetch("to-excite", server.url)
+    result = fetch("to-excite", server.url)
     query = {name: [0.1, -0.2] for name in ("q", "dq", "ddq")}
     answer = server.client.post("/v1/models/to-excite/predict", json=query).json()
-    np.testing.assert_allclose(found.predict(**query).tau[0], answer["tau"], rtol=1e-9)
-    np.testing.assert_allclose(found.predict(**query).tau_std[0], answer["tau_std"], rtol=1e-6)
+    np.testing.assert_allclose(result.predict(**query).tau[0], answer["tau"], rtol=1e-9)
+    np.testing.assert_allclose(result.predict(**query).tau_std[0], answer["tau_std"], rtol=1e-6)
 
 
 def test_the_robot_is_told_by_the_joints_of_the_model():
     samples = simulate(load_robot("panda"), Stream(n_samples=20), 0)
     model = lipcore.train(samples, ("revolute",) * 7, "lip-chain", lipcore.FitOptions(**QUICK, starts=1))
-    found = find(None, model)
-    assert found.name == "panda"
-    np.testing.assert_array_equal(found.limits.acceleration, profile("panda").acceleration)
-    assert found.limits.joint_names == samples.joint_names
+    result = find(None, model)
+    assert result.name == "panda"
+    np.testing.assert_array_equal(result.limits.acceleration, profile("panda").acceleration)
+    assert result.limits.joint_names == samples.joint_names
 
 
 @pytest.mark.parametrize(
@@ -130,12 +116,3 @@ def test_mistakes_are_explained(folder, tmp_path, monkeypatch, arguments, messag
     assert isinstance(error, (ValueError, OSError, *command.ERRORS))
     assert message in str(error)
     assert not (tmp_path / "motion.csv").exists()
-
-
-def test_a_damaged_model_is_refused(folder, tmp_path):
-    path = tmp_path / "model"
-    path.mkdir()
-    (path / "manifest.json").write_bytes((folder / "manifest.json").read_bytes())
-    (path / "model.safetensors").write_bytes((folder / "model.safetensors").read_bytes()[:-9])
-    with pytest.raises(lipcore.ModelFormatError):
-        find_model(str(path), "http://127.0.0.1:1")

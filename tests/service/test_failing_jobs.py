@@ -2,44 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-import pytest
-import torch
-
 from service.training import worker
-from tests.service.data import ended, error, job, queue, service_of, stream, train, upload
-
-
-def test_lost_samples_fail_the_job_with_its_reason(api, monkeypatch):
-    service = service_of(api)
-    dataset = upload(api, stream(seed=11))["id"]
-    with monkeypatch.context() as patch:
-        patch.setattr(service.jobs, "submit", lambda job: None)
-        name = queue(api, "lost", dataset)["id"]
-    service.files.delete_samples(dataset)
-    service.jobs.submit(name)
-    seen = ended(api, name)
-    assert (seen["state"], seen["version"], seen["attempts"]) == ("failed", None, 1)
-    assert seen["error"]["code"] == "damaged_data"
-    assert dataset in seen["error"]["message"]
-    assert seen["finished_at"]
-    error(api.get("/v1/models/lost"), 404, "not_found")
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
-def test_a_device_that_is_not_there_fails_the_job(api, pendulum):
-    name = queue(api, "gpu", pendulum["id"], options={"device": "cuda", "max_iterations": 1})["id"]
-    seen = ended(api, name)
-    assert seen["state"] == "failed"
-    assert "no CUDA device is available" in seen["error"]["message"]
-
-
-def test_torques_without_any_variation_do_not_stop_the_worker(api, pendulum):
-    """Whatever becomes of such a job, it ends, and the next one runs."""
-    still = stream(seed=12)
-    still = type(still)(still.joint_names, still.t, still.episode, still.q, still.dq, still.ddq, np.zeros_like(still.q))
-    assert ended(api, queue(api, "still", upload(api, still)["id"])["id"])["attempts"] == 1
-    train(api, "after-still", pendulum["id"])
+from tests.service.data import error, job, queue, service_of
 
 
 def test_an_attempt_that_was_superseded_publishes_nothing(api, pendulum, monkeypatch):

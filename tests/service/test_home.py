@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 
 import pytest
 from fastapi.testclient import TestClient
@@ -16,7 +19,8 @@ from service.models import registry
 from service.storage.database import Database, JobRow, VersionRow, now
 from service.storage.files import Files
 from service.storage.home import HomeInUseError
-from tests.service.data import ADDRESS, QUICK, ended, error, job, stream, train, upload
+from tests.service.data import ADDRESS, DEADLINE, QUICK, ended, error, job, stream, train, upload
+from tests.service.server import free_port
 
 QUERY = {"q": [0.3, -0.2], "dq": [0.1, 0.4], "ddq": [1.0, -0.5], "covariance": True}
 
@@ -75,10 +79,7 @@ def test_what_was_finished_is_kept(second_start):
     assert api.get("/v1/datasets").json() == before["datasets"]
     models = {item["name"]: item for item in api.get("/v1/models").json()["items"]}
     assert [models[item["name"]] for item in before["models"]["items"]] == before["models"]["items"]
-
-
-def test_the_same_query_has_the_identical_answer(second_start):
-    api, before, _ = second_start
+    assert models["panda-sim"]["latest_version"] == 1  # the shipped model is registered once
     assert api.post("/v1/models/kept/predict", json=QUERY).json() == before["predict"]
 
 
@@ -99,33 +100,12 @@ def test_an_interrupted_job_is_done_again(second_start):
     assert (seen["state"], seen["attempts"], seen["version"]) == ("succeeded", 2, 1)
 
 
-def test_jobs_that_waited_are_done_in_their_order(second_start):
-    api, _, _ = second_start
-    seen = [ended(api, f"job_waiting{number}") for number in (1, 2)]
-    assert [(now["version"], now["attempts"]) for now in seen] == [(1, 1), (2, 1)]
-
-
-def test_a_job_that_was_interrupted_too_often_fails(second_start):
+def test_a_job_that_was_interrupted_too_often_fails_and_an_unwanted_one_is_cancelled(second_start):
     api, _, _ = second_start
     seen = job(api, "job_enough")
     assert (seen["state"], seen["attempts"], seen["error"]["code"]) == ("failed", 3, "interrupted")
     assert seen["finished_at"]
-
-
-def test_a_job_that_was_to_be_cancelled_is_cancelled(second_start):
-    api, _, _ = second_start
     assert job(api, "job_unwanted")["state"] == "cancelled"
-
-
-def test_the_shipped_model_is_registered_once(second_start):
-    api, _, _ = second_start
-    assert api.get("/v1/models/panda-sim").json()["latest_version"] == 1
-
-
-def test_a_second_service_on_the_same_home_is_refused(second_start):
-    _, _, home = second_start
-    with pytest.raises(HomeInUseError, match=r"another service uses .*: stop it, or set LIPSERVE_HOME"), started(home):
-        pass
 
 
 def test_a_damaged_version_does_not_keep_the_others_from_answering(home):
@@ -141,9 +121,9 @@ def test_a_damaged_version_does_not_keep_the_others_from_answering(home):
     with TestClient(create_app(Settings(home=home)), ADDRESS, raise_server_exceptions=False) as api:
         assert api.get("/health/ready").status_code == 200
         assert api.post("/v1/models/panda-sim/predict", json=zero).status_code == 200
-        said = error(api.post("/v1/models/damaged/predict", json=zero), 500, "unreadable_version")
-        assert said["message"].startswith("version 1 of model 'damaged' cannot be loaded: ")
-        assert "does not have the sha256 that was kept of it" in said["message"]
+        reply = error(api.post("/v1/models/damaged/predict", json=zero), 500, "unreadable_version")
+        assert reply["message"].startswith("version 1 of model 'damaged' cannot be loaded: ")
+        assert "does not have the sha256 that was kept of it" in reply["message"]
 
 
 def earlier_release(home, job):
@@ -164,8 +144,8 @@ def test_an_upgrade_brings_its_shipped_model(home):
         assert api.get("/v1/models/panda-sim").json()["latest_version"] == 2
         query = {"q": [0.0] * 7, "dq": [0.0] * 7, "ddq": [0.0] * 7}
         assert api.post("/v1/models/panda-sim/predict", json=query).json()["version"] == 2
-        said = error(api.post("/v1/models/panda-sim/predict", json=query | {"version": 1}), 500, "unreadable_version")
-        assert "format_version is 2, expected 3: train the model again" in said["message"]
+        reply = error(api.post("/v1/models/panda-sim/predict", json=query | {"version": 1}), 500, "unreadable_version")
+        assert "format_version is 2, expected 3: train the model again" in reply["message"]
         assert api.get("/v1/models/panda-sim/versions/1").status_code == 200
 
 
@@ -174,3 +154,23 @@ def test_an_upgrade_leaves_a_model_alone_that_the_user_has_trained(home):
     earlier_release(home, job="job_of_the_user")
     with TestClient(create_app(Settings(home=home)), ADDRESS) as api:
         assert api.get("/v1/models/panda-sim").json()["latest_version"] == 1
+
+
+def test_a_second_service_on_the_same_home_is_refused(second_start):
+    _, _, home = second_start
+    with pytest.raises(HomeInUseError, match=r"another service uses .*: stop it, or set LIPSERVE_HOME"), started(home):
+        pass
+
+
+def test_a_second_server_on_the_same_home_says_why_it_ends(server):
+    ended = subprocess.run(
+        [sys.executable, "-m", "service", "serve", "--port", str(free_port())],
+        env={**os.environ, "LIPSERVE_HOME": str(server.home)},
+        capture_output=True,
+        text=True,
+        timeout=DEADLINE,
+        check=False,
+    )
+    assert ended.returncode != 0
+    assert f"another service uses {server.home}: stop it, or set LIPSERVE_HOME" in ended.stdout + ended.stderr
+    assert "Traceback" not in ended.stdout + ended.stderr

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import signal
 from dataclasses import dataclass
 from typing import Any
 
 import pytest
-from fastapi.testclient import TestClient
 
-from service.app import create_app
-from service.foundation.settings import Settings
-from tests.service.data import ADDRESS, ENDLESS, ended, eventually, queue, running, stream, train, upload
+from tests.service.data import ENDLESS, ended, eventually, queue, running, stream, train, upload
 from tests.service.server import Server, command
 
 pytestmark = pytest.mark.slow
@@ -79,21 +75,3 @@ def test_exactly_one_version_is_made(story):
     assert story.at_the_end["version"] == 1
     assert [version["version"] for version in story.model["versions"]] == [1]
     assert story.versions_on_disk == 3  # panda-sim, pendulum, panda
-
-
-@pytest.mark.slow
-def test_asked_to_end_while_it_trains_a_server_ends_and_the_job_goes_on_at_the_next_start(tmp_path):
-    home = tmp_path / "home"
-    with Server(home) as server:
-        name = queue(server.client, "long", upload(server.client, stream("panda", 200))["id"], options=ENDLESS)["id"]
-        running(server.client, name)
-        workers = server.workers()
-        assert server.terminate() in (0, -signal.SIGTERM)  # long before the fit can have ended
-        assert "Application shutdown complete" in server.log.read_text()
-        assert all(command(pid) == "" for pid in workers)
-    with TestClient(create_app(Settings(home=home)), ADDRESS) as api:
-        again = running(api, name)
-        assert (again["state"], again["attempts"]) == ("running", 1)  # ending in order costs no attempt
-        api.post(f"/v1/jobs/{name}/cancel")
-        assert ended(api, name)["state"] == "cancelled"
-        assert api.get("/v1/models/long").status_code == 404

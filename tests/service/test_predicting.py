@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 import pytest
 
-from tests.service.data import service_of, train
+from tests.service.data import error, service_of, train
 
 EXACT = {"rtol": 1e-12, "atol": 1e-12}
 
@@ -42,77 +40,52 @@ def test_a_single_query_is_answered_as_its_row_of_a_batch(api, trained, motion):
             np.testing.assert_allclose(single[name], batch[name][row], rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("rows", [None, 1, 12])
-def test_answers_are_shaped_as_the_query(api, trained, motion, rows):
-    query = {name: values[0] if rows is None else values[:rows] for name, values in motion.items()}
-    answer = ask(api, trained.name, query, covariance=True)
-    lead = () if rows is None else (rows,)
-    assert np.shape(answer["tau"]) == np.shape(answer["tau_std"]) == (*lead, 2)
-    assert np.shape(answer["covariance"]) == (*lead, 2, 2)
-    assert np.shape(answer["noise_std"]) == (2,)
-
-
-def test_covariance_is_symmetric_and_has_the_variances_on_its_diagonal(api, trained, motion):
-    answer = ask(api, trained.name, motion, covariance=True)
-    covariance = np.array(answer["covariance"])
-    np.testing.assert_allclose(covariance, covariance.transpose(0, 2, 1), **EXACT)
-    np.testing.assert_allclose(np.diagonal(covariance, axis1=1, axis2=2), np.array(answer["tau_std"]) ** 2, rtol=1e-9)
-    assert (np.linalg.eigvalsh(covariance) > 0).all()
-
-
-def test_covariance_is_left_out_unless_asked_for(api, trained, motion):
-    assert "covariance" not in ask(api, trained.name, motion)
-    assert "covariance" not in ask(api, trained.name, motion, covariance=False)
-
-
 def test_the_answer_says_what_it_is(api, trained, motion):
     answer = ask(api, trained.name, motion)
     assert (answer["model"], answer["version"], answer["revision"]) == (trained.name, 1, 0)
     assert answer["joint_names"] == ["joint1", "joint2"]
     assert answer["torque_convention"] == "gravity_included"
-    shown = api.get(f"/v1/models/{trained.name}/versions/1").json()
-    assert answer["noise_std"] == shown["noise_std"]
+    view = api.get(f"/v1/models/{trained.name}/versions/1").json()
+    assert answer["noise_std"] == view["noise_std"]
 
 
-def test_equal_questions_have_equal_answers(api, trained, motion):
-    assert ask(api, trained.name, motion) == ask(api, trained.name, motion)
+def refused(api, width=7, rows=None, **changes):
+    """A query of zeros but for what is changed; the first of what is wrong with it."""
+    zeros = np.zeros(width if rows is None else (rows, width)).tolist()
+    answer = api.post("/v1/models/panda-sim/predict", json={"q": zeros, "dq": zeros, "ddq": zeros} | changes)
+    return error(answer, 422, "invalid_request")["detail"][0]
 
 
-def test_whole_numbers_are_numbers(api, trained):
-    whole = ask(api, trained.name, {"q": [1, 0], "dq": [0, 2], "ddq": [-1, 0]})
-    assert whole == ask(api, trained.name, {"q": [1.0, 0.0], "dq": [0.0, 2.0], "ddq": [-1.0, 0.0]})
+@pytest.mark.parametrize("rows", [None, 2])
+def test_what_the_model_cannot_answer_is_explained(strict, rows):
+    joints = ", ".join(f"panda_joint{joint}" for joint in range(1, 8))
+    assert refused(strict, 6, rows) == {"field": "q", "value": "6 numbers long", "expected": f"7 numbers: {joints}"}
+    degrees = [0.0, -30.0, 0.0, -115.0, 0.0, 85.0, 40.0]
+    problem = refused(strict, 7, rows, q=degrees if rows is None else [[0.0] * 7, degrees])
+    assert problem["field"] == ("q[3]" if rows is None else "q[1][3]")
+    assert "are these degrees?" in problem["expected"]
 
 
-def test_uncertainty_grows_away_from_the_data(api, trained):
-    inside = {name: getattr(trained.samples, name)[40] for name in ("q", "dq", "ddq")}
-    outside = {name: values + 2.5 for name, values in inside.items()}
-    near, far = (np.array(ask(api, trained.name, query)["tau_std"]) for query in (inside, outside))
-    assert (far > 3 * near).all()
+def test_a_batch_has_a_limit(strict):
+    assert refused(strict, rows=21) == {"field": "q", "value": "21 queries", "expected": "at most 20 in one request"}
 
 
-def test_torques_are_close_to_the_measured_ones(api, trained):
-    query = {name: getattr(trained.samples, name) for name in ("q", "dq", "ddq")}
-    answer = ask(api, trained.name, query)
-    wrong = np.sqrt(np.mean((np.array(answer["tau"]) - trained.samples.tau) ** 2, axis=0))
-    assert (wrong < 0.1 * trained.samples.tau.std(axis=0)).all()
+def test_large_velocities_are_answered_unclipped(strict):
+    """Twice the speed is four times the centrifugal torque: nothing between is cut."""
+    zero = [0.0] * 7
+    slow, fast = (
+        np.array(ask(strict, "panda-sim", {"q": zero, "dq": [speed, *zero[1:]], "ddq": zero})["tau"])
+        for speed in (1e3, 2e3)
+    )
+    assert np.abs(slow).max() > 1e3
+    assert np.abs(fast).max() > 1.5 * np.abs(slow).max()
 
 
-def test_questions_at_the_same_time_do_not_disturb_each_other(api, trained, motion):
-    queries = [{name: values[row : row + 3] for name, values in motion.items()} for row in range(9)] * 4
-    alone = [ask(api, trained.name, query) for query in queries]
-    with ThreadPoolExecutor(8) as pool:
-        together = list(pool.map(lambda query: ask(api, trained.name, query), queries))
-    assert together == alone
-
-
-def test_the_shipped_model_answers_from_the_start(strict):
-    listed = strict.get("/v1/models").json()["items"]
-    assert "panda-sim" in [model["name"] for model in listed]
-    answer = ask(strict, "panda-sim", {"q": [0, -0.5, 0, -2, 0, 1.5, 0.7], "dq": [0] * 7, "ddq": [0] * 7})
-    assert answer["joint_names"] == [f"panda_joint{joint}" for joint in range(1, 8)]
-    assert answer["version"] == 1
-    assert np.isfinite(answer["tau"]).all()
-    assert strict.get("/v1/models/panda-sim/versions/1").json()["job"] is None
+@pytest.mark.parametrize("path", ["/v1/models/panda-sim/predict", "/v1/models/panda-sim/evaluate", "/v1/jobs"])
+def test_bodies_beyond_the_limit_are_refused_however_they_come(strict, path):
+    for body in (b"[" + b" " * 20_000, (b" " * 1000 for _ in range(21))):
+        answer = strict.post(path, content=body, headers={"content-type": "application/json"})
+        assert "20000 bytes" in error(answer, 413, "too_large")["message"]
 
 
 def test_more_models_than_fit_in_memory_all_answer(api, trained, motion):

@@ -11,10 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.foundation.errors import InvalidRequestError, problem, readable
-from service.inference.predicting import decode
-from service.learning.ingest import routes as observations
 from service.web.route import Route, each_once, read_json
-from tests.service.data import error, service_of
+from tests.service.data import service_of
 
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
@@ -26,7 +24,7 @@ PAGES = {"/", "/docs", "/docs/oauth2-redirect", "/guide", "/guide/{page}", "/gui
 
 
 def test_every_route_is_of_the_class_that_checks_requests(api):
-    routes = [found.original_route for found in iter_route_contexts(api.app.routes)]
+    routes = [result.original_route for result in iter_route_contexts(api.app.routes)]
     unchecked = {route.path for route in routes if isinstance(route, APIRoute) and not isinstance(route, Route)}
     assert unchecked == PAGES
     assert sum(isinstance(route, Route) for route in routes) > 40
@@ -63,29 +61,13 @@ def test_fields_are_counted_once():
     assert not each_once(b'{"q": [0], "\\u0071": [0]}', b"q", b"dq")
 
 
-@pytest.mark.parametrize("twice", ['"q": [1], ', '"\\u0071": [1], ', '"version": 1, "version": 1, '])
-def test_the_readers_of_hot_routes_leave_a_field_that_comes_twice_to_the_one_that_explains_it(twice):
-    query = '{%s"q": [0], "dq": [0], "ddq": [0]}'
-    assert decode((query % "").encode()) is not None
-    assert decode((query % twice).encode()) is None
-    batch = '{%s"stream_id": "a", "sequence": 0, "q": [0], "dq": [0], "ddq": [0], "tau": [0]}'
-    assert observations.decode((batch % "").encode()) is not None
-    assert observations.decode((batch % twice).encode()) is None
-
-
-@pytest.mark.parametrize("media_type", ["application/json", "Application/JSON ; charset=utf-8", "application/ld+json"])
-def test_json_by_its_names(api, media_type):
-    answer = api.post("/v1/jobs", content=b"{}", headers={"content-type": media_type})
-    assert error(answer, 422, "invalid_request")["detail"][0]["field"] == "model"
-
-
 @given(st.text())
 def test_what_is_shown_can_be_shown_and_tells_texts_apart(text):
-    shown = readable(text)
-    assert shown.isprintable()
-    assert shown.encode().decode() == shown
+    view = readable(text)
+    assert view.isprintable()
+    assert view.encode().decode() == view
     if text.isprintable():
-        assert shown == text
+        assert view == text
 
 
 def test_values_that_are_large_or_deep_are_shown_in_short():

@@ -1,4 +1,4 @@
-"""Torque streams of a real server: the numbers, their order, deadlines, the address, and the floor."""
+"""Torque streams of a real server: the numbers, their order, the address, the floor, and a version that is new."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from websockets.exceptions import InvalidStatus
 
-from tests.service.data import DEADLINE
-from tests.service.streams import LATE, MOTION, STD, STREAM, ask, dial, frame, hello, motions, read
+from service.client.stream import StreamClient
+from tests.service.data import DEADLINE, ended, eventually, queue, stream, train, upload
+from tests.service.streams import MOTION, STD, STREAM, ask, dial, frame, hello, motions, read, saved_model
 
 ECHO = "/v1/echo/stream"
 
@@ -26,9 +27,9 @@ def agrees(answer, model, motion, std=True):
 
 def test_hello_says_what_holds_for_all_answers(streaming):
     with dial(streaming.server) as connection:
-        said = hello(connection)
-    noise = said.pop("noise_std")
-    assert said == {
+        reply = hello(connection)
+    noise = reply.pop("noise_std")
+    assert reply == {
         "layout": 1,
         "model": "pendulum",
         "version": 1,
@@ -50,16 +51,6 @@ def test_answers_are_those_of_the_model(streaming, query, flags, std):
             assert (answer.sequence, answer.flags, answer.version, answer.revision) == (number, STD * std, 1, 0)
 
 
-def test_a_stream_answers_what_http_answers(streaming):
-    q, dq, ddq = MOTION.tolist()
-    answer = streaming.server.client.post("/v1/models/pendulum/predict", json={"q": q, "dq": dq, "ddq": ddq}).json()
-    with dial(streaming.server) as connection:
-        hello(connection)
-        streamed = ask(connection, frame())
-    np.testing.assert_allclose(streamed.tau, answer["tau"], rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(streamed.std, answer["tau_std"], rtol=1e-9, atol=1e-9)
-
-
 def test_frames_sent_ahead_are_answered_one_by_one_in_order(streaming):
     queries = motions(200, seed=1)
     with dial(streaming.server) as connection:
@@ -72,69 +63,30 @@ def test_frames_sent_ahead_are_answered_one_by_one_in_order(streaming):
         agrees(answer, streaming.model, motion)
 
 
-def test_streams_side_by_side_have_their_own_answers(streaming):
-    queries = motions(5, seed=2)
-    with dial(streaming.server) as one, dial(streaming.server, f"{STREAM}?version=1") as other:
-        hello(one), hello(other)
-        for number, motion in enumerate(queries):
-            one.send(frame(motion, number))
-            other.send(frame(-motion, 100 + number))
-        for number, motion in enumerate(queries):
-            agrees(read(one.recv(DEADLINE)), streaming.model, motion)
-            second = read(other.recv(DEADLINE))
-            agrees(second, streaming.model, -motion)
-            assert second.sequence == 100 + number
-
-
-def test_a_message_in_fragments_is_one_frame(streaming):
-    whole = frame()
-    with dial(streaming.server) as connection:
-        hello(connection)
-        connection.send([whole[:7], whole[7:40], whole[40:]])
-        agrees(read(connection.recv(DEADLINE)), streaming.model, MOTION)
-
-
-def test_missed_deadlines_are_flagged_and_counted(streaming):
-    with dial(streaming.server) as connection, dial(streaming.server) as other:
-        hello(connection), hello(other)
-        seen = [ask(connection, frame(budget=budget)) for budget in (60.0, 1e-9, 0.0, 1e-9, 60.0)]
-        assert [bool(answer.flags & LATE) for answer in seen] == [False, True, False, True, False]
-        assert [answer.late for answer in seen] == [0, 1, 1, 2, 2]
-        agrees(seen[1], streaming.model, MOTION)
-        assert ask(other, frame()).late == 0
-
-
 @pytest.mark.parametrize(
-    ("path", "status", "code", "said"),
+    ("path", "status", "message"),
     [
-        ("/v1/models/nobody/stream", 404, "not_found", "no model 'nobody'"),
-        ("/v1/models/Nobody%20%C3%B6/stream", 404, "not_found", "no model 'Nobody ö'"),
-        (f"{STREAM}?version=7", 404, "not_found", "no version '7'"),
-        (f"{STREAM}?version=x", 422, "invalid_request", "version is x, expected the number of a version"),
-        (f"{STREAM}?version=0", 422, "invalid_request", "version is 0, expected the number of a version"),
-        (f"{STREAM}?version=9999999999", 422, "invalid_request", "version is 9999999999, expected the number"),
-        (f"{STREAM}?version={'9' * 5000}", 422, "invalid_request", "expected the number of a version"),
-        (f"{STREAM}?version=%D9%A1", 422, "invalid_request", "expected the number of a version"),
-        (f"{STREAM}?version=", 422, "invalid_request", "expected the number of a version"),
-        (f"{STREAM}?std=yes", 422, "invalid_request", "std is yes, expected 0 or 1"),
-        (f"{STREAM}?verison=1", 422, "invalid_request", "verison is 1, expected no parameter but version, alias"),
-        (f"{STREAM}?min_revision=x", 422, "invalid_request", "min_revision is x, expected a revision of the version"),
-        (f"{STREAM}?min_revision=2147483648", 422, "invalid_request", "expected a revision of the version"),
-        (f"{STREAM}?stream_id=", 422, "invalid_request", "stream_id is , expected a name that matches [A-Za-z0-9]"),
-        (f"{STREAM}?stream_id=-arm", 422, "invalid_request", "stream_id is -arm, expected a name that matches"),
-        (f"{STREAM}?stream_id=arm%0A", 422, "invalid_request", "expected a name that matches"),
-        (f"{STREAM}?stream_id={'a' * 65}", 422, "invalid_request", "expected a name that matches"),
+        ("/v1/models/Nobody%20%C3%B6/stream", 404, "no model 'Nobody ö'"),
+        (f"{STREAM}?version=7", 404, "no version '7'"),
+        (f"{STREAM}?version=0", 422, "version is 0, expected the number of a version"),
+        (f"{STREAM}?version=9999999999", 422, "version is 9999999999, expected the number"),
+        (f"{STREAM}?version={'9' * 5000}", 422, "expected the number of a version"),
+        (f"{STREAM}?version=%D9%A1", 422, "expected the number of a version"),
+        (f"{STREAM}?std=yes", 422, "std is yes, expected 0 or 1"),
+        (f"{STREAM}?verison=1", 422, "verison is 1, expected no parameter but version, alias"),
+        (f"{STREAM}?min_revision=2147483648", 422, "expected a revision of the version"),
+        (f"{STREAM}?stream_id=-arm", 422, "stream_id is -arm, expected a name that matches [A-Za-z0-9]"),
     ],
 )
-def test_a_wrong_address_is_refused_in_http(streaming, path, status, code, said):
+def test_a_wrong_address_is_refused_in_http(streaming, path, status, message):
     with pytest.raises(InvalidStatus) as refused, dial(streaming.server, path):
         pass
     response = refused.value.response
     assert response.status_code == status
     body = json.loads(response.body)
     assert set(body) == {"error"}
-    assert body["error"]["code"] == code
-    assert said in body["error"]["message"]
+    assert body["error"]["code"] == {404: "not_found", 422: "invalid_request"}[status]
+    assert message in body["error"]["message"]
     assert body["error"]["detail"]
 
 
@@ -169,3 +121,35 @@ def test_the_echo_sends_back_what_comes(streaming):
         for message in (frame(), b"", "text"):
             connection.send(message)
             assert connection.recv(DEADLINE) == (message.encode() if isinstance(message, str) else message)
+
+
+def test_streams_follow_the_newest_version_and_pinned_ones_stay(streaming):
+    server, api = streaming.server, streaming.server.client
+    train(api, "swapped", streaming.dataset)
+    other = upload(api, stream(seed=3, viscous=2.0))["id"]
+    queries, answers = motions(50, seed=4), []
+    with dial(server, "/v1/models/swapped/stream?version=1") as pinned, StreamClient("swapped", server.url) as client:
+        assert hello(pinned)["version"] == client.hello.version == 1
+        job = queue(api, "swapped", other)["id"]
+
+        def swapped():
+            for motion in queries:
+                answers.append((client.ask(*motion), motion))
+            return answers[-1][0].version == 2
+
+        eventually(swapped)
+        assert client.hello.version == 2
+        assert ended(api, job)["state"] == "succeeded"
+        still = ask(pinned, frame(queries[0]))
+
+    models = {version: saved_model(server, "swapped", version) for version in (1, 2)}
+    assert np.abs(models[1].answer(queries[0])[0] - models[2].answer(queries[0])[0]).max() > 1e-3
+    for answer, motion in answers:
+        tau, std = models[answer.version].answer(motion)
+        np.testing.assert_allclose([answer.tau, answer.tau_std], [tau, std], rtol=1e-12, atol=1e-12)
+    versions = [answer.version for answer, _ in answers]
+    assert versions == sorted(versions)
+    assert set(versions) == {1, 2}
+    assert [answer.sequence for answer, _ in answers] == list(range(1, len(answers) + 1))
+    assert still.version == 1
+    agrees(still, models[1], queries[0])

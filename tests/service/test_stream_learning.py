@@ -6,6 +6,7 @@ import asyncio
 import json
 import threading
 import time
+from functools import wraps
 from time import perf_counter
 from types import SimpleNamespace
 
@@ -20,21 +21,10 @@ from service.stream.session import Session
 from service.web.observability.meters import Meters
 from tests.service.data import DEADLINE
 from tests.service.streams import ERROR, STD, TAU, frame, read
+from tests.service.test_stream_session import Model, served
 
 QUICK = {"stream_flush_rows": 100, "stream_flush_s": 0.01}
 NEVER = 3600.0
-
-
-class Model:
-    """A model whose torque is q times a factor, with a standard deviation of its own."""
-
-    joint_names, torque_convention = ("a", "b"), "gravity_included"
-
-    def __init__(self, factor=1.0):
-        self.factor = factor
-
-    def answer(self, motion, std=True):
-        return self.factor * motion[0], np.array([0.5, self.factor]) if std else None
 
 
 class Learners:
@@ -65,34 +55,22 @@ class Learners:
         return [block.sequences.tolist() for block in self.blocks]
 
 
-def served(version=1, revision=0, model=None):
-    return SimpleNamespace(name="m", version=version, revision=revision, model=model or Model(), noise_std=[0.1, 0.2])
-
-
 class Talk:
     """One connection to a session, from the client's side of ASGI."""
 
-    def __init__(self, learners, pinned=False, std=False, stream_id="arm-1", **settings):
-        self.learners, self.messages, self.sent = learners, asyncio.Queue(), asyncio.Queue()
-        self.said, self.aborted = [], asyncio.Event()
+    def __init__(self, learners=None, pinned=False, std=False, stream_id="arm-1", **settings):
+        self.learners, self.messages, self.sent = learners or Learners(), asyncio.Queue(), asyncio.Queue()
+        self.received, self.aborted = [], asyncio.Event()
         self.passing = {"bytes": asyncio.Event(), "text": asyncio.Event()}
         for passing in self.passing.values():
             passing.set()
-        self.current = served()
+        self.current = served(1, Model())
         loaded = SimpleNamespace(hot=lambda name, version, alias: self.current)
-        learners.settings, learners.loaded = Settings(**{**QUICK, **settings}), loaded
+        self.learners.settings, self.learners.loaded = Settings(**{**QUICK, **settings}), loaded
         self.connection = SimpleNamespace(arrived=perf_counter(), abort=self.aborted.set, scope={"subprotocols": []})
-        self.session = Session(
-            self.connection,
-            self.messages.get,
-            self.send,
-            learners,
-            self.current,
-            Meters().stream("m"),
-            pinned,
-            std,
-            stream_id,
-        )
+        client = self.connection, self.messages.get, self.send
+        meter = Meters().stream("m")
+        self.session = Session(*client, self.learners, self.current, meter, pinned, std, stream_id)
 
     async def __aenter__(self):
         self.messages.put_nowait({"type": "websocket.connect"})
@@ -113,11 +91,15 @@ class Talk:
         self.sent.put_nowait(message)
 
     async def next(self):
-        self.said.append(await asyncio.wait_for(self.sent.get(), DEADLINE))
-        return self.said[-1]
+        self.received.append(await asyncio.wait_for(self.sent.get(), DEADLINE))
+        return self.received[-1]
 
     async def text(self):
         return json.loads((await self.next())["text"])
+
+    async def through(self):
+        """The last sequence of the acknowledgement that comes next."""
+        return (await self.text())["learnt"]["through"]
 
     async def answer(self):
         return read((await self.next())["bytes"])
@@ -137,277 +119,205 @@ class Talk:
             await asyncio.sleep(0)
 
 
-def play(scene):
+def played(scene):
     """Run an asynchronous test."""
-    asyncio.run(asyncio.wait_for(scene(), 2 * DEADLINE))
+
+    @wraps(scene)
+    def run(*arguments, **more):
+        asyncio.run(asyncio.wait_for(scene(*arguments, **more), 2 * DEADLINE))
+
+    return run
 
 
-@pytest.mark.parametrize(
-    ("flags", "always", "answered"), [(0, False, False), (STD, False, True), (0, True, True), (STD, True, True)]
-)
-def test_a_frame_with_torque_is_answered_as_without_and_then_learnt(flags, always, answered):
-    learners, began = Learners(), time.time()
-
-    async def scene():
-        async with Talk(learners, std=always) as talk:
-            talk.current = served(revision=4, model=Model(3.0))
-            talk.put(frame([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]], 9, flags, tau=[7.0, 8.0]))
-            answer = await talk.answer()
-            assert (answer.sequence, answer.revision, answer.tau.tolist()) == (9, 4, [3.0, 6.0])
-            assert (answer.std.tolist() == [0.5, 3.0]) if answered else (answer.std is None)
-            assert await talk.text() == {
-                "learnt": {"through": 9, "accepted": 1, "duplicates": 0, "rejected": {}, "revision": 7}
-            }
-            (block,) = learners.blocks
-            assert (block.model, block.stream_id, block.served) == ("m", "arm-1", talk.current)
-            assert block.sequences.tolist() == [9]
-            assert began - 1.0 < block.time[0] < time.time() + 1.0
-            for name, expected in {"q": [1, 2], "dq": [3, 4], "ddq": [5, 6], "tau": [7, 8], "mean": [3, 6]}.items():
-                np.testing.assert_array_equal(getattr(block, name), [expected])
-            np.testing.assert_array_equal(block.std, [[0.5, 3.0]])
-            assert all(getattr(block, name).flags.writeable for name in ("q", "dq", "ddq", "tau", "mean", "std"))
-
-    play(scene)
+@pytest.mark.parametrize(("flags", "always", "answered"), [(0, False, False), (STD, False, True), (0, True, True)])
+@played
+async def test_a_frame_with_torque_is_answered_as_without_and_then_learnt(flags, always, answered):
+    began = time.time()
+    async with Talk(std=always) as talk:
+        talk.current = served(1, Model(3.0), revision=4)
+        talk.put(frame([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]], 9, flags, tau=[7.0, 8.0]))
+        answer = await talk.answer()
+        assert (answer.sequence, answer.revision, answer.tau.tolist()) == (9, 4, [3.0, 6.0])
+        assert (answer.std.tolist() == [3.0, 3.0]) if answered else (answer.std is None)
+        learnt = {"through": 9, "accepted": 1, "duplicates": 0, "rejected": {}, "revision": 7}
+        assert await talk.text() == {"learnt": learnt}
+        (block,) = talk.learners.blocks
+        assert (block.model, block.stream_id, block.served) == ("m", "arm-1", talk.current)
+        assert block.sequences.tolist() == [9]
+        assert began - 1.0 < block.time[0] < time.time() + 1.0
+        for name, expected in {"q": [1, 2], "dq": [3, 4], "ddq": [5, 6], "tau": [7, 8], "mean": [3, 6]}.items():
+            np.testing.assert_array_equal(getattr(block, name), [expected])
+        np.testing.assert_array_equal(block.std, [[3.0, 3.0]])
+        assert all(getattr(block, name).flags.writeable for name in ("q", "dq", "ddq", "tau", "mean", "std"))
 
 
-def test_frames_without_torque_are_not_learnt_and_cause_no_texts():
-    learners = Learners()
-
-    async def scene():
-        async with Talk(learners) as talk:
-            talk.put(*[frame(sequence=number) for number in range(5)])
-            assert [(await talk.answer()).sequence for _ in range(5)] == [0, 1, 2, 3, 4]
-        assert (learners.blocks, talk.sent.empty()) == ([], True)
-
-    play(scene)
-
-
-def test_so_many_frames_are_logged_together_and_the_last_at_the_end_untold():
-    learners = Learners()
-
-    async def scene():
-        async with Talk(learners, stream_flush_rows=3, stream_flush_s=NEVER) as talk:
-            await talk.teach(1, 2, 3)
-            assert (await talk.text())["learnt"]["through"] == 3
-            await talk.teach(5, 8, 13)
-            assert (await talk.text())["learnt"]["through"] == 13
-            await talk.teach(14, 15)
-            await talk.settle()
-            assert learners.sequences == [[1, 2, 3], [5, 8, 13]]
-        assert learners.sequences == [[1, 2, 3], [5, 8, 13], [14, 15]]
-        assert talk.sent.empty()
-
-    play(scene)
+@played
+async def test_so_many_frames_are_logged_together_and_the_last_at_the_end_untold():
+    async with Talk(stream_flush_rows=3, stream_flush_s=NEVER) as talk:
+        await talk.teach(1, 2, 3)
+        assert await talk.through() == 3
+        await talk.teach(5, 8, 13)
+        assert await talk.through() == 13
+        await talk.teach(14, 15)
+        await talk.settle()
+        assert talk.learners.sequences == [[1, 2, 3], [5, 8, 13]]
+    assert talk.learners.sequences == [[1, 2, 3], [5, 8, 13], [14, 15]]
+    assert talk.sent.empty()
 
 
-def test_a_few_frames_are_logged_after_a_while():
-    learners = Learners()
-
-    async def scene():
-        async with Talk(learners, stream_flush_s=0.01) as talk:
-            for first in (1, 3):
-                await talk.teach(first, first + 1)
-                through = 0
-                while through < first + 1:  # on a slow machine the two may be logged one by one
-                    through = (await talk.text())["learnt"]["through"]
-        assert np.concatenate(learners.sequences).tolist() == [1, 2, 3, 4]
-
-    play(scene)
+@played
+async def test_a_few_frames_are_logged_after_a_while():
+    async with Talk(stream_flush_s=0.01) as talk:
+        for first in (1, 3):
+            await talk.teach(first, first + 1)
+            while await talk.through() < first + 1:  # on a slow machine the two may be logged one by one
+                pass
+    assert np.concatenate(talk.learners.sequences).tolist() == [1, 2, 3, 4]
 
 
-def test_blocks_are_logged_one_by_one_in_order_and_a_full_backlog_stops_the_reading():
-    learners = Learners()
-    learners.open.clear()
-
-    async def scene():
-        async with Talk(learners, stream_flush_rows=2, stream_flush_s=NEVER) as talk:
-            talk.put(*[frame(sequence=number, tau=TAU) for number in range(60)])
-            answered = [await talk.answer() for _ in range(22)]
-            await talk.settle()
-            assert talk.sent.empty()  # 2 are being logged, 20 wait, the others are not read
-            learners.open.set()
-            texts = []
-            while len(answered) < 60 or len(texts) < 30:
-                said = await talk.next()
-                if "bytes" in said:
-                    answered.append(read(said["bytes"]))
-                else:
-                    texts.append(json.loads(said["text"])["learnt"]["through"])
-            assert [each.sequence for each in answered] == list(range(60))
-            assert texts == list(range(1, 60, 2))
-        assert learners.sequences == [[number, number + 1] for number in range(0, 60, 2)]
-        assert learners.most_at_once == 1
-
-    play(scene)
+@played
+async def test_blocks_are_logged_one_by_one_in_order_and_a_full_backlog_stops_the_reading():
+    async with Talk(stream_flush_rows=2, stream_flush_s=NEVER) as talk:
+        talk.learners.open.clear()
+        talk.put(*[frame(sequence=number, tau=TAU) for number in range(60)])
+        answered = [await talk.answer() for _ in range(22)]
+        await talk.settle()
+        assert talk.sent.empty()  # 2 are being logged, 20 wait, the others are not read
+        talk.learners.open.set()
+        texts = []
+        while len(answered) < 60 or len(texts) < 30:
+            message = await talk.next()
+            if "bytes" in message:
+                answered.append(read(message["bytes"]))
+            else:
+                texts.append(json.loads(message["text"])["learnt"]["through"])
+        assert [each.sequence for each in answered] == list(range(60))
+        assert texts == list(range(1, 60, 2))
+    assert talk.learners.sequences == [[number, number + 1] for number in range(0, 60, 2)]
+    assert talk.learners.most_at_once == 1
 
 
-def test_what_one_revision_answered_is_logged_together():
-    learners = Learners()
-
-    async def scene():
-        async with Talk(learners, stream_flush_s=NEVER) as talk:
-            first = talk.current
-            await talk.teach(1, 2)
-            talk.current = second = served(revision=1, model=Model(2.0))
-            await talk.teach(3)
-        assert learners.sequences == [[1, 2], [3]]
-        assert [block.served for block in learners.blocks] == [first, second]
-        np.testing.assert_array_equal(learners.blocks[1].mean, 2.0 * learners.blocks[1].q)
-
-    play(scene)
+@played
+async def test_what_one_revision_answered_is_logged_together():
+    async with Talk(stream_flush_s=NEVER) as talk:
+        first = talk.current
+        await talk.teach(1, 2)
+        talk.current = second = served(1, Model(2.0), revision=1)
+        await talk.teach(3)
+    blocks = talk.learners.blocks
+    assert [(block.served, len(block.sequences)) for block in blocks] == [(first, 2), (second, 1)]
+    np.testing.assert_array_equal(blocks[1].mean, 2.0 * blocks[1].q)
 
 
-def test_frames_that_come_in_one_piece_have_times_one_after_the_other():
-    learners = Learners()
-
-    async def scene():
-        async with Talk(learners, stream_flush_rows=2, stream_flush_s=NEVER) as talk:
-            for first, later in ((1, -9.0), (3, 0.0), (5, 5.0)):
-                talk.connection.arrived += later
-                await talk.teach(first, first + 1)
-                await talk.text()
-
-    play(scene)
-    times = np.concatenate([block.time for block in learners.blocks])
-    steps = np.diff(times)
+@played
+async def test_frames_that_come_in_one_piece_have_times_one_after_the_other():
+    async with Talk(stream_flush_rows=2, stream_flush_s=NEVER) as talk:
+        for first, later in ((1, -9.0), (3, 0.0), (5, 5.0)):
+            talk.connection.arrived += later
+            await talk.teach(first, first + 1)
+            await talk.text()
+    steps = np.diff(np.concatenate([block.time for block in talk.learners.blocks]))
     assert (steps > 0).all()
     np.testing.assert_allclose(steps, [0, 0, 0, 5, 0], atol=1e-3)
 
 
-def test_a_torque_that_is_no_number_is_answered_and_handed_on():
-    learners = Learners()
-
-    async def scene():
-        async with Talk(learners) as talk:
-            talk.put(frame(tau=[np.nan, np.inf]))
-            assert (await talk.answer()).error is None
-
-    play(scene)
-    np.testing.assert_array_equal(learners.blocks[0].tau, [[np.nan, np.inf]])
+@played
+async def test_a_torque_that_is_no_number_is_answered_and_handed_on():
+    async with Talk() as talk:
+        talk.put(frame(tau=[np.nan, np.inf]))
+        assert (await talk.answer()).error is None
+    np.testing.assert_array_equal(talk.learners.blocks[0].tau, [[np.nan, np.inf]])
 
 
-def test_sequences_must_go_up_among_frames_with_torque():
-    learners = Learners()
-
-    async def scene():
-        async with Talk(learners, stream_flush_s=NEVER) as talk:
-            talk.put(frame([[np.nan, 0]] * 3, 2**32 - 1, tau=TAU))  # an error takes no sequence
-            assert (await talk.answer()).flags == ERROR
-            seen = await talk.teach(3, 3, 2, 4)
-            talk.put(frame(sequence=1))
-            assert (await talk.answer()).error is None
-            assert [each.error is None for each in seen] == [True, False, False, True]
-            assert seen[2].sequence == 2
-            assert seen[2].error["message"] == (
-                "sequence is 2, expected more than 3, the last one to learn from: count up, or connect again to "
-                "repeat frames"
-            )
-        assert learners.sequences == [[3, 4]]
-
-    play(scene)
+@played
+async def test_sequences_must_go_up_among_frames_with_torque():
+    async with Talk(stream_flush_s=NEVER) as talk:
+        talk.put(frame([[np.nan, 0]] * 3, 2**32 - 1, tau=TAU))  # an error takes no sequence
+        assert (await talk.answer()).flags == ERROR
+        seen = await talk.teach(3, 3, 2, 4)
+        talk.put(frame(sequence=1))
+        assert (await talk.answer()).error is None
+        assert [each.error is None for each in seen] == [True, False, False, True]
+        assert seen[2].sequence == 2
+        assert seen[2].error["message"] == (
+            "sequence is 2, expected more than 3, the last one to learn from: count up, or connect again to "
+            "repeat frames"
+        )
+    assert talk.learners.sequences == [[3, 4]]
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ({"stream_id": None}, "stream_id is missing, expected a name of the torque's source in the address"),
-        ({"pinned": True}, "flags is 3, expected no 2: a stream pinned to a version only asks; leave version out"),
-    ],
-)
-def test_streams_that_only_ask_refuse_torque_and_go_on(options, said):
-    learners = Learners()
-
-    async def scene():
-        async with Talk(learners, **options) as talk:
-            (refused,) = await talk.teach(1)
-            assert refused.flags == ERROR
-            assert said in refused.error["message"]
-            talk.put(frame(sequence=2))
-            assert (await talk.answer()).error is None
-
-    play(scene)
-    assert learners.blocks == []
-
-
-def test_a_block_that_cannot_be_logged_is_refused_and_the_next_is_learnt(caplog):
-    learners = Learners(ConflictError("learning is held"), invalid_request("tau", 1, "2"), ZeroDivisionError("odd"))
-
-    async def scene():
-        async with Talk(learners, stream_flush_rows=2, stream_flush_s=NEVER) as talk:
-            for first in (1, 3, 5, 7):
-                await talk.teach(first, first + 1)
-                await talk.text()
-
-        held, invalid, odd, learnt = (json.loads(each["text"]) for each in talk.said[2:] if "text" in each)
-        assert held == {
-            "refused": {
-                "first": 1,
-                "through": 2,
-                "error": {"code": "conflict", "message": "learning is held", "detail": []},
-            }
-        }
-        assert invalid["refused"]["error"]["detail"] == [{"field": "tau", "value": "1", "expected": "2"}]
-        assert odd["refused"]["error"]["code"] == "internal_error"
-        assert (odd["refused"]["first"], odd["refused"]["through"]) == (5, 6)
-        assert learnt["learnt"]["through"] == 8
-
-    play(scene)
+@played
+async def test_a_block_that_cannot_be_logged_is_refused_and_the_next_is_learnt(caplog):
+    errors = ConflictError("learning is held"), invalid_request("tau", 1, "2"), ZeroDivisionError("odd")
+    async with Talk(Learners(*errors), stream_flush_rows=2, stream_flush_s=NEVER) as talk:
+        for first in (1, 3, 5, 7):
+            await talk.teach(first, first + 1)
+            await talk.text()
+    held, invalid, odd, learnt = (json.loads(each["text"]) for each in talk.received[2:] if "text" in each)
+    problem = {"code": "conflict", "message": "learning is held", "detail": []}
+    assert held == {"refused": {"first": 1, "through": 2, "error": problem}}
+    assert invalid["refused"]["error"]["detail"] == [{"field": "tau", "value": "1", "expected": "2"}]
+    assert odd["refused"]["error"]["code"] == "internal_error"
+    assert (odd["refused"]["first"], odd["refused"]["through"]) == (5, 6)
+    assert learnt["learnt"]["through"] == 8
     assert "ZeroDivisionError" in caplog.text
 
 
-def test_frames_lost_at_the_end_are_in_the_log_of_the_service(caplog):
-    async def scene():
-        async with Talk(Learners(ConflictError("learning is held")), stream_flush_s=NEVER) as talk:
-            await talk.teach(6, 7)
-        assert talk.sent.empty()
-
-    play(scene)
+@played
+async def test_frames_lost_at_the_end_are_in_the_log_of_the_service(caplog):
+    async with Talk(Learners(ConflictError("learning is held")), stream_flush_s=NEVER) as talk:
+        await talk.teach(6, 7)
+    assert talk.sent.empty()
     assert "frames 6 to 7 of stream 'arm-1' are not learnt: learning is held" in caplog.text
 
 
-def test_an_acknowledgement_waits_for_the_answer_that_is_being_written():
-    learners = Learners()
-
-    async def scene():
-        async with Talk(learners, stream_flush_rows=1) as talk:
-            talk.passing["bytes"].clear()
-            talk.put(frame(sequence=1, tau=TAU))
-            while not talk.session._texts:
-                await asyncio.sleep(0)
-            assert talk.sent.empty()
-            talk.passing["bytes"].set()
-            assert "bytes" in await talk.next()
-            assert (await talk.text())["learnt"]["through"] == 1
-
-    play(scene)
+@played
+async def test_an_acknowledgement_waits_for_the_answer_that_is_being_written():
+    async with Talk(stream_flush_rows=1) as talk:
+        talk.passing["bytes"].clear()
+        talk.put(frame(sequence=1, tau=TAU))
+        while not talk.session._texts:
+            await asyncio.sleep(0)
+        assert talk.sent.empty()
+        talk.passing["bytes"].set()
+        assert "bytes" in await talk.next()
+        assert await talk.through() == 1
 
 
-def test_who_does_not_read_acknowledgements_is_cut_off():
-    async def scene():
-        learners = Learners()
-        learners.open.clear()
-        async with Talk(learners, stream_flush_rows=1, stream_write_s=0.01) as talk:
-            await talk.teach(1)
-            talk.passing["text"].clear()
-            learners.open.set()
-            await asyncio.wait_for(talk.aborted.wait(), DEADLINE)
-
-    play(scene)
+@played
+async def test_who_does_not_read_acknowledgements_is_cut_off():
+    async with Talk(stream_flush_rows=1, stream_write_s=0.01) as talk:
+        talk.learners.open.clear()
+        await talk.teach(1)
+        talk.passing["text"].clear()
+        talk.learners.open.set()
+        await asyncio.wait_for(talk.aborted.wait(), DEADLINE)
 
 
-def test_a_client_that_is_gone_is_told_nothing_and_logged_all_the_same():
-    learners = Learners()
-    learners.open.clear()
+@played
+async def test_a_client_that_is_gone_is_told_nothing_and_logged_all_the_same():
+    async with Talk(stream_flush_rows=2, stream_flush_s=NEVER) as talk:
+        talk.learners.open.clear()
+        await talk.teach(1, 2, 3)
+        talk.messages.put_nowait({"type": "websocket.disconnect", "code": 1006})
+        await talk.settle()
+        assert not talk.task.done()
+        talk.learners.open.set()
+        await asyncio.wait_for(asyncio.shield(talk.task), DEADLINE)
+        assert talk.session._learning is None
+    assert talk.learners.sequences == [[1, 2], [3]]
 
-    async def scene():
-        async with Talk(learners, stream_flush_rows=2, stream_flush_s=NEVER) as talk:
-            await talk.teach(1, 2, 3)
-            talk.messages.put_nowait({"type": "websocket.disconnect", "code": 1006})
-            await talk.settle()
-            assert not talk.task.done()
-            learners.open.set()
-            await asyncio.wait_for(asyncio.shield(talk.task), DEADLINE)
-            assert talk.session._learning is None
-        assert learners.sequences == [[1, 2], [3]]
 
-    play(scene)
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"stream_id": None}, "stream_id is missing, expected a name of the torque's source"),
+        ({"pinned": True}, "flags is 3"),
+    ],
+)
+@played
+async def test_streams_that_only_ask_refuse_torque(options, message):
+    async with Talk(**options) as talk:
+        (refused,) = await talk.teach(1)
+        assert message in refused.error["message"]
+    assert talk.learners.blocks == []

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 from websockets.client import ClientProtocol
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import InvalidStatus
 from websockets.uri import parse_uri
 
 from tests.service.data import DEADLINE, eventually
 from tests.service.server import Server
-from tests.service.streams import ask, dial, frame, hello
+from tests.service.streams import dial, hello
 
 PANDA, ECHO = "/v1/models/panda-sim/stream", "/v1/echo/stream"
 MiB = 1024 * 1024
@@ -50,13 +50,6 @@ class Unread:
         for message in messages:
             self.protocol.send_binary(message)
         return self.flush()
-
-    def send_until_stuck(self, message: bytes) -> None:
-        """Fill the buffers of both sides."""
-        self.socket.settimeout(0.2)
-        with suppress(TimeoutError):
-            while True:
-                self.send(message)
 
 
 def opened(server: Server, path: str) -> Unread | None:
@@ -111,24 +104,3 @@ def test_a_client_that_never_reads_is_slowed_down_and_then_cut_off(bounded, path
         other.send(b"still here")
         assert other.recv(DEADLINE) == b"still here"
     assert "ERROR" not in bounded.log.read_text()
-
-
-@pytest.mark.slow
-def test_a_server_that_stops_says_so_and_waits_for_nobody(home):
-    with Server(home, LIPSERVE_STREAM_WRITE_S="3600") as server:
-        with dial(server, PANDA) as stream, dial(server, ECHO) as echo:
-            hello(stream)
-            ask(stream, frame([[0.0] * 7] * 3))
-            unread = Unread(server, ECHO)
-            unread.send_until_stuck(bytes(60_000))
-            server.process.terminate()
-            for connection in (stream, echo):
-                with pytest.raises(ConnectionClosed) as ended:
-                    connection.recv(DEADLINE)
-                assert ended.value.rcvd.code == 1001
-                assert ended.value.rcvd.reason == "the service stops"
-        server.process.wait(DEADLINE)
-        unread.socket.close()
-        said = server.log.read_text()
-    assert "Application shutdown complete" in said
-    assert "ERROR" not in said

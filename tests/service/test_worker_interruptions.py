@@ -8,7 +8,7 @@ import signal
 
 import pytest
 
-from tests.service.data import ENDLESS, ended, eventually, job, queue, running, service_of, stream, train, upload
+from tests.service.data import ENDLESS, ended, queue, running, stream, upload
 from tests.service.server import command
 
 LONG = {**ENDLESS, "hyperparameter_samples": 60, "max_iterations": 25}
@@ -31,15 +31,6 @@ def test_a_job_whose_process_is_killed_is_tried_again(api):
 
 
 @pytest.mark.slow
-def test_a_process_killed_while_it_has_nothing_to_do_is_replaced(api, pendulum):
-    train(api, "idle", pendulum["id"])
-    for pid in workers():
-        os.kill(pid, signal.SIGKILL)
-    train(api, "idle", pendulum["id"])
-    assert api.get("/v1/models/idle").json()["latest_version"] == 2
-
-
-@pytest.mark.slow
 def test_an_interrupt_from_the_keyboard_does_not_reach_a_job(api):
     """Ctrl-C goes to the whole process group: the service decides what becomes of its processes."""
     name = queue(api, "interrupted", upload(api, stream("panda", 100))["id"], options=LONG)["id"]
@@ -48,17 +39,3 @@ def test_an_interrupt_from_the_keyboard_does_not_reach_a_job(api):
         os.kill(pid, signal.SIGINT)
     seen = ended(api, name)
     assert (seen["state"], seen["attempts"]) == ("succeeded", 1)
-
-
-@pytest.mark.slow
-def test_a_job_whose_process_dies_every_time_fails_in_the_end(api):
-    most = service_of(api).settings.max_job_attempts
-    name = queue(api, "poison", upload(api, stream("panda", 200))["id"], options=ENDLESS)["id"]
-    for attempt in range(1, most + 1):
-        eventually(lambda now=attempt: job(api, name)["attempts"] == now and running(api, name))
-        for pid in workers():
-            os.kill(pid, signal.SIGKILL)
-    seen = ended(api, name)
-    assert seen["state"] == "failed"
-    assert seen["error"]["code"] == "interrupted"
-    assert f"{most} times" in seen["error"]["message"]

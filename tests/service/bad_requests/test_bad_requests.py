@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
-from tests.service.bad_requests import addresses, texts, uploads, values
-from tests.service.bad_requests.bad import PREDICT
+from tests.service.bad_requests import addresses, bodies, uploads
 from tests.service.data import error
 
-BAD = [*texts.BAD, *values.BAD, *addresses.BAD, *uploads.BAD]
-KINDS = {(bad.method, bad.path.partition("?")[0], bad.status, bad.code, bad.named): bad for bad in reversed(BAD)}
-"""The first request of each kind: what it asks for, and what is wrong with it."""
-QUICK = {id(bad) for bad in (*KINDS.values(), *(bad for bad in texts.BAD if bad.path == PREDICT))}
-"""These, and every text that is no JSON of one route."""
+BAD = [*bodies.BAD, *addresses.BAD, *uploads.BAD]
 LISTS = ("/v1/datasets", "/v1/robots", "/v1/jobs", "/v1/models", "/v1/models/panda-sim/observations")
 
 
@@ -24,31 +21,45 @@ def nothing_stays(api):
     assert [api.get(path).json() for path in LISTS] == before
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [pytest.param(bad, id=bad.label, marks=[] if id(bad) in QUICK else [pytest.mark.slow]) for bad in BAD],
-)
-def test_what_is_wrong_is_refused_by_name(api, bad):
+@pytest.fixture(scope="module")
+def documented(api):
+    """Statuses that a request may be answered with, as the OpenAPI document has it; None where it has no such route."""
+    paths = api.get("/openapi.json").json()["paths"]
+    patterns = {path: re.compile(re.sub(r"\{\w+\}", "[^/]+", path)) for path in paths}
+    routes = sorted(patterns, key=lambda path: path.count("{"))
+
+    def statuses(bad):
+        asked = bad.path.partition("?")[0]
+        result = (paths[path].get(bad.method.lower()) for path in routes if patterns[path].fullmatch(asked))
+        return next((set(map(int, operation["responses"])) for operation in result if operation), None)
+
+    return statuses
+
+
+@pytest.mark.parametrize("bad", [pytest.param(bad, id=bad.label) for bad in BAD])
+def test_what_is_wrong_is_refused_by_name(api, documented, bad):
     answer = api.request(bad.method, bad.path, content=bad.content, headers=bad.headers)
     assert answer.headers["content-type"] == "application/json"
+    allowed = documented(bad)
+    assert allowed is None or bad.status in allowed
     if bad.status == 405:
         allowed = answer.headers["allow"].split(", ")
         assert allowed
         assert bad.method not in allowed
     if bad.path.startswith("/v2"):
         assert answer.status_code == bad.status, answer.text
-        (said,) = answer.json().values()
-        assert said.startswith(bad.named)
-        assert said.isprintable()
+        (message,) = answer.json().values()
+        assert message.startswith(bad.named)
+        assert message.isprintable()
         return
-    found = error(answer, bad.status, bad.code)
+    refused = error(answer, bad.status, bad.code)
     if bad.named is not None:
-        first = found["detail"][0]
+        first = refused["detail"][0]
         assert first["field"] == bad.named
         assert first["expected"]
-    for text in (found["message"], *(item[name] for item in found["detail"] for name in item)):
+    for text in (refused["message"], *(item[name] for item in refused["detail"] for name in item)):
         assert text.isprintable(), text
 
 
-def test_there_are_many_and_each_is_another_one():
-    assert len({(bad.method, bad.path, bad.content, tuple(bad.headers.items())) for bad in BAD}) == len(BAD) >= 150
+def test_each_is_another_one():
+    assert len({(bad.method, bad.path, bad.content, tuple(bad.headers.items())) for bad in BAD}) == len(BAD)

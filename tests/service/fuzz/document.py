@@ -35,11 +35,11 @@ def fitting(document: dict[str, Any], known: dict[str, list[Any]], joints: int) 
 
 def _bodies(document: dict[str, Any]) -> list[dict[str, Any]]:
     """Schemas of JSON bodies of requests."""
-    found = []
+    result = []
     for operations in document["paths"].values():
         for method in METHODS:
             content = operations.get(method, {}).get("requestBody", {}).get("content", {})
             reference = content.get("application/json", {}).get("schema", {}).get("$ref")
             if reference is not None:
-                found.append(document["components"]["schemas"][reference.rpartition("/")[2]])
-    return found
+                result.append(document["components"]["schemas"][reference.rpartition("/")[2]])
+    return result

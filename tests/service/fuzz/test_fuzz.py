@@ -8,10 +8,9 @@ from hypothesis import HealthCheck, Phase, given, settings
 from schemathesis import GenerationMode
 from schemathesis.checks import CHECKS, load_all_checks
 
+from tests.choosing import slow
 from tests.service.data import ADDRESS
 
-FEW, MANY = 1, 60
-"""Requests of each operation in each way."""
 NAMES = (
     "not_a_server_error",
     "status_code_conformance",
@@ -38,12 +37,12 @@ def checks():
 
 def operations(fuzzed, part, mode):
     """Every operation that there are requests of, deletions last: what they delete, others ask for."""
-    found = [result.ok() for result in getattr(fuzzed, part).get_all_operations()]
+    outcome = [result.ok() for result in getattr(fuzzed, part).get_all_operations()]
     if part == "fitting":
-        found = [one for one in found if one.label not in ENDLESS]
+        outcome = [one for one in outcome if one.label not in ENDLESS]
     if mode is GenerationMode.NEGATIVE:  # nothing is wrong with a path that leads to nothing
-        found = [one for one in found if (one.query or one.body) and one.label not in ANYTHING]
-    return sorted(found, key=lambda one: one.method == "delete")
+        outcome = [one for one in outcome if (one.query or one.body) and one.label not in ANYTHING]
+    return sorted(outcome, key=lambda one: one.method == "delete")
 
 
 def send(client, case):
@@ -52,7 +51,10 @@ def send(client, case):
     return client.request(prepared.method, prepared.url, content=prepared.body, headers=dict(prepared.headers))
 
 
-def fuzz(fuzzed, subtests, way, count):
+@pytest.mark.parametrize("count", [1, slow(60)])
+@pytest.mark.parametrize("way", WAYS)
+def test_answers_to_generated_requests(fuzzed, subtests, way, count):
+    """So many requests of each operation."""
     (part, mode), chosen = WAYS[way], checks()
     for operation in operations(fuzzed, part, mode):
 
@@ -72,14 +74,3 @@ def fuzz(fuzzed, subtests, way, count):
 
         with subtests.test(operation.label):
             run()
-
-
-@pytest.mark.parametrize("way", WAYS)
-def test_answers_to_generated_requests(fuzzed, subtests, way):
-    fuzz(fuzzed, subtests, way, FEW)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("way", WAYS)
-def test_answers_to_many_generated_requests(fuzzed, subtests, way):
-    fuzz(fuzzed, subtests, way, MANY)

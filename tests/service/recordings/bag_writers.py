@@ -53,11 +53,11 @@ def states(count: int, names: Sequence[str] = ("a", "b", "c"), seed: int = 0, st
     return [State(START + k * step, names, *row.tolist()) for k, row in enumerate(numbers)]
 
 
-def table_of(said: Iterable[State]) -> np.ndarray:
+def table_of(written: Iterable[State]) -> np.ndarray:
     """What is to be read of them: s from the first stamp on, positions, velocities, efforts."""
-    said = list(said)
-    times = [(each.stamp - said[0].stamp) / 1e9 for each in said]
-    return np.column_stack([times, *([getattr(s, key) for s in said] for key in ("position", "velocity", "effort"))])
+    written = list(written)
+    times = [(each.stamp - written[0].stamp) / 1e9 for each in written]
+    return np.column_stack([times, *([getattr(s, key) for s in written] for key in ("position", "velocity", "effort"))])
 
 
 def message(store: Any, state: State) -> Any:
@@ -70,14 +70,14 @@ def message(store: Any, state: State) -> Any:
     return types[JOINT_STATE](header=header, name=list(state.names), **numbers)
 
 
-def write_rosbag1(path: Path, said: Iterable[State], compression: str | None = None) -> Path:
+def write_rosbag1(path: Path, written: Iterable[State], compression: str | None = None) -> Path:
     """A bag of ROS 1, by rosbags."""
     writer = rosbag1.Writer(path)
     if compression:
         writer.set_compression(getattr(rosbag1.Writer.CompressionFormat, compression.upper()))
     with writer:
         connections: dict[str, Any] = {}
-        for each in said:
+        for each in written:
             if each.topic not in connections:
                 connections[each.topic] = writer.add_connection(each.topic, JOINT_STATE, typestore=ROS1)
             data = ROS1.serialize_ros1(message(ROS1, each), JOINT_STATE)
@@ -86,14 +86,18 @@ def write_rosbag1(path: Path, said: Iterable[State], compression: str | None = N
 
 
 def write_rosbag2(
-    folder: Path, said: Iterable[State], storage: str = "SQLITE3", compression: str = "NONE", big_endian: bool = False
+    folder: Path,
+    written: Iterable[State],
+    storage: str = "SQLITE3",
+    compression: str = "NONE",
+    big_endian: bool = False,
 ) -> Path:
     """A folder of rosbag2, by rosbags."""
     writer = rosbag2.Writer(folder, version=9, storage_plugin=getattr(rosbag2.StoragePlugin, storage))
     writer.set_compression(getattr(rosbag2.CompressionMode, compression), rosbag2.CompressionFormat.ZSTD)
     with writer:
         connections: dict[str, Any] = {}
-        for each in said:
+        for each in written:
             if each.topic not in connections:
                 connections[each.topic] = writer.add_connection(each.topic, JOINT_STATE, typestore=ROS2)
             data = ROS2.serialize_cdr(message(ROS2, each), JOINT_STATE, little_endian=not big_endian)
@@ -101,7 +105,7 @@ def write_rosbag2(
     return folder
 
 
-def write_mcap(path: Path, said: Iterable[State], compression: str = "ZSTD", chunk_size: int = 4096) -> Path:
+def write_mcap(path: Path, written: Iterable[State], compression: str = "ZSTD", chunk_size: int = 4096) -> Path:
     """An MCAP file by Foxglove's writers, which know nothing of rosbags; message times are those of reception."""
     mcap = pytest.importorskip("mcap.writer", reason="MCAP files are written by `mcap`, of the extra `dev`")
     ros2 = pytest.importorskip("mcap_ros2.writer", reason="written by `mcap-ros2-support`, of the extra `dev`")
@@ -109,7 +113,7 @@ def write_mcap(path: Path, said: Iterable[State], compression: str = "ZSTD", chu
         writer = ros2.Writer(file, chunk_size=chunk_size, compression=getattr(mcap.CompressionType, compression))
         text, _ = ROS2.generate_msgdef(JOINT_STATE, ros_version=2)
         schema = writer.register_msgdef(JOINT_STATE, text)
-        for each in said:
+        for each in written:
             stamp = {"sec": each.stamp // 10**9, "nanosec": each.stamp % 10**9}
             body = {
                 "header": {"stamp": stamp, "frame_id": each.frame},
@@ -133,8 +137,8 @@ def zipped(folder: Path, file: Path, inside: str = "recording") -> Path:
 
 def bare(folder: Path, file: Path) -> Path:
     """The only data file of a folder of rosbag2, alone."""
-    (found,) = [each for each in folder.iterdir() if each.suffix in (".db3", ".mcap")]
-    shutil.copyfile(found, file)
+    (result,) = [each for each in folder.iterdir() if each.suffix in (".db3", ".mcap")]
+    shutil.copyfile(result, file)
     return file
 
 

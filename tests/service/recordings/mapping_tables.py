@@ -41,11 +41,11 @@ def canonical(data: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def table(columns: Mapping[str, np.ndarray], block: int = 64, **kwargs) -> Table:
     """A table that yields these columns in blocks of so many rows."""
-    whole = np.column_stack([np.asarray(each, dtype=np.float64) for each in columns.values()])
+    entire = np.column_stack([np.asarray(each, dtype=np.float64) for each in columns.values()])
 
     def blocks() -> Iterator[np.ndarray]:
-        for start in range(0, len(whole), block):
-            yield whole[start : start + block].copy()
+        for start in range(0, len(entire), block):
+            yield entire[start : start + block].copy()
 
     return Table(tuple(columns), blocks(), **kwargs)
 

@@ -50,8 +50,8 @@ def read(folder, body, kind, options=None, **settings):
             assert block.shape == (len(block), len(table.names))
     assert set(folder.iterdir()) == before, "leftovers"
     assert len(set(table.names)) == len(table.names)
-    whole = np.concatenate(blocks) if blocks else np.empty((0, len(table.names)))
-    return Read(dict(zip(table.names, whole.T, strict=True)), table.units, table.facts, table.joint_names)
+    entire = np.concatenate(blocks) if blocks else np.empty((0, len(table.names)))
+    return Read(dict(zip(table.names, entire.T, strict=True)), table.units, table.facts, table.joint_names)
 
 
 def refused(folder, body, kind, options=None, error=ServiceError, **settings):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from tests.service.recordings.bag_writers import (
     ROS2,
     START,
     bare,
-    message,
     read,
     rosbag1,
     rosbag2,
@@ -103,9 +103,11 @@ def filled(store: Any, name: str, **given: Any) -> Any:
     return store.types[name](**values)
 
 
-def seven(seed: int, count: int = 40) -> np.ndarray:
-    """Positions, velocities and efforts of seven joints."""
-    return np.random.default_rng(seed).normal(size=(count, 3, 7))
+def forget_definitions(path):
+    """What ROS 2 Humble does not record."""
+    with sqlite3.connect(path) as database:
+        database.execute("DROP TABLE message_definitions")
+    database.close()
 
 
 def stamp(store: Any, number: int) -> Any:
@@ -119,89 +121,71 @@ def stamp(store: Any, number: int) -> Any:
     )
 
 
-@pytest.mark.parametrize("ros1", [True, False])
-def test_franka_state(tmp_path, ros1):
-    text = FRANKA_STATE if ros1 else FRANKA_STATE.replace("tau_J", "tau_j")
-    name, numbers = "franka_msgs/msg/FrankaState", seven(0)
-    store = store_with(name, text, ROS1 if ros1 else ROS2)
-    said = [
-        filled(store, name, header=stamp(store, number), q=q, dq=dq, q_d=q + 9, **{"tau_J" if ros1 else "tau_j": tau})
-        for number, (q, dq, tau) in enumerate(numbers)
+def check_forty(tmp_path, name, text, base, fields, with_definition=True, options=None):
+    """Write and read forty states of seven joints. fields: of a message, from store, positions, velocities, efforts."""
+    store, numbers = store_with(name, text, base), np.random.default_rng(0).normal(size=(40, 3, 7))
+    messages = [
+        filled(store, name, header=stamp(store, number), **fields(store, *each)) for number, each in enumerate(numbers)
     ]
-    found = read(write(tmp_path / "upload.x", name, said, store, ros1), "rosbag1" if ros1 else "rosbag2")
-    np.testing.assert_array_equal(found.rows[:, 1:], numbers.reshape(40, -1))
-    np.testing.assert_array_equal(found.column("t"), np.arange(40) / 1000)
-    assert found.joint_names == tuple(f"joint{joint}" for joint in range(1, 8))
-    assert found.units["joint3/effort"] == "N·m"
-    named = read(tmp_path / "upload.x", "rosbag1" if ros1 else "rosbag2", ReadOptions(joint_names=JOINTS))
-    assert named.joint_names == JOINTS
+    path = write(tmp_path / "upload.x", name, messages, store, base is ROS1)
+    if not with_definition:
+        forget_definitions(path)
+    result = read(path, "rosbag1" if base is ROS1 else "rosbag2", options)
+    np.testing.assert_array_equal(result.rows[:, 1:], numbers.reshape(40, -1))
+    np.testing.assert_array_equal(result.column("t"), np.arange(40) / 1000)
+    return result
+
+
+@pytest.mark.parametrize(("base", "torque"), [(ROS1, "tau_J"), (ROS2, "tau_j")])
+def test_franka_state(tmp_path, base, torque):
+    def fields(store, q, dq, tau):
+        return {"q": q, "dq": dq, "q_d": q + 9, torque: tau}
+
+    state = "franka_msgs/msg/FrankaState", FRANKA_STATE.replace("tau_J", torque), base, fields
+    result = check_forty(tmp_path, *state)
+    assert result.joint_names == tuple(f"joint{joint}" for joint in range(1, 8))
+    assert result.units["joint3/effort"] == "N·m"
+    (tmp_path / "named").mkdir()
+    assert check_forty(tmp_path / "named", *state, options=ReadOptions(joint_names=JOINTS)).joint_names == JOINTS
 
 
 @pytest.mark.parametrize("with_definition", [True, False])
 def test_franka_robot_state(tmp_path, with_definition):
     """Without its definition, as ROS 2 Humble records it, the message is read as far as its beginning is known."""
-    import sqlite3
 
-    name, numbers = "franka_msgs/msg/FrankaRobotState", seven(1)
-    store = store_with(name, FRANKA_ROBOT_STATE, ROS2)
+    def fields(store, *numbers):
+        def state(q, dq, tau):
+            kind = store.types["sensor_msgs/msg/JointState"]
+            header = filled(store, "std_msgs/msg/Header")
+            return kind(header=header, name=list(JOINTS), position=q, velocity=dq, effort=tau)
 
-    def state(q, dq, tau):
-        kind = store.types["sensor_msgs/msg/JointState"]
-        header = filled(store, "std_msgs/msg/Header")
-        return kind(header=header, name=list(JOINTS), position=q, velocity=dq, effort=tau)
+        return {"measured_joint_state": state(*numbers), "desired_joint_state": state(*(np.array(numbers) + 5))}
 
-    said = [
-        filled(
-            store,
-            name,
-            header=stamp(store, number),
-            measured_joint_state=state(*each),
-            desired_joint_state=state(*(each + 5)),
-        )
-        for number, each in enumerate(numbers)
-    ]
-    path = write(tmp_path / "upload.x", name, said, store, ros1=False)
-    if not with_definition:
-        with sqlite3.connect(path) as database:
-            database.execute("DROP TABLE message_definitions")
-        database.close()
-    found = read(path, "rosbag2")
-    assert found.joint_names == JOINTS
-    np.testing.assert_array_equal(found.rows[:, 1:], numbers.reshape(40, -1))
-    np.testing.assert_array_equal(found.column("t"), np.arange(40) / 1000)
+    name = "franka_msgs/msg/FrankaRobotState"
+    assert check_forty(tmp_path, name, FRANKA_ROBOT_STATE, ROS2, fields, with_definition).joint_names == JOINTS
 
 
 def test_state_of_a_controller(tmp_path):
-    name, numbers = "control_msgs/msg/JointTrajectoryControllerState", seven(2)
-    store = store_with(name, CONTROLLER, ROS1)
+    def fields(store, *numbers):
+        def point(q, dq, tau):
+            kind = "trajectory_msgs/msg/JointTrajectoryPoint"
+            return filled(store, kind, positions=q, velocities=dq, effort=tau)
 
-    def point(q, dq, tau):
-        kind = "trajectory_msgs/msg/JointTrajectoryPoint"
-        return filled(store, kind, positions=q, velocities=dq, effort=tau)
+        points = {"desired": point(*(np.array(numbers) + 3)), "actual": point(*numbers)}
+        return {"joint_names": list(JOINTS), **points}
 
-    said = [
-        filled(
-            store,
-            name,
-            header=stamp(store, number),
-            joint_names=list(JOINTS),
-            desired=point(*(each + 3)),
-            actual=point(*each),
-        )
-        for number, each in enumerate(numbers)
-    ]
-    found = read(write(tmp_path / "upload.x", name, said, store, ros1=True), "rosbag1")
-    np.testing.assert_array_equal(found.rows[:, 1:], numbers.reshape(40, -1))
+    name = "control_msgs/msg/JointTrajectoryControllerState"
+    assert check_forty(tmp_path, name, CONTROLLER, ROS1, fields).joint_names == JOINTS
 
 
 def test_several_topics_ask_which(tmp_path):
-    said = states(30)
-    for each in said[::3]:
+    written = states(30)
+    for each in written[::3]:
         each.topic = "/desired"
     for path, kind in (
-        (write_mcap(tmp_path / "a.mcap", said), "mcap"),
-        (write_rosbag1(tmp_path / "a.bag", said), "rosbag1"),
-        (bare(write_rosbag2(tmp_path / "bag", said), tmp_path / "a.db3"), "rosbag2"),
+        (write_mcap(tmp_path / "a.mcap", written), "mcap"),
+        (write_rosbag1(tmp_path / "a.bag", written), "rosbag1"),
+        (bare(write_rosbag2(tmp_path / "bag", written), tmp_path / "a.db3"), "rosbag2"),
     ):
         with pytest.raises(InvalidDataError, match="topic is not given") as error:
             read(path, kind)
@@ -209,20 +193,8 @@ def test_several_topics_ask_which(tmp_path):
         assert "/joint_states (sensor_msgs/JointState, 20 messages)" in str(error.value)
         with pytest.raises(InvalidRequestError, match=r"topic is /other, expected one of .*/desired"):
             read(path, kind, ReadOptions(topic="/other"))
-        found = read(path, kind, ReadOptions(topic="/joint_states"))
-        np.testing.assert_array_equal(found.rows, table_of(each for each in said if each.topic == "/joint_states"))
-
-
-def test_several_publishers_of_one_topic_are_one_recording(tmp_path):
-    said = states(20)
-    name = "sensor_msgs/msg/JointState"
-    with rosbag1.Writer(tmp_path / "a.bag") as writer:
-        first = writer.add_connection("/joint_states", name, typestore=ROS1, callerid="/one")
-        second = writer.add_connection("/joint_states", name, typestore=ROS1, callerid="/two")
-        for number, each in enumerate(said):
-            data = ROS1.serialize_ros1(message(ROS1, each), name)
-            writer.write((first, second)[number % 2], each.stamp, data)
-    np.testing.assert_array_equal(read(tmp_path / "a.bag", "rosbag1").rows, table_of(said))
+        result = read(path, kind, ReadOptions(topic="/joint_states"))
+        np.testing.assert_array_equal(result.rows, table_of(each for each in written if each.topic == "/joint_states"))
 
 
 def test_a_bag_without_joint_states_says_what_it_has(tmp_path):
@@ -235,13 +207,9 @@ def test_a_bag_without_joint_states_says_what_it_has(tmp_path):
 
 
 def test_a_type_without_its_definition_is_refused_with_the_reason(tmp_path):
-    import sqlite3
-
     name = "franka_msgs/msg/FrankaState"
     store = store_with(name, FRANKA_STATE.replace("tau_J", "tau_j"), ROS2)
     path = write(tmp_path / "upload.x", name, [filled(store, name)], store, ros1=False)
-    with sqlite3.connect(path) as database:
-        database.execute("DROP TABLE message_definitions")
-    database.close()
+    forget_definitions(path)
     with pytest.raises(InvalidDataError, match="of type franka_msgs/FrankaState, without its definition"):
         read(path, "rosbag2")

@@ -31,48 +31,23 @@ def frame(rows=300):
     return pd.DataFrame({name: RNG.normal(size=rows) for name in ("t", "q1", "tau1")})
 
 
-@pytest.mark.parametrize("compression", ["none", "snappy", "gzip", "zstd", "lz4", "brotli"])
-@pytest.mark.parametrize("version", ["1.0", "2.0"])
+@pytest.mark.parametrize(
+    ("compression", "version"), [("none", "1.0"), ("snappy", "2.0"), ("gzip", "1.0"), ("zstd", "2.0"), ("lz4", "1.0")]
+)
 def test_pandas_is_read_back_exactly(tmp_path, compression, version):
     data = frame()
     data.loc[[3, 4], "q1"] = np.nan
     data["phase"], data["contact"] = "up", True
     body = io.BytesIO()
     data.to_parquet(body, compression=compression, data_page_version=version)
-    found = read(tmp_path, body.getvalue(), "parquet")
+    result = read(tmp_path, body.getvalue(), "parquet")
     for name in ("t", "q1", "tau1"):
-        np.testing.assert_array_equal(found[name], data[name])
-    assert found.names == ("t", "q1", "tau1")
-    assert any("phase, contact" in fact for fact in found.facts)
+        np.testing.assert_array_equal(result[name], data[name])
+    assert result.names == ("t", "q1", "tau1")
+    assert any("phase, contact" in fact for fact in result.facts)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        pytest.param({"row_group_size": 7}, id="small row groups"),
-        pytest.param({"data_page_size": 100, "write_batch_size": 10}, id="small pages"),
-        pytest.param({"use_dictionary": False}, id="no dictionary"),
-        pytest.param({"column_encoding": "BYTE_STREAM_SPLIT", "use_dictionary": False}, id="split bytes"),
-        pytest.param({"write_page_index": True, "write_page_checksum": True}, id="page index and checksums"),
-        pytest.param({"write_statistics": False}, id="no statistics"),
-    ],
-)
-def test_every_layout_is_the_same_table(tmp_path, options):
-    data = frame()
-    found = read(tmp_path, parquet(pa.Table.from_pandas(data), **options), "parquet")
-    np.testing.assert_array_equal(np.column_stack([found[name] for name in data]), data)
-
-
-def test_more_rows_than_a_block(tmp_path):
-    values = np.arange(50_000)
-    found = read(tmp_path, parquet({"t": values, "q": [[v, -v] for v in values]}, row_group_size=30_000), "parquet")
-    np.testing.assert_array_equal(found["t"], values)
-    np.testing.assert_array_equal(found["q[1]"], -values)
-
-
-@pytest.mark.parametrize(
-    "kind", [pa.int8(), pa.uint16(), pa.int64(), pa.float16(), pa.float32(), pa.decimal128(9, 3), pa.decimal256(40, 2)]
-)
+@pytest.mark.parametrize("kind", [pa.uint16(), pa.int64(), pa.float16(), pa.decimal128(9, 3), pa.decimal256(40, 2)])
 def test_numbers_of_every_kind(tmp_path, kind):
     values = [1, None, 3]
     if pa.types.is_decimal(kind):
@@ -81,31 +56,25 @@ def test_numbers_of_every_kind(tmp_path, kind):
     np.testing.assert_array_equal(read(tmp_path, parquet({"q1": array}), "parquet")["q1"], [1, np.nan, 3])
 
 
-@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
+@pytest.mark.parametrize("unit", ["s", "ns"])
 def test_times_become_seconds(tmp_path, unit):
-    start = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[unit] * 1_700_000_000
+    start = {"s": 1, "ns": 10**9}[unit] * 1_700_000_000
     stamps = pa.array([start, start + 1, None, start + 500], pa.timestamp(unit, "UTC"))
     spans = pa.array([0, 1, None, 500], pa.duration(unit))
-    step = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[unit]
-    found = read(tmp_path, parquet({"t": stamps, "d": spans}), "parquet")
+    step = {"s": 1.0, "ns": 1e-9}[unit]
+    result = read(tmp_path, parquet({"t": stamps, "d": spans}), "parquet")
     for name in ("t", "d"):
-        np.testing.assert_allclose(found[name], [0, step, np.nan, 500 * step], rtol=1e-14)
-    assert found.units == {"t": "s", "d": "s"}
-    assert any(fact.startswith("t holds dates") for fact in found.facts)
-
-
-def test_times_keep_their_first_one_across_row_groups(tmp_path):
-    stamps = pd.date_range("2024-05-01", periods=100, freq="10ms", tz="Europe/Berlin")
-    found = read(tmp_path, parquet(pa.table({"t": stamps}), row_group_size=7), "parquet")
-    np.testing.assert_allclose(found["t"], np.arange(100) * 0.01, rtol=1e-14)
+        np.testing.assert_allclose(result[name], [0, step, np.nan, 500 * step], rtol=1e-14)
+    assert result.units == {"t": "s", "d": "s"}
+    assert any(fact.startswith("t holds dates") for fact in result.facts)
 
 
 @pytest.mark.parametrize("kind", [pa.list_(pa.float32()), pa.large_list(pa.float64()), pa.list_(pa.float32(), 2)])
 def test_lists_become_columns(tmp_path, kind):
     values = pa.array([[1, 2], None, [3, None], [5, 6]], kind)
-    found = read(tmp_path, parquet({"q": values, "t": [0, 1, 2, 3]}, row_group_size=2), "parquet")
-    np.testing.assert_array_equal(found["q[0]"], [1, np.nan, 3, 5])
-    np.testing.assert_array_equal(found["q[1]"], [2, np.nan, np.nan, 6])
+    result = read(tmp_path, parquet({"q": values, "t": [0, 1, 2, 3]}, row_group_size=2), "parquet")
+    np.testing.assert_array_equal(result["q[0]"], [1, np.nan, 3, 5])
+    np.testing.assert_array_equal(result["q[1]"], [2, np.nan, np.nan, 6])
 
 
 def test_nested_columns_become_names_with_points_and_places(tmp_path):
@@ -117,34 +86,27 @@ def test_nested_columns_become_names_with_points_and_places(tmp_path):
         },
         {"pose": [[1.5, 2.5], [3.5, 4.5]], "joint": None, "all": None},
     ]
-    found = read(tmp_path, parquet(pa.Table.from_pylist(rows)), "parquet")
-    first = {name: values[0] for name, values in found.columns.items()}
+    result = read(tmp_path, parquet(pa.Table.from_pylist(rows)), "parquet")
+    first = {name: values[0] for name, values in result.columns.items()}
     assert first == {
         "pose[0][0]": 1, "pose[0][1]": 2, "pose[1][0]": 3, "pose[1][1]": 4,
         "joint.pos": 5, "joint.in.w[0]": 6, "all[0].x": 7, "all[1].x": 8,
     }  # fmt: skip
-    assert [found[name][1] for name in found.names] == [1.5, 2.5, 3.5, 4.5] + [pytest.approx(np.nan, nan_ok=True)] * 4
+    assert [result[name][1] for name in result.names] == [1.5, 2.5, 3.5, 4.5] + [pytest.approx(np.nan, nan_ok=True)] * 4
 
 
 def test_names_with_points_are_kept_apart(tmp_path):
     table = {"state.now": [[1.0, 2.0]], "state.next": [[3.0, 4.0]], "state": [5.0], "x.y": ["a"]}
-    found = read(tmp_path, parquet(table), "parquet")
+    result = read(tmp_path, parquet(table), "parquet")
     flat = {"state.now[0]": 1, "state.now[1]": 2, "state.next[0]": 3, "state.next[1]": 4, "state": 5}
-    assert {name: values[0] for name, values in found.columns.items()} == flat
-
-
-def test_an_extension_type_is_what_it_is_stored_as(tmp_path):
-    values = np.arange(12, dtype=np.float32).reshape(2, 2, 3)
-    array = pa.FixedShapeTensorArray.from_numpy_ndarray(values)
-    found = read(tmp_path, parquet({"m": array}), "parquet")
-    assert [found[name][1] for name in found.names] == list(range(6, 12))
+    assert {name: values[0] for name, values in result.columns.items()} == flat
 
 
 def test_lists_of_different_lengths_are_left_out_and_an_odd_one_is_named(tmp_path):
     different = [[0.0] * (row % 5) for row in range(100)]
-    found = read(tmp_path, parquet({"t": np.arange(100), "contacts": different}), "parquet")
-    assert found.names == ("t",)
-    assert any("contacts" in fact for fact in found.facts)
+    result = read(tmp_path, parquet({"t": np.arange(100), "contacts": different}), "parquet")
+    assert result.names == ("t",)
+    assert any("contacts" in fact for fact in result.facts)
     odd = [[1.0, 2.0]] * 20_000
     odd[17_000] = [1.0]
     assert refused(tmp_path, parquet({"q": odd}), "parquet")[:2] == ("q, row 17001", "1 values")
@@ -152,31 +114,15 @@ def test_lists_of_different_lengths_are_left_out_and_an_odd_one_is_named(tmp_pat
 
 def test_pictures_are_left_out(tmp_path):
     table = {"t": [0, 1], "image": [{"bytes": b"x" * 100, "path": None}] * 2, "flat": [[1] * 3000] * 2}
-    found = read(tmp_path, parquet(table), "parquet")
-    assert found.names == ("t",)
-    assert any("image, flat" in fact for fact in found.facts)
+    result = read(tmp_path, parquet(table), "parquet")
+    assert result.names == ("t",)
+    assert any("image, flat" in fact for fact in result.facts)
 
 
 def test_units_of_a_field_are_told(tmp_path):
     schema = pa.schema([pa.field("q", pa.list_(pa.float64()), metadata={"unit": "deg"})])
-    found = read(tmp_path, parquet(pa.table({"q": [[1.0, 2.0]]}, schema=schema)), "parquet")
-    assert found.units == {"q[0]": "deg", "q[1]": "deg"}
-
-
-def test_no_rows(tmp_path):
-    assert len(read(tmp_path, parquet({"t": pa.array([], pa.float64())}), "parquet")["t"]) == 0
-    assert read(tmp_path, parquet({"x": ["a"]}), "parquet").names == ()
-
-
-@pytest.mark.parametrize("cut", [1, 8, 100, 1000])
-def test_truncated(tmp_path, cut):
-    field, value, _ = refused(tmp_path, parquet(pa.Table.from_pandas(frame()))[:-cut], "parquet")
-    assert (field, value) == ("file", "cut off")
-
-
-def test_a_footer_of_two_gigabytes_is_refused(tmp_path):
-    body = parquet(pa.Table.from_pandas(frame()))[:-8] + struct.pack("<I4s", 2**31 - 1, b"PAR1")
-    assert refused(tmp_path, body, "parquet")[0] == "file"
+    result = read(tmp_path, parquet(pa.table({"q": [[1.0, 2.0]]}, schema=schema)), "parquet")
+    assert result.units == {"q[0]": "deg", "q[1]": "deg"}
 
 
 def huge_page(body, size):
@@ -203,30 +149,21 @@ def test_a_page_that_unpacks_to_too_much_is_refused_before_it_is_read(tmp_path, 
     assert "100000" in expected
 
 
-def test_a_page_that_declares_two_gigabytes_is_refused(tmp_path):
-    body = parquet({"t": RNG.normal(size=200_000)}, use_dictionary=False, compression="none")
-    page = pq.ParquetFile(io.BytesIO(body)).metadata.row_group(0).column(0).data_page_offset
-    header = b"\x15\x00\x15\xfe\xff\xff\xff\x0f\x15\x80\x01\x00"  # 2147483647 bytes, 64 of them packed
-    assert refused(tmp_path, body[:page] + header + body[page + len(header) :], "parquet")[:2] == (
-        "t", "page 1 of 2147483647 bytes",
-    )  # fmt: skip
-
-
 @pytest.mark.parametrize(
     "again",
     [
         pytest.param(b"\x06\x04\x80\x01", id="the size once more as a number of 64 bits, which Arrow passes over"),
         pytest.param(b"\x05\x84\x80\x08\xfe\xff\xff\xff\x0f", id="field 65538, which Arrow counts as the second"),
+        pytest.param(b"", id="two gigabytes, once"),
     ],
 )
 def test_a_header_that_says_its_size_twice_counts_as_arrow_reads_it(tmp_path, again):
     body = parquet({"t": RNG.normal(size=200_000)}, use_dictionary=False, compression="none")
     page = pq.ParquetFile(io.BytesIO(body)).metadata.row_group(0).column(0).data_page_offset
-    first = b"\xfe\xff\xff\xff\x0f" if again[0] == 6 else b"\x80\x01"
+    first = b"\x80\x01" if again[:1] == b"\x05" else b"\xfe\xff\xff\xff\x0f"
     header = b"\x15\x00\x15" + first + b"\x15\x80\x01" + again + b"\x00"
-    assert refused(tmp_path, body[:page] + header + body[page + len(header) :], "parquet")[:2] == (
-        "t", "page 1 of 2147483647 bytes",
-    )  # fmt: skip
+    reply = refused(tmp_path, body[:page] + header + body[page + len(header) :], "parquet")
+    assert reply[:2] == ("t", "page 1 of 2147483647 bytes")
 
 
 def test_many_pages_that_unpack_to_too_much_are_refused(tmp_path):
@@ -245,12 +182,17 @@ def test_a_page_that_lies_about_its_size_is_refused(tmp_path):
     path.unlink()
 
 
-@pytest.mark.parametrize("names", [["t", "t"], ["t", "\x07"]])
-def test_names_that_cannot_be_told_apart(tmp_path, names):
-    table = pa.Table.from_arrays([pa.array([1.0]), pa.array([2.0])], names=names)
-    assert refused(tmp_path, parquet(table), "parquet")[0] == "column 2"
+def test_an_extension_type_is_what_it_is_stored_as(tmp_path):
+    values = np.arange(12, dtype=np.float32).reshape(2, 2, 3)
+    array = pa.FixedShapeTensorArray.from_numpy_ndarray(values)
+    result = read(tmp_path, parquet({"m": array}), "parquet")
+    assert [result[name][1] for name in result.names] == list(range(6, 12))
 
 
-def test_too_many_columns(tmp_path):
-    body = parquet({f"c{i}": [1.0] for i in range(50)})
-    assert refused(tmp_path, body, "parquet", max_columns=20)[:2] == ("columns", "50")
+def test_no_rows_two_gigabytes_of_footer_and_too_many_columns(tmp_path):
+    assert len(read(tmp_path, parquet({"t": pa.array([], pa.float64())}), "parquet")["t"]) == 0
+    assert read(tmp_path, parquet({"x": ["a"]}), "parquet").names == ()
+    footer = parquet(pa.Table.from_pandas(frame()))[:-8] + struct.pack("<I4s", 2**31 - 1, b"PAR1")
+    assert refused(tmp_path, footer, "parquet")[0] == "file"
+    many = parquet({f"c{i}": [1.0] for i in range(50)})
+    assert refused(tmp_path, many, "parquet", max_columns=20)[:2] == ("columns", "50")

@@ -1,13 +1,18 @@
-"""Clock, limits and saturation: against what plain counting says of recordings made to have them."""
+"""Clock, parts, noise, limits, saturation and lag: against what plain counting says of recordings made for it."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from lipcore.data.signals import noise_level
 from lipcore.preparation.recipe import Recipe
-from service.datasets.report.signals import against_limits, limits_of, saturation
-from service.datasets.report.timing import look_at_clock
+from service.datasets.preview import extremes
+from service.datasets.report.lag import shifts
+from service.datasets.report.signals import against_limits, limits_of, noise_or_share, saturation, white_noise
+from service.datasets.report.timing import bounds, look_at_clock, number_parts, thin
 from service.datasets.schema import DatasetReport
 from tests.service.recordings.report_data import FakeProfile, recording, report_on, staged
 
@@ -55,11 +60,6 @@ def test_gaps_are_listed_with_their_times(tmp_path: Path) -> None:
     assert np.unique(clock.part, return_counts=True)[1].tolist() == [10, 1, 1, 288, 200, 200, 300]
 
 
-def test_a_recording_without_times_has_no_rate(tmp_path: Path) -> None:
-    timing = look_at_clock(staged(tmp_path, ("a",), {"q": np.zeros((50, 1))}), 1.5, 0).timing
-    assert (timing.rate_hz, timing.jitter_max, timing.duration_s) == (None, None, None)
-
-
 def test_limits_are_compared_joint_by_joint() -> None:
     limits = limits_of(robot(), PENDULUM)
     q = np.linspace(-0.5, 1.5, 201)
@@ -79,15 +79,12 @@ def test_limits_are_compared_joint_by_joint() -> None:
 def test_limits_follow_the_names() -> None:
     profile = robot(upper=np.array([1.0, 2.0]))
     swapped, one = limits_of(profile, PENDULUM[::-1]), limits_of(profile, ("joint2", "gripper"))
-    assert swapped is not None
     assert swapped.upper.tolist() == [2.0, 1.0]
     assert swapped.urdf_joints == PENDULUM[::-1]
-    assert one is not None
     assert one.upper[0] == 2.0
     assert np.isnan(one.upper[1])
     assert one.urdf_joints is None
     by_order = limits_of(profile, ("x", "y"))
-    assert by_order is not None
     assert by_order.by_order
     assert by_order.urdf_joints == PENDULUM
     assert limits_of(profile, ("x", "y", "z")) is None
@@ -99,20 +96,12 @@ def test_a_torque_that_is_cut_off_is_seen() -> None:
     full = 8 * np.sin(2 * t) + 2 * np.sin(7 * t)
     tau = np.clip(full, -6, 5)
     limits = limits_of(robot(), PENDULUM)
-    found = saturation(1, "joint2", np.cos(t), tau, limits)
-    assert found.at_largest == pytest.approx(np.mean((full >= 5) | (full <= -6)))
-    assert found.flat == pytest.approx(found.at_largest, rel=0.05)
-    assert found.at_limit == pytest.approx(np.mean(np.abs(tau) >= 0.99 * 5))
+    result = saturation(1, "joint2", np.cos(t), tau, limits)
+    assert result.at_largest == pytest.approx(np.mean((full >= 5) | (full <= -6)))
+    assert result.flat == pytest.approx(result.at_largest, rel=0.05)
+    assert result.at_limit == pytest.approx(np.mean(np.abs(tau) >= 0.99 * 5))
     assert saturation(0, "joint1", np.cos(t), full, limits).flat == 0
     assert saturation(0, "joint1", np.cos(t), full, limits).at_limit is None
-
-
-def test_a_robot_that_holds_still_is_not_cut_off() -> None:
-    q = np.concatenate([np.linspace(0, 1, 500), np.ones(500)])
-    found = saturation(0, "a", q, 9.81 * q, None)
-    assert found.flat == 0
-    assert found.at_largest == pytest.approx(0.5, abs=0.01)
-    assert saturation(0, "a", q, np.ones(1000), None).at_largest == 0
 
 
 @pytest.fixture
@@ -127,11 +116,101 @@ def troubled(tmp_path: Path) -> DatasetReport:
 
 
 def test_what_is_wrong_is_said(troubled: DatasetReport) -> None:
-    said = " ".join(troubled.warnings)
-    assert "100 of 3000 rows lack a value" in said
-    assert "positions of joint1" in said
-    assert "are beyond the robot's limits" in said
-    assert "it was cut off there" in said
+    reply = " ".join(troubled.warnings)
+    assert "100 of 3000 rows lack a value" in reply
+    assert "positions of joint1" in reply
+    assert "are beyond the robot's limits" in reply
+    assert "it was cut off there" in reply
     assert troubled.robot == "arm"
-    assert troubled.noise is not None
     assert troubled.noise[0].velocity == pytest.approx(0, abs=1e-3)
+
+
+@pytest.mark.parametrize(("rate", "late"), [(50.0, 0.02), (50.0, -0.015), (250.0, 0.0033)])
+def test_a_known_lag_is_found(tmp_path: Path, rate: float, late: float) -> None:
+    report = report_on(tmp_path, PENDULUM, recording("double-pendulum", 30.0, rate, 3, late))
+    assert [each.joint for each in report.lag] == [None, *PENDULUM]
+    for each in report.lag:
+        assert each.seconds == pytest.approx(late, abs=2e-3)
+        assert each.std_s < 5e-3
+    reply = " ".join(report.warnings)
+    assert ("not of the same time" in reply) == (abs(late) > 0.01)
+    if late > 0.01:
+        assert "after motion" in reply
+    if late < -0.01:
+        assert "before motion" in reply
+
+
+def test_torque_that_motion_does_not_explain_has_no_lag(tmp_path: Path) -> None:
+    columns = dict(recording("double-pendulum", 20.0, 100.0, 4))
+    columns["tau"] = np.random.default_rng(1).standard_normal(columns["tau"].shape)
+    report = report_on(tmp_path, PENDULUM, columns)
+    assert all(each.seconds is None and each.reason for each in report.lag)
+    assert "explains only" in (report.lag[1].reason or "")
+
+
+def test_slow_motion_cannot_tell(tmp_path: Path) -> None:
+    t = np.arange(3000) / 100
+    q = np.column_stack([0.5 * np.sin(0.3 * t), 0.4 * np.sin(0.2 * t)])
+    tau = 3 * q + 0.02 * np.random.default_rng(1).standard_normal(q.shape)
+    report = report_on(tmp_path, PENDULUM, {"t": t, "q": q, "tau": tau})
+    assert report.lag[0].seconds is None
+    assert "record faster motion" in (report.lag[1].reason or "")
+
+
+@pytest.mark.parametrize(("rate", "longest"), [(30.0, 10_000), (250.0, 10_000), (1000.0, 400), (5000.0, 10**6)])
+def test_shifts_lie_within_a_quarter_of_a_second(rate: float, longest: int) -> None:
+    steps = shifts(rate, longest)
+    assert (steps == -steps[::-1]).all()
+    assert len(steps) <= 130
+    assert steps[-1] <= min(rate / 4, longest / 8)
+    assert shifts(rate, 15) is None
+
+
+LENGTHS = st.lists(st.integers(1, 40), min_size=1, max_size=12)
+
+
+def parts_of(lengths: list[int]) -> np.ndarray:
+    return np.repeat(np.arange(len(lengths)), lengths)
+
+
+@given(LENGTHS)
+def test_parts_are_numbered_by_their_breaks(lengths: list[int]) -> None:
+    part = parts_of(lengths)
+    assert (number_parts(len(part), [np.diff(part) != 0]) == part).all()
+    starts, ends = bounds(part)
+    assert (ends - starts).tolist() == lengths
+
+
+@given(LENGTHS, st.integers(1, 60), st.integers(0, 6))
+def test_thinned_rows_keep_their_distance_from_the_ends(lengths: list[int], most: int, margin: int) -> None:
+    part = parts_of(lengths)
+    rows = thin(part, most, margin)
+    allowed = [
+        row for row in range(len(part)) if margin <= row - (part < part[row]).sum() < lengths[part[row]] - margin
+    ]
+    assert len(rows) == min(most, len(allowed))
+    assert (np.diff(rows) > 0).all()
+    assert set(rows.tolist()) <= set(allowed)
+
+
+def test_noise_is_that_of_noise_level() -> None:
+    rng = np.random.default_rng(1)
+    part = parts_of([200, 5, 90, 1, 300])
+    values = np.sin(np.arange(len(part)) / 50) + 0.02 * rng.standard_normal(len(part))
+    episodes = [values[part == k][:, None] for k in range(5)]
+    assert white_noise(values, part) == pytest.approx(noise_level(episodes)[0], rel=1e-12)
+    short = parts_of([2, 2, 2])
+    episodes = [values[:6][short == k][:, None] for k in range(3)]
+    assert white_noise(values[:6], short) is None
+    assert noise_or_share(values[:6], short) == pytest.approx(noise_level(episodes)[0], rel=1e-12)
+
+
+@given(st.integers(1, 300), st.integers(2, 80), st.integers(0, 5))
+def test_a_preview_keeps_the_extremes(count: int, points: int, seed: int) -> None:
+    table = np.random.default_rng(seed).integers(0, 20, (count, 2)).astype(float)
+    for joint, (rows, values) in enumerate(extremes(count, "q", lambda _, first, last: table[first:last], points)):
+        assert len(rows) <= points
+        assert (np.diff(rows) > 0).all()
+        assert (table[rows, joint] == values).all()
+        assert values.max() == table[:, joint].max()
+        assert values.min() == table[:, joint].min()

@@ -1,23 +1,29 @@
-"""What of an upload is stored and shown: the file of its samples, its report, its preview, and nothing beside."""
+"""What of an upload is stored and shown: its samples, prepared step by step, its report, its preview."""
 
 from __future__ import annotations
 
 import hashlib
 import io
+import json
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from safetensors.numpy import load_file
+from scipy.interpolate import Akima1DInterpolator
+from scipy.signal import butter, sosfiltfilt
 from sqlalchemy import select
 
 from benchmarks.ingest import recording
-from benchmarks.ingest import running as ingest
+from lipcore.preparation.recipe import Recipe
 from lipcore.robots.library import load_robot
+from service.datasets.staging import QUANTITIES, Staged, column, prepare
+from service.foundation.settings import Settings
 from service.storage import sample_file
 from service.storage.database import JobRow
-from tests.service.data import arrays, error, npz, post, queue, service_of, stream
+from service.storage.disk import Disk
+from tests.service.data import arrays, npz, post, queue, service_of, stream
 
 SAMPLES = stream(samples=600, rate=100.0, seed=71)
 
@@ -37,9 +43,9 @@ def test_the_library_reads_what_was_written_array_by_array(tmp_path):
     path = tmp_path / "samples.safetensors"
     with path.open("wb") as file:
         digest = sample_file.write(file, len(SAMPLES), SAMPLES.n_joints, lambda name: getattr(SAMPLES, name))
-    found = load_file(path)
-    assert set(found) == set(sample_file.ARRAYS)
-    for name, values in found.items():
+    result = load_file(path)
+    assert set(result) == set(sample_file.ARRAYS)
+    for name, values in result.items():
         np.testing.assert_array_equal(values, getattr(SAMPLES, name))
         assert values.dtype == getattr(SAMPLES, name).dtype
     assert digest == hashlib.sha256(path.read_bytes()).hexdigest() == sample_file.sha256(path)
@@ -47,20 +53,6 @@ def test_the_library_reads_what_was_written_array_by_array(tmp_path):
     chosen = np.array([0, 7, 599])
     for name, values in sample_file.read(path, chosen).items():
         np.testing.assert_array_equal(values, getattr(SAMPLES, name)[chosen])
-
-
-def test_an_array_of_another_shape_is_not_written(tmp_path):
-    with (tmp_path / "x").open("wb") as file, pytest.raises(ValueError, match="q has shape"):
-        sample_file.write(file, len(SAMPLES), 3, lambda name: getattr(SAMPLES, name))
-
-
-def test_an_upload_leaves_its_samples_and_nothing_else(api):
-    service = service_of(api)
-    before = set(service.files.uploads.iterdir())
-    dataset = created(post(api, npz(**arrays(SAMPLES, "t", "q", "tau"))))
-    error(post(api, npz(**arrays(SAMPLES, "q", "tau"))), 422, "invalid_data")
-    assert set(service.files.uploads.iterdir()) == before
-    assert (service.files.datasets / f"{dataset['id']}.safetensors").exists()
 
 
 def test_recipe_and_source_of_an_upload_are_kept(api):
@@ -109,34 +101,16 @@ def test_preview_keeps_the_extremes(api):
     dataset = created(post(api, npz(**arrays(SAMPLES), joint_names=np.array(["a", "b"]))))
     answer = api.get(f"/v1/datasets/{dataset['id']}/preview", params={"quantities": "tau,q", "points": 50})
     assert answer.status_code == 200
-    found = answer.json()
-    assert found["samples"] == len(SAMPLES)
-    assert [(each["quantity"], each["joint"]) for each in found["columns"]] == [
-        ("tau", "a"),
-        ("tau", "b"),
-        ("q", "a"),
-        ("q", "b"),
-    ]
-    for each in found["columns"]:
+    result = answer.json()
+    assert result["samples"] == len(SAMPLES)
+    names = [(each["quantity"], each["joint"]) for each in result["columns"]]
+    assert names == [("tau", "a"), ("tau", "b"), ("q", "a"), ("q", "b")]
+    for each in result["columns"]:
         values = getattr(SAMPLES, each["quantity"])[:, "ab".index(each["joint"])]
         assert len(each["values"]) <= 50
         assert (max(each["values"]), min(each["values"])) == (values.max(), values.min())
         np.testing.assert_array_equal(values[each["rows"]], each["values"])
         np.testing.assert_array_equal(SAMPLES.t[each["rows"]], each["t"])
-
-
-@pytest.mark.parametrize(
-    ("params", "field"),
-    [({"quantities": "q,force"}, "quantities"), ({"quantities": "q,q"}, "quantities"), ({"points": 1}, "points")],
-)
-def test_what_a_preview_cannot_show_is_named(api, params, field):
-    dataset = created(post(api, npz(**arrays(SAMPLES))))
-    said = error(api.get(f"/v1/datasets/{dataset['id']}/preview", params=params), 422, "invalid_request")
-    assert said["detail"][0]["field"] == field
-
-
-def test_preview_of_nothing_is_not_found(api):
-    error(api.get("/v1/datasets/ds_none/preview"), 404, "not_found")
 
 
 @pytest.mark.parametrize("kind", recording.FORMATS)
@@ -149,12 +123,40 @@ def test_the_benchmark_writes_what_the_service_reads(api, tmp_path, kind):
     assert report["rate_hz"] == pytest.approx(1000.0)
 
 
-def test_promises_of_ingestion_are_judged_for_a_million_rows_only():
-    found = ingest.Ingested("parquet", 200.0, 61.0, 500.0, 900.0, 10)
-    results = ingest.Results(ingest.Options(), {}, [found])
-    assert [each.met for each in ingest.targets(results)] == [False, True]
-    few = ingest.Results(ingest.Options(rows=1000), {}, [found])
-    assert [each.met for each in ingest.targets(few)] == [None, None]
-    assert "61.0" in ingest.grids(results)[1].markdown()
-    with pytest.raises(ValueError, match="formats"):
-        ingest.Options(formats=("xls",))
+def test_an_array_of_another_shape_is_not_written(tmp_path):
+    with (tmp_path / "x").open("wb") as file, pytest.raises(ValueError, match="q has shape"):
+        sample_file.write(file, len(SAMPLES), 3, lambda name: getattr(SAMPLES, name))
+
+
+RATE, ROWS, NAMES = 90.0, 900, ("shoulder", "elbow", "wrist")
+
+
+def position(t, joint):
+    return np.sin((1 + 0.5 * joint) * t) + 0.2 * np.cos(3.3 * t + joint)
+
+
+def test_the_steps_say_all_that_is_needed_to_do_it_by_hand(tmp_path):
+    t = np.arange(ROWS) / RATE + np.random.default_rng(0).uniform(0, 0.7, ROWS) / RATE
+    t[500:] += 3
+    raw = Staged(tmp_path, NAMES, Disk(Settings(home=tmp_path)))
+    rows = {column("q", joint): position(t, joint) for joint in range(3)}
+    raw.append({"t": t, **rows, **{column("tau", joint): np.cos(rows[column("q", joint)]) for joint in range(3)}})
+    prepared = prepare(raw, tmp_path, Recipe(cutoff_hz=5), 30)
+    assert (prepared.staged.joint_names, prepared.staged.quantities) == (NAMES, QUANTITIES)
+    assert all(step["step"] and step["text"] for step in prepared.steps)
+
+    split, resample, low_pass, _, trim = json.loads(json.dumps(prepared.steps))
+    rate, q = resample["rate_hz"], position(t, 1)
+    sections = butter(4, low_pass["cutoff_hz"], fs=rate, output="sos")
+    ends = np.flatnonzero(np.diff(t) > split["longer_than_s"]) + 1
+    # uneven stamps with a gap, done anew with SciPy from the parameters of the steps alone
+    parts = []
+    for part in np.split(np.arange(ROWS), ends):
+        times = np.arange(t[part[0]], t[part[-1]], 1 / rate)
+        even = sosfiltfilt(sections, Akima1DInterpolator(t[part], q[part])(times))
+        dq = np.gradient(even, 1 / rate, edge_order=2)
+        ddq = np.gradient(sosfiltfilt(sections, dq), 1 / rate, edge_order=2)
+        parts.append(np.stack([times, even, dq, ddq])[:, trim["first"] : len(times) - trim["last"]])
+    for name, expected in zip(("t", "q2", "dq2", "ddq2"), np.hstack(parts), strict=True):
+        np.testing.assert_allclose(prepared.staged.read(name), expected, rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(raw.read("q1"), position(t, 0))
