@@ -8,9 +8,11 @@ from math import isfinite
 from lipcore.data import paired
 from lipcore.data.metrics import evaluate
 from lipcore.data.paired import Answer, Comparison, Difference
-from lipcore.data.samples import Array, Samples
+from lipcore.data.samples import Samples
 from service.foundation.errors import invalid_request
-from service.inference.comparison_schema import (
+from service.foundation.fields import finite
+from service.inference.evaluating import figures, measured
+from service.inference.schema import (
     CompareRequest,
     CompareResponse,
     Differences,
@@ -19,7 +21,6 @@ from service.inference.comparison_schema import (
     TotalDifference,
     VersionFigures,
 )
-from service.inference.evaluating import measured
 from service.models.loaded import LoadedModels, Served
 
 
@@ -73,17 +74,8 @@ def _answer(served: Served, samples: Samples) -> Answer:
 
 
 def _figures(served: Served, answer: Answer, samples: Samples, in_training: bool) -> VersionFigures:
-    metrics = evaluate(samples.tau, *answer)
-    return VersionFigures(
-        version=served.version,
-        revision=served.revision,
-        nmse=_finite(metrics.nmse),
-        rmse=metrics.rmse.tolist(),
-        coverage=metrics.coverage.tolist(),
-        nlpd=metrics.nlpd.tolist(),
-        interval_width=metrics.width.tolist(),
-        in_training=in_training,
-    )
+    shown = figures(evaluate(samples.tau, *answer))
+    return VersionFigures(version=served.version, revision=served.revision, **shown, in_training=in_training)
 
 
 def _verdict(first: int, second: int, compared: Comparison) -> tuple[Outcome, str]:
@@ -138,11 +130,7 @@ def _warnings(versions: Collection[Served], in_training: Collection[bool]) -> li
 
 def _shown(difference: Difference) -> dict[str, list[float | None]]:
     names = {"difference": difference.mean, "standard_error": difference.standard_error}
-    return {name: _finite(values) for name, values in {**names, "half_width": difference.half_width}.items()}
-
-
-def _finite(values: Array) -> list[float | None]:
-    return [value if isfinite(value) else None for value in values.tolist()]
+    return {name: finite(values) for name, values in {**names, "half_width": difference.half_width}.items()}
 
 
 def _total(difference: Difference, place: int) -> TotalDifference:

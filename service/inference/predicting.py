@@ -69,6 +69,19 @@ class Query(NamedTuple):
         return f"{name}[{joint}]" if self.single else f"{name}[{row}][{joint}]"
 
 
+def check_shapes(request: Any, model: TorqueModel) -> list[Array]:
+    """The arrays q, dq, ddq and tau of a request, those left out that are None; raise InvalidRequestError where they
+    are not of the model's joints or of several shapes."""
+    parts = {name: values for name in QUANTITIES if (values := getattr(request, name)) is not None}
+    for name, values in parts.items():
+        if values.shape[-1] != model.n_joints:
+            expected = f"{model.n_joints} numbers: {', '.join(model.joint_names)}"
+            raise invalid_request(name, f"{values.shape[-1]} numbers long", expected)
+        if values.shape != request.q.shape:
+            raise invalid_request(name, f"of shape {values.shape}", f"the shape of q, {request.q.shape}")
+    return list(parts.values())
+
+
 def check_answer(name: str, values: Array) -> None:
     """Raise InvalidRequestError where a number of an answer, of any shape, is not finite."""
     if isfinite(np.vdot(values, values)):  # at one query a third of what np.isfinite takes
@@ -81,13 +94,18 @@ def check_answer(name: str, values: Array) -> None:
         raise invalid_request(field, f"{values[place]:g}", expected)
 
 
-def check_components(model: TorqueModel, request: PredictRequest, limit: int) -> None:
-    """Raise InvalidRequestError for components the model lacks, too many queries, or a torque missing or in vain."""
+def check_offered(model: TorqueModel, components: Sequence[ComponentName]) -> None:
+    """Raise InvalidRequestError for a component that the model's estimator does not offer."""
     offered = dynamics.available(model.estimator)
-    for index, name in enumerate(request.components):
+    for index, name in enumerate(components):
         if name not in offered:
             expected = f"what a model with the estimator {model.estimator.name} offers: {', '.join(offered)}"
             raise invalid_request(f"components[{index}]", name, expected)
+
+
+def check_components(model: TorqueModel, request: PredictRequest, limit: int) -> None:
+    """Raise InvalidRequestError for components the model lacks, too many queries, or a torque missing or in vain."""
+    check_offered(model, request.components)
     if request.components and request.q.ndim == 2 and len(request.q) > limit:
         raise invalid_request("q", f"{len(request.q)} queries", f"at most {limit} in one request with components")
     forward = "forward_dynamics" in request.components
@@ -127,23 +145,13 @@ class PredictBody(Struct, forbid_unknown_fields=True):
 
     def request(self) -> PredictRequest | None:
         """Return what it says with arrays (n,) or (N, n), or None where a list is ragged or a component comes twice."""
-        q, dq, ddq = _array(self.q), _array(self.dq), _array(self.ddq)
-        tau = None if self.tau is None else _array(self.tau)
-        if q is None or dq is None or ddq is None or (tau is None and self.tau is not None):
-            return None
         if len(set(self.components)) < len(self.components):
             return None
-        return PredictRequest.model_construct(
-            q=q,
-            dq=dq,
-            ddq=ddq,
-            tau=tau,
-            version=self.version,
-            alias=self.alias,
-            covariance=self.covariance,
-            components=self.components,
-            min_revision=self.min_revision,
-        )
+        try:
+            arrays = {name: to_array(values) for name in QUANTITIES if (values := getattr(self, name)) is not None}
+        except ValueError:
+            return None
+        return PredictRequest.model_construct(**(msgspec.structs.asdict(self) | arrays))
 
 
 class Prediction(Struct, omit_defaults=True):
@@ -183,11 +191,11 @@ def encode(answer: Prediction) -> bytes:
     return _encoder.encode(answer)
 
 
-def _array(values: Numbers) -> Array | None:
-    try:
-        return np.array(values, np.float64) if values else None
-    except ValueError:  # ragged
-        return None
+def to_array(values: Sequence[Any]) -> Array:
+    """Numbers (n,) or rows of them (N, n), null as NaN; raise ValueError where there are none, or rows differ."""
+    if not values:
+        raise ValueError("no rows")
+    return np.array(values, np.float64)
 
 
 def at_once(served: Served, motion: Array, max_position: float) -> Prediction | None:
@@ -212,13 +220,7 @@ def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: S
     known = served.model
     single = request.q.ndim == 1
     check_components(known, request, settings.max_component_batch)
-    parts = [values for name in QUANTITIES if (values := getattr(request, name)) is not None]
-    for name, values in zip(QUANTITIES, parts, strict=False):
-        if values.shape[-1] != known.n_joints:
-            expected = f"{known.n_joints} numbers: {', '.join(known.joint_names)}"
-            raise invalid_request(name, f"{values.shape[-1]} numbers long", expected)
-        if values.shape != request.q.shape:
-            raise invalid_request(name, f"of shape {values.shape}", f"the shape of q, {request.q.shape}")
+    parts = check_shapes(request, known)
     query = Query(np.stack([np.atleast_2d(values) for values in parts]), single)
     if (count := query.values.shape[1]) > settings.max_batch:
         raise invalid_request("q", f"{count} queries", f"at most {settings.max_batch} in one request")
@@ -236,13 +238,10 @@ def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: S
         lists[name] = shaped.tolist()
     prediction = _prediction_of(served, **lists)
     if request.components:
-        estimates = query.components(known, request.components)
+        of_query = 0 if single else slice(None)
         prediction.components = {
-            name: {
-                "mean": (estimates[name].mean[0] if single else estimates[name].mean).tolist(),
-                "std": (estimates[name].std[0] if single else estimates[name].std).tolist(),
-            }
-            for name in request.components
+            name: {"mean": each.mean[of_query].tolist(), "std": each.std[of_query].tolist()}
+            for name, each in query.components(known, request.components).items()
         }
     return prediction
 

@@ -18,10 +18,18 @@ from service.foundation.errors import (
     UnreadableVersionError,
     responses,
 )
-from service.inference import comparison, evaluating, predicting, trace
-from service.inference.comparison_schema import CompareRequest, CompareResponse, TraceRequest, TraceResponse
+from service.inference import comparison, evaluating, predicting
 from service.inference.predicting import decode, encode
-from service.inference.schema import EvaluateRequest, EvaluateResponse, PredictRequest, PredictResponse
+from service.inference.schema import (
+    CompareRequest,
+    CompareResponse,
+    EvaluateRequest,
+    EvaluateResponse,
+    PredictRequest,
+    PredictResponse,
+    TraceRequest,
+    TraceResponse,
+)
 from service.models.loaded import LoadedModels, LoadedModelsDep
 from service.models.served import Served, reached
 from service.web.limits.requests import PredictionsDep
@@ -145,7 +153,7 @@ async def trace_model(
     the share of them outside the interval is fair, but a peak between two of them is missing: ask for fewer rows to
     see all.
     """
-    return await to_thread.run_sync(trace.trace, loaded, model, request, limiter=turns)
+    return await to_thread.run_sync(evaluating.trace, loaded, model, request, limiter=turns)
 
 
 @router.post(

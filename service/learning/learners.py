@@ -21,8 +21,7 @@ from service.compute.process import Place
 from service.foundation.errors import BusyError
 from service.foundation.fields import of_app
 from service.foundation.states import PartState
-from service.learning.ingest.batches import observe_batch
-from service.learning.ingest.frames import Frames, FramesResult, observe_frames
+from service.learning.ingest.batches import Frames, FramesResult, observe_batch, observe_frames
 from service.learning.ingest.intake import Intake
 from service.learning.ingest.monitor import Monitor
 from service.learning.learner import publication

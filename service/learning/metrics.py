@@ -10,7 +10,7 @@ from prometheus_client.registry import Collector
 from sqlalchemy import select
 
 from lipcore.vocabulary import CODES
-from service.learning.control import status, undoing
+from service.learning.control import decisions, status
 from service.learning.ingest.monitor import Monitor
 from service.learning.learners import Learners
 from service.models.loaded import Served
@@ -82,7 +82,7 @@ class Learning(Collector):
 
     def _lag(self, served: Served) -> int:
         with self._learners.database.session() as session:
-            return max(undoing.current(session, served.name, served.version) - served.revision, 0)
+            return max(decisions.current(session, served.name, served.version) - served.revision, 0)
 
 
 def _add_quality(gauges: dict[str, GaugeMetricFamily], model: str, monitor: Monitor) -> None:

@@ -17,6 +17,7 @@ from lipcore.data.samples import Samples
 from lipcore.files.manifest import FORMAT_VERSION
 from lipcore.model.torque_model import TorqueModel
 from service import __version__
+from service.foundation.fields import finite
 from service.storage.database import DatasetRow
 
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -83,8 +84,7 @@ def figures(model: TorqueModel, samples: Samples, most: int, of: int) -> dict[st
     # not by the compiled form of the model: a process that trains and never serves would wait for it
     answer = model.posterior.predict(used.motion())
     compared = metrics.evaluate(used.tau, answer.mean.numpy(), answer.std.numpy(), model.noise_std)
-    values = {name: getattr(compared, name) for name in ("nmse", "rmse", "coverage", "nlpd")}
-    shown = {name: [float(each) if np.isfinite(each) else None for each in values[name]] for name in values}
+    shown = {name: finite(getattr(compared, name)) for name in ("nmse", "rmse", "coverage", "nlpd")}
     return {"samples": len(used), "of": of, **shown}
 
 

@@ -15,7 +15,7 @@ from service.foundation.errors import NotFoundError, NotReadyError, UnreadableVe
 from service.models import registry
 from service.models.loaded import LoadedModels, Served
 from service.models.schema import ALIAS
-from service.oip import answer, wire
+from service.oip import query, wire
 from service.oip.query import FORWARD, shapes
 from service.oip.schema import (
     BINARY,
@@ -194,12 +194,12 @@ async def _answer(scope: Scope, body: bytes) -> Reply:
     headers, where = scope["headers"], scope["path_params"]
     served = await find(loaded, limiter, where["model"], where.get("version"))
     if len(body) > SMALL:
-        return await to_thread.run_sync(answer.infer, served, body, headers, settings, limiter=limiter)
+        return await to_thread.run_sync(query.infer, served, body, headers, settings, limiter=limiter)
     message = wire.decode(body, headers)
-    query = answer.read_question(served, message, body, settings)
-    if query.quick:
-        return answer.respond(served, message.request, query)
-    return await to_thread.run_sync(answer.respond, served, message.request, query, limiter=limiter)
+    question = query.read_question(served, message, body, settings)
+    if question.quick:
+        return query.respond(served, message.request, question)
+    return await to_thread.run_sync(query.respond, served, message.request, question, limiter=limiter)
 
 
 async def infer(request: Request) -> Response:

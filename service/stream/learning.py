@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from service.foundation.errors import ErrorBody, ServiceError, invalid_request
-from service.learning.ingest.frames import Frames, FramesResult
+from service.learning.ingest.batches import Frames, FramesResult
 from service.learning.learners import Learners
 from service.models.loaded import Served
 from service.stream.frames import NUMBER, REQUEST

@@ -17,8 +17,7 @@ from service.inference.schema import one_choice
 from service.learning.learners import Learners
 from service.models.schema import ALIAS
 from service.models.served import reached
-from service.stream.conversation import Conversation, Echo
-from service.stream.session import Session
+from service.stream.session import Conversation, Echo, Session
 from service.web.server.stream_protocol import CONNECTION, StreamProtocol
 
 STREAM_ID = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"

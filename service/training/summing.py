@@ -31,8 +31,7 @@ from service.compute.shards import summed
 from service.foundation.settings import Settings
 from service.storage.files import PATIENCE_S, Files
 from service.storage.sample_file import Reader
-from service.training.material import Material
-from service.training.rows import Shard, Table
+from service.training.material import Material, Shard, Table
 
 Made = TypeVar("Made")
 

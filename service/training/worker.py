@@ -27,9 +27,8 @@ from service.storage.disk import Disk
 from service.storage.files import PATIENCE_S, Files
 from service.training import lifecycle, refresh_data
 from service.training.holding_out import CannotHoldOutError
-from service.training.material import Material, observed, recorded
+from service.training.material import CANDIDATES, Material, observed, recorded
 from service.training.pulse import Pulse, Remaining, SupersededError
-from service.training.rows import CANDIDATES
 from service.training.summing import all_rows
 from service.web import storage_errors
 from service.web.observability.logs import job_id

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from service.foundation.settings import Settings
-from service.stream.conversation import Echo
-from service.stream.session import Session
+from service.stream.session import Echo, Session
 from service.web.observability.meters import Meters
 from tests.service.data import DEADLINE
 from tests.service.streams import ERROR, LATE, STD, frame, read

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from math import isfinite
 from typing import Any
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
 from lipcore.online.record import Record
 from lipcore.vocabulary import CODES
 from service.foundation.errors import NotFoundError, not_found
+from service.foundation.fields import finite
 from service.journal import log
 from service.journal.log import EventKind, decode
 from service.learning.control.schema import (
@@ -130,18 +129,8 @@ def _replay(session: Session, batch: EventRow, event: EventRow) -> Replay:
 
 
 def _rows(rows: Rows) -> ObservationRows:
-    return ObservationRows(
-        time=_finite(rows.time),
-        q=[_finite(row) for row in rows.q],
-        dq=[_finite(row) for row in rows.dq],
-        ddq=[_finite(row) for row in rows.ddq],
-        tau=[_finite(row) for row in rows.tau],
-        code=[CODES[code] for code in rows.code],
-    )
-
-
-def _finite(values: Array) -> list[float | None]:
-    return [value if isfinite(value) else None for value in values.tolist()]
+    vectors = {name: [finite(row) for row in getattr(rows, name)] for name in ("q", "dq", "ddq", "tau")}
+    return ObservationRows(time=finite(rows.time), **vectors, code=[CODES[code] for code in rows.code])
 
 
 def _moment(seconds: float) -> str:

@@ -16,7 +16,7 @@ from service.foundation.errors import (
     UnreadableVersionError,
     responses,
 )
-from service.learning.control import decisions, inspection, status, undoing
+from service.learning.control import decisions, inspection, status
 from service.learning.control.schema import (
     AlarmPage,
     ChangeRequest,
@@ -90,7 +90,7 @@ def unlearn(learners: LearnersDep, model: str, stream_id: StreamId, sequence: Se
 
     Where accelerations are derived, rows at a batch's edge are learnt with the batch beside it, and stay with that.
     """
-    return undoing.unlearn(learners, model, stream_id, sequence)
+    return decisions.unlearn(learners, model, stream_id, sequence)
 
 
 @router.post(
@@ -113,7 +113,7 @@ def rollback(learners: LearnersDep, model: str, request: RollbackRequest) -> Rol
 
     What was unlearnt since stays unlearnt.
     """
-    return undoing.rollback(learners, model, request)
+    return decisions.rollback(learners, model, request)
 
 
 @router.get("/{model}/learning", summary="How a model learns")

@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 from lipcore.vocabulary import CODES, LEARNT
 from service.journal import log
 from service.learning import owner
-from service.learning.control import undoing
+from service.learning.control import decisions
 from service.learning.control.inspection import figures
 from service.learning.control.schema import (
     Candidate,
@@ -50,10 +50,10 @@ def learning(learners: Learners, model: str) -> Learning:
             held=None if held is None else Held(at=held["at"], evidence=held["evidence"]),
             candidate=_candidate(session, model, version),
             streams=_streams(session, model),
-            reachable=[list(each) for each in undoing.reachable(session, model, version)],
+            reachable=[list(each) for each in decisions.reachable(session, model, version)],
             snapshots=[
                 Snapshot(revision=row.number - start, created_at=row.created_at)
-                for row in undoing.snapshots(session, model, version)
+                for row in decisions.snapshots(session, model, version)
             ],
         )
         return Learning(model=model, options=owner.options(session, model), status=status)
@@ -102,7 +102,7 @@ def _candidate(session: Session, model: str, serving: int) -> Candidate | None:
     version = session.scalar(query.order_by(LearnerRow.version.desc()).limit(1))
     if version is None:
         return None
-    return Candidate(version=version, revision=undoing.current(session, model, version))
+    return Candidate(version=version, revision=decisions.current(session, model, version))
 
 
 def _streams(session: Session, model: str) -> list[Stream]:

@@ -15,9 +15,8 @@ from service.foundation.errors import BusyError, InvalidRequestError, NotFoundEr
 from service.journal import log
 from service.learning import owner
 from service.learning.control import decisions, status
-from service.learning.control.schema import Held
+from service.learning.control.schema import Held, LiveAnswers, LiveNovelty, LiveStatus
 from service.learning.learners import Learners, LearnersDep
-from service.learning.live.schema import LiveAnswers, LiveNovelty, LiveStatus
 from service.web.observability.meters import OTHER, Meters, MetersDep, StreamMeter
 from service.web.observability.readiness import StoppingDep
 from service.web.pagination import Page

@@ -10,7 +10,7 @@ import pytest
 from service.client.call import Answer
 from service.client.results.evaluation import read_comparison, read_evaluation
 from service.client.results.series import LiveRows, read_live
-from service.learning.live.schema import LiveLost
+from service.learning.control.schema import LiveLost
 from tests.service.data import stream, upload
 
 EVALUATION = {

@@ -88,7 +88,7 @@ STORE = "service.journal.snapshots:save"
 LEARNING = [
     Point("observation: row made", actions.observe, Fault("service.journal.log:append_batch", "after"), "nothing"),
     *_around_commit("observation", actions.observe, APPEND),
-    *_around_commit("unlearning", actions.unlearn, "service.learning.control.undoing:unlearn"),
+    *_around_commit("unlearning", actions.unlearn, "service.learning.control.decisions:unlearn"),
     *_both("learner: page read", actions.observe, Fault("service.learning.learner.restore:advance", "before")),
     *_both(
         "learner: publication written", actions.observe, Fault("service.learning.learner.publication:write", "after")
@@ -113,7 +113,7 @@ MOVES = [
     Point(
         "other version serves: pointer moved", actions.serve, Fault("service.models.registry:serve", "after"), "nothing"
     ),
-    *_around_commit("other version serves", actions.serve, "service.learning.control.undoing:_to_version"),
+    *_around_commit("other version serves", actions.serve, "service.learning.control.decisions:_to_version"),
     Point(
         "other version serves: before it answers",
         actions.serve,

@@ -13,7 +13,7 @@ from lipcore.data.independence import INDEPENDENT_HZ, stream_weights
 from lipcore.online.record import Record
 from service.foundation.errors import BusyError, ConflictError
 from service.journal import log, retention
-from service.learning.ingest.frames import Frames, FramesResult
+from service.learning.ingest.batches import Frames, FramesResult
 from service.learning.schema import ExpiredError, LearningDisabledError
 from tests.service.learning.lessons import apart
 from tests.service.learning.recordings import codes, learnt_from, logged, part, recording, send

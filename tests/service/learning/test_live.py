@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.learning.live.schema import LiveRows, LiveStatus
+from service.learning.control.schema import LiveRows, LiveStatus
 from tests.service.data import error, eventually, service_of
 from tests.service.learning.following import following
 from tests.service.learning.lessons import LESSON, lesson

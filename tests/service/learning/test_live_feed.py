@@ -15,10 +15,9 @@ from service.foundation.errors import BusyError, NotFoundError
 from service.foundation.settings import Settings
 from service.learning.ingest.intake import Judged
 from service.learning.ingest.screening import Screened
-from service.learning.live import feed, thinning
-from service.learning.live.feed import MOST_UNREAD, Feed, FeedEvent
+from service.learning.live import feed
+from service.learning.live.feed import MOST_UNREAD, Feed, FeedEvent, pick, thinned
 from service.learning.live.routes import at_most
-from service.learning.live.thinning import pick, thinned
 from tests.service.learning.batches import rows
 
 CONTACT, EDGE = CODES.index("contact"), CODES.index("edge")
@@ -96,8 +95,8 @@ def test_only_doubtful_rows_are_looked_at_and_not_too_many(monkeypatch):
         looked.append(len(these))
         return np.arange(len(these)) % 2 == 0
 
-    monkeypatch.setattr(thinning, "uncovered", uncovered)
-    gathered = thinning.Novelty()
+    monkeypatch.setattr(feed, "uncovered", uncovered)
+    gathered = feed.Novelty()
     for seed in range(4):
         gathered.add(thinned([judged(20, seed=seed, bare=0.05)], 100)[0][1])
     gathered.add(thinned([judged(4, stream_id="two", bare=0.15)], 100)[0][1])
