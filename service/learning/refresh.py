@@ -26,7 +26,7 @@ from service.learning.owner import AlarmKind
 from service.models import registry
 from service.models.loaded import LoadedModels
 from service.storage.database import AlarmRow, Database, LearnerRow, ServingRow
-from service.training import jobs, refreshes
+from service.training import jobs
 from service.training import refresh_data as scope
 from service.training.queue import JobQueue
 from service.training.schema import Job
@@ -83,7 +83,7 @@ def consider(settings: Settings, database: Database, queue: JobQueue, published:
             return None
         why = reasons[0]
         try:
-            job = refreshes.add(session, settings, version, why.trigger)
+            job = jobs.add_refresh(session, settings, version, why.trigger)
         except ConflictError as error:
             text = f"{why.text}, but it cannot be refreshed: {error.message}"
             _raise_once(session, model, "refresh", text, why.evidence)
@@ -102,7 +102,7 @@ def _is_due(session: Session, settings: Settings, published: Published) -> bool:
     serving = session.get(ServingRow, model)
     if serving is None or serving.version != version or owner.held(session, model) is not None:
         return False
-    before = list(session.scalars(refreshes.of(model)))
+    before = list(session.scalars(jobs.refreshes_of(model)))
     if any(job.state in ACTIVE for job in before):
         return False
     contest = select(LearnerRow.version).where(LearnerRow.model == model, LearnerRow.role == CANDIDATE)

@@ -131,15 +131,13 @@ def _read(upload: Path, settings: Settings) -> dict[str, bytes]:
         ROBOT: settings.max_urdf_bytes,
     }
     try:
-        places = archive.members(upload, limits)
+        files = archive.read(upload, limits)
     except ArchiveError as error:
         raise invalid_data(error.member, error.given, error.expected) from None
     for name in archive.MEMBERS:
-        if name not in places and name != ROBOT:
+        if name not in files and name != ROBOT:
             raise invalid_data(name, "missing", "a file of that name in the archive")
-    sums = _json(CHECKSUMS, archive.read(upload, places.pop(CHECKSUMS)))
-    files = {name: archive.read(upload, member) for name, member in places.items()}
-    _check_sums(files, sums)
+    _check_sums(files, _json(CHECKSUMS, files.pop(CHECKSUMS)))
     return files
 
 

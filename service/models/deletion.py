@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from service.foundation.errors import ConflictError, not_found
 from service.foundation.states import ACTIVE
-from service.models import moves, registry
+from service.models import registry
 from service.models.loaded import LoadedModels
 from service.storage.database import (
     AlarmRow,
@@ -73,7 +73,7 @@ def delete_model(loaded: LoadedModels, model: str) -> None:
             if row is None:
                 raise not_found("model", model)
             for job in _active_jobs(session, model):
-                raise ConflictError(f"job {job.id!r} of model {model!r} is {job.state}: cancel it or wait for its end")
+                raise ConflictError(f"{job.id} of model {model!r} is {job.state}: cancel it or wait for its end")
             versions = list(session.scalars(select(VersionRow).where(VersionRow.model == model)))
             snapshots = list(session.scalars(select(SnapshotRow.id).where(SnapshotRow.model == model)))
             _note_deletion(session, row, [each.version for each in versions])
@@ -90,8 +90,8 @@ def delete_model(loaded: LoadedModels, model: str) -> None:
 def _check_unused(session: Session, model: str, version: int) -> None:
     """Raise ConflictError, naming the reason, where a version is needed."""
     name = f"version {version} of model {model!r}"
-    pointing = [alias for alias in moves.pointing(session, model, version) if alias != moves.SERVING]
-    if pointing:
+    aliases = select(AliasRow.alias).where(AliasRow.model == model, AliasRow.version == version)
+    if pointing := list(session.scalars(aliases.order_by(AliasRow.alias))):
         raise ConflictError(f"{name} has the alias {', '.join(map(repr, pointing))}: move or remove it first")
     if registry.answering(session, model) == version:
         raise ConflictError(f"{name} serves: let another version serve first, or delete the model")
@@ -100,7 +100,7 @@ def _check_unused(session: Session, model: str, version: int) -> None:
         raise ConflictError(f"{name} is compared with the version that serves: wait until that is decided")
     for job in _active_jobs(session, model):
         if (job.request.get("refresh") or {}).get("version") == version:
-            raise ConflictError(f"job {job.id!r} trains {name} anew: cancel it or wait for its end")
+            raise ConflictError(f"{job.id} trains {name} anew: cancel it or wait for its end")
 
 
 def _active_jobs(session: Session, model: str) -> list[JobRow]:

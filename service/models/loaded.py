@@ -20,10 +20,9 @@ from lipcore.online.transfer import Revision
 from service.foundation.errors import NotFoundError, UnreadableVersionError, not_found
 from service.foundation.fields import of_app
 from service.foundation.states import PartState
-from service.models import moves, registry
+from service.models import registry
 from service.models.lineage import learnt_from
-from service.models.moves import SERVING
-from service.models.registry import Serving
+from service.models.registry import SERVING, Serving
 from service.models.served import Alias, Key, LearntStates, Served, Waiting
 from service.storage.database import VersionRow
 from service.storage.storage import Storage
@@ -79,7 +78,7 @@ class LoadedModels:
         self._revisions: dict[Key, tuple[int, Revision]] = {}
         self._held: WeakValueDictionary[Key, Served] = WeakValueDictionary()  # by streams too, after they are dropped
         self._revising = threading.Lock()
-        self._snapshot = Snapshot(aliases=moves.pointers(storage.database))
+        self._snapshot = Snapshot(aliases=registry.pointers(storage.database))
         self._deleted: set[Key] = set()
         self._lock = threading.Lock()
         self.moving = threading.Lock()
@@ -120,15 +119,15 @@ class LoadedModels:
         """
         served = self.hot(model, version, alias)
         while served is None:
-            number, serving = self._find(model, version, alias)
+            number, serving = self.meant(model, version, alias)
             try:
                 served = self._load(registry.find(self.database, model, number), serving)
             except NotFoundError:
-                if self._find(model, version, alias)[0] == number:
+                if self.meant(model, version, alias)[0] == number:
                     raise  # else the alias has moved on, and the version before was deleted
         return served
 
-    def _find(self, model: str, version: int | None, alias: str | None) -> tuple[int | None, Serving | None]:
+    def meant(self, model: str, version: int | None, alias: str | None) -> tuple[int | None, Serving | None]:
         """The number of the version that is meant, and what serves where that is it; raise NotFoundError."""
         if version is not None:
             return version, None

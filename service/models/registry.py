@@ -1,4 +1,4 @@
-"""Named models and their versions: publishing, finding, listing."""
+"""Named models and their versions: publishing, finding, listing, and which of them answers."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ import lipcore
 from lipcore.files.persistence import checksums, read_manifest
 from service.foundation.errors import not_found
 from service.foundation.settings import shipped_models
-from service.models import moves
 from service.models.schema import Model, ModelPage, Version, VersionSummary
 from service.storage.database import (
+    AliasMoveRow,
     AliasRow,
     Database,
     DeletedModelRow,
@@ -33,6 +33,8 @@ from service.web.pagination import Page, newest
 logger = logging.getLogger(__name__)
 
 SHIPPED = "panda-sim"
+SERVING = "serving"
+"""The alias that every model has: the version that answers where none is named."""
 
 
 class Serving(NamedTuple):
@@ -110,7 +112,7 @@ def exists(session: Session, model: str, version: int) -> bool:
 def serve(session: Session, model: str, version: int, takes_back: int | None = None) -> int:
     """Let a version answer where none is named, once the session commits, and learn; return the number of the change.
 
-    The version before neither answers nor learns any more. takes_back: see `moves.point`. Raise NotFoundError where
+    The version before neither answers nor learns any more. takes_back: see `note`. Raise NotFoundError where
     there is no such version.
     """
     session.flush()
@@ -120,9 +122,9 @@ def serve(session: Session, model: str, version: int, takes_back: int | None = N
     if serving is None:
         serving = ServingRow(model=model, version=version, change=1)
         session.add(serving)
-        moves.note(session, model, moves.SERVING, None, version)
+        note(session, model, SERVING, None, version)
     elif serving.version != version:
-        moves.note(session, model, moves.SERVING, serving.version, version, takes_back)
+        note(session, model, SERVING, serving.version, version, takes_back)
         serving.version, serving.change = version, serving.change + 1
     served = (LearnerRow.model == model, LearnerRow.role == "serving", LearnerRow.version != version)
     session.execute(update(LearnerRow).where(*served).values(role="dismissed"))
@@ -132,6 +134,24 @@ def serve(session: Session, model: str, version: int, takes_back: int | None = N
     else:
         learner.role = "serving"
     return serving.change
+
+
+def note(
+    session: Session, model: str, alias: str, before: int | None, version: int | None, takes_back: int | None = None
+) -> None:
+    """Write a move of an alias down. takes_back: number of the move that this one takes back."""
+    move = AliasMoveRow(model=model, alias=alias, before=before, version=version, takes_back=takes_back, at=now())
+    session.add(move)
+    session.flush()
+
+
+def pointers(database: Database, models: Collection[str] | None = None) -> dict[tuple[str, str], int]:
+    """The version of every alias of these models, of all where None, by (model, alias), but for those that serve."""
+    query = select(AliasRow.model, AliasRow.alias, AliasRow.version)
+    if models is not None:
+        query = query.where(AliasRow.model.in_(models))
+    with database.session() as session:
+        return {(model, alias): version for model, alias, version in session.execute(query)}
 
 
 def serving(database: Database, models: Collection[str]) -> dict[str, Serving]:

@@ -18,10 +18,7 @@ from service.foundation.errors import (
     UnsupportedMediaTypeError,
     responses,
 )
-from service.models import aliases, archive_import, deletion, registry
-from service.models import export as urdf
-from service.models.archive import MEDIA_TYPE
-from service.models.export import export
+from service.models import aliases, archive, archive_import, deletion, registry
 from service.models.loaded import LoadedModelsDep
 from service.models.schema import (
     Alias,
@@ -39,14 +36,14 @@ from service.web.limits.upload import Kinds, receive_to
 from service.web.pagination import PageQuery
 from service.web.route import Route
 
-ARCHIVES = Kinds({MEDIA_TYPE: "tar"}, {".tar": "tar"})
+ARCHIVES = Kinds({archive.MEDIA_TYPE: "tar"}, {".tar": "tar"})
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 _BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
         "description": "An archive as an export writes it.",
         "content": {
-            MEDIA_TYPE: _BINARY,
+            archive.MEDIA_TYPE: _BINARY,
             "multipart/form-data": {
                 "schema": {
                     "type": "object",
@@ -96,7 +93,7 @@ async def import_version(
     response_class=StreamingResponse,
     responses={
         **responses(NotFoundError, UnreadableVersionError),
-        200: {"description": "A tar file", "content": {MEDIA_TYPE: _BINARY}},
+        200: {"description": "A tar file", "content": {archive.MEDIA_TYPE: _BINARY}},
     },
 )
 async def export_version(
@@ -108,9 +105,9 @@ async def export_version(
     learnt: Annotated[bool, Query(description="With what it has learnt online; false: as it was trained")] = True,
 ) -> StreamingResponse:
     """One archive with all that another service needs to answer alike; `export.json` in it says what it holds."""
-    archived = await to_thread.run_sync(export, loaded, model, version, alias, learnt, limiter=turns)
+    archived = await to_thread.run_sync(archive.export, loaded, model, version, alias, learnt, limiter=turns)
     headers = {"Content-Length": str(archived.size), "Content-Disposition": f'attachment; filename="{archived.name}"'}
-    return StreamingResponse(archived.pieces, media_type=MEDIA_TYPE, headers=headers)
+    return StreamingResponse(archived.pieces, media_type=archive.MEDIA_TYPE, headers=headers)
 
 
 @router.get(
@@ -121,7 +118,7 @@ async def export_version(
         **responses(NotFoundError, InvalidRequestError),
         200: {
             "description": "A URDF",
-            "content": {urdf.URDF_MEDIA_TYPE: {"schema": {"type": "string"}, "example": urdf.URDF_EXAMPLE}},
+            "content": {archive.URDF_MEDIA_TYPE: {"schema": {"type": "string"}, "example": archive.URDF_EXAMPLE}},
         },
     },
 )
@@ -133,9 +130,9 @@ def version_urdf(
     Of estimators with rigid bodies whose geometry is known; the others answer 422. Comments in the text say what a URDF
     has no place for, and what torque does not tell.
     """
-    name, text = urdf.write_urdf(loaded, model, version, alias)
+    name, text = archive.write_urdf(loaded, model, version, alias)
     headers = {"Content-Disposition": f'attachment; filename="{name}"'}
-    return Response(text, media_type=urdf.URDF_MEDIA_TYPE, headers=headers)
+    return Response(text, media_type=archive.URDF_MEDIA_TYPE, headers=headers)
 
 
 @router.get("", summary="List models, newest first")

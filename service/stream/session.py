@@ -21,7 +21,7 @@ from service.foundation.settings import Settings
 from service.inference.predicting import Query, check_answer
 from service.learning.learners import Learners
 from service.models.loaded import Served
-from service.models.moves import SERVING
+from service.models.registry import SERVING
 from service.stream.frames import (
     ANSWER,
     ASK_LEARN,

@@ -140,7 +140,7 @@ class Host:
             try:
                 row = self._row(hand.job)
             except Exception:  # without it the process cannot go on either, but it may come back
-                logger.warning("the row of job %s could not be read", hand.job, exc_info=True)
+                logger.warning("the row of %s could not be read", hand.job, exc_info=True)
                 continue
             clock = time.monotonic()
             if row is None or row.attempts > attempt or (hand.ran is not None and row.state == QUEUED):

@@ -153,7 +153,7 @@ def remove_leftovers(database: Database, files: Files, job: str) -> int:
         for name in left:
             files.delete_version(name)
     except OSError as error:
-        logger.warning("files that job %s did not publish are left until they are swept: %s", job, error)
+        logger.warning("files that %s did not publish are left until they are swept: %s", job, error)
         return 0
     return len(left)
 
@@ -212,7 +212,7 @@ class Settler:
         if ended.why == "cancelled" or row.cancel_requested:
             enter(row, CANCELLED, f"cancelled: {ended.message}")
             return Settled()
-        logger.error("job %s: %s", row.id, ended.message)
+        logger.error("%s: %s", row.id, ended.message)
         if ended.why == "too_long":
             fail(row, "too_long", ended.message)
             return Settled()

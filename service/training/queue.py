@@ -275,7 +275,7 @@ class JobQueue:
                 try:
                     settled = self._settler.settle(ended)
                 except Exception:
-                    logger.exception("what becomes of job %s could not be written: tried again", ended.job)
+                    logger.exception("what becomes of %s could not be written: tried again", ended.job)
                     self._closing.wait(AGAIN_S)
             if settled is None:
                 return

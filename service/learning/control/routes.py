@@ -33,7 +33,7 @@ from service.learning.control.schema import (
 )
 from service.learning.learners import LearnersDep
 from service.learning.schema import MOST_SEQUENCE, LearningOptions, StreamId
-from service.training import refreshes
+from service.training import jobs
 from service.training.queue import JobQueueDep
 from service.training.schema import Job
 from service.web.pagination import PageQuery
@@ -161,6 +161,6 @@ def create(queue: JobQueueDep, model: str, request: RefreshRequest, response: Re
 
     The version that it makes learns along and answers once it has predicted better than the one that serves.
     """
-    job = refreshes.ask(queue, model)
+    job = jobs.refresh(queue, model)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job
