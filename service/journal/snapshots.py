@@ -58,6 +58,11 @@ def latest(session: Session, model: str, version: int, at_most: int | None) -> S
     return session.scalar(query.limit(1))
 
 
+def of(session: Session, model: str, version: int) -> list[SnapshotRow]:
+    """The snapshots of a version, that with the highest number first."""
+    return list(session.scalars(_of(model, version)))
+
+
 def last_stored(session: Session, model: str, version: int) -> tuple[str, float] | None:
     """Id of the snapshot of a version that was stored last, by whichever service, and when: Unix time, s."""
     query = select(SnapshotRow).where(SnapshotRow.model == model, SnapshotRow.version == version)
@@ -84,11 +89,8 @@ def thinned(numbers: Sequence[int], most: int) -> list[int]:
 
 
 def _of(model: str, version: int) -> Select[SnapshotRow]:
-    return (
-        select(SnapshotRow)
-        .where(SnapshotRow.model == model, SnapshotRow.version == version)
-        .order_by(SnapshotRow.number.desc())
-    )
+    of_version = select(SnapshotRow).where(SnapshotRow.model == model, SnapshotRow.version == version)
+    return of_version.order_by(SnapshotRow.number.desc())
 
 
 def _is_outdated(session: Session, model: str, version: int, number: int) -> bool:
@@ -104,7 +106,7 @@ def _is_outdated(session: Session, model: str, version: int, number: int) -> boo
 
 def _add(session: Session, snapshot: str, digest: str, model: str, version: int, number: int, most: int) -> list[str]:
     """Add a snapshot's row; return the ids of those that gave way to it."""
-    rows = list(session.scalars(_of(model, version)))
+    rows = of(session, model, version)
     row = SnapshotRow(id=snapshot, model=model, version=version, number=number, created_at=now(), sha256=digest)
     session.add(row)
     others = [row for row in rows if row.number != number]

@@ -15,8 +15,7 @@ from sqlalchemy.orm import Session
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.errors import ConflictError, invalid_request, problem
-from service.journal import log
-from service.journal.log import EventKind
+from service.journal import log, snapshots
 from service.learning import owner
 from service.learning.control import inspection
 from service.learning.control.schema import (
@@ -36,12 +35,10 @@ from service.learning.ingest.batches import state
 from service.learning.learners import Learners
 from service.learning.schema import LearningOptions
 from service.models import registry
-from service.storage.database import AlarmRow, Database, EventRow, LearnerRow, SnapshotRow
+from service.storage.database import AlarmRow, Database, EventRow, LearnerRow
 from service.web.pagination import Page
 
 Range = tuple[int, int]
-PAGE = 100
-ROLLBACKS: tuple[EventKind] = ("rollback",)
 WORDS = {"unlearnt": "has been unlearnt", "rolled_back": "was undone by a rollback"}
 
 
@@ -60,12 +57,6 @@ def revised_now(session: Session, model: str, version: int) -> Revised:
     return Revised(model=model, version=version, revision=current(session, model, version))
 
 
-def snapshots(session: Session, model: str, version: int) -> list[SnapshotRow]:
-    """Return the stored states of a version, newest first."""
-    query = select(SnapshotRow).where(SnapshotRow.model == model, SnapshotRow.version == version)
-    return list(session.scalars(query.order_by(SnapshotRow.number.desc())))
-
-
 def reachable(session: Session, model: str, version: int) -> list[Range]:
     """Return the ranges [first, last] of revisions whose state can be made again, rising.
 
@@ -73,14 +64,14 @@ def reachable(session: Session, model: str, version: int) -> list[Range]:
     behind it since: the events that a rollback has undone teach nothing any more, so that their states are gone.
     """
     start, newest = log.start_of(session, model, version), log.newest(session, model)
-    bases = sorted({start, *(row.number for row in snapshots(session, model, version) if row.number > start)})
+    bases = sorted({start, *(row.number for row in snapshots.of(session, model, version) if row.number > start)})
     ranges: list[Range] = []
     for base, following in zip(bases, [*bases[1:], newest + 1], strict=True):
         last = following - 1
         ranges.append((base, last if log.is_complete(session, model, base, last) else base))
-    for event in _rollbacks(session, model):
-        to = (event.detail or {})["to"]
-        ranges = [part for each in ranges for part in _without(each, to + 1, event.number - 1)]
+    rollbacks = select(EventRow.number, EventRow.detail).where(EventRow.model == model, EventRow.kind == "rollback")
+    for number, detail in session.execute(rollbacks):
+        ranges = [part for each in ranges for part in _without(each, detail["to"] + 1, number - 1)]
     return _joined([(first - start, last - start) for first, last in ranges])
 
 
@@ -100,7 +91,7 @@ def unlearn(learners: Learners, model: str, stream_id: str, sequence: int) -> Un
     version = serving(learners.database, model)
     with learners.database.turn(model), learners.database.transaction(model) as session:
         batch = find_learnt(session, model, stream_id, sequence)
-        rows = batch.learnt + sum(each.learnt for each in inspection.replays(session, batch) if not each.void)
+        rows = batch.learnt + sum(each.learnt for each in log.about(session, batch, "replay") if not each.void)
         trained = select(LearnerRow.version).where(LearnerRow.model == model, LearnerRow.start >= batch.number)
         versions = list(session.scalars(trained.order_by(LearnerRow.version)))
         log.unlearn(session, model, batch, time.time())
@@ -173,16 +164,6 @@ def _to_version(learners: Learners, model: str, version: int) -> RolledBack:
     learners.loaded.adopt(model)
     learners.process.wake(model)
     return RolledBack(**revised.model_dump(), undone=0, complete=complete)
-
-
-def _rollbacks(session: Session, model: str) -> Iterator[EventRow]:
-    cursor: str | None = None
-    while True:
-        part = Page(after=None if cursor is None else int(cursor), limit=PAGE)
-        events, cursor = log.page(session, model, part, kinds=ROLLBACKS)
-        yield from events
-        if cursor is None:
-            return
 
 
 def _without(span: Range, first: int, last: int) -> Iterator[Range]:
@@ -269,7 +250,7 @@ def admit(session: Session, batch: EventRow, codes: Collection[str], received: f
     Nothing is logged where there are none. Rows whose time was wrong count as of their arrival.
     """
     pending = set(codes) - _replayed(session, batch)
-    rows = inspection.rows_of(batch)
+    rows = log.rows_of(batch)
     chosen = _complete(rows) & np.isin(rows.code, [CODES.index(code) for code in pending])
     taken = rows.take(chosen)
     counts = taken.rejected()
@@ -291,7 +272,7 @@ def alarms(learners: Learners, model: str, part: Page) -> AlarmPage:
 
 def _replayed(session: Session, batch: EventRow) -> set[str]:
     """Codes whose rows are learnt by now; what a rollback has undone can be replayed again."""
-    events = inspection.replays(session, batch)
+    events = log.about(session, batch, "replay")
     return {code for event in events if not event.void for code in (event.detail or {})["codes"]}
 
 
@@ -303,7 +284,7 @@ def _complete(rows: Rows) -> NDArray[np.bool_]:
 
 def _refusal(session: Session, batch: EventRow, codes: Collection[str]) -> Exception:
     """Why no row of a batch is left that could be learnt."""
-    rows, name = inspection.rows_of(batch), f"batch {batch.sequence} of stream {batch.stream_id!r}"
+    rows, name = log.rows_of(batch), f"batch {batch.sequence} of stream {batch.stream_id!r}"
     counts = rows.take(_complete(rows)).rejected()
     offered = [code for code in REPLAYABLE if code in counts]
     if done := [code for code in offered if code in codes and code in _replayed(session, batch)]:

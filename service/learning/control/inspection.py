@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from lipcore.online.batch import Rows
@@ -15,7 +13,6 @@ from lipcore.vocabulary import CODES
 from service.foundation.errors import NotFoundError, not_found
 from service.foundation.fields import finite
 from service.journal import log
-from service.journal.log import EventKind, decode
 from service.learning.control.schema import (
     Figures,
     Observation,
@@ -31,7 +28,6 @@ from service.models import registry
 from service.storage.database import EventRow
 from service.web.pagination import Page
 
-BATCHES: tuple[EventKind] = ("batch",)
 FIGURES = ("nmse", "rmse", "coverage", "nlpd")
 
 
@@ -39,7 +35,7 @@ def page(learners: Learners, model: str, part: Page, stream_id: str | None, reje
     """List the batches of a model, newest first; raise NotFoundError where there is no such model."""
     registry.find(learners.database, model, None)
     with learners.database.session() as session:
-        events, following = log.page(session, model, part, stream_id, rejected, BATCHES)
+        events, following = log.page(session, model, part, stream_id, rejected)
         return ObservationPage(
             items=[Observation(**_outline(session, event)) for event in events], next_cursor=following
         )
@@ -54,8 +50,8 @@ def show(learners: Learners, model: str, stream_id: str, sequence: int, rows: bo
             **_outline(session, event),
             report=None if event.report is None else _acknowledged(event.report),
             figures=None if event.record is None else figures(Record.from_json(event.record)),
-            replays=[_replay(session, event, each) for each in replays(session, event)],
-            observed=_rows(rows_of(event)) if rows else None,
+            replays=[_replay(session, event, each) for each in log.about(session, event, "replay")],
+            observed=_rows(log.rows_of(event)) if rows else None,
         )
 
 
@@ -74,23 +70,6 @@ def find(session: Session, model: str, stream_id: str, sequence: int) -> EventRo
     if source is not None and log.is_forgotten(source, sequence):
         raise NotFoundError(f"batch {sequence} of stream {stream_id!r} is no longer kept, if it has come")
     raise not_found("batch", f"{sequence} of stream {stream_id}")
-
-
-def rows_of(event: EventRow) -> Rows:
-    """Return the rows of a batch or a replay, which are read only now."""
-    assert event.payload is not None  # both have one for as long as they are in the log
-    return decode(event.payload)
-
-
-def replays(session: Session, batch: EventRow) -> Sequence[EventRow]:
-    """Events that have learnt rows of a batch later, in order, also those that were undone since."""
-    query = select(EventRow).where(
-        EventRow.model == batch.model,
-        EventRow.number > batch.number,
-        EventRow.kind == "replay",
-        EventRow.detail["event"].as_integer() == batch.number,
-    )
-    return session.scalars(query.order_by(EventRow.number)).all()
 
 
 def _outline(session: Session, event: EventRow) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from lipcore.vocabulary import CODES, LEARNT
-from service.journal import log
+from service.journal import log, snapshots
 from service.learning import owner
 from service.learning.control import decisions
 from service.learning.control.inspection import figures
@@ -53,7 +53,7 @@ def learning(learners: Learners, model: str) -> Learning:
             reachable=[list(each) for each in decisions.reachable(session, model, version)],
             snapshots=[
                 Snapshot(revision=row.number - start, created_at=row.created_at)
-                for row in decisions.snapshots(session, model, version)
+                for row in snapshots.of(session, model, version)
             ],
         )
         return Learning(model=model, options=owner.options(session, model), status=status)

@@ -11,7 +11,6 @@ from struct import pack
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from lipcore.data import independence
@@ -23,8 +22,9 @@ from service.foundation.errors import ConflictError, invalid_request
 from service.foundation.settings import Settings
 from service.inference.predicting import QUANTITIES, check_shapes
 from service.journal import log
+from service.journal.log import Arrival, check_kind
 from service.learning.ingest import screening
-from service.learning.ingest.intake import Arrival, Intake, check_kind, enabled
+from service.learning.ingest.intake import Intake, enabled
 from service.learning.ingest.monitor import Monitor
 from service.learning.ingest.screening import Clock, Measured
 from service.learning.schema import Derivation, ExpiredError, ObservationRequest, ObservationResponse, State
@@ -158,13 +158,7 @@ def state(session: Session, event: EventRow) -> State:
     """Whether a batch of the log still teaches, and if not, why."""
     if not event.void:
         return "learnt"
-    query = select(EventRow.seq).where(
-        EventRow.model == event.model,
-        EventRow.number > event.number,
-        EventRow.kind == "unlearn",
-        EventRow.detail["event"].as_integer() == event.number,
-    )
-    return "rolled_back" if session.scalar(query.limit(1)) is None else "unlearnt"
+    return "unlearnt" if log.about(session, event, "unlearn") else "rolled_back"
 
 
 @dataclass(frozen=True)
@@ -283,11 +277,9 @@ def _logged(session: Session, frames: Frames, sequence: int) -> tuple[EventRow, 
     if event is None:
         check_kept(session, frames.model, frames.stream_id, sequence)
         raise _order(frames, sequence)
-    data = session.scalar(select(EventRow.payload).where(EventRow.seq == event.seq))
-    assert data is not None
     ranges = (event.report or {})["frames"]
     sequences = [number for first, last in ranges for number in range(first, last + 1)]
-    return event, {number: place for place, number in enumerate(sequences)}, log.decode(data)
+    return event, {number: place for place, number in enumerate(sequences)}, log.rows_of(event)
 
 
 def _order(frames: Frames, sequence: int) -> ConflictError:

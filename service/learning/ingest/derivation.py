@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import select
-from sqlalchemy.orm import Session, undefer
+from sqlalchemy.orm import Session
 
 from lipcore.data.samples import Array
 from lipcore.online import acceleration
@@ -20,7 +19,7 @@ from lipcore.online.acceleration import JITTER, RateError, derive
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES
 from service.foundation.errors import invalid_request
-from service.journal.log import decode
+from service.journal import log
 from service.storage.database import EventRow
 
 EDGE = CODES.index("edge")
@@ -119,9 +118,8 @@ def _window(session: Session, model: str, stream_id: str, sequence: int) -> int 
 
 
 def _neighbour(session: Session, model: str, stream_id: str, sequence: int) -> EventRow | None:
-    """The batch of a sequence with its rows, if its accelerations were derived and it still teaches."""
-    query = select(EventRow).where(EventRow.model == model, EventRow.stream_id == stream_id)
-    event = session.scalar(query.where(EventRow.sequence == sequence).options(undefer(EventRow.payload)))
+    """The batch of a sequence, if its accelerations were derived and it still teaches."""
+    event = log.find_batch(session, model, stream_id, sequence)
     if event is None or event.void or event.report is None or event.report["derived"] is None:
         return None
     return event
@@ -143,6 +141,5 @@ def _around(session: Session, model: str, stream_id: str, sequence: int, way: in
 
 def _own(event: EventRow) -> Rows:
     """A batch's own rows, without those that had waited for it."""
-    assert event.payload is not None
     first, last = (event.report or {})["own"]
-    return decode(event.payload).take(slice(first, last))
+    return log.rows_of(event).take(slice(first, last))

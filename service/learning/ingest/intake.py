@@ -6,7 +6,6 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,7 +15,7 @@ from sqlalchemy.orm import Session
 from lipcore.online.batch import Rows
 from service.foundation.errors import ConflictError, not_found
 from service.journal import log
-from service.journal.log import NewBatch, StreamKind
+from service.journal.log import Arrival
 from service.journal.retention import retain
 from service.learning import owner
 from service.learning.ingest import judging
@@ -26,7 +25,7 @@ from service.learning.ingest.screening import Screened
 from service.learning.schema import LearningDisabledError, LearningOptions
 from service.models import registry
 from service.models.loaded import LoadedModels, Served
-from service.storage.database import EventRow, ModelRow, StreamRow
+from service.storage.database import EventRow, ModelRow
 
 logger = logging.getLogger(__name__)
 
@@ -41,21 +40,6 @@ CONSEQUENCES = {
     "adapt": "a new regime begins, in which what was learnt before counts less",
     "learn": "learning goes on as before",
 }
-
-
-@dataclass(frozen=True)
-class Arrival:
-    """A batch that is new. last_sequence: of its last frame; offset (s), span: see `Clock`; received: Unix time, s."""
-
-    stream_id: str
-    kind: StreamKind
-    sequence: int
-    last_sequence: int
-    digest: str
-    rows: int
-    offset: float
-    span: list[float] | None
-    received: float
 
 
 class Judged(NamedTuple):
@@ -132,21 +116,16 @@ class Intake:
             verdict = judging.judge(screened, monitor.watch(arrival.stream_id), held, options, usual)
             if verdict.change is not None and options.on_change == "adapt":
                 log.append(session, model, "change", {"t": verdict.change.at}, arrival.received)
-            batch = NewBatch(
-                stream_id=arrival.stream_id,
-                kind=arrival.kind,
-                sequence=arrival.sequence,
-                last_sequence=arrival.last_sequence,
-                digest=arrival.digest,
-                offset=arrival.offset,
-                received=arrival.received,
+            event = log.append_batch(
+                session,
+                model,
+                arrival,
+                verdict.rows,
+                self.settings.max_observation_streams,
                 version=served.version,
                 revision=served.revision,
-                rows=verdict.rows,
-                report={},
                 record=None if verdict.record is None else verdict.record.to_json(),
             )
-            event = log.append_batch(session, model, batch, self.settings.max_observation_streams)
             event.rows = arrival.rows  # without those that had waited, which other batches count
             source = log.stream(session, model, arrival.stream_id)
             assert source is not None
@@ -197,15 +176,6 @@ def enabled(session: Session, model: str) -> LearningOptions:
     if not options.enabled:
         raise LearningDisabledError(f"learning of model {model!r} is switched off: nothing is logged")
     return options
-
-
-def check_kind(source: StreamRow | None, kind: StreamKind) -> None:
-    """Raise ConflictError where a stream carries something else: one sequence cannot count both."""
-    if source is not None and source.kind != kind:
-        raise ConflictError(
-            f"stream {source.stream_id!r} of model {source.model!r} carries {source.kind}, not {kind}: use another "
-            "stream_id"
-        )
 
 
 def _check_kept(session: Session, served: Served) -> None:

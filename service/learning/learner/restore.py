@@ -208,7 +208,7 @@ def _take(database: Database, known: Restored, online: OnlineModel, taking: Taki
     try:
         if taking.reweighed:
             raise ForgottenError("forgetting has changed since")
-        every = [decode(each.payload or b"") for each in taking.events]
+        every = [log.rows_of(each) for each in taking.events]
         for rows in every:
             online.check_unlearn(rows)
         for rows in every:
