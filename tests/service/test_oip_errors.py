@@ -10,7 +10,7 @@ import torch
 from fastapi.testclient import TestClient
 
 from lipcore.model import dynamics
-from service.oip import answer as answering
+from service.oip import query as answering
 from service.oip import query
 from tests.service.data import ADDRESS, error, service_of
 from tests.service.oip import listed, message, path_of, refused

@@ -12,7 +12,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from lipcore.data.motion import Motion
 from lipcore.model import dynamics
 from lipcore.model.torque_model import TorqueModel
-from service.oip import answer as answering
 from service.oip import query as querying
 from service.oip import wire
 from service.oip.query import PARTS
@@ -168,13 +167,13 @@ def test_nothing_is_computed_that_is_not_asked_for(api, trained, motion, monkeyp
 def test_single_queries_run_on_the_event_loop_and_all_else_in_threads(
     api, trained, motion, monkeypatch, names, rows, here
 ):
-    loop, compute, seen = api.portal.call(threading.get_ident), answering.compute, []
+    loop, compute, seen = api.portal.call(threading.get_ident), querying.compute, []
 
     def computing(*arguments):
         seen.append(threading.get_ident())
         return compute(*arguments)
 
-    monkeypatch.setattr(answering, "compute", computing)
+    monkeypatch.setattr(querying, "compute", computing)
     query = first(motion) if rows is None else {name: values[:rows] for name, values in motion.items()}
     ask(api, trained.name, message(query, *names))
     assert [thread == loop for thread in seen] == [here]
