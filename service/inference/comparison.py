@@ -11,20 +11,12 @@ from lipcore.data.paired import Answer, Comparison, Difference
 from lipcore.data.samples import Samples
 from service.foundation.errors import invalid_request
 from service.foundation.fields import finite
+from service.inference import schema
 from service.inference.evaluating import figures, measured
-from service.inference.schema import (
-    CompareRequest,
-    CompareResponse,
-    Differences,
-    JointDifferences,
-    Outcome,
-    TotalDifference,
-    VersionFigures,
-)
 from service.models.loaded import LoadedModels, Served
 
 
-def compare(loaded: LoadedModels, model: str, request: CompareRequest) -> CompareResponse:
+def compare(loaded: LoadedModels, model: str, request: schema.CompareRequest) -> schema.CompareResponse:
     """Compare two versions; raise InvalidRequestError, NotFoundError, DamagedDataError or UnreadableVersionError.
 
     Not for the event loop.
@@ -35,7 +27,7 @@ def compare(loaded: LoadedModels, model: str, request: CompareRequest) -> Compar
     compared = paired.compare(recorded.used, *answers)
     outcome, verdict = _verdict(first.version, second.version, compared)
     in_training = [recorded.in_training_of(each) for each in versions]
-    return CompareResponse(
+    return schema.CompareResponse(
         model=model,
         dataset=recorded.id,
         joint_names=list(first.model.joint_names),
@@ -46,8 +38,11 @@ def compare(loaded: LoadedModels, model: str, request: CompareRequest) -> Compar
             _figures(each, answer, recorded.used, trained)
             for each, answer, trained in zip(versions, answers, in_training, strict=True)
         ],
-        differences=JointDifferences(
-            **{name: Differences(**_shown(getattr(compared, name))) for name in JointDifferences.model_fields}
+        differences=schema.JointDifferences(
+            **{
+                name: schema.Differences(**_shown(getattr(compared, name)))
+                for name in schema.JointDifferences.model_fields
+            }
         ),
         nlpd=_total(compared.total, 0),
         nmse=_total(compared.total, 1),
@@ -58,7 +53,7 @@ def compare(loaded: LoadedModels, model: str, request: CompareRequest) -> Compar
     )
 
 
-def _versions(loaded: LoadedModels, model: str, request: CompareRequest) -> tuple[Served, Served]:
+def _versions(loaded: LoadedModels, model: str, request: schema.CompareRequest) -> tuple[Served, Served]:
     first, second = (
         loaded.get(model, named, None) if isinstance(named, int) else loaded.get(model, None, named)
         for named in request.versions
@@ -73,12 +68,12 @@ def _answer(served: Served, samples: Samples) -> Answer:
     return Answer(answer.tau, answer.tau_std, answer.noise_std)
 
 
-def _figures(served: Served, answer: Answer, samples: Samples, in_training: bool) -> VersionFigures:
+def _figures(served: Served, answer: Answer, samples: Samples, in_training: bool) -> schema.VersionFigures:
     shown = figures(evaluate(samples.tau, *answer))
-    return VersionFigures(version=served.version, revision=served.revision, **shown, in_training=in_training)
+    return schema.VersionFigures(version=served.version, revision=served.revision, **shown, in_training=in_training)
 
 
-def _verdict(first: int, second: int, compared: Comparison) -> tuple[Outcome, str]:
+def _verdict(first: int, second: int, compared: Comparison) -> tuple[schema.Outcome, str]:
     """What the difference says, for programs and in words."""
     if compared.blocks < paired.MIN_BLOCKS:
         return "cannot_tell", (
@@ -89,7 +84,7 @@ def _verdict(first: int, second: int, compared: Comparison) -> tuple[Outcome, st
     (density, nmse), (clear, larger_or_smaller) = total.mean.tolist(), total.significant.tolist()
     better, worse = (first, second) if density > 0 else (second, first)
     if clear:
-        outcome: Outcome = "first_better" if better == first else "second_better"
+        outcome: schema.Outcome = "first_better" if better == first else "second_better"
         text = (
             f"Version {better} predicts better than version {worse}: its negative log predictive density is lower by "
         )
@@ -133,5 +128,5 @@ def _shown(difference: Difference) -> dict[str, list[float | None]]:
     return {name: finite(values) for name, values in {**names, "half_width": difference.half_width}.items()}
 
 
-def _total(difference: Difference, place: int) -> TotalDifference:
-    return TotalDifference(**{name: values[place] for name, values in _shown(difference).items()})
+def _total(difference: Difference, place: int) -> schema.TotalDifference:
+    return schema.TotalDifference(**{name: values[place] for name, values in _shown(difference).items()})

@@ -19,18 +19,8 @@ from lipcore.model import dynamics
 from service.datasets import store
 from service.foundation.errors import invalid_request
 from service.foundation.fields import finite
+from service.inference import schema
 from service.inference.predicting import check_offered
-from service.inference.schema import (
-    EvaluateRequest,
-    EvaluateResponse,
-    Interval,
-    Reliability,
-    Stretches,
-    TraceComponent,
-    TraceComponentValues,
-    TraceRequest,
-    TraceResponse,
-)
 from service.models import registry
 from service.models.loaded import LoadedModels, Served
 from service.storage import sample_file
@@ -43,7 +33,7 @@ FEWEST_EPISODES, MOST_EPISODES = 5, 200
 EQUAL = 10
 
 
-def stretches(samples: Samples, mean: Array) -> Stretches:
+def stretches(samples: Samples, mean: Array) -> schema.Stretches:
     """Mean squared error of each stretch / variance of the measured torque over all samples; mean: (N, n) N·m.
 
     The variance is that of all samples: a joint that rests for a while has a variance near zero then, and any error
@@ -58,7 +48,7 @@ def stretches(samples: Samples, mean: Array) -> Stretches:
     varies = np.ptp(samples.tau, axis=0) > 0  # rounding gives a constant column a variance above zero
     variance = samples.tau.var(axis=0)
     means = np.array([squared[each].mean(axis=0) for each in episodes])
-    return Stretches(
+    return schema.Stretches(
         kind="episodes" if by_episode else "equal",
         samples=[each.stop - each.start for each in episodes],
         nmse=[
@@ -134,8 +124,8 @@ def fitting(loaded: LoadedModels, dataset: str, *versions: Served) -> DatasetRow
 
 
 def evaluate(
-    loaded: LoadedModels, model: str, request: EvaluateRequest, served: Served | None = None
-) -> EvaluateResponse:
+    loaded: LoadedModels, model: str, request: schema.EvaluateRequest, served: Served | None = None
+) -> schema.EvaluateResponse:
     """Compare a model with a data set or what it has held out of it; raise InvalidRequestError or NotFoundError.
 
     served: what answers, where that is found already.
@@ -147,7 +137,7 @@ def evaluate(
     used = recorded.used
     answer = known.predict(used.q, used.dq, used.ddq)
     metrics = compare(used.tau, answer.tau, answer.tau_std, answer.noise_std)
-    return EvaluateResponse(
+    return schema.EvaluateResponse(
         model=served.name,
         version=served.version,
         revision=served.revision,
@@ -159,10 +149,10 @@ def evaluate(
         level=metrics.level,
         **figures(metrics),
         coverages=[
-            Interval(level=each, coverage=coverage.tolist(), interval_width=width.tolist())
+            schema.Interval(level=each, coverage=coverage.tolist(), interval_width=width.tolist())
             for each, coverage, width in zip(LEVELS, metrics.coverages, metrics.widths, strict=True)
         ],
-        reliability=Reliability(nominal=list(RELIABILITY_LEVELS), observed=metrics.reliability.T.tolist()),
+        reliability=schema.Reliability(nominal=list(RELIABILITY_LEVELS), observed=metrics.reliability.T.tolist()),
         stretches=stretches(used, answer.tau),
         in_training=all_of_it and recorded.in_training_of(served),
     )
@@ -177,7 +167,7 @@ def figures(metrics: Metrics) -> dict[str, Any]:
 Rows = NDArray[np.int64]
 
 
-def trace(loaded: LoadedModels, model: str, request: TraceRequest) -> TraceResponse:
+def trace(loaded: LoadedModels, model: str, request: schema.TraceRequest) -> schema.TraceResponse:
     """Follow a model along a data set or what it has held out of it.
 
     Raise InvalidRequestError, NotFoundError or DamagedDataError. Not for the event loop.
@@ -199,7 +189,7 @@ def trace(loaded: LoadedModels, model: str, request: TraceRequest) -> TraceRespo
     rows = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), request.points)).round().astype(np.int64)]
     samples = Samples(served.model.joint_names, **sample_file.read(path, rows))
     predicted = served.model.predict(samples.q, samples.dq, samples.ddq)
-    return TraceResponse(
+    return schema.TraceResponse(
         model=served.name,
         version=served.version,
         revision=served.revision,
@@ -217,13 +207,13 @@ def trace(loaded: LoadedModels, model: str, request: TraceRequest) -> TraceRespo
         mean=predicted.tau.tolist(),
         std=predicted.tau_std.tolist(),
         noise_std=predicted.noise_std.tolist(),
-        offered=[name for name in get_args(TraceComponent) if name in offered],
+        offered=[name for name in get_args(schema.TraceComponent) if name in offered],
         components=_components(served, samples, request.components, loaded.storage.settings.max_component_batch),
         in_training=request.part == "all" and served.has_learnt_from(dataset.id, dataset.sha256),
     )
 
 
-def _within(part: Rows, request: TraceRequest, count: int) -> Rows:
+def _within(part: Rows, request: schema.TraceRequest, count: int) -> Rows:
     """Rows of a part from `start` to `stop`; raise InvalidRequestError where there are none."""
     if request.start >= count:
         raise invalid_request("start", request.start, f"a row of the data set, 0 to {count - 1}")
@@ -245,13 +235,13 @@ def _breaks(part: Rows, episode: NDArray[np.int64], rows: Rows) -> list[int]:
 
 
 def _components(
-    served: Served, samples: Samples, names: Sequence[TraceComponent], batch: int
-) -> dict[TraceComponent, TraceComponentValues]:
+    served: Served, samples: Samples, names: Sequence[schema.TraceComponent], batch: int
+) -> dict[schema.TraceComponent, schema.TraceComponentValues]:
     """Parts of the torque at samples, so many at a time: they take far more memory than a torque."""
     if not names:
         return {}
-    mean: dict[TraceComponent, list[Array]] = {name: [] for name in names}
-    std: dict[TraceComponent, list[Array]] = {name: [] for name in names}
+    mean: dict[schema.TraceComponent, list[Array]] = {name: [] for name in names}
+    std: dict[schema.TraceComponent, list[Array]] = {name: [] for name in names}
     for first in range(0, len(samples), batch):
         some = samples.rows(slice(first, first + batch))
         estimates = dynamics.components(served.model, Motion.from_arrays(some.q, some.dq, some.ddq), names)
@@ -259,6 +249,8 @@ def _components(
             mean[name].append(estimates[name].mean.numpy())
             std[name].append(estimates[name].std.numpy())
     return {
-        name: TraceComponentValues(mean=np.concatenate(mean[name]).tolist(), std=np.concatenate(std[name]).tolist())
+        name: schema.TraceComponentValues(
+            mean=np.concatenate(mean[name]).tolist(), std=np.concatenate(std[name]).tolist()
+        )
         for name in names
     }

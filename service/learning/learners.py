@@ -90,6 +90,16 @@ class Status:
     published: Published | None = None
     failed: Failed | None = None
 
+    @property
+    def novel_share(self) -> float | None:
+        """Share of the latest samples beyond the basis; None before something is learnt."""
+        return None if self.published is None else self.published.novel_share
+
+    @property
+    def failure(self) -> str | None:
+        """Why the version does not learn, None while it does."""
+        return None if self.failed is None else self.failed.error
+
 
 class Learners:
     """Learning of all models; safe from several threads. Close it before the database.

@@ -63,8 +63,7 @@ class Learning(Collector):
                 continue
             revision.add_metric([model, str(served.version)], served.revision)
             lag.add_metric([model], self._lag(served))
-            share = status.novel_share(self._learners.status(model, served.version))
-            if share is not None:
+            if (share := self._learners.status(model, served.version).novel_share) is not None:
                 novel.add_metric([model], share)
         yield from (*gauges.values(), revision, novel, lag, rows)
         yield LOADED.of([((), len(self._learners.loaded.versions()))])

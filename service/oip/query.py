@@ -15,21 +15,7 @@ from service.foundation.errors import invalid_request
 from service.foundation.settings import Settings
 from service.inference.predicting import Query, check_answer
 from service.models.loaded import Served
-from service.oip import wire
-from service.oip.schema import (
-    BINARY,
-    DATATYPES,
-    HEADER,
-    INPUTS,
-    TORQUE,
-    AnswerParameters,
-    InferInput,
-    InferOutput,
-    InferRequest,
-    InferResponse,
-    InferTensor,
-    TensorParameters,
-)
+from service.oip import schema, wire
 from service.oip.wire import Headers, Message
 from service.web.route import Reply
 
@@ -78,7 +64,7 @@ def _shape(component: ComponentName, n: int) -> Shape:
 
 
 _DTYPES: dict[str, np.dtype[np.floating]] = {"FP64": np.dtype("<f8"), "FP32": np.dtype("<f4")}
-_NO_TENSORS = f"tensors in the body: of the extensions, {BINARY} is supported"
+_NO_TENSORS = f"tensors in the body: of the extensions, {schema.BINARY} is supported"
 
 
 class Question(NamedTuple):
@@ -116,7 +102,7 @@ def read(message: Message, body: bytes, model: TorqueModel, settings: Settings) 
     return Question(query, outputs)
 
 
-def _outputs(request: InferRequest, model: TorqueModel) -> dict[str, bool]:
+def _outputs(request: schema.InferRequest, model: TorqueModel) -> dict[str, bool]:
     usual = bool(request.parameters and request.parameters.binary_data_output)
     if not request.outputs:
         return dict.fromkeys(DEFAULT, usual)
@@ -133,7 +119,7 @@ def _outputs(request: InferRequest, model: TorqueModel) -> dict[str, bool]:
     return outputs
 
 
-def _binary(output: InferOutput, field: str, usual: bool) -> bool:
+def _binary(output: schema.InferOutput, field: str, usual: bool) -> bool:
     asked = output.parameters
     if asked is None:
         return usual
@@ -143,13 +129,13 @@ def _binary(output: InferOutput, field: str, usual: bool) -> bool:
     return usual if asked.binary_data is None else asked.binary_data
 
 
-def _inputs(request: InferRequest, forward: bool) -> tuple[str, ...]:
+def _inputs(request: schema.InferRequest, forward: bool) -> tuple[str, ...]:
     """Names of the tensors that the query needs; they are all there, each once, and no other."""
-    needed = (*INPUTS, TORQUE) if forward else INPUTS
+    needed = (*schema.INPUTS, schema.TORQUE) if forward else schema.INPUTS
     names = [tensor.name for tensor in request.inputs]
     for index, name in enumerate(names):
-        if name == TORQUE and not forward:
-            raise invalid_request(TORQUE, "given", f"no tau, or {FORWARD} among the outputs")
+        if name == schema.TORQUE and not forward:
+            raise invalid_request(schema.TORQUE, "given", f"no tau, or {FORWARD} among the outputs")
         if name not in needed:
             raise invalid_request(f"inputs[{index}].name", name, f"one of {', '.join(needed)}")
         if name in names[:index]:
@@ -157,12 +143,14 @@ def _inputs(request: InferRequest, forward: bool) -> tuple[str, ...]:
     for name in needed:
         if name not in names:
             torque = f"the torque that {FORWARD} is asked for, shaped as q"
-            raise invalid_request(name, "missing", torque if name == TORQUE else f"the inputs {', '.join(needed)}")
+            raise invalid_request(
+                name, "missing", torque if name == schema.TORQUE else f"the inputs {', '.join(needed)}"
+            )
     return needed
 
 
 def _check_shape(
-    tensor: InferInput, shape: list[int], model: TorqueModel, settings: Settings, components: bool
+    tensor: schema.InferInput, shape: list[int], model: TorqueModel, settings: Settings, components: bool
 ) -> None:
     n, field = model.n_joints, f"{tensor.name}.shape"
     if len(shape) not in (1, 2) or shape[-1] != n or shape[0] == 0:
@@ -175,20 +163,22 @@ def _check_shape(
         raise invalid_request(field, shape, expected)
 
 
-def _check_payload(request: InferRequest, present: int) -> None:
+def _check_payload(request: schema.InferRequest, present: int) -> None:
     """Compare the bytes after the JSON with those that the inputs announce."""
     announced = sum(each.parameters.binary_data_size or 0 for each in request.inputs if each.parameters)
     if announced != present:
-        expected = f"{announced} bytes, the sum of every binary_data_size, after the JSON whose length {HEADER} gives"
+        expected = (
+            f"{announced} bytes, the sum of every binary_data_size, after the JSON whose length {schema.HEADER} gives"
+        )
         raise invalid_request("the binary data", f"{present} bytes", expected)
 
 
-def _values(tensor: InferInput, body: bytes, offset: int) -> tuple[Array, int]:
+def _values(tensor: schema.InferInput, body: bytes, offset: int) -> tuple[Array, int]:
     """Numbers of a tensor, flat or in rows, and where the next one's binary data begin."""
     name, count, given = tensor.name, prod(tensor.shape), tensor.parameters
     dtype = _DTYPES.get(tensor.datatype)
     if dtype is None:
-        raise invalid_request(f"{name}.datatype", tensor.datatype, " or ".join(DATATYPES))
+        raise invalid_request(f"{name}.datatype", tensor.datatype, " or ".join(schema.DATATYPES))
     if given is not None and given.shared_memory_region is not None:
         raise invalid_request(f"{name}.parameters.shared_memory_region", given.shared_memory_region, _NO_TENSORS)
     size = None if given is None else given.binary_data_size
@@ -211,7 +201,7 @@ def _as_read(values: NDArray[np.floating], dtype: np.dtype[np.floating]) -> Arra
         return values.astype(dtype).astype(np.float64)
 
 
-def _listed(tensor: InferInput, count: int) -> Array:
+def _listed(tensor: schema.InferInput, count: int) -> Array:
     field, expected = f"{tensor.name}.data", f"{count} numbers or rows of them, as the shape {tensor.shape} has"
     try:
         values = np.array(tensor.data, np.float64)
@@ -278,10 +268,10 @@ def read_question(served: Served, message: Message, body: bytes, settings: Setti
     return read(message, body, served.model, settings)
 
 
-def respond(served: Served, request: InferRequest, question: Question) -> Reply:
+def respond(served: Served, request: schema.InferRequest, question: Question) -> Reply:
     """Compute the answer to a query and encode it; raise InvalidRequestError."""
     values_of = compute(served.model, question.query, frozenset(question.outputs))
-    tensors: list[InferTensor] = []
+    tensors: list[schema.InferTensor] = []
     payload: list[bytes] = []
     for name, binary in question.outputs.items():
         values = values_of[name]
@@ -289,10 +279,10 @@ def respond(served: Served, request: InferRequest, question: Question) -> Reply:
             values = values[0]
         check_answer(name, values)
         tensors.append(_tensor(name, values, payload if binary else None))
-    response = InferResponse(
+    response = schema.InferResponse(
         served.name,
         str(served.version),
-        AnswerParameters(served.revision, served.model.torque_convention),
+        schema.AnswerParameters(served.revision, served.model.torque_convention),
         tensors,
     )
     if request.id is not None:
@@ -300,11 +290,11 @@ def respond(served: Served, request: InferRequest, question: Question) -> Reply:
     return wire.encode(response, payload)
 
 
-def _tensor(name: str, values: Array, payload: list[bytes] | None) -> InferTensor:
+def _tensor(name: str, values: Array, payload: list[bytes] | None) -> schema.InferTensor:
     """Describe a tensor that lies in the JSON, or at the end of the payload."""
     shape = list(values.shape)
     if payload is None:
-        return InferTensor(name, "FP64", shape, data=values.ravel().tolist())
+        return schema.InferTensor(name, "FP64", shape, data=values.ravel().tolist())
     data = values.astype("<f8", copy=False).tobytes()
     payload.append(data)
-    return InferTensor(name, "FP64", shape, TensorParameters(len(data)))
+    return schema.InferTensor(name, "FP64", shape, schema.TensorParameters(len(data)))

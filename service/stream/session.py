@@ -22,19 +22,7 @@ from service.inference.predicting import Query, check_answer
 from service.learning.learners import Learners
 from service.models.loaded import Served
 from service.models.registry import SERVING
-from service.stream.frames import (
-    ANSWER,
-    ASK_LEARN,
-    ASK_STD,
-    ERROR,
-    HAS_STD,
-    LATE,
-    LAYOUT,
-    NUMBER,
-    REQUEST,
-    UNREAD,
-    request_bytes,
-)
+from service.stream import frames
 from service.stream.learning import Learning, Taught
 from service.web.access.middleware import subprotocol_of
 from service.web.observability.meters import StreamMeter
@@ -151,8 +139,8 @@ class FrameReader:
         self.joint_names, self.n_joints, self.max_position = joint_names, len(joint_names), max_position
         self.motion: Array = np.zeros((3, self.n_joints))
         self._numbers, self._query = self.motion.reshape(-1), Query(self.motion[:, None], single=True)
-        self._length = request_bytes(self.n_joints)
-        self._learn_length = request_bytes(self.n_joints, learn=True)
+        self._length = frames.request_bytes(self.n_joints)
+        self._learn_length = frames.request_bytes(self.n_joints, learn=True)
 
     def read(self, data: bytes, flags: int, n: int, budget: float) -> Array:
         """Return q, dq, ddq of a frame, (3, n), whose header is already read; raise InvalidRequestError.
@@ -161,20 +149,21 @@ class FrameReader:
         """
         if n != self.n_joints:
             raise invalid_request("n", n, f"{self.n_joints} joints: {', '.join(self.joint_names)}")
-        if flags > ASK_STD:
+        if flags > frames.ASK_STD:
             data = self._without_torque(data, flags)
         if len(data) != self._length:
             raise invalid_request("frame", f"{len(data)} bytes long", f"{self._length} bytes for {n} joints")
         if not 0.0 <= budget < inf:
             raise invalid_request("deadline", budget, "seconds, or 0 for none")
         # a copy, because the model takes aligned and writable memory, and the message is neither for certain
-        self._numbers[:] = np.frombuffer(data, NUMBER, offset=REQUEST.size)
+        self._numbers[:] = np.frombuffer(data, frames.NUMBER, offset=frames.REQUEST.size)
         self._query.check(self.max_position)
         return self.motion
 
     def _without_torque(self, data: bytes, flags: int) -> bytes:
-        if flags & ~(ASK_STD | ASK_LEARN):
-            expected = f"0, {ASK_STD} to be answered tau_std, {ASK_LEARN} to be learnt from, or {ASK_STD | ASK_LEARN}"
+        both = frames.ASK_STD | frames.ASK_LEARN
+        if flags & ~both:
+            expected = f"0, {frames.ASK_STD} to be answered tau_std, {frames.ASK_LEARN} to be learnt from, or {both}"
             raise invalid_request("flags", flags, expected)
         if len(data) != self._learn_length:
             expected = f"{self._learn_length} bytes for {self.n_joints} joints with tau"
@@ -225,7 +214,7 @@ class Session(Conversation):
         """Send what holds for all answers of the version."""
         model = self._served.model
         hello = {
-            "layout": LAYOUT,
+            "layout": frames.LAYOUT,
             "model": self._served.name,
             "version": self._served.version,
             "revision": self._served.revision,
@@ -242,21 +231,21 @@ class Session(Conversation):
             self._late += 1
             self._meter.late += 1
         self._due = inf
-        sequence, flags = 0, UNREAD
+        sequence, flags = 0, frames.UNREAD
         try:
             data = message.get("bytes")
             if data is None:
                 raise invalid_request("frame", "a text message", "a binary message")
-            if len(data) < REQUEST.size:
-                expected = f"a header of {REQUEST.size} bytes, and numbers"
+            if len(data) < frames.REQUEST.size:
+                expected = f"a header of {frames.REQUEST.size} bytes, and numbers"
                 raise invalid_request("frame", f"{len(data)} bytes long", expected)
-            sequence, asked, n, budget = REQUEST.unpack_from(data)
+            sequence, asked, n, budget = frames.REQUEST.unpack_from(data)
             flags = 0
             current = self._loaded.hot(self._name, self._pin, self._alias)
             if current is not self._served:
                 await self._follow(current)
             motion = self._reader.read(data, asked, n, budget)
-            if asked > ASK_STD:
+            if asked > frames.ASK_STD:
                 await self._admit(sequence, asked)
             tau, std = self._answer(motion, self._std or asked != 0)
             check_answer("tau", tau)
@@ -270,12 +259,12 @@ class Session(Conversation):
             return self._refuse(sequence, flags, arrived, unexpected)
         served, numbers = self._served, tau.tobytes()
         if std is not None:
-            flags = HAS_STD
+            flags = frames.HAS_STD
             numbers += std.tobytes()
-        if asked > ASK_STD:
+        if asked > frames.ASK_STD:
             assert self._learning is not None
             self._learning.add(Taught(served, sequence, arrived, data, numbers))
-            if asked == ASK_LEARN and not self._std:  # its standard deviation is for the record alone
+            if asked == frames.ASK_LEARN and not self._std:  # its standard deviation is for the record alone
                 flags, numbers = 0, tau.tobytes()
         now = perf_counter()
         seconds = now - arrived
@@ -285,21 +274,25 @@ class Session(Conversation):
             if now > self._due:
                 self._late, self._due = self._late + 1, inf
                 self._meter.late += 1
-                flags |= LATE
+                flags |= frames.LATE
         elif seconds > self._deadline:
             self._meter.late += 1
-        return ANSWER.pack(sequence, flags, n, served.version, self._late, served.revision, seconds) + numbers
+        return frames.ANSWER.pack(sequence, flags, n, served.version, self._late, served.revision, seconds) + numbers
 
     async def _admit(self, sequence: int, flags: int) -> None:
         """Wait until there is room for a frame to learn from; raise InvalidRequestError where it may not be learnt."""
         if self._pin is not None:
-            expected = f"no {ASK_LEARN}: a stream pinned to a version only asks; leave version out of the address"
+            expected = (
+                f"no {frames.ASK_LEARN}: a stream pinned to a version only asks; leave version out of the address"
+            )
             raise invalid_request("flags", flags, expected)
         if self._alias is not None:
-            expected = f"no {ASK_LEARN}: only the version that serves learns; leave alias out of the address"
+            expected = f"no {frames.ASK_LEARN}: only the version that serves learns; leave alias out of the address"
             raise invalid_request("flags", flags, expected)
         if self._learning is None:
-            expected = f"a name of the torque's source in the address, as in ?stream_id=arm-1, for flag {ASK_LEARN}"
+            expected = (
+                f"a name of the torque's source in the address, as in ?stream_id=arm-1, for flag {frames.ASK_LEARN}"
+            )
             raise invalid_request("stream_id", "missing", expected)
         await self._learning.admit(sequence)
 
@@ -307,7 +300,9 @@ class Session(Conversation):
         self._meter.refuse(error.code)
         body = ErrorResponse(error=ErrorBody(code=error.code, message=error.message, detail=error.detail))
         served, seconds = self._served, perf_counter() - arrived
-        header = ANSWER.pack(sequence, flags | ERROR, 0, served.version, self._late, served.revision, seconds)
+        header = frames.ANSWER.pack(
+            sequence, flags | frames.ERROR, 0, served.version, self._late, served.revision, seconds
+        )
         return header + body.model_dump_json().encode()
 
     async def _follow(self, current: Served | None) -> None:

@@ -11,8 +11,6 @@ import logging
 import time
 from secrets import token_hex
 
-from sqlalchemy import select
-
 from service import __version__
 from service.compute import remote
 from service.compute.cluster import Cluster, needs_gpu
@@ -84,7 +82,7 @@ class ClusterQueue(JobQueue):
     def _announce(self, job: str) -> bool | None:
         """Make a waiting job this service's and say what it waits for: with a GPU? None where it does not."""
         with self.database.transaction() as session:
-            row = session.scalar(select(JobRow).where(JobRow.id == job))
+            row = lifecycle.row_of(session, job)
             if row is None or row.state != QUEUED or row.owner not in (None, self.replicas.id):
                 return None
             gpu = needs_gpu(row.request)

@@ -32,7 +32,7 @@ from service.compute.executors import GPU_SHARD, SHARD, placed
 from service.compute.process import Slot, training_place
 from service.foundation.errors import ServiceError
 from service.foundation.settings import Settings
-from service.foundation.states import ACTIVE, CANCELLED, QUEUED, RUNNING
+from service.foundation.states import ACTIVE, QUEUED, RUNNING
 from service.storage.database import Database, JobRow
 from service.storage.files import Files
 from service.training import lifecycle, worker
@@ -176,19 +176,14 @@ class Host:
 
     def _row(self, job: str) -> JobRow | None:
         with self.database.session() as session:
-            row: JobRow | None = session.scalar(select(JobRow).where(JobRow.id == job))
-        return row
+            return lifecycle.row_of(session, job)
 
     def _hand_back(self, job: str, attempt: int) -> None:
         with self.database.transaction() as session:
-            row = session.scalar(select(JobRow).where(JobRow.id == job))
+            row = lifecycle.row_of(session, job)
             if row is None or row.state != RUNNING or row.attempts != attempt:
                 return
-            if row.cancel_requested:
-                lifecycle.enter(row, CANCELLED, "cancelled: its worker was stopped while it ran")
-            else:
-                row.attempts -= 1  # handed back in order: such a start is no failed attempt
-                lifecycle.enter(row, QUEUED, "its worker was stopped while it ran: queued again")
+            lifecycle.hand_back(row, "its worker was stopped while it ran")
         lifecycle.remove_leftovers(self.database, self.files, job)
 
     def _settle(self, ended: Ended) -> None:

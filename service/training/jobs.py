@@ -139,7 +139,10 @@ def page(queue: JobQueue, loaded: LoadedModels, part: Page) -> JobPage:
 def find(database: Database, job: str) -> JobRow:
     """Return a job's row; raise NotFoundError."""
     with database.session() as session:
-        row = session.scalar(select(JobRow).where(JobRow.id == job))
+        return _existing(lifecycle.row_of(session, job), job)
+
+
+def _existing(row: JobRow | None, job: str) -> JobRow:
     if row is None:
         raise not_found("job", job)
     return row
@@ -152,9 +155,7 @@ def cancel(queue: JobQueue, job: str) -> Job:
     """
     queue.stop(job)  # before anything is written, for which its process may hold the lock
     with queue.database.transaction() as session:
-        row = session.scalar(select(JobRow).where(JobRow.id == job))
-        if row is None:
-            raise not_found("job", job)
+        row = _existing(lifecycle.row_of(session, job), job)
         if row.state not in ACTIVE:
             raise ConflictError(f"{job} has {row.state} already")
         if row.state == QUEUED:

@@ -24,7 +24,7 @@ from service.compute.cluster import Cluster
 from service.compute.process import Slot, training_place
 from service.foundation.fields import of_app
 from service.foundation.settings import Settings
-from service.foundation.states import ACTIVE, CANCELLED, QUEUED, RUNNING
+from service.foundation.states import ACTIVE, QUEUED, RUNNING
 from service.storage.database import JobRow
 from service.storage.replicas import Replicas
 from service.storage.storage import Storage
@@ -113,13 +113,8 @@ class JobQueue:
     def _hand_back(self) -> None:
         with self.database.transaction() as session:
             for row in session.scalars(select(JobRow).where(JobRow.state == RUNNING)):
-                if not self.replicas.mine(row.owner):
-                    continue
-                if row.cancel_requested:
-                    lifecycle.enter(row, CANCELLED, "cancelled: the service was stopped while it ran")
-                    continue
-                row.attempts -= 1  # handed back in order: such a start is no failed attempt
-                lifecycle.enter(row, QUEUED, "the service was stopped while it ran: queued again")
+                if self.replicas.mine(row.owner):
+                    lifecycle.hand_back(row, "the service was stopped while it ran")
 
     def _is_ready(self, row: JobRow) -> bool:
         if row.state == QUEUED and not row.cancel_requested:

@@ -8,7 +8,7 @@ import sys
 from dataclasses import dataclass, replace
 from typing import Any
 
-from sqlalchemy import select, update
+from sqlalchemy import update
 from sqlalchemy.orm import Session
 
 import lipcore
@@ -72,7 +72,7 @@ class Claim:
 
 def _claim(settings: Settings, database: Database, job: str) -> Claim | None:
     with database.transaction() as session:
-        row = session.scalar(select(JobRow).where(JobRow.id == job))
+        row = lifecycle.row_of(session, job)
         if row is None or row.state != QUEUED:
             return None
         row.attempts += 1
@@ -191,7 +191,7 @@ def _peak_memory_mb() -> int:
 
 def _own(session: Any, claim: Claim) -> JobRow:
     """Return the job's row while it still is this attempt's; a restarted service may have given it away."""
-    row: JobRow | None = session.scalar(select(JobRow).where(JobRow.id == claim.job))
+    row = lifecycle.row_of(session, claim.job)
     if row is None or row.state != RUNNING or row.attempts != claim.attempt:
         raise SupersededError(claim.job)
     return row

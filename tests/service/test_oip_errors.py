@@ -10,8 +10,8 @@ import torch
 from fastapi.testclient import TestClient
 
 from lipcore.model import dynamics
-from service.oip import query as answering
 from service.oip import query
+from service.oip import query as answering
 from tests.service.data import ADDRESS, error, service_of
 from tests.service.oip import listed, message, path_of, refused
 

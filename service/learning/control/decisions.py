@@ -17,25 +17,12 @@ from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.errors import ConflictError, invalid_request, problem
 from service.journal import log, snapshots
 from service.learning import owner
-from service.learning.control import inspection
-from service.learning.control.schema import (
-    REPLAYABLE,
-    Alarm,
-    AlarmPage,
-    ChangeRequest,
-    Decided,
-    Replayed,
-    ReplayRequest,
-    Revised,
-    RollbackRequest,
-    RolledBack,
-    Unlearnt,
-)
+from service.learning.control import inspection, schema
 from service.learning.ingest.batches import state
 from service.learning.learners import Learners
 from service.learning.schema import LearningOptions
 from service.models import registry
-from service.storage.database import AlarmRow, Database, EventRow, LearnerRow
+from service.storage.database import Database, EventRow, LearnerRow
 from service.web.pagination import Page
 
 Range = tuple[int, int]
@@ -52,9 +39,9 @@ def current(session: Session, model: str, version: int) -> int:
     return log.newest(session, model) - log.start_of(session, model, version)
 
 
-def revised_now(session: Session, model: str, version: int) -> Revised:
+def revised_now(session: Session, model: str, version: int) -> schema.Revised:
     """Return the revision of a version that contains everything logged so far."""
-    return Revised(model=model, version=version, revision=current(session, model, version))
+    return schema.Revised(model=model, version=version, revision=current(session, model, version))
 
 
 def reachable(session: Session, model: str, version: int) -> list[Range]:
@@ -86,7 +73,7 @@ def find_learnt(session: Session, model: str, stream_id: str, sequence: int) -> 
     return batch
 
 
-def unlearn(learners: Learners, model: str, stream_id: str, sequence: int) -> Unlearnt:
+def unlearn(learners: Learners, model: str, stream_id: str, sequence: int) -> schema.Unlearnt:
     """Take a batch and what was replayed of it out again; raise NotFoundError or ConflictError."""
     version = serving(learners.database, model)
     with learners.database.turn(model), learners.database.transaction(model) as session:
@@ -97,10 +84,10 @@ def unlearn(learners: Learners, model: str, stream_id: str, sequence: int) -> Un
         log.unlearn(session, model, batch, time.time())
         revised = revised_now(session, model, version)
     learners.process.wake(model)
-    return Unlearnt(**revised.model_dump(), stream_id=stream_id, sequence=sequence, rows=rows, trained=versions)
+    return schema.Unlearnt(**revised.model_dump(), stream_id=stream_id, sequence=sequence, rows=rows, trained=versions)
 
 
-def rollback(learners: Learners, model: str, request: RollbackRequest) -> RolledBack:
+def rollback(learners: Learners, model: str, request: schema.RollbackRequest) -> schema.RolledBack:
     """Go back to a revision of the version that serves, or to another version.
 
     Raise NotFoundError, InvalidRequestError where not exactly one of the two is named or it is not older than what
@@ -115,7 +102,7 @@ def rollback(learners: Learners, model: str, request: RollbackRequest) -> Rolled
     return _to_revision(learners, model, request.revision)
 
 
-def _to_revision(learners: Learners, model: str, revision: int) -> RolledBack:
+def _to_revision(learners: Learners, model: str, revision: int) -> schema.RolledBack:
     version = serving(learners.database, model)
     with learners.database.turn(model), learners.database.transaction(model) as session:
         newest = current(session, model, version)
@@ -133,7 +120,7 @@ def _to_revision(learners: Learners, model: str, revision: int) -> RolledBack:
         log.rollback(session, model, to, time.time())
         revised = revised_now(session, model, version)
     learners.process.wake(model)
-    return RolledBack(**revised.model_dump(), undone=count, complete=True)
+    return schema.RolledBack(**revised.model_dump(), undone=count, complete=True)
 
 
 def _check_reach(revision: int, version: int, ranges: list[Range]) -> None:
@@ -153,7 +140,7 @@ def _is_reached(revision: int, ranges: list[Range]) -> bool:
     return any(first <= revision <= last for first, last in ranges)
 
 
-def _to_version(learners: Learners, model: str, version: int) -> RolledBack:
+def _to_version(learners: Learners, model: str, version: int) -> schema.RolledBack:
     if version == serving(learners.database, model):
         raise ConflictError(f"version {version} of model {model!r} serves already")
     learners.loaded.get(model, version)  # so that the change costs no query anything, or fails before it is made
@@ -163,7 +150,7 @@ def _to_version(learners: Learners, model: str, version: int) -> RolledBack:
         complete = _is_reached(revised.revision, reachable(session, model, version))
     learners.loaded.adopt(model)
     learners.process.wake(model)
-    return RolledBack(**revised.model_dump(), undone=0, complete=complete)
+    return schema.RolledBack(**revised.model_dump(), undone=0, complete=complete)
 
 
 def _without(span: Range, first: int, last: int) -> Iterator[Range]:
@@ -197,7 +184,7 @@ def set_options(learners: Learners, model: str, options: LearningOptions) -> Non
     learners.process.wake(model)
 
 
-def decide(learners: Learners, model: str, request: ChangeRequest) -> Decided:
+def decide(learners: Learners, model: str, request: schema.ChangeRequest) -> schema.Decided:
     """End a hold; raise NotFoundError, or ConflictError where learning is not held.
 
     The change is logged first and the hold ends last. In between, the rows that were kept out are learnt some batches
@@ -213,7 +200,9 @@ def decide(learners: Learners, model: str, request: ChangeRequest) -> Decided:
                 _log_change(session, model, held)
             done = held["event"] - 1 if done is None else done
             pending = log.events(session, model, done, CHUNK) if request.replay else []
-            rows += sum(_learn(session, event) for event in pending)
+            for event in pending:
+                if event.kind == "batch":
+                    rows += sum(admit(session, event, [CHANGE], time.time()).values())
             ended = len(pending) < CHUNK
             if ended:
                 owner.release(session, model)
@@ -221,17 +210,19 @@ def decide(learners: Learners, model: str, request: ChangeRequest) -> Decided:
                 done = pending[-1].number
             revised = revised_now(session, model, version)
     learners.process.wake(model)
-    return Decided(**revised.model_dump(), decision=request.decision, at=held["at"], rows=rows)
+    return schema.Decided(**revised.model_dump(), decision=request.decision, at=held["at"], rows=rows)
 
 
-def replay(learners: Learners, model: str, stream_id: str, sequence: int, request: ReplayRequest) -> Replayed:
+def replay(
+    learners: Learners, model: str, stream_id: str, sequence: int, request: schema.ReplayRequest
+) -> schema.Replayed:
     """Learn rows of a batch after all that were kept out with some codes, once each.
 
     Raise NotFoundError, InvalidRequestError where the batch has no such rows, ConflictError where it was undone or all
     of these rows have been replayed.
     """
     version = serving(learners.database, model)
-    codes = REPLAYABLE if request.codes is None else request.codes
+    codes = schema.REPLAYABLE if request.codes is None else request.codes
     with learners.database.turn(model), learners.database.transaction(model) as session:
         batch = find_learnt(session, model, stream_id, sequence)
         learnt = admit(session, batch, codes, time.time())
@@ -239,7 +230,7 @@ def replay(learners: Learners, model: str, stream_id: str, sequence: int, reques
             raise _refusal(session, batch, codes)
         revised = revised_now(session, model, version)
     learners.process.wake(model)
-    return Replayed(
+    return schema.Replayed(
         **revised.model_dump(), stream_id=stream_id, sequence=sequence, rows=sum(learnt.values()), codes=learnt
     )
 
@@ -262,12 +253,14 @@ def admit(session: Session, batch: EventRow, codes: Collection[str], received: f
     return counts
 
 
-def alarms(learners: Learners, model: str, part: Page) -> AlarmPage:
+def alarms(learners: Learners, model: str, part: Page) -> schema.AlarmPage:
     """List the alarms of a model, newest first; raise NotFoundError where there is no such model."""
     registry.find(learners.database, model, None)
     with learners.database.session() as session:
         rows, following = owner.alarms(session, model, part)
-    return AlarmPage(items=[_alarm(row) for row in rows], next_cursor=following)
+    names = ("kind", "at", "message", "evidence")
+    items = [schema.Alarm(id=row.seq, **{name: getattr(row, name) for name in names}) for row in rows]
+    return schema.AlarmPage(items=items, next_cursor=following)
 
 
 def _replayed(session: Session, batch: EventRow) -> set[str]:
@@ -286,7 +279,7 @@ def _refusal(session: Session, batch: EventRow, codes: Collection[str]) -> Excep
     """Why no row of a batch is left that could be learnt."""
     rows, name = log.rows_of(batch), f"batch {batch.sequence} of stream {batch.stream_id!r}"
     counts = rows.take(_complete(rows)).rejected()
-    offered = [code for code in REPLAYABLE if code in counts]
+    offered = [code for code in schema.REPLAYABLE if code in counts]
     if done := [code for code in offered if code in codes and code in _replayed(session, batch)]:
         return ConflictError(f"rows of {name} with the code {', '.join(done)} have been replayed: they are learnt once")
     has = f"those of {name} whose rows can be learnt: {', '.join(offered) or 'there are none'}"
@@ -298,16 +291,6 @@ def _held(session: Session, model: str) -> dict[str, Any]:
     if held is None:
         raise ConflictError(f"model {model!r} is not held for a change: there is nothing to decide")
     return held
-
-
-def _alarm(row: AlarmRow) -> Alarm:
-    names = ("kind", "at", "message", "evidence")
-    return Alarm.model_validate({"id": row.seq} | {name: getattr(row, name) for name in names})
-
-
-def _learn(session: Session, event: EventRow) -> int:
-    """Learn the rows of a batch that were held for the change; return how many. Other events have none."""
-    return sum(admit(session, event, [CHANGE], time.time()).values()) if event.kind == "batch" else 0
 
 
 def _log_change(session: Session, model: str, held: dict[str, Any]) -> None:

@@ -13,14 +13,7 @@ from lipcore.vocabulary import CODES
 from service.foundation.errors import NotFoundError, not_found
 from service.foundation.fields import finite
 from service.journal import log
-from service.learning.control.schema import (
-    Figures,
-    Observation,
-    ObservationDetail,
-    ObservationPage,
-    ObservationRows,
-    Replay,
-)
+from service.learning.control import schema
 from service.learning.ingest.batches import state
 from service.learning.learners import Learners
 from service.learning.schema import ObservationResponse
@@ -31,22 +24,22 @@ from service.web.pagination import Page
 FIGURES = ("nmse", "rmse", "coverage", "nlpd")
 
 
-def page(learners: Learners, model: str, part: Page, stream_id: str | None, rejected: bool) -> ObservationPage:
+def page(learners: Learners, model: str, part: Page, stream_id: str | None, rejected: bool) -> schema.ObservationPage:
     """List the batches of a model, newest first; raise NotFoundError where there is no such model."""
     registry.find(learners.database, model, None)
     with learners.database.session() as session:
         events, following = log.page(session, model, part, stream_id, rejected)
-        return ObservationPage(
-            items=[Observation(**_outline(session, event)) for event in events], next_cursor=following
+        return schema.ObservationPage(
+            items=[schema.Observation(**_outline(session, event)) for event in events], next_cursor=following
         )
 
 
-def show(learners: Learners, model: str, stream_id: str, sequence: int, rows: bool) -> ObservationDetail:
+def show(learners: Learners, model: str, stream_id: str, sequence: int, rows: bool) -> schema.ObservationDetail:
     """Return a batch with all that is known of it; raise NotFoundError."""
     registry.find(learners.database, model, None)
     with learners.database.session() as session:
         event = find(session, model, stream_id, sequence)
-        return ObservationDetail(
+        return schema.ObservationDetail(
             **_outline(session, event),
             report=None if event.report is None else _acknowledged(event.report),
             figures=None if event.record is None else figures(Record.from_json(event.record)),
@@ -55,10 +48,10 @@ def show(learners: Learners, model: str, stream_id: str, sequence: int, rows: bo
         )
 
 
-def figures(record: Record) -> Figures:
+def figures(record: Record) -> schema.Figures:
     """Return the figures of a record, per joint."""
     metrics = record.metrics()
-    return Figures(rows=record.rows, **{name: metrics[name] for name in FIGURES})
+    return schema.Figures(rows=record.rows, **{name: metrics[name] for name in FIGURES})
 
 
 def find(session: Session, model: str, stream_id: str, sequence: int) -> EventRow:
@@ -95,10 +88,10 @@ def _acknowledged(report: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in report.items() if name in ObservationResponse.model_fields}
 
 
-def _replay(session: Session, batch: EventRow, event: EventRow) -> Replay:
+def _replay(session: Session, batch: EventRow, event: EventRow) -> schema.Replay:
     """A replay is unlearnt with its batch; undone in another way it is by a rollback."""
     undone = state(session, batch) if batch.void else "rolled_back"
-    return Replay(
+    return schema.Replay(
         event=event.number,
         replayed_at=_moment(event.received),
         state=undone if event.void else "learnt",
@@ -107,9 +100,9 @@ def _replay(session: Session, batch: EventRow, event: EventRow) -> Replay:
     )
 
 
-def _rows(rows: Rows) -> ObservationRows:
+def _rows(rows: Rows) -> schema.ObservationRows:
     vectors = {name: [finite(row) for row in getattr(rows, name)] for name in ("q", "dq", "ddq", "tau")}
-    return ObservationRows(time=finite(rows.time), **vectors, code=[CODES[code] for code in rows.code])
+    return schema.ObservationRows(time=finite(rows.time), **vectors, code=[CODES[code] for code in rows.code])
 
 
 def _moment(seconds: float) -> str:

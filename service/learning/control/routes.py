@@ -16,21 +16,7 @@ from service.foundation.errors import (
     UnreadableVersionError,
     responses,
 )
-from service.learning.control import decisions, inspection, status
-from service.learning.control.schema import (
-    AlarmPage,
-    ChangeRequest,
-    Decided,
-    Learning,
-    ObservationDetail,
-    ObservationPage,
-    Quality,
-    Replayed,
-    ReplayRequest,
-    RollbackRequest,
-    RolledBack,
-    Unlearnt,
-)
+from service.learning.control import decisions, inspection, schema, status
 from service.learning.learners import LearnersDep
 from service.learning.schema import MOST_SEQUENCE, LearningOptions, StreamId
 from service.training import jobs
@@ -55,7 +41,7 @@ class RefreshRequest(BaseModel):
 
 
 @router.get("/{model}/quality", summary="How well a model predicts what it has not learnt yet")
-def show_quality(learners: LearnersDep, model: str) -> Quality:
+def show_quality(learners: LearnersDep, model: str) -> schema.Quality:
     """Figures over sliding windows: every row is predicted, compared with what was measured, and learnt only then."""
     return status.quality(learners, model)
 
@@ -67,7 +53,7 @@ def list_observations(
     page: PageQuery,
     stream_id: Annotated[StreamId | None, Query(description="Only batches of this stream")] = None,
     rejected: Annotated[bool, Query(description="Only batches with rows that were kept out")] = False,
-) -> ObservationPage:
+) -> schema.ObservationPage:
     """One page of the log: which batches came and what became of their rows."""
     return inspection.page(learners, model, page, stream_id, rejected)
 
@@ -79,13 +65,13 @@ def show_observation(
     stream_id: StreamId,
     sequence: Sequence,
     rows: Annotated[bool, Query(description="Also answer its rows, each with its code")] = False,
-) -> ObservationDetail:
+) -> schema.ObservationDetail:
     """What was said of a batch when it came, how well it was predicted, and what has become of it."""
     return inspection.show(learners, model, stream_id, sequence, rows)
 
 
 @router.delete(BATCH, summary="Unlearn an observation batch", responses=responses(ConflictError))
-def unlearn(learners: LearnersDep, model: str, stream_id: StreamId, sequence: Sequence) -> Unlearnt:
+def unlearn(learners: LearnersDep, model: str, stream_id: StreamId, sequence: Sequence) -> schema.Unlearnt:
     """Take the rows that a batch has taught, and replayed ones, out of what is learnt, exactly. It stays in the log.
 
     Where accelerations are derived, rows at a batch's edge are learnt with the batch beside it, and stay with that.
@@ -97,8 +83,8 @@ def unlearn(learners: LearnersDep, model: str, stream_id: StreamId, sequence: Se
     f"{BATCH}/replay", summary="Learn rejected rows of a batch", responses=responses(ConflictError, TooLargeError)
 )
 def replay(
-    learners: LearnersDep, model: str, stream_id: StreamId, sequence: Sequence, request: ReplayRequest
-) -> Replayed:
+    learners: LearnersDep, model: str, stream_id: StreamId, sequence: Sequence, request: schema.ReplayRequest
+) -> schema.Replayed:
     """Learn rows after all that were kept out, each once. Rows with the code `time_jump` count as of their arrival."""
     return decisions.replay(learners, model, stream_id, sequence, request)
 
@@ -108,7 +94,7 @@ def replay(
     summary="Go back to a revision or a version",
     responses=responses(ConflictError, TooLargeError, UnreadableVersionError),
 )
-def rollback(learners: LearnersDep, model: str, request: RollbackRequest) -> RolledBack:
+def rollback(learners: LearnersDep, model: str, request: schema.RollbackRequest) -> schema.RolledBack:
     """Forget what was learnt since a revision of the version that serves, or let another version serve.
 
     What was unlearnt since stays unlearnt.
@@ -117,7 +103,7 @@ def rollback(learners: LearnersDep, model: str, request: RollbackRequest) -> Rol
 
 
 @router.get("/{model}/learning", summary="How a model learns")
-def show_learning(learners: LearnersDep, model: str) -> Learning:
+def show_learning(learners: LearnersDep, model: str) -> schema.Learning:
     """What is set, how far learning is, what it waits for, and where it can go back to."""
     return status.learning(learners, model)
 
@@ -128,7 +114,7 @@ def show_learning(learners: LearnersDep, model: str) -> Learning:
     responses=responses(TooLargeError),
     openapi_extra={"requestBody": {"content": {"application/json": {"example": EXAMPLE}}}},
 )
-def set_learning(learners: LearnersDep, model: str, options: LearningOptions) -> Learning:
+def set_learning(learners: LearnersDep, model: str, options: LearningOptions) -> schema.Learning:
     """Set all options, those left out to their defaults. What has been learnt stays."""
     decisions.set_options(learners, model, options)
     return status.learning(learners, model)
@@ -139,13 +125,13 @@ def set_learning(learners: LearnersDep, model: str, options: LearningOptions) ->
     summary="Decide about a change of the robot",
     responses=responses(ConflictError, TooLargeError),
 )
-def decide(learners: LearnersDep, model: str, request: ChangeRequest) -> Decided:
+def decide(learners: LearnersDep, model: str, request: schema.ChangeRequest) -> schema.Decided:
     """End the hold that a detected change has led to: adapt to the changed robot, or go on as if nothing had been."""
     return decisions.decide(learners, model, request)
 
 
 @router.get("/{model}/alarms", summary="List alarms, newest first")
-def list_alarms(learners: LearnersDep, model: str, page: PageQuery) -> AlarmPage:
+def list_alarms(learners: LearnersDep, model: str, page: PageQuery) -> schema.AlarmPage:
     """One page of what the model's owner should know: changes, motion beyond what is known, new versions."""
     return decisions.alarms(learners, model, page)
 

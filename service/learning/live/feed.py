@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import defaultdict, deque
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import AsyncIterator, Callable, Iterable, Sequence
+from contextlib import suppress
 from contextvars import Context
 from dataclasses import dataclass
 from itertools import groupby
 from time import monotonic
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from anyio import to_thread
@@ -21,12 +21,13 @@ from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
 from lipcore.online.learner import uncovered
 from lipcore.vocabulary import CODES, LEARNT
-from service.foundation.errors import BusyError, NotFoundError
+from service.foundation.errors import NotFoundError
 from service.foundation.settings import Settings
 from service.learning.control.schema import DECIMALS, LiveLost, LiveNovelty, LivePart, LiveRows, LiveStatus
 from service.learning.ingest.derivation import EDGE
 from service.learning.ingest.intake import Judged
 from service.models.loaded import Served
+from service.web.limits.requests import Counted
 
 logger = logging.getLogger(__name__)
 
@@ -112,23 +113,12 @@ def _worst(error: Array, total: Array) -> list[float | None]:
     return worst
 
 
-class Novelty:
-    """Which of the rows shown between two looks lie beyond a version's basis. From one thread at a time."""
-
-    def __init__(self) -> None:
-        self._picked: list[Picked] = []
-
-    def add(self, picked: Picked) -> None:
-        """Gather rows that are shown."""
-        self._picked.append(picked)
-
-    def look(self) -> list[LiveNovelty]:
-        """Return which of the rows gathered the basis does not cover, stream by stream; start again."""
-        gathered, self._picked = self._picked, []
-        streams: dict[str, list[Picked]] = defaultdict(list)
-        for picked in gathered:
-            streams[picked.stream_id].append(picked)
-        return [_look(stream_id, parts) for stream_id, parts in streams.items()]
+def beyond(shown: Iterable[Picked]) -> list[LiveNovelty]:
+    """Which of the rows shown lie beyond their versions' bases, stream by stream."""
+    streams: dict[str, list[Picked]] = defaultdict(list)
+    for picked in shown:
+        streams[picked.stream_id].append(picked)
+    return [_look(stream_id, parts) for stream_id, parts in streams.items()]
 
 
 def _look(stream_id: str, parts: list[Picked]) -> LiveNovelty:
@@ -180,11 +170,14 @@ class FeedEvent(NamedTuple):
     data: str
 
 
-class Feed:
+class Feed(Counted):
     """Followers of models. It belongs to the event loop, but for `note`."""
 
+    too_many = "models are followed {} times, the most there may be: close one, or try again later"
+    headers: ClassVar = {"Retry-After": "5"}
+
     def __init__(self, settings: Settings) -> None:
-        self.open = 0
+        super().__init__()
         self._rows_per_s = settings.live_rows_per_s
         self._followed: dict[str, Followed] = {}
 
@@ -193,20 +186,6 @@ class Feed:
         followed = self._followed.get(batch.served.name)
         if followed is not None:
             followed.waiting.append(batch)
-
-    @contextmanager
-    def one_more(self, most: int) -> Iterator[None]:
-        """Count a reader while it lasts; raise BusyError beyond `most`."""
-        if self.open >= most:
-            raise BusyError(
-                f"models are followed {self.open} times, the most there may be: close one, or try again later",
-                headers={"Retry-After": "5"},
-            )
-        self.open += 1
-        try:
-            yield
-        finally:
-            self.open -= 1
 
     async def follow(self, model: str, look: Look, closing: asyncio.Event) -> AsyncIterator[FeedEvent]:
         """Events of a model until the service closes or the model is deleted; a status comes first."""
@@ -272,7 +251,7 @@ class Followed:
         self.readers: list[Reader] = []
         self.over = False
         self.task: asyncio.Task[None] | None = None
-        self._novelty = Novelty()
+        self._picked: list[Picked] = []  # since the last status
         self._status_at: float | None = None
         self._shown_at = monotonic()
         self._asked = True
@@ -315,11 +294,11 @@ class Followed:
             return []
         passed, self._shown_at = min(now - self._shown_at, LONGEST_S), now
         parts = thinned(batches, max(round(self._rows_per_s * passed), 1))
-        for _, picked in parts:
-            self._novelty.add(picked)
+        self._picked += [picked for _, picked in parts]
         return [FeedEvent("rows", LiveRows(parts=[part for part, _ in parts]).model_dump_json())]
 
     def _status(self, now: float) -> list[FeedEvent]:
         passed = None if self._status_at is None else now - self._status_at
         self._asked, self._status_at = False, now
-        return [FeedEvent("status", self._look(self._novelty.look(), passed).model_dump_json())]
+        picked, self._picked = self._picked, []
+        return [FeedEvent("status", self._look(beyond(picked), passed).model_dump_json())]

@@ -96,17 +96,17 @@ def test_only_doubtful_rows_are_looked_at_and_not_too_many(monkeypatch):
         return np.arange(len(these)) % 2 == 0
 
     monkeypatch.setattr(feed, "uncovered", uncovered)
-    gathered = feed.Novelty()
+    gathered = []
     for seed in range(4):
-        gathered.add(thinned([judged(20, seed=seed, bare=0.05)], 100)[0][1])
-    gathered.add(thinned([judged(4, stream_id="two", bare=0.15)], 100)[0][1])
-    gathered.add(thinned([judged(50, stream_id="three", bare=0.15)], 100)[0][1])
-    one, two, three = gathered.look()
+        gathered.append(thinned([judged(20, seed=seed, bare=0.05)], 100)[0][1])
+    gathered.append(thinned([judged(4, stream_id="two", bare=0.15)], 100)[0][1])
+    gathered.append(thinned([judged(50, stream_id="three", bare=0.15)], 100)[0][1])
+    one, two, three = feed.beyond(gathered)
     assert looked == [4, 17]
     assert (one.stream_id, one.times, one.unknown) == ("one", [], 0)
     assert (two.stream_id, len(two.times), two.unknown) == ("two", 2, 0)
     assert (len(three.times), three.unknown) == (9, 33)
-    assert gathered.look() == []
+    assert feed.beyond([]) == []
 
 
 def test_latency_is_told_by_the_bound_of_its_bucket():
