@@ -70,40 +70,34 @@ class Gaps:
 
 
 @dataclass(frozen=True)
-class Arrival:
-    """A batch that is new. last_sequence: of its last frame; digest: of its content; rows: how many; offset: event time
-    less its stream's own, s; span: its first and last time by the stream's clock; received: Unix time, s."""
+class NewBatch:
+    """A batch to be logged; its fields are those of `EventRow` and, where the stream is new, of `StreamRow`."""
 
     stream_id: str
     kind: StreamKind
     sequence: int
     last_sequence: int
     digest: str
-    rows: int
     offset: float
-    span: list[float] | None
     received: float
+    version: int
+    revision: int
+    rows: Rows
+    report: dict[str, Any]
+    record: dict[str, Any] | None
 
 
-def append_batch(
-    session: Session, model: str, batch: Arrival, rows: Rows, most_streams: int | None = None, **judged: Any
-) -> EventRow:
-    """Log a batch and what its stream still misses; return its event. judged: more columns of its row.
+def append_batch(session: Session, model: str, batch: NewBatch, most_streams: int | None = None) -> EventRow:
+    """Log a batch and what its stream still misses; return its event.
 
     Raise ConflictError where the stream is of another kind, where frames do not go on after the last, or where the
     batch may have been learnt before and is no longer kept; BusyError beyond `most_streams` streams of the model. That
     no batch of this sequence is kept is checked with `find_batch` before, in the same transaction.
     """
-    event = EventRow(
-        number=newest(session, model) + 1,
-        stream_id=batch.stream_id,
-        sequence=batch.sequence,
-        last_sequence=batch.last_sequence,
-        digest=batch.digest,
-        **judged,
-    )
+    names = ("stream_id", "sequence", "last_sequence", "digest", "version", "revision", "report", "record")
+    event = EventRow(number=newest(session, model) + 1, **{name: getattr(batch, name) for name in names})
     _note_arrival(session, model, batch, most_streams)
-    return _append(session, event, model, "batch", batch.received, rows)
+    return _append(session, event, model, "batch", batch.received, batch.rows)
 
 
 def append(
@@ -266,7 +260,7 @@ def _append(
     return event
 
 
-def _note_arrival(session: Session, model: str, batch: Arrival, most_streams: int | None) -> None:
+def _note_arrival(session: Session, model: str, batch: NewBatch, most_streams: int | None) -> None:
     """Note in the row of a stream which sequences are there; a new row for a new stream."""
     source = stream(session, model, batch.stream_id)
     if source is None:
@@ -293,7 +287,7 @@ def check_kind(source: StreamRow | None, kind: StreamKind) -> None:
         raise ConflictError(f"{name} carries {source.kind}, not {kind}: use another stream_id")
 
 
-def _check_stream(source: StreamRow, batch: Arrival) -> None:
+def _check_stream(source: StreamRow, batch: NewBatch) -> None:
     name = f"stream {source.stream_id!r} of model {source.model!r}"
     check_kind(source, batch.kind)
     if batch.kind == "frames" and batch.sequence <= source.last:

@@ -22,7 +22,7 @@ from service.foundation.errors import ConflictError, invalid_request
 from service.foundation.settings import Settings
 from service.inference.predicting import QUANTITIES, check_shapes
 from service.journal import log
-from service.journal.log import Arrival, check_kind
+from service.journal.log import NewBatch, StreamKind, check_kind
 from service.learning.ingest import screening
 from service.learning.ingest.intake import Intake, enabled
 from service.learning.ingest.monitor import Monitor
@@ -75,9 +75,25 @@ def _take(
         if batch.ddq is None and batch.t is not None:
             rows, own, derived = screening.derive(session, *key, rows, batch.t, bounds)
     screened = screening.predict(rows, own, derived, served.model)
-    arrival = Arrival(stream_id, "batches", sequence, sequence, content, len(batch), dated.offset, dated.span, received)
-    details = {"derived": None if derived is None else Derivation(ddq=derived).model_dump()}
-    return ObservationResponse.model_validate(intake.append(monitor, served, options, arrival, screened, details))
+    new = _new(served, stream_id, "batches", (sequence, sequence), content, rows, dated.offset, received)
+    details = {"derived": None if derived is None else Derivation(ddq=derived).model_dump(), "span": dated.span}
+    return ObservationResponse.model_validate(intake.append(monitor, served, options, new, screened, details))
+
+
+def _new(
+    served: Served,
+    stream_id: str,
+    kind: StreamKind,
+    ends: tuple[int, int],
+    content: str,
+    rows: Rows,
+    offset: float,
+    received: float,
+) -> NewBatch:
+    """A batch that is yet to be judged. ends: its first and last sequence; content: digest of it."""
+    return NewBatch(
+        stream_id, kind, *ends, content, offset, received, served.version, served.revision, rows, report={}, record=None
+    )
 
 
 def measured(request: ObservationRequest, model: TorqueModel, settings: Settings) -> Measured:
@@ -223,19 +239,11 @@ def observe_frames(intake: Intake, frames: Frames) -> FramesResult:
         rows = Rows(frames.time[new], q, dq, ddq, tau, check_rows(None, q, dq, ddq, tau, bounds), weights)
         screened = screening.answered(rows, frames.mean[new], frames.std[new], model)
         sequences = frames.sequences[new]
-        arrival = Arrival(
-            frames.stream_id,
-            "frames",
-            int(sequences[0]),
-            int(sequences[-1]),
-            _digest(sequences, numbers),
-            len(rows),
-            0.0,
-            None,
-            float(frames.time[-1]),
-        )
-        details = {"derived": None, "frames": _ranges(sequences)}
-        report = intake.append(monitor, frames.served, options, arrival, screened, details)
+        ends = int(sequences[0]), int(sequences[-1])
+        content = _digest(sequences, numbers)
+        batch = _new(frames.served, frames.stream_id, "frames", ends, content, rows, 0.0, float(frames.time[-1]))
+        details = {"derived": None, "span": None, "frames": _ranges(sequences)}
+        report = intake.append(monitor, frames.served, options, batch, screened, details)
     intake.follow_up(monitor, frames.model)
     return FramesResult(int(sequences[-1]), report["accepted"], repeated.frames, report["rejected"], report["revision"])
 

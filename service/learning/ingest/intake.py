@@ -6,6 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ from sqlalchemy.orm import Session
 from lipcore.online.batch import Rows
 from service.foundation.errors import ConflictError, not_found
 from service.journal import log
-from service.journal.log import Arrival
+from service.journal.log import NewBatch
 from service.journal.retention import retain
 from service.learning import owner
 from service.learning.ingest import judging
@@ -97,7 +98,7 @@ class Intake:
         monitor: Monitor,
         served: Served,
         options: LearningOptions,
-        arrival: Arrival,
+        batch: NewBatch,
         screened: Screened,
         details: dict[str, Any],
     ) -> dict[str, Any]:
@@ -106,40 +107,34 @@ class Intake:
         Return the report that the log keeps of it: `details`, and what every report has. The batch is durable then.
         """
         model = served.name
-        self.disk.take(ROW_NUMBERS * NUMBER_BYTES * served.model.n_joints * arrival.rows)
+        rows = screened.own.stop - screened.own.start
+        self.disk.take(ROW_NUMBERS * NUMBER_BYTES * served.model.n_joints * rows)
         with self.database.transaction(model) as session:
             _check_kept(session, served)
             held = owner.held(session, model) is not None
             if monitor.held and not held:
                 monitor.decided()
-            usual = partial(monitor.usual, arrival.received)
-            verdict = judging.judge(screened, monitor.watch(arrival.stream_id), held, options, usual)
+            usual = partial(monitor.usual, batch.received)
+            verdict = judging.judge(screened, monitor.watch(batch.stream_id), held, options, usual)
             if verdict.change is not None and options.on_change == "adapt":
-                log.append(session, model, "change", {"t": verdict.change.at}, arrival.received)
-            event = log.append_batch(
-                session,
-                model,
-                arrival,
-                verdict.rows,
-                self.settings.max_observation_streams,
-                version=served.version,
-                revision=served.revision,
-                record=None if verdict.record is None else verdict.record.to_json(),
-            )
-            event.rows = arrival.rows  # without those that had waited, which other batches count
-            source = log.stream(session, model, arrival.stream_id)
+                log.append(session, model, "change", {"t": verdict.change.at}, batch.received)
+            record = None if verdict.record is None else verdict.record.to_json()
+            judged = replace(batch, rows=verdict.rows, record=record)
+            event = log.append_batch(session, model, judged, self.settings.max_observation_streams)
+            event.rows = rows  # without those that had waited, which other batches count
+            source = log.stream(session, model, batch.stream_id)
             assert source is not None
             if source.offset == 0:
-                source.offset = arrival.offset
+                source.offset = batch.offset
             if verdict.change is not None:
                 _alarm(session, served, options, verdict, event)
             report = details | {
                 "model": model,
                 "version": served.version,
                 "revision": event.number - log.start_of(session, model, served.version),
-                "stream_id": arrival.stream_id,
-                "sequence": arrival.sequence,
-                "rows": arrival.rows,
+                "stream_id": batch.stream_id,
+                "sequence": batch.sequence,
+                "rows": rows,
                 "accepted": event.learnt,
                 "duplicate": False,
                 "state": "learnt",
@@ -148,7 +143,6 @@ class Intake:
                 "held": verdict.held,
                 # for the batches that follow, for other services, and for one that starts again
                 "own": [screened.own.start, screened.own.stop],
-                "span": arrival.span,
                 "open": verdict.watch.gate.open,
                 "gate": verdict.watch.gate.to_json(),
                 "waited": held,
@@ -156,8 +150,8 @@ class Intake:
                 "surprise": None if verdict.surprise is None else verdict.surprise.tolist(),
             }
             event.report = report
-        monitor.note(event, arrival.stream_id, verdict, report)
-        self._show(Judged(served, arrival.stream_id, verdict.rows, screened))
+        monitor.note(event, batch.stream_id, verdict, report)
+        self._show(Judged(served, batch.stream_id, verdict.rows, screened))
         return report
 
     def follow_up(self, monitor: Monitor, model: str) -> None:
