@@ -8,13 +8,14 @@ import logging
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable
+from dataclasses import asdict
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from service.foundation.errors import ErrorBody, ServiceError, invalid_request
-from service.learning.ingest.batches import Frames, FramesResult
+from service.learning.ingest.batches import Frames
 from service.learning.learners import Learners
 from service.models.loaded import Served
 from service.stream.frames import NUMBER, REQUEST
@@ -130,7 +131,7 @@ class Learning:
         """Log a block; return what there is to say of it."""
         first, through = block[0].sequence, block[-1].sequence
         try:
-            result = await self._learners.threads.run(self._hand_over, block)
+            result = await self._learners.threads.run(lambda: self._learners.observe_frames(self._frames(block)))
         except ServiceError as error:
             refusal = error
         except Exception as error:  # the next block may be logged
@@ -140,40 +141,18 @@ class Learning:
             )
             refusal = known or ServiceError("an unexpected error; the service's log says more")
         else:
-            return {
-                "learnt": {
-                    "through": result.through,
-                    "accepted": result.accepted,
-                    "duplicates": result.duplicates,
-                    "rejected": result.rejected,
-                    "revision": result.revision,
-                }
-            }
+            return {"learnt": asdict(result)}
         if self._ended:
             logger.warning("frames %d to %d of stream %r are not learnt: %s", first, through, self._stream_id, refusal)
         body = ErrorBody(code=refusal.code, message=refusal.message, detail=refusal.detail)
         return {"refused": {"first": first, "through": through, "error": body.model_dump()}}
 
-    def _hand_over(self, block: list[Taught]) -> FramesResult:
-        return self._learners.observe_frames(self._frames(block))
-
     def _frames(self, block: list[Taught]) -> Frames:
         served = block[0].served
-        q, dq, ddq, tau = _columns([each.request[REQUEST.size :] for each in block], 4)
-        mean, std = _columns([each.answer for each in block], 2)
-        return Frames(
-            model=served.name,
-            stream_id=self._stream_id,
-            served=served,
-            sequences=np.array([each.sequence for each in block], np.int64),
-            time=self._times(block),
-            q=q,
-            dq=dq,
-            ddq=ddq,
-            tau=tau,
-            mean=mean,
-            std=std,
-        )
+        sequences = np.array([each.sequence for each in block], np.int64)
+        motions = _columns([each.request[REQUEST.size :] for each in block], 4)
+        answers = _columns([each.answer for each in block], 2)
+        return Frames(served.name, self._stream_id, served, sequences, self._times(block), *motions, *answers)
 
     def _times(self, block: list[Taught]) -> Array:
         """Times of arrival, Unix time in s, each later than the one before."""
