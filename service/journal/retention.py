@@ -7,7 +7,8 @@ from sqlalchemy.orm import Session
 
 from service.foundation.settings import Settings
 from service.journal import log, snapshots
-from service.storage.database import Database, EventRow, LearnerRow, ServingRow, StreamRow, VersionRow
+from service.models import registry
+from service.storage.database import Database, EventRow, StreamRow
 
 CHUNK = 200
 """Events deleted in one transaction, so that observations do not wait long for the lock."""
@@ -40,19 +41,10 @@ def retain(database: Database, settings: Settings, model: str, now: float) -> in
 def contained(session: Session, model: str) -> int:
     """Number of the newest event that every learning version has learnt for good, by training or in a snapshot."""
     through = []
-    for version in _learning(session, model):
+    for version in registry.learning(session, model):
         row = snapshots.latest(session, model, version, None)
         through.append(log.start_of(session, model, version) if row is None else row.number)
     return min(through, default=0)
-
-
-def _learning(session: Session, model: str) -> set[int]:
-    """The version that serves and those that are compared with it."""
-    candidates = select(LearnerRow.version).where(LearnerRow.model == model, LearnerRow.role == "candidate")
-    serving = session.scalar(select(ServingRow.version).where(ServingRow.model == model))
-    if serving is None:
-        serving = session.scalar(select(func.max(VersionRow.version)).where(VersionRow.model == model))
-    return {*session.scalars(candidates), *([] if serving is None else [serving])}
 
 
 def _chosen(session: Session, settings: Settings, model: str, now: float) -> list[int]:

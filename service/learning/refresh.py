@@ -183,29 +183,16 @@ def decide(database: Database, loaded: LoadedModels, wake: Callable[[str], None]
 def _act(session: Session, contested: Contested, learner: LearnerRow) -> bool:
     """Change roles as the verdict says, and note why; return whether the candidate serves."""
     model, old, new = contested.model, contested.serving, contested.candidate
-    learner.role = DISMISSED  # unless it serves
+    learner.role, promoted = DISMISSED, False  # unless it serves
     if contested.verdict == "dismiss":
-        _note(session, contested, f"version {new} does not predict better than version {old} and is dismissed", False)
-        return False
-    if scope.taken_back(session, model, learner.start, learner.start):
+        message = f"version {new} does not predict better than version {old} and is dismissed"
+    elif scope.taken_back(session, model, learner.start, learner.start):
         message = f"version {new} is dismissed: part of what it was trained on has been taken back since"
-        _note(session, contested, message, False)
-        return False
-    if not owner.options(session, model).auto_promote:
+    elif not owner.options(session, model).auto_promote:
         message = f"version {new} predicts better than version {old}: a rollback to version {new} lets it answer"
-        _note(session, contested, message, False)
-        return False
-    registry.serve(session, model, new)
-    _note(session, contested, f"version {new} predicts better than version {old} and answers from now on", True)
-    return True
-
-
-def _note(session: Session, contested: Contested, message: str, promoted: bool) -> None:
-    evidence: dict[str, Any] = {
-        "serving": contested.serving,
-        "candidate": contested.candidate,
-        "verdict": contested.verdict,
-        "promoted": promoted,
-        **contested.evidence,
-    }
-    owner.raise_alarm(session, contested.model, "promotion", message, evidence)
+    else:
+        registry.serve(session, model, new)
+        message, promoted = f"version {new} predicts better than version {old} and answers from now on", True
+    named = {"serving": old, "candidate": new, "verdict": contested.verdict, "promoted": promoted}
+    owner.raise_alarm(session, model, "promotion", message, {**named, **contested.evidence})
+    return promoted

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection
 
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
@@ -47,8 +46,7 @@ def delete_version(loaded: LoadedModels, model: str, version: int) -> None:
         with loaded.database.transaction() as session:
             row = session.get(VersionRow, (model, version))
             if row is None:
-                known = session.scalar(select(ModelRow.name).where(ModelRow.name == model))
-                raise not_found("model", model) if known is None else not_found("version", version)
+                raise registry.missing(session, model, version)
             _check_unused(session, model, version)
             of_version = (SnapshotRow.model == model, SnapshotRow.version == version)
             snapshots = list(session.scalars(select(SnapshotRow.id).where(*of_version)))
@@ -118,17 +116,9 @@ def _note_deletion(session: Session, row: ModelRow, versions: Collection[int]) -
 
 def _remove_files(files: Files, folders: Collection[str], snapshots: Collection[str]) -> None:
     """Remove files that no row names any more; what cannot be removed now is at the next start."""
-    for folder in folders:
-        with _forgiven():
-            files.delete_version(folder)
-    for snapshot in snapshots:
-        with _forgiven():
-            files.delete_snapshot(snapshot)
-
-
-@contextmanager
-def _forgiven() -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        logger.warning("a file of a deleted version is left until the next start: %s", error)
+    for delete_file, names in ((files.delete_version, folders), (files.delete_snapshot, snapshots)):
+        for name in names:
+            try:
+                delete_file(name)
+            except OSError as error:
+                logger.warning("a file of a deleted version is left until the next start: %s", error)

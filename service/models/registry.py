@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 
 import lipcore
 from lipcore.files.persistence import checksums, read_manifest
-from service.foundation.errors import not_found
+from service.foundation.errors import NotFoundError, not_found
 from service.foundation.settings import shipped_models
 from service.models.schema import Model, ModelPage, Version, VersionSummary
 from service.storage.database import (
@@ -101,6 +101,19 @@ def answering(session: Session, model: str) -> int:
     """The version that answers where none is named, 0 where there is none."""
     chosen = session.get(ServingRow, model)
     return _newest(session, model) if chosen is None else chosen.version
+
+
+def learning(session: Session, model: str) -> list[int]:
+    """Versions that learn: candidates for the place of the one that serves, and last that one."""
+    candidates = select(LearnerRow.version).where(LearnerRow.model == model, LearnerRow.role == "candidate")
+    serves = answering(session, model)
+    return [*(each for each in session.scalars(candidates) if each != serves), *([serves] if serves else [])]
+
+
+def missing(session: Session, model: str, version: int | None) -> NotFoundError:
+    """The error for a version that there is not: of its model, where that is none either."""
+    known = session.scalar(select(ModelRow.name).where(ModelRow.name == model))
+    return not_found("model", model) if known is None else not_found("version", version)
 
 
 def exists(session: Session, model: str, version: int) -> bool:
@@ -220,8 +233,7 @@ def find(database: Database, model: str, version: int | None) -> VersionRow:
     with database.session() as session:
         row = None if version is None else session.get(VersionRow, (model, version))
         if row is None:
-            known = session.scalar(select(ModelRow).where(ModelRow.name == model))
-            raise not_found("model", model) if known is None else not_found("version", version)
+            raise missing(session, model, version)
     return row
 
 
