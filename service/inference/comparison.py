@@ -35,7 +35,12 @@ def compare(loaded: LoadedModels, model: str, request: schema.CompareRequest) ->
         samples_used=len(recorded.used),
         blocks=compared.blocks,
         versions=[
-            _figures(each, answer, recorded.used, trained)
+            schema.VersionFigures(
+                version=each.version,
+                revision=each.revision,
+                **figures(evaluate(recorded.used.tau, *answer)),
+                in_training=trained,
+            )
             for each, answer, trained in zip(versions, answers, in_training, strict=True)
         ],
         differences=schema.JointDifferences(
@@ -66,11 +71,6 @@ def _versions(loaded: LoadedModels, model: str, request: schema.CompareRequest) 
 def _answer(served: Served, samples: Samples) -> Answer:
     answer = served.model.predict(samples.q, samples.dq, samples.ddq)
     return Answer(answer.tau, answer.tau_std, answer.noise_std)
-
-
-def _figures(served: Served, answer: Answer, samples: Samples, in_training: bool) -> schema.VersionFigures:
-    shown = figures(evaluate(samples.tau, *answer))
-    return schema.VersionFigures(version=served.version, revision=served.revision, **shown, in_training=in_training)
 
 
 def _verdict(first: int, second: int, compared: Comparison) -> tuple[schema.Outcome, str]:

@@ -239,9 +239,10 @@ def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: S
     prediction = _prediction_of(served, **lists)
     if request.components:
         of_query = 0 if single else slice(None)
+        estimates = query.components(known, request.components)
         prediction.components = {
-            name: {"mean": each.mean[of_query].tolist(), "std": each.std[of_query].tolist()}
-            for name, each in query.components(known, request.components).items()
+            name: {part: getattr(estimates[name], part)[of_query].tolist() for part in ("mean", "std")}
+            for name in request.components
         }
     return prediction
 

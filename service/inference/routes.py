@@ -92,11 +92,7 @@ async def _answer(scope: Scope, body: bytes) -> Reply | None:
 async def _in_thread(
     loaded: LoadedModels, turns: CapacityLimiter, model: str, request: schema.PredictRequest, served: Served | None
 ) -> bytes:
-    return await to_thread.run_sync(_encoded, loaded, model, request, served, limiter=turns)
-
-
-def _encoded(loaded: LoadedModels, model: str, request: schema.PredictRequest, served: Served | None) -> bytes:
-    return encode(predicting.predict(loaded, model, request, served))
+    return await to_thread.run_sync(lambda: encode(predicting.predict(loaded, model, request, served)), limiter=turns)
 
 
 async def _revised(

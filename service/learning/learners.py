@@ -204,7 +204,9 @@ class Learners:
     def _receive(self, message: Message) -> None:
         """Act on a message of the learner process; called in its reader's thread."""
         if isinstance(message, Published):
-            self._publish(message)
+            # an immutable revision takes the place of the one before
+            self.loaded.revise(message.model, message.version, message.revision, publication.read(message.path))
+            self._note(message, published=message, failed=None)
             for call in self.when_published:
                 call(message)
         elif isinstance(message, Contested):
@@ -213,12 +215,6 @@ class Learners:
         elif isinstance(message, Failed):
             logger.error("version %s of model %s does not learn: %s", message.version, message.model, message.error)
             self._note(message, failed=message)
-
-    def _publish(self, message: Published) -> None:
-        """Answer with what a version has learnt: an immutable revision takes the place of the one before."""
-        revision = publication.read(message.path)
-        self.loaded.revise(message.model, message.version, message.revision, revision)
-        self._note(message, published=message, failed=None)
 
 
 LearnersDep = Annotated[Learners, Depends(of_app("learners"))]

@@ -13,7 +13,6 @@ from lipcore.vocabulary import CODES
 from service.learning.control import decisions, status
 from service.learning.ingest.monitor import Monitor
 from service.learning.learners import Learners
-from service.models.loaded import Served
 from service.storage.database import StreamRow
 from service.web.observability.meters import MetricKind
 
@@ -62,7 +61,9 @@ class Learning(Collector):
             if (served := self._learners.loaded.hot(model, None)) is None:
                 continue
             revision.add_metric([model, str(served.version)], served.revision)
-            lag.add_metric([model], self._lag(served))
+            with self._learners.database.session() as session:
+                behind = decisions.current(session, model, served.version) - served.revision
+            lag.add_metric([model], max(behind, 0))
             if (share := self._learners.status(model, served.version).novel_share) is not None:
                 novel.add_metric([model], share)
         yield from (*gauges.values(), revision, novel, lag, rows)
@@ -78,10 +79,6 @@ class Learning(Collector):
             learning = list(session.scalars(select(StreamRow.model).distinct()))
         fresh = {model: learners.monitor(model) for model in learning if loaded.hot(model, None) is not None}
         return dict(sorted((learners.monitors() | fresh).items()))
-
-    def _lag(self, served: Served) -> int:
-        with self._learners.database.session() as session:
-            return max(decisions.current(session, served.name, served.version) - served.revision, 0)
 
 
 def _add_quality(gauges: dict[str, GaugeMetricFamily], model: str, monitor: Monitor) -> None:

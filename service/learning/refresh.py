@@ -110,7 +110,7 @@ def _is_due(session: Session, settings: Settings, published: Published) -> bool:
         return False
     if not owner.options(session, model).auto_promote and _is_better_known(session, model, version):
         return False
-    ended = [_unix(job.finished_at or job.created_at) for job in before]
+    ended = [datetime.fromisoformat(job.finished_at or job.created_at).timestamp() for job in before]
     earlier = sum(job.request["refresh"]["version"] == version for job in before)
     pause = settings.refresh_pause_s * 2 ** min(max(earlier - 1, 0), MOST_DOUBLINGS)
     return not ended or time.time() - max(ended) >= pause
@@ -153,10 +153,6 @@ def _reasons(settings: Settings, published: Published) -> Iterator[Reason]:
 
 def _alarms(model: str, kind: AlarmKind) -> Select[int]:
     return select(AlarmRow.seq).where(AlarmRow.model == model, AlarmRow.kind == kind)
-
-
-def _unix(moment: str) -> float:
-    return datetime.fromisoformat(moment).timestamp()
 
 
 def decide(database: Database, loaded: LoadedModels, wake: Callable[[str], None], contested: Contested) -> bool:

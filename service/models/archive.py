@@ -159,8 +159,10 @@ def _files(loaded: LoadedModels, row: VersionRow, learnt: bool) -> tuple[dict[st
     known = loaded.learnt.consolidated(row.model, row.version, base)
     if known is None:
         return files, 0
-    lineage = {**row.manifest["lineage"], "learnt": _learnt(row, known.revision)}
-    _, files = persistence.encode(known.model, lineage)
+    # of an earlier life too, where the version was imported with online updates
+    before = {} if (earlier := row.manifest["lineage"].get("learnt")) is None else {"before": earlier}
+    learnt_since = {"model": row.model, "version": row.version, "revision": known.revision, **before}
+    _, files = persistence.encode(known.model, {**row.manifest["lineage"], "learnt": learnt_since})
     return {MANIFEST: files.pop(MANIFEST), **files}, known.revision
 
 
@@ -169,13 +171,6 @@ def _checked(folder: Path, row: VersionRow) -> dict[str, bytes]:
     if row.checksums is not None:
         persistence.check(files, row.checksums)
     return files
-
-
-def _learnt(row: VersionRow, revision: int) -> dict[str, Any]:
-    """What the lineage says of online updates: of an earlier life too, where the version was imported with some."""
-    about: dict[str, Any] = {"model": row.model, "version": row.version, "revision": revision}
-    earlier = row.manifest["lineage"].get("learnt")
-    return about if earlier is None else {**about, "before": earlier}
 
 
 def _packed(loaded: LoadedModels, files: Mapping[str, bytes]) -> IO[bytes]:

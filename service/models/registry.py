@@ -217,12 +217,8 @@ def _is_missing(session: Session, source: Path) -> bool:
     made_by_user = known[0].job is not None or "imported" in known[0].manifest["lineage"]
     if made_by_user or row.last_version > known[0].version:
         return False
-    shipped = read_manifest(source)
-    return not any(_same(each, shipped) for each in known)
-
-
-def _same(version: VersionRow, manifest: dict[str, Any]) -> bool:
-    return bool(version.manifest["tensors"]["sha256"] == manifest["tensors"]["sha256"])
+    shipped = read_manifest(source)["tensors"]["sha256"]
+    return all(each.manifest["tensors"]["sha256"] != shipped for each in known)
 
 
 def find(database: Database, model: str, version: int | None) -> VersionRow:

@@ -86,13 +86,9 @@ def _load(loaded: LoadedModels, name: str, version: str | None, number: int | No
     except NotFoundError as error:
         if error.detail[0].field == "model":
             raise NotFoundError(f"no model {name[:200]!r}: GET /v1/models lists all", error.detail) from error
-        item = problem("version", version, f"one of {', '.join(_names(loaded, name)[-_LISTED:])}")
+        known = [*registry.show(loaded.database, name).aliases, *_known(loaded, name)]
+        item = problem("version", version, f"one of {', '.join(known[-_LISTED:])}")
         raise NotFoundError(f"{sentence(item)}, of model {name!r}", [item]) from error
-
-
-def _names(loaded: LoadedModels, name: str) -> list[str]:
-    """Aliases and numbers."""
-    return [*registry.show(loaded.database, name).aliases, *_known(loaded, name)]
 
 
 def _known(loaded: LoadedModels, name: str) -> list[str]:

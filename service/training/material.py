@@ -8,7 +8,6 @@ from datetime import datetime
 from typing import Any
 
 import numpy as np
-from sqlalchemy import select
 
 from lipcore.data import independence
 from lipcore.data.samples import Array, Samples
@@ -190,7 +189,9 @@ class Material:
 
 def recorded(settings: Settings, database: Database, files: Files, request: dict[str, Any]) -> Material:
     """Samples of the data sets that a job names; raise CannotHoldOutError."""
-    rows = _datasets(database, request["datasets"])
+    with database.session() as session:
+        known = refresh_data.datasets(session, request["datasets"])
+    rows = [known[name] for name in request["datasets"]]
     parts = opened(files, rows)
     asked = request.get("holdout")
     divided = Divided([None] * len(parts), [None] * len(parts), None)
@@ -288,12 +289,6 @@ def _aged(row: DatasetRow, within: refresh_data.Scope) -> float:
     """What a data set's samples count where the model forgets: their age counts from their upload."""
     weights = refresh_data.age_weights(np.array([datetime.fromisoformat(row.created_at).timestamp()]), within)
     return 1.0 if weights is None else float(weights[0])
-
-
-def _datasets(database: Database, names: list[str]) -> list[DatasetRow]:
-    with database.session() as session:
-        rows = {row.id: row for row in session.scalars(select(DatasetRow).where(DatasetRow.id.in_(names)))}
-    return [rows[name] for name in names]
 
 
 def _holdout(lineage: HoldoutLineage | None) -> dict[str, Any]:

@@ -85,7 +85,10 @@ def _claim(settings: Settings, database: Database, job: str) -> Claim | None:
 def _train(settings: Settings, database: Database, files: Files, claim: Claim) -> None:
     try:
         with Pulse(database, lambda session: _own(session, claim), claim.model) as pulse:
-            material = _material(settings, database, files, claim)
+            if claim.request.get("refresh") is None:
+                material = recorded(settings, database, files, claim.request)
+            else:
+                material = observed(settings, database, files, claim.model, claim.request)
             trained = _fit(settings, claim, material, pulse)
             lineage = {
                 "job": claim.job,
@@ -122,12 +125,6 @@ def _train(settings: Settings, database: Database, files: Files, claim: Claim) -
         if unavailable or isinstance(storage_errors.translated(error), StorageUnavailableError):
             raise StorageError(str(error)) from None  # another time it may work
         _finish(database, files, claim, FAILED, f"{type(error).__name__}: {error}", _code(error))
-
-
-def _material(settings: Settings, database: Database, files: Files, claim: Claim) -> Material:
-    if claim.request.get("refresh") is None:
-        return recorded(settings, database, files, claim.request)
-    return observed(settings, database, files, claim.model, claim.request)
 
 
 def _fit(settings: Settings, claim: Claim, material: Material, pulse: Pulse) -> TorqueModel:

@@ -22,6 +22,8 @@ from service.storage.database import EventRow
 from service.web.pagination import Page
 
 FIGURES = ("nmse", "rmse", "coverage", "nlpd")
+ACKNOWLEDGED = ObservationResponse.model_fields
+"""The part of a report that acknowledged a batch; the rest is for judging what follows."""
 
 
 def page(learners: Learners, model: str, part: Page, stream_id: str | None, rejected: bool) -> schema.ObservationPage:
@@ -41,7 +43,7 @@ def show(learners: Learners, model: str, stream_id: str, sequence: int, rows: bo
         event = find(session, model, stream_id, sequence)
         return schema.ObservationDetail(
             **_outline(session, event),
-            report=None if event.report is None else _acknowledged(event.report),
+            report=None if event.report is None else {k: v for k, v in event.report.items() if k in ACKNOWLEDGED},
             figures=None if event.record is None else figures(Record.from_json(event.record)),
             replays=[_replay(session, event, each) for each in log.about(session, event, "replay")],
             observed=_rows(log.rows_of(event)) if rows else None,
@@ -81,11 +83,6 @@ def _outline(session: Session, event: EventRow) -> dict[str, Any]:
         "accepted": event.learnt,
         "rejected": (event.report or {}).get("rejected", {}),
     }
-
-
-def _acknowledged(report: dict[str, Any]) -> dict[str, Any]:
-    """The part of a report that acknowledged the batch; the rest is for judging what follows."""
-    return {name: value for name, value in report.items() if name in ObservationResponse.model_fields}
 
 
 def _replay(session: Session, batch: EventRow, event: EventRow) -> schema.Replay:

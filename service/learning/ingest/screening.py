@@ -332,13 +332,8 @@ def _around(session: Session, model: str, stream_id: str, sequence: int, way: in
         event = _neighbour(session, model, stream_id, sequence)
         if event is None:
             break
-        part = _own(event)
+        first, last = (event.report or {})["own"]  # without those that had waited for it
+        part = log.rows_of(event).take(slice(first, last))
         parts.append(part.take(slice(0, count) if way > 0 else slice(max(len(part) - count, 0), None)))
         count -= len(part)
     return parts[::way]
-
-
-def _own(event: EventRow) -> Rows:
-    """A batch's own rows, without those that had waited for it."""
-    first, last = (event.report or {})["own"]
-    return log.rows_of(event).take(slice(first, last))

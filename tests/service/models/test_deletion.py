@@ -206,13 +206,13 @@ def test_a_batch_that_was_predicted_by_what_is_deleted_is_not_logged(api, arm):
     service = service_of(api)
     served = service.loaded.get(arm, None)
     intake = service.learners._intake
-    monitor, arrival = service.learners.monitor(arm), SimpleNamespace(rows=1)
+    monitor, screened = service.learners.monitor(arm), SimpleNamespace(own=slice(0, 1))
     assert delete(api, arm).status_code == 204
     with pytest.raises(NotFoundError, match="no model"):
-        intake.append(monitor, served, None, arrival, None, {})
+        intake.append(monitor, served, None, None, screened, {})
     publish(api, arm)
     with pytest.raises(ConflictError, match=r"version 3 .* was deleted meanwhile"):
-        intake.append(monitor, served, None, arrival, None, {})
+        intake.append(monitor, served, None, None, screened, {})
 
 
 def test_who_asks_for_a_pointer_is_answered_though_it_moves_and_the_version_before_goes(api, arm, monkeypatch):
