@@ -139,8 +139,7 @@ class FrameReader:
         self.joint_names, self.n_joints, self.max_position = joint_names, len(joint_names), max_position
         self.motion: Array = np.zeros((3, self.n_joints))
         self._numbers, self._query = self.motion.reshape(-1), Query(self.motion[:, None], single=True)
-        self._length = frames.request_bytes(self.n_joints)
-        self._learn_length = frames.request_bytes(self.n_joints, learn=True)
+        self._lengths = {learn: frames.request_bytes(self.n_joints, learn) for learn in (False, True)}
 
     def read(self, data: bytes, flags: int, n: int, budget: float) -> Array:
         """Return q, dq, ddq of a frame, (3, n), whose header is already read; raise InvalidRequestError.
@@ -149,26 +148,20 @@ class FrameReader:
         """
         if n != self.n_joints:
             raise invalid_request("n", n, f"{self.n_joints} joints: {', '.join(self.joint_names)}")
-        if flags > frames.ASK_STD:
-            data = self._without_torque(data, flags)
-        if len(data) != self._length:
-            raise invalid_request("frame", f"{len(data)} bytes long", f"{self._length} bytes for {n} joints")
-        if not 0.0 <= budget < inf:
-            raise invalid_request("deadline", budget, "seconds, or 0 for none")
-        # a copy, because the model takes aligned and writable memory, and the message is neither for certain
-        self._numbers[:] = np.frombuffer(data, frames.NUMBER, offset=frames.REQUEST.size)
-        self._query.check(self.max_position)
-        return self.motion
-
-    def _without_torque(self, data: bytes, flags: int) -> bytes:
         both = frames.ASK_STD | frames.ASK_LEARN
         if flags & ~both:
             expected = f"0, {frames.ASK_STD} to be answered tau_std, {frames.ASK_LEARN} to be learnt from, or {both}"
             raise invalid_request("flags", flags, expected)
-        if len(data) != self._learn_length:
-            expected = f"{self._learn_length} bytes for {self.n_joints} joints with tau"
+        length = self._lengths[learn := flags > frames.ASK_STD]
+        if len(data) != length:
+            expected = f"{length} bytes for {n} joints{' with tau' if learn else ''}"
             raise invalid_request("frame", f"{len(data)} bytes long", expected)
-        return data[: self._length]
+        if not 0.0 <= budget < inf:
+            raise invalid_request("deadline", budget, "seconds, or 0 for none")
+        # a copy, because the model takes aligned and writable memory, and the message is neither for certain
+        self._numbers[:] = np.frombuffer(data, frames.NUMBER, 3 * n, frames.REQUEST.size)
+        self._query.check(self.max_position)
+        return self.motion
 
 
 class Session(Conversation):

@@ -25,6 +25,8 @@ UNTIMED_GUARD = 25.0
 class CannotHoldOutError(ValueError):
     """A data set cannot be split as asked for."""
 
+    code = "cannot_hold_out"
+
 
 @dataclass(frozen=True)
 class SetSplit:

@@ -43,6 +43,8 @@ class StorageError(RuntimeError):
 class TakenBackError(RuntimeError):
     """What the job was training on has been unlearnt or rolled back meanwhile."""
 
+    code = "observations_taken_back"
+
 
 def run(settings: Settings, job: str) -> None:
     """Run one queued job to its end. All outcomes are written to its row; nothing is raised for a failed fit.
@@ -169,13 +171,9 @@ def _publish(session: Session, claim: Claim, material: Material, folder: str, ma
 
 def _code(error: Exception) -> str:
     """Stable word for why a job failed."""
-    if isinstance(error, TakenBackError):
-        return "observations_taken_back"
-    if isinstance(error, CannotHoldOutError):
-        return "cannot_hold_out"
     if isinstance(storage_errors.translated(error), StorageFullError):
         return StorageFullError.code
-    if isinstance(error, ServiceError):  # as of a data set that is damaged
+    if isinstance(error, (TakenBackError, CannotHoldOutError, ServiceError)):  # the last as of a damaged data set
         return error.code
     return "not_positive_definite" if isinstance(error, lipcore.NotPositiveDefiniteError) else "training_failed"
 
