@@ -45,7 +45,7 @@ def compare(loaded: LoadedModels, model: str, request: schema.CompareRequest) ->
         ],
         differences=schema.JointDifferences(
             **{
-                name: schema.Differences(**_shown(getattr(compared, name)))
+                name: schema.Differences(**_lists(getattr(compared, name)))
                 for name in schema.JointDifferences.model_fields
             }
         ),
@@ -123,10 +123,10 @@ def _warnings(versions: Collection[Served], in_training: Collection[bool]) -> li
     return warnings
 
 
-def _shown(difference: Difference) -> dict[str, list[float | None]]:
+def _lists(difference: Difference) -> dict[str, list[float | None]]:
     names = {"difference": difference.mean, "standard_error": difference.standard_error}
     return {name: finite(values) for name, values in {**names, "half_width": difference.half_width}.items()}
 
 
 def _total(difference: Difference, place: int) -> schema.TotalDifference:
-    return schema.TotalDifference(**{name: values[place] for name, values in _shown(difference).items()})
+    return schema.TotalDifference(**{name: values[place] for name, values in _lists(difference).items()})

@@ -160,8 +160,8 @@ def evaluate(
 
 def figures(metrics: Metrics) -> dict[str, Any]:
     """Figures of each joint, nmse null where its torque does not vary."""
-    shown = {name: getattr(metrics, name).tolist() for name in ("rmse", "coverage", "nlpd")}
-    return {"nmse": finite(metrics.nmse), **shown, "interval_width": metrics.width.tolist()}
+    per_joint = {name: getattr(metrics, name).tolist() for name in ("rmse", "coverage", "nlpd")}
+    return {"nmse": finite(metrics.nmse), **per_joint, "interval_width": metrics.width.tolist()}
 
 
 Rows = NDArray[np.int64]

@@ -93,7 +93,7 @@ def consider(settings: Settings, database: Database, queue: JobQueue, published:
             return None
         owner.raise_alarm(session, model, why.trigger, f"{why.text}: it is refreshed", {**why.evidence, "job": job.id})
     queue.submit(job.id)
-    return jobs.shown(job)
+    return jobs.represent(job)
 
 
 def _is_due(session: Session, settings: Settings, published: Published) -> bool:

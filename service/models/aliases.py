@@ -75,13 +75,13 @@ def _move(loaded: LoadedModels, model: str, alias: str, version: int, taken_back
             else:
                 _check_room(loaded, session, model, alias)
                 point(session, model, alias, version, number)
-            shown = _show(loaded, session, model, alias)
+            answer = _show(loaded, session, model, alias)
         if alias != SERVING:
             loaded.point(model, alias, version)
     if alias == SERVING:
         loaded.adopt(model)
         loaded.wake(model)
-    return shown
+    return answer
 
 
 def point(session: Session, model: str, alias: str, version: int | None, takes_back: int | None = None) -> None:

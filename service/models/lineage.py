@@ -84,8 +84,8 @@ def figures(model: TorqueModel, samples: Samples, most: int, of: int) -> dict[st
     # not by the compiled form of the model: a process that trains and never serves would wait for it
     answer = model.posterior.predict(used.motion())
     compared = metrics.evaluate(used.tau, answer.mean.numpy(), answer.std.numpy(), model.noise_std)
-    shown = {name: finite(getattr(compared, name)) for name in ("nmse", "rmse", "coverage", "nlpd")}
-    return {"samples": len(used), "of": of, **shown}
+    per_joint = {name: finite(getattr(compared, name)) for name in ("nmse", "rmse", "coverage", "nlpd")}
+    return {"samples": len(used), "of": of, **per_joint}
 
 
 @cache

@@ -48,11 +48,11 @@ class Taught(NamedTuple):
 class Learning:
     """What one connection teaches. One block at a time is logged, in order; what comes meanwhile waits.
 
-    stream_id: source of the torques; say: sends a text to the client. For the event loop; logging is done in a thread.
+    stream_id: source of the torques; send: sends a text to the client. For the event loop; logging is done in a thread.
     """
 
-    def __init__(self, learners: Learners, stream_id: str, say: Callable[[str], Awaitable[None]]) -> None:
-        self._learners, self._stream_id, self._say = learners, stream_id, say
+    def __init__(self, learners: Learners, stream_id: str, send: Callable[[str], Awaitable[None]]) -> None:
+        self._learners, self._stream_id, self._send = learners, stream_id, send
         self._most, self._wait = learners.settings.stream_flush_rows, learners.settings.stream_flush_s
         # event time goes on evenly though the clock of the host be set while the stream is open
         self._clock = time.time() - perf_counter()
@@ -114,7 +114,7 @@ class Learning:
                 outcome = await self._learn(block)
                 self._flushed.set()
                 if not self._ended:
-                    await self._say(json.dumps(outcome))
+                    await self._send(json.dumps(outcome))
         finally:
             self._task = None
             self._go_on()

@@ -72,14 +72,14 @@ class Conversation(ABC):
                 await send({"type": "websocket.send", "bytes": answer})
                 self.left = perf_counter()
                 if self._texts:
-                    await self._say()
+                    await self._write_texts()
                 self._writing = False
                 # neither call above lets others run when messages wait: a client that sends many must not hold up all
                 await asyncio.sleep(0)
         finally:
             self._timer.cancel()
 
-    async def say(self, text: str) -> None:
+    async def send_text(self, text: str) -> None:
         """Send a text between answers: now, or after the answer that is being written. One caller at a time.
 
         A client that does not read it is cut off as one that does not read its answers; one that is gone misses it.
@@ -90,11 +90,11 @@ class Conversation(ABC):
         with suppress(OSError, RuntimeError):  # gone, or closing, which uvicorn says in its own way
             try:
                 async with asyncio.timeout(self.settings.stream_write_s):
-                    await self._say()
+                    await self._write_texts()
             except TimeoutError:
                 self.connection.abort()
 
-    async def _say(self) -> None:
+    async def _write_texts(self) -> None:
         while self._texts:
             await self.send({"type": "websocket.send", "text": self._texts.popleft()})
 
@@ -191,7 +191,7 @@ class Session(Conversation):
         self._alias = None if alias == SERVING else alias
         self._std, self._late, self._due = std, 0, inf
         self._meter, self._deadline = meter, learners.settings.stream_deadline_s
-        self._learning = None if stream_id is None else Learning(learners, stream_id, self.say)
+        self._learning = None if stream_id is None else Learning(learners, stream_id, self.send_text)
         self._take(served)
 
     async def run(self) -> None:

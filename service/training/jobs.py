@@ -59,7 +59,7 @@ def create(queue: JobQueue, request: JobRequest, retry_of: str | None = None, na
     _check_estimator(queue.database, request, rows[0].joint_names, joint_types)
     with queue.database.transaction() as session:
         if (row := done(session, JobRow, named)) is not None:  # the same request was faster on another connection
-            return shown(row)
+            return represent(row)
         content = {**request.model_dump(mode="json"), "joint_types": joint_types}
         job = add(session, queue.settings, request.model, content, retry_of, named)
         present = set(session.scalars(select(DatasetRow.id).where(DatasetRow.id.in_(request.datasets))))
@@ -70,14 +70,14 @@ def create(queue: JobQueue, request: JobRequest, retry_of: str | None = None, na
         if uploaded and session.scalar(select(RobotRow.id).where(RobotRow.id == request.robot)) is None:
             raise not_found("robot", request.robot)
     queue.submit(job.id)
-    return shown(job)
+    return represent(job)
 
 
 def done_before(database: Database, named: Identity | None) -> Job | None:
     """The job that a request has made before, as it is now; None where it has not. Raise ConflictError."""
     with database.session() as session:
         row = done(session, JobRow, named)
-    return None if row is None else shown(row)
+    return None if row is None else represent(row)
 
 
 def add(
@@ -125,7 +125,7 @@ def show(queue: JobQueue, loaded: LoadedModels, job: str) -> Job:
     row = find(queue.database, job)
     if row.version is not None:
         loaded.announce([row.model])
-    return shown(row)
+    return represent(row)
 
 
 def page(queue: JobQueue, loaded: LoadedModels, part: Page) -> JobPage:
@@ -133,7 +133,7 @@ def page(queue: JobQueue, loaded: LoadedModels, part: Page) -> JobPage:
     with queue.database.session() as session:
         rows, following = newest(session, JobRow, part)
     loaded.announce({row.model for row in rows if row.version is not None})
-    return JobPage(items=[shown(row) for row in rows], next_cursor=following)
+    return JobPage(items=[represent(row) for row in rows], next_cursor=following)
 
 
 def find(database: Database, job: str) -> JobRow:
@@ -163,7 +163,7 @@ def cancel(queue: JobQueue, job: str) -> Job:
         elif not row.cancel_requested:
             lifecycle.enter(row, RUNNING, "asked to end")
         row.cancel_requested = True
-    return shown(row)
+    return represent(row)
 
 
 def _check_joints(request: JobRequest, rows: list[DatasetRow]) -> list[str]:
@@ -205,7 +205,7 @@ def _check_options(options: Options, settings: Settings) -> None:
             raise invalid_request(f"options.{name}", getattr(options, name), f"at most {most}")
 
 
-def shown(row: JobRow) -> Job:
+def represent(row: JobRow) -> Job:
     """A job as the API shows it: columns of its row, and what its request says."""
     fields = {name: getattr(row, name, row.request.get(name)) for name in Job.model_fields}
     return Job.model_validate(fields)
@@ -230,10 +230,10 @@ def refresh(
     version = registry.find(queue.database, model, None)
     with queue.database.transaction() as session:
         if (before := done(session, JobRow, named)) is not None:
-            return shown(before)
+            return represent(before)
         job = add_refresh(session, queue.settings, version, trigger, retry_of, named)
     queue.submit(job.id)
-    return shown(job)
+    return represent(job)
 
 
 def add_refresh(

@@ -54,7 +54,7 @@ async def _events(
             continue
         if now.version is not None:  # who sees it succeed is answered by its version from then on
             await to_thread.run_sync(loaded.announce, [now.model])
-        yield ServerSentEvent(event=kind or "state", data=jobs.shown(now))
+        yield ServerSentEvent(event=kind or "state", data=jobs.represent(now))
         if now.state not in ACTIVE:
             return
         last = now

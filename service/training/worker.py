@@ -115,7 +115,7 @@ def _train(settings: Settings, database: Database, files: Files, claim: Claim) -
             if row.cancel_requested:
                 raise lipcore.FitCancelledError("cancelled after the last look at the flag")
             row.version = _publish(session, claim, material, folder, manifest)
-            row.progress = {**pulse.shown(), "stage": "done", "fraction": 1.0, "remaining_s": 0.0}
+            row.progress = {**pulse.as_json(), "stage": "done", "fraction": 1.0, "remaining_s": 0.0}
             lifecycle.enter(row, SUCCEEDED, f"version {row.version} is trained")
     except lipcore.FitCancelledError:
         _finish(database, files, claim, CANCELLED, "cancelled while it ran")

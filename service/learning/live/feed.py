@@ -113,10 +113,10 @@ def _worst(error: Array, total: Array) -> list[float | None]:
     return worst
 
 
-def beyond(shown: Iterable[Picked]) -> list[LiveNovelty]:
-    """Which of the rows shown lie beyond their versions' bases, stream by stream."""
+def beyond(picked_rows: Iterable[Picked]) -> list[LiveNovelty]:
+    """Which of the rows picked lie beyond their versions' bases, stream by stream."""
     streams: dict[str, list[Picked]] = defaultdict(list)
-    for picked in shown:
+    for picked in picked_rows:
         streams[picked.stream_id].append(picked)
     return [_look(stream_id, parts) for stream_id, parts in streams.items()]
 
