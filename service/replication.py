@@ -150,9 +150,7 @@ class Listener:
 
 def look(learners: Learners, models: Collection[str] | None) -> None:
     """Take in which versions of these models serve, have aliases or are gone; of all that are known here where None.
-
-    Not for the event loop: versions are loaded before they answer.
-    """
+    Not for the event loop: versions are loaded before they answer."""
     known = {model for model, _ in learners.loaded.held()} | learners.monitors().keys()
     here = known if models is None else known & set(models)
     learners.loaded.announce(here)

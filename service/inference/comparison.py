@@ -17,10 +17,8 @@ from service.models.loaded import LoadedModels, Served
 
 
 def compare(loaded: LoadedModels, model: str, request: schema.CompareRequest) -> schema.CompareResponse:
-    """Compare two versions; raise InvalidRequestError, NotFoundError, DamagedDataError or UnreadableVersionError.
-
-    Not for the event loop.
-    """
+    """Compare two versions; raise InvalidRequestError, NotFoundError, DamagedDataError or UnreadableVersionError. Not
+    for the event loop."""
     first, second = versions = _versions(loaded, model, request)
     recorded = measured(loaded, request.dataset, *versions)
     answers = [_answer(each, recorded.used) for each in versions]

@@ -127,9 +127,7 @@ def evaluate(
     loaded: LoadedModels, model: str, request: schema.EvaluateRequest, served: Served | None = None
 ) -> schema.EvaluateResponse:
     """Compare a model with a data set or what it has held out of it; raise InvalidRequestError or NotFoundError.
-
-    served: what answers, where that is found already.
-    """
+    served: what answers, where that is found already."""
     served = served or loaded.get(model, request.version, request.alias)
     known = served.model
     all_of_it = request.part == "all"
@@ -168,10 +166,8 @@ Rows = NDArray[np.int64]
 
 
 def trace(loaded: LoadedModels, model: str, request: schema.TraceRequest) -> schema.TraceResponse:
-    """Follow a model along a data set or what it has held out of it.
-
-    Raise InvalidRequestError, NotFoundError or DamagedDataError. Not for the event loop.
-    """
+    """Follow a model along a data set or what it has held out of it. Raise InvalidRequestError, NotFoundError or
+    DamagedDataError. Not for the event loop."""
     most = loaded.storage.settings.max_trace_points
     if request.points > most:
         raise invalid_request("points", request.points, f"at most {most}")

@@ -39,9 +39,7 @@ class Query(NamedTuple):
 
     def check(self, max_position: float, expected: Callable[[str], str] = lambda _: "a finite number") -> None:
         """Raise InvalidRequestError where a number is not finite or a position beyond ±`max_position`, rad (m).
-
-        expected: says what a number of q, dq, ddq or tau has to be.
-        """
+        expected: says what a number of q, dq, ddq or tau has to be."""
         if not np.isfinite(self.values).all():
             part, row, joint = np.argwhere(~np.isfinite(self.values))[0]
             number = f"{self.values[part, row, joint]:g}"
@@ -212,9 +210,7 @@ def at_once(served: Served, motion: Array, max_position: float) -> Prediction | 
 
 def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: Served | None = None) -> Prediction:
     """Torque with uncertainty at the queries; raise InvalidRequestError or NotFoundError. Not for the event loop.
-
-    served: what answers, where that is found already.
-    """
+    served: what answers, where that is found already."""
     settings = loaded.storage.settings
     served = served or loaded.get(model, request.version, request.alias)
     known = served.model

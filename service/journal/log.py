@@ -196,10 +196,8 @@ def unlearn(session: Session, model: str, event: EventRow, received: float) -> E
 
 
 def rollback(session: Session, model: str, to: int, received: float) -> EventRow:
-    """Take what was learnt after event `to` out again, by every version, and what was set; return the event.
-
-    What was unlearnt stays unlearnt.
-    """
+    """Take what was learnt after event `to` out again, by every version, and what was set; return the event. What was
+    unlearnt stays unlearnt."""
     made = ("batch", "replay", "change", "settings")
     later = (EventRow.model == model, EventRow.number > to)
     session.execute(update(EventRow).where(*later, EventRow.kind.in_(made), EventRow.void.is_(False)).values(void=True))

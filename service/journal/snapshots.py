@@ -38,10 +38,8 @@ def save(
 
 
 def sweep(database: Database, files: Files) -> int:
-    """Delete the files that an interrupted `save` has left; return how many. Only for the process that saves.
-
-    None where several services store snapshots: one whose row is not there yet may be another's.
-    """
+    """Delete the files that an interrupted `save` has left; return how many. Only for the process that saves. None
+    where several services store snapshots: one whose row is not there yet may be another's."""
     if database.shared:
         return 0
     with database.session() as session:

@@ -140,9 +140,7 @@ class Learners:
 
     def monitor(self, model: str) -> Monitor:
         """The monitor of a model, up to the batches that other services have logged by now. Not for the event loop.
-
-        Raise NotFoundError or UnreadableVersionError.
-        """
+        Raise NotFoundError or UnreadableVersionError."""
         monitor = self._monitor(self.loaded.get(model, None))
         self._intake.follow(monitor, model)
         return monitor

@@ -70,10 +70,8 @@ class Learning(Collector):
         yield LOADED.of([((), len(self._learners.loaded.versions()))])
 
     def _monitors(self) -> dict[str, Monitor]:
-        """Monitors by model: those there are, and of models in memory that have got observations before the start.
-
-        No model is loaded for it, which would drop another one.
-        """
+        """Monitors by model: those there are, and of models in memory that have got observations before the start. No
+        model is loaded for it, which would drop another one."""
         learners, loaded = self._learners, self._learners.loaded
         with self._learners.database.session() as session:
             learning = list(session.scalars(select(StreamRow.model).distinct()))

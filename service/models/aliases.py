@@ -85,10 +85,8 @@ def _move(loaded: LoadedModels, model: str, alias: str, version: int, taken_back
 
 
 def point(session: Session, model: str, alias: str, version: int | None, takes_back: int | None = None) -> None:
-    """Point an alias to a version, or to none, and note the move; nothing happens where it points there already.
-
-    Not for the alias `serving`, see `registry.serve`. takes_back: see `registry.note`.
-    """
+    """Point an alias to a version, or to none, and note the move; nothing happens where it points there already. Not
+    for the alias `serving`, see `registry.serve`. takes_back: see `registry.note`."""
     row = session.get(AliasRow, (model, alias))
     before = None if row is None else row.version
     if before == version:

@@ -52,10 +52,8 @@ class ArchiveError(ValueError):
 
 
 def read(path: Path, limits: Mapping[str, int]) -> dict[str, bytes]:
-    """The members of an archive by name. limits: most bytes of each.
-
-    Raise ArchiveError for anything but plain files with these names, each once, complete and within its limit.
-    """
+    """The members of an archive by name. limits: most bytes of each. Raise ArchiveError for anything but plain files
+    with these names, each once, complete and within its limit."""
     files: dict[str, bytes] = {}
     length = path.stat().st_size
     with path.open("rb") as file:
@@ -225,10 +223,8 @@ URDF_EXAMPLE = """<?xml version="1.0"?>
 
 
 def write_urdf(loaded: LoadedModels, model: str, version: int | None, alias: str | None) -> tuple[str, str]:
-    """The name of a file and the URDF that belongs in it, of the version that serves where none is named.
-
-    Raise NotFoundError, InvalidRequestError for both a version and an alias, and for a version without an arm.
-    """
+    """The name of a file and the URDF that belongs in it, of the version that serves where none is named. Raise
+    NotFoundError, InvalidRequestError for both a version and an alias, and for a version without an arm."""
     row = _find(loaded, model, version, alias)
     name, manifest = f"{row.model}-v{row.version}", row.manifest
     try:

@@ -89,10 +89,8 @@ class LoadedModels:
         self._unreadable: dict[Key, str] = {}
 
     def hot(self, model: str, version: int | None, alias: str | None = None) -> Served | None:
-        """Return a version, or the one that an alias points to, if it is in memory; never waits.
-
-        With neither, as with the alias `serving`, it is the one that serves.
-        """
+        """Return a version, or the one that an alias points to, if it is in memory; never waits. With neither, as with
+        the alias `serving`, it is the one that serves."""
         snapshot = self._snapshot
         if version is None:
             version = snapshot.pointed(model, alias)
@@ -113,10 +111,8 @@ class LoadedModels:
         return (model, version) in self._deleted
 
     def get(self, model: str, version: int | None, alias: str | None = None) -> Served:
-        """Return a version, or the one that an alias points to, loaded if need be. Not for the event loop.
-
-        With neither it is the one that serves. Raise NotFoundError or UnreadableVersionError.
-        """
+        """Return a version, or the one that an alias points to, loaded if need be. Not for the event loop. With neither
+        it is the one that serves. Raise NotFoundError or UnreadableVersionError."""
         served = self.hot(model, version, alias)
         while served is None:
             number, serving = self.meant(model, version, alias)
@@ -225,9 +221,7 @@ class LoadedModels:
 
     def learn_from(self, wake: Callable[[str], None]) -> None:
         """Have a learner woken, by the name of the model, whenever a version is loaded without all that its log holds.
-
-        It is woken for those that have been loaded so already.
-        """
+        It is woken for those that have been loaded so already."""
         self._wake = wake
         while self._lagging:
             wake(self._lagging.pop())
@@ -238,9 +232,7 @@ class LoadedModels:
 
     def revise(self, name: str, version: int, revision: int, learnt: Revision) -> bool:
         """Answer with what a version has learnt, from now on or once it is loaded; return whether that changed answers.
-
-        Nothing is done where a revision as high is known. Not for the event loop; it computes next to nothing.
-        """
+        Nothing is done where a revision as high is known. Not for the event loop; it computes next to nothing."""
         key = (name, version)
         with self._revising:  # one at a time, so that the highest is the last
             if key in self._deleted:

@@ -285,10 +285,8 @@ def _show(session: Session, row: ModelRow) -> Model:
 def lost(
     database: Database, files: Files, held: Collection[tuple[str, int]], damaged: Collection[tuple[str, int]]
 ) -> tuple[int, int]:
-    """How many models have a version that serves and cannot be read, and how many there are.
-
-    held: versions in memory, which answer whatever their files are; damaged: those whose files could not be read.
-    """
+    """How many models have a version that serves and cannot be read, and how many there are. held: versions in memory,
+    which answer whatever their files are; damaged: those whose files could not be read."""
     with database.session() as session:
         names = list(session.scalars(select(ModelRow.name)))
         rows = session.execute(select(VersionRow.model, VersionRow.version, VersionRow.folder))

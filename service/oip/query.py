@@ -214,10 +214,8 @@ def _listed(tensor: schema.InferInput, count: int) -> Array:
 
 
 def compute(model: TorqueModel, query: Query, names: frozenset[str]) -> dict[str, Array]:
-    """Tensors by name, their first axis N, noise_std (n,) apart; nothing is computed that they do not need.
-
-    Raise InvalidRequestError where inertia cannot be inverted.
-    """
+    """Tensors by name, their first axis N, noise_std (n,) apart; nothing is computed that they do not need. Raise
+    InvalidRequestError where inertia cannot be inverted."""
     tensors = _torques(model, query.values[:3], names)
     if "noise_std" in names:
         tensors["noise_std"] = model.noise_std

@@ -25,10 +25,8 @@ _LISTED = 20
 
 
 async def find(loaded: LoadedModels, turns: CapacityLimiter, name: str, version: str | None) -> Served:
-    """Return a version by its number or an alias, the one that serves where None, loaded if need be.
-
-    turns: of what loads. Raise NotFoundError naming those there are.
-    """
+    """Return a version by its number or an alias, the one that serves where None, loaded if need be. turns: of what
+    loads. Raise NotFoundError naming those there are."""
     number, alias = (None, None) if version is None else _meant(version)
     served = loaded.hot(name, number, alias)
     if served is not None:

@@ -45,9 +45,7 @@ class Message(NamedTuple):
 
 def decode(body: bytes, headers: Headers) -> Message:
     """Decode the JSON of a body; raise InvalidRequestError, or UnsupportedMediaTypeError where it is compressed.
-
-    headers: of the request, their names in lower case.
-    """
+    headers: of the request, their names in lower case."""
     length: bytes | None = None
     for name, value in headers:
         if name == _HEADER:

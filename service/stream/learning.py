@@ -33,10 +33,8 @@ TICK = 1e-6
 
 
 class Taught(NamedTuple):
-    """A frame to learn from. served: what answered it; arrived: time of `time.perf_counter`.
-
-    request: the whole frame; answer: bytes of mean and standard deviation, (2, n), made before it is learnt.
-    """
+    """A frame to learn from. served: what answered it; arrived: time of `time.perf_counter`. request: the whole frame;
+    answer: bytes of mean and standard deviation, (2, n), made before it is learnt."""
 
     served: Served
     sequence: int
@@ -46,10 +44,8 @@ class Taught(NamedTuple):
 
 
 class Learning:
-    """What one connection teaches. One block at a time is logged, in order; what comes meanwhile waits.
-
-    stream_id: source of the torques; send: sends a text to the client. For the event loop; logging is done in a thread.
-    """
+    """What one connection teaches. One block at a time is logged, in order; what comes meanwhile waits. stream_id:
+    source of the torques; send: sends a text to the client. For the event loop; logging is done in a thread."""
 
     def __init__(self, learners: Learners, stream_id: str, send: Callable[[str], Awaitable[None]]) -> None:
         self._learners, self._stream_id, self._send = learners, stream_id, send

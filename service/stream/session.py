@@ -80,10 +80,8 @@ class Conversation(ABC):
             self._timer.cancel()
 
     async def send_text(self, text: str) -> None:
-        """Send a text between answers: now, or after the answer that is being written. One caller at a time.
-
-        A client that does not read it is cut off as one that does not read its answers; one that is gone misses it.
-        """
+        """Send a text between answers: now, or after the answer that is being written. One caller at a time. A client
+        that does not read it is cut off as one that does not read its answers; one that is gone misses it."""
         self._texts.append(text)
         if self._writing:
             return
@@ -142,10 +140,8 @@ class FrameReader:
         self._lengths = {learn: frames.request_bytes(self.n_joints, learn) for learn in (False, True)}
 
     def read(self, data: bytes, flags: int, n: int, budget: float) -> Array:
-        """Return q, dq, ddq of a frame, (3, n), whose header is already read; raise InvalidRequestError.
-
-        Torque that it carries must be there, and is not looked at.
-        """
+        """Return q, dq, ddq of a frame, (3, n), whose header is already read; raise InvalidRequestError. Torque that it
+        carries must be there, and is not looked at."""
         if n != self.n_joints:
             raise invalid_request("n", n, f"{self.n_joints} joints: {', '.join(self.joint_names)}")
         both = frames.ASK_STD | frames.ASK_LEARN
@@ -299,10 +295,8 @@ class Session(Conversation):
         return header + body.model_dump_json().encode()
 
     async def _follow(self, current: Served | None) -> None:
-        """Take the version that is current; None: it has been dropped from memory, maybe for a newer one.
-
-        Raise NotFoundError where the version, the alias or the model has been deleted.
-        """
+        """Take the version that is current; None: it has been dropped from memory, maybe for a newer one. Raise
+        NotFoundError where the version, the alias or the model has been deleted."""
         if current is None:
             meant = self._loaded.newest(self._name, self._alias) if self._pin is None else self._pin
             if meant == self._served.version and not self._loaded.is_deleted(self._name, meant):

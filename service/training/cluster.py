@@ -33,9 +33,7 @@ HOST = "service.training.hosting:host"
 
 class ClusterQueue(JobQueue):
     """Has workers of a cluster run jobs, and goes on with jobs of services that are gone; a job outlives its service.
-
-    Which service owns a job says who watches it; the one that dies is followed by another.
-    """
+    Which service owns a job says who watches it; the one that dies is followed by another."""
 
     def _places(self) -> list[Slot]:
         assert self.settings.cluster is not None

@@ -30,10 +30,8 @@ class CannotHoldOutError(ValueError):
 
 @dataclass(frozen=True)
 class SetSplit:
-    """How one data set is split.
-
-    entire: nothing of it is learnt from; guard: in `unit`; known: rows held out and guarded where it was split before.
-    """
+    """How one data set is split. entire: nothing of it is learnt from; guard: in `unit`; known: rows held out and
+    guarded where it was split before."""
 
     dataset: str
     asked: Holdout

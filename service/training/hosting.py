@@ -56,10 +56,8 @@ class VersionsDifferError(RuntimeError):
 
 
 def host(version: str, job: str) -> None:
-    """Run a job on this worker, and then whatever else waits that it can run. version: of the service that asks.
-
-    Work that others wait for is not left lying: the cluster gives tickets to workers before these are free.
-    """
+    """Run a job on this worker, and then whatever else waits that it can run. version: of the service that asks. Work
+    that others wait for is not left lying: the cluster gives tickets to workers before these are free."""
     if version != __version__:
         raise VersionsDifferError(f"the worker has version {__version__}, the service {version}: start them alike")
     with _one:  # a worker that has lost its scheduler and joined again may still be at work

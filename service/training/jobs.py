@@ -42,10 +42,8 @@ USUAL_WAIT_S, LONGEST_WAIT_S = 30, 3600
 
 
 def create(queue: JobQueue, request: JobRequest, retry_of: str | None = None, named: Identity | None = None) -> Job:
-    """Check a request, store it as a queued job and hand it to the queue.
-
-    retry_of: the job that it repeats; named: the request, which is not done again where it was before.
-    """
+    """Check a request, store it as a queued job and hand it to the queue. retry_of: the job that it repeats; named: the
+    request, which is not done again where it was before."""
     if (before := done_before(queue.database, named)) is not None:
         return before
     _check_options(request.options, queue.settings)
@@ -150,9 +148,7 @@ def _existing(row: JobRow | None, job: str) -> JobRow:
 
 def cancel(queue: JobQueue, job: str) -> Job:
     """Cancel a job: at once while it waits; while it runs within `job_cancel_grace_s`, with or without its consent.
-
-    Raise NotFoundError, ConflictError where it has ended.
-    """
+    Raise NotFoundError, ConflictError where it has ended."""
     queue.stop(job)  # before anything is written, for which its process may hold the lock
     with queue.database.transaction() as session:
         row = _existing(lifecycle.row_of(session, job), job)

@@ -152,10 +152,8 @@ def new_folder(job: str) -> str:
 
 
 def remove_leftovers(database: Database, files: Files, job: str) -> int:
-    """Delete what a job that runs nowhere has written and no version names; return how many folders.
-
-    Where several services share the files it is done once the job has ended, else when they are swept.
-    """
+    """Delete what a job that runs nowhere has written and no version names; return how many folders. Where several
+    services share the files it is done once the job has ended, else when they are swept."""
     try:
         names = files.versions_marked(_folder_mark(job))
         if not names:

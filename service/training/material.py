@@ -35,11 +35,8 @@ STRETCHES, STRETCH = 40, 500
 
 @dataclass(frozen=True)
 class Shard:
-    """Rows `first` to `last`, exclusive, of a data set, in plain data.
-
-    chosen: bits of those that count, all where None; timed: whether their times say how much they count; factor: what
-    each counts besides.
-    """
+    """Rows `first` to `last`, exclusive, of a data set, in plain data. chosen: bits of those that count, all where
+    None; timed: whether their times say how much they count; factor: what each counts besides."""
 
     dataset: str
     sha256: str

@@ -111,10 +111,8 @@ class Logged:
 def read_log(
     database: Database, model: str, joint_names: tuple[str, ...], scope: Scope, most: int, longest_step: float
 ) -> Logged:
-    """Rows in scope that teach, at most `most` of them, thinned evenly.
-
-    Sorted by stream and time; where time steps by more than `longest_step` seconds a new episode begins.
-    """
+    """Rows in scope that teach, at most `most` of them, thinned evenly. Sorted by stream and time; where time steps by
+    more than `longest_step` seconds a new episode begins."""
     kept, count = _thinned(database, model, scope, most)
     if count == 0:
         return Logged(None, 0)
@@ -134,10 +132,8 @@ def age_weights(times: Array, scope: Scope) -> Array | None:
 
 
 def _thinned(database: Database, model: str, scope: Scope, most: int) -> tuple[list[tuple[Rows, Array]], int]:
-    """Every k-th row in scope in the order of the log, each with the number of its stream, and how many there are.
-
-    One pass, and never more than twice `most` rows in memory: k doubles whenever there are that many.
-    """
+    """Every k-th row in scope in the order of the log, each with the number of its stream, and how many there are. One
+    pass, and never more than twice `most` rows in memory: k doubles whenever there are that many."""
     kept: list[tuple[Rows, Array]] = []
     streams: dict[str | None, int] = {}
     step, count, held, after = 1, 0, 0, 0

@@ -47,10 +47,8 @@ class TakenBackError(RuntimeError):
 
 
 def run(settings: Settings, job: str) -> None:
-    """Run one queued job to its end. All outcomes are written to its row; nothing is raised for a failed fit.
-
-    Raise StorageError where the outcome could not be written, or what is needed not be read.
-    """
+    """Run one queued job to its end. All outcomes are written to its row; nothing is raised for a failed fit. Raise
+    StorageError where the outcome could not be written, or what is needed not be read."""
     token = job_id.set(job)
     database, files = Database.of(settings), Files.of(settings, PATIENCE_S)
     try:

@@ -237,9 +237,7 @@ def replay(
 
 def admit(session: Session, batch: EventRow, codes: Collection[str], received: float) -> dict[str, int]:
     """Log a replay: the rows of a batch with these codes that no earlier replay has learnt; return their counts.
-
-    Nothing is logged where there are none. Rows whose time was wrong count as of their arrival.
-    """
+    Nothing is logged where there are none. Rows whose time was wrong count as of their arrival."""
     pending = set(codes) - _replayed(session, batch)
     rows = log.rows_of(batch)
     chosen = _complete(rows) & np.isin(rows.code, [CODES.index(code) for code in pending])

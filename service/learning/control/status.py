@@ -49,10 +49,8 @@ def learning(learners: Learners, model: str) -> schema.Learning:
 
 
 def quality(learners: Learners, model: str) -> schema.Quality:
-    """Return how well a model predicts each row before it is learnt, over the windows of the settings.
-
-    Raise NotFoundError. Not for the event loop.
-    """
+    """Return how well a model predicts each row before it is learnt, over the windows of the settings. Raise
+    NotFoundError. Not for the event loop."""
     served = learners.loaded.get(model, None)
     now = time.time()
     return schema.Quality(

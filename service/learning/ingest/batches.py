@@ -33,11 +33,8 @@ from service.storage.database import EventRow
 
 
 def observe_batch(intake: Intake, model: str, request: ObservationRequest) -> ObservationResponse:
-    """Take a batch; once this returns it is durable.
-
-    Raise NotFoundError, LearningDisabledError, InvalidRequestError, ConflictError, ExpiredError, BusyError or
-    StorageFullError.
-    """
+    """Take a batch; once this returns it is durable. Raise NotFoundError, LearningDisabledError, InvalidRequestError,
+    ConflictError, ExpiredError, BusyError or StorageFullError."""
     served, received = intake.loaded.get(model, None), time.time()
     batch = measured(request, served.model, intake.settings)
     content = digest(batch)
@@ -179,10 +176,8 @@ def state(session: Session, event: EventRow) -> State:
 
 @dataclass(frozen=True)
 class Frames:
-    """N frames of one stream with what `served` answered. sequences: (N,), rising; time: (N,) Unix time, s.
-
-    q, dq, ddq, tau, mean, std: (N, n).
-    """
+    """N frames of one stream with what `served` answered. sequences: (N,), rising; time: (N,) Unix time, s. q, dq, ddq,
+    tau, mean, std: (N, n)."""
 
     model: str
     stream_id: str
@@ -200,9 +195,7 @@ class Frames:
 @dataclass(frozen=True)
 class FramesResult:
     """Durable frames. through: highest sequence of them; accepted, rejected (by code): of those that are new.
-
-    duplicates: frames that were in the log; revision: answers from it on contain the frames.
-    """
+    duplicates: frames that were in the log; revision: answers from it on contain the frames."""
 
     through: int
     accepted: int
@@ -212,11 +205,8 @@ class FramesResult:
 
 
 def observe_frames(intake: Intake, frames: Frames) -> FramesResult:
-    """Log frames; once this returns they are durable. All of them or none.
-
-    Raise LearningDisabledError, ConflictError for a sequence that was used for something else or does not rise,
-    ExpiredError, BusyError or StorageFullError.
-    """
+    """Log frames; once this returns they are durable. All of them or none. Raise LearningDisabledError, ConflictError
+    for a sequence that was used for something else or does not rise, ExpiredError, BusyError or StorageFullError."""
     _check_order(frames)
     monitor = intake.monitor(frames.served)
     with intake.turn(monitor, frames.model):

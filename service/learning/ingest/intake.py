@@ -73,10 +73,8 @@ class Intake:
 
     @contextmanager
     def turn(self, monitor: Monitor, model: str) -> Iterator[None]:
-        """Have a model's log alone, among all threads and services; its monitor is up to the log by then.
-
-        Raise StorageUnavailableError where the turn does not come within `database_timeout_s`.
-        """
+        """Have a model's log alone, among all threads and services; its monitor is up to the log by then. Raise
+        StorageUnavailableError where the turn does not come within `database_timeout_s`."""
         # the turn first: who only looks at the monitor does not wait for other services
         with self.database.turn(model), monitor.lock:
             self._follow(monitor, model)
@@ -102,10 +100,8 @@ class Intake:
         screened: Screened,
         details: dict[str, Any],
     ) -> dict[str, Any]:
-        """Judge a batch and log it with all that follows from it, in one transaction, in a `turn` of its model.
-
-        Return the report that the log keeps of it: `details`, and what every report has. The batch is durable then.
-        """
+        """Judge a batch and log it with all that follows from it, in one transaction, in a `turn` of its model. Return
+        the report that the log keeps of it: `details`, and what every report has. The batch is durable then."""
         model = served.name
         rows = screened.own.stop - screened.own.start
         self.disk.take(ROW_NUMBERS * NUMBER_BYTES * served.model.n_joints * rows)

@@ -87,9 +87,7 @@ class Clock:
 
     def leaps(self, t: Array, usable: NDArray[np.bool_], offset: float, gap: float) -> NDArray[np.bool_]:
         """Rows (N,) dated later than now, right after a gap, and before another one or at the end: most likely wrong.
-
-        Taken for true, such a time would be the present for all rows to come.
-        """
+        Taken for true, such a time would be the present for all rows to come."""
         leaping = np.zeros(len(t), dtype=np.bool_)
         times = t[usable]
         start = self.after if self.adjacent and self.after is not None else times[:1]
@@ -169,10 +167,8 @@ def limits(model: TorqueModel, options: LearningOptions, settings: Settings) -> 
 
 
 def dated(measured: Measured, clock: Clock, bounds: Limits, previous: float | None) -> Dated:
-    """Check, date and weigh rows. previous: event time of the row right before them, s, where it is known.
-
-    Weights come from the batch itself where it has a spacing, so that they do not depend on the order of arrival.
-    """
+    """Check, date and weigh rows. previous: event time of the row right before them, s, where it is known. Weights come
+    from the batch itself where it has a spacing, so that they do not depend on the order of arrival."""
     t = measured.t
     numbers = measured.q, measured.dq, measured.ddq, measured.tau
     codes = check_rows(t, *numbers, bounds, clock.after, clock.before)
@@ -198,10 +194,8 @@ def predict(
     derived: DerivedAcceleration | None = None,
     answered: tuple[Array, Array] | None = None,
 ) -> Screened:
-    """Let a model predict the rows that passed; those it has no finite answer for are beyond its limits.
-
-    answered: mean and std, (N, n) each, of all rows, where a stream has answered them already.
-    """
+    """Let a model predict the rows that passed; those it has no finite answer for are beyond its limits. answered: mean
+    and std, (N, n) each, of all rows, where a stream has answered them already."""
     codes, predicted = rows.code.copy(), rows.code == LEARNT
     good, floor = rows.take(predicted), model.posterior.floor.numpy()
     if answered is None:
@@ -261,10 +255,8 @@ def derive(
 
 
 def _rate(t: Array) -> float:
-    """Rows a second, in the longest stretch without a gap: event time is too coarse to tell, to 0.2 µs today.
-
-    Raise InvalidRequestError where accelerations cannot be derived at this rate, or time is too uneven.
-    """
+    """Rows a second, in the longest stretch without a gap: event time is too coarse to tell, to 0.2 µs today. Raise
+    InvalidRequestError where accelerations cannot be derived at this rate, or time is too uneven."""
     finite = t[np.isfinite(t)]
     if len(finite) < 2:
         raise invalid_request("t", f"{len(finite)} times", "at least 2 rows with times, to derive ddq from dq with")

@@ -75,10 +75,8 @@ class Contest:
         return cls(Record.empty(n_joints), Record.empty(n_joints), {})
 
     def step(self, time: Array, tau: Array, serving: Answer, candidate: Answer, at: float) -> Contest:
-        """Add rows with event times (N,) s, measured torques (N, n), and the predictions of both versions.
-
-        at: Unix time, s.
-        """
+        """Add rows with event times (N,) s, measured torques (N, n), and the predictions of both versions. at: Unix
+        time, s."""
         difference = (surprise(tau, serving) - surprise(tau, candidate)).sum(axis=1)
         blocks = dict(self.blocks)
         for number, value in zip(

@@ -140,10 +140,8 @@ class Follower:
         return self._stored_at + self.settings.snapshot_every_s
 
     def store_in_turn(self) -> None:
-        """Store the state, unless another service has stored what this version has learnt since it was due last.
-
-        The first one does it for all: they learn the same.
-        """
+        """Store the state, unless another service has stored what this version has learnt since it was due last. The
+        first one does it for all: they learn the same."""
         if self.database.shared:
             with self.database.session() as session:
                 last = snapshots.last_stored(session, self.model, self.version)
@@ -154,10 +152,8 @@ class Follower:
         self.store()
 
     def store(self) -> None:
-        """Store the state, unless it is stored, or a later one, or it is a stage on the way to another one.
-
-        Where there is no room for it, learning goes on all the same: the log has everything.
-        """
+        """Store the state, unless it is stored, or a later one, or it is a stage on the way to another one. Where there
+        is no room for it, learning goes on all the same: the log has everything."""
         if self.number == self._stored or not self.known.settled or self._is_stored():
             return
         self._stored_at = time.monotonic()

@@ -37,10 +37,8 @@ def learner_place(settings: Settings) -> Place:
 
 
 class LearnerProcess:
-    """Started when a model is woken for the first time.
-
-    on_message: called in a thread of its own, with one message after the other, in the order in which they were sent.
-    """
+    """Started when a model is woken for the first time. on_message: called in a thread of its own, with one message
+    after the other, in the order in which they were sent."""
 
     def __init__(self, settings: Settings, on_message: Callable[[Message], None]) -> None:
         self.settings, self.on_message = settings, on_message

@@ -116,11 +116,8 @@ def advance(
     watch: Watch | None = None,
     novel: Novel | None = None,
 ) -> Restored:
-    """Return the state after the next page of events, the very same one where nothing is new.
-
-    watch: called with the batches of the page before they are learnt; novel: see `OnlineModel.learn`.
-    Raise RewoundError.
-    """
+    """Return the state after the next page of events, the very same one where nothing is new. watch: called with the
+    batches of the page before they are learnt; novel: see `OnlineModel.learn`. Raise RewoundError."""
     with database.session() as session:
         newest = log.newest(session, known.model)
         last = newest if at_most is None else min(at_most, newest)
@@ -200,9 +197,7 @@ def _learn(
 
 def _take(database: Database, known: Restored, online: OnlineModel, taking: Taking, end: int) -> OnlineModel:
     """Take a batch and its replays out again, for the sake of event `end`; raise RewoundError where that takes the log.
-
-    online: one whose sums nobody else has.
-    """
+    online: one whose sums nobody else has."""
     if _is_without(known, taking.batch, taking.number) or not taking.events:
         return online
     try:

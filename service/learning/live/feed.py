@@ -38,9 +38,7 @@ MOST_LOOKED = 20
 @dataclass(frozen=True)
 class Picked:
     """The rows that are shown, (N,), and their predictions before they were learnt, (N, n), NaN where there are none.
-
-    bare: the standard deviation without the floor of past errors, as `Screened` has it.
-    """
+    bare: the standard deviation without the floor of past errors, as `Screened` has it."""
 
     stream_id: str
     served: Served
@@ -58,10 +56,8 @@ def thinned(batches: Iterable[Judged], most: int) -> list[tuple[LivePart, Picked
 
 
 def pick(code: NDArray[np.uint8], most: int) -> NDArray[np.int64]:
-    """Places of at most so many rows (at least one) of these codes, in order, those at an edge left out.
-
-    One of each stretch: the first that was kept out where there is one, so that no stretch looks calmer than it was.
-    """
+    """Places of at most so many rows (at least one) of these codes, in order, those at an edge left out. One of each
+    stretch: the first that was kept out where there is one, so that no stretch looks calmer than it was."""
     places = np.flatnonzero(code != EDGE)
     if len(places) <= most:
         return places
@@ -138,11 +134,8 @@ def _look(stream_id: str, parts: list[Picked]) -> LiveNovelty:
 
 
 def _doubtful(picked: Picked) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    """Places of rows that may lie beyond the basis.
-
-    What the basis leaves open is part of the variance of every answer: where that is below the noise's, nothing
-    more needs to be computed.
-    """
+    """Places of rows that may lie beyond the basis. What the basis leaves open is part of the variance of every answer:
+    where that is below the noise's, nothing more needs to be computed."""
     with np.errstate(invalid="ignore"):
         doubtful = (picked.bare > picked.served.model.noise_std).any(axis=1)
     return np.flatnonzero(doubtful)
