@@ -10,7 +10,7 @@ from prometheus_client.registry import Collector
 from sqlalchemy import select
 
 from lipcore.vocabulary import CODES
-from service.learning.control import decisions, status
+from service.learning.control import status
 from service.learning.ingest.monitor import Monitor
 from service.learning.learners import Learners
 from service.storage.database import StreamRow
@@ -62,7 +62,7 @@ class Learning(Collector):
                 continue
             revision.add_metric([model, str(served.version)], served.revision)
             with self._learners.database.session() as session:
-                behind = decisions.current(session, model, served.version) - served.revision
+                behind = status.current(session, model, served.version) - served.revision
             lag.add_metric([model], max(behind, 0))
             if (share := self._learners.status(model, served.version).novel_share) is not None:
                 novel.add_metric([model], share)

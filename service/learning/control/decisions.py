@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import replace
 from typing import Any
 
@@ -15,9 +15,9 @@ from sqlalchemy.orm import Session
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.errors import ConflictError, invalid_request, problem
-from service.journal import log, snapshots
+from service.journal import log
 from service.learning import owner
-from service.learning.control import inspection, schema
+from service.learning.control import schema, status
 from service.learning.ingest.batches import state
 from service.learning.learners import Learners
 from service.learning.schema import LearningOptions
@@ -25,7 +25,6 @@ from service.models import registry
 from service.storage.database import Database, EventRow, LearnerRow
 from service.web.pagination import Page
 
-Range = tuple[int, int]
 WORDS = {"unlearnt": "has been unlearnt", "rolled_back": "was undone by a rollback"}
 
 
@@ -34,37 +33,14 @@ def serving(database: Database, model: str) -> int:
     return registry.find(database, model, None).version
 
 
-def current(session: Session, model: str, version: int) -> int:
-    """Return the revision of a version once all of the log is learnt."""
-    return log.newest(session, model) - log.start_of(session, model, version)
-
-
 def revised_now(session: Session, model: str, version: int) -> schema.Revised:
     """Return the revision of a version that contains everything logged so far."""
-    return schema.Revised(model=model, version=version, revision=current(session, model, version))
-
-
-def reachable(session: Session, model: str, version: int) -> list[Range]:
-    """Return the ranges [first, last] of revisions whose state can be made again, rising.
-
-    That takes the version as trained, or a snapshot, and all events from there; and no rollback may have gone back
-    behind it since: the events that a rollback has undone teach nothing any more, so that their states are gone.
-    """
-    start, newest = log.start_of(session, model, version), log.newest(session, model)
-    bases = sorted({start, *(row.number for row in snapshots.of(session, model, version) if row.number > start)})
-    ranges: list[Range] = []
-    for base, following in zip(bases, [*bases[1:], newest + 1], strict=True):
-        last = following - 1
-        ranges.append((base, last if log.is_complete(session, model, base, last) else base))
-    rollbacks = select(EventRow.number, EventRow.detail).where(EventRow.model == model, EventRow.kind == "rollback")
-    for number, detail in session.execute(rollbacks):
-        ranges = [part for each in ranges for part in _without(each, detail["to"] + 1, number - 1)]
-    return _joined([(first - start, last - start) for first, last in ranges])
+    return schema.Revised(model=model, version=version, revision=status.current(session, model, version))
 
 
 def find_learnt(session: Session, model: str, stream_id: str, sequence: int) -> EventRow:
     """Return the batch of exactly this sequence; raise NotFoundError, or ConflictError where it was undone."""
-    batch = inspection.find(session, model, stream_id, sequence)
+    batch = status.find(session, model, stream_id, sequence)
     if batch.sequence != sequence:
         together = f"{batch.sequence}: frames {batch.sequence} to {batch.last_sequence} were logged together"
         raise invalid_request("sequence", sequence, together)
@@ -105,10 +81,10 @@ def rollback(learners: Learners, model: str, request: schema.RollbackRequest) ->
 def _to_revision(learners: Learners, model: str, revision: int) -> schema.RolledBack:
     version = serving(learners.database, model)
     with learners.database.turn(model), learners.database.transaction(model) as session:
-        newest = current(session, model, version)
+        newest = status.current(session, model, version)
         if revision >= newest:
             raise invalid_request("revision", revision, f"one below {newest}, the newest of version {version}")
-        _check_reach(revision, version, reachable(session, model, version))
+        _check_reach(revision, version, status.reachable(session, model, version))
         to = log.start_of(session, model, version) + revision
         undone = select(func.count()).where(
             EventRow.model == model,
@@ -123,9 +99,9 @@ def _to_revision(learners: Learners, model: str, revision: int) -> schema.Rolled
     return schema.RolledBack(**revised.model_dump(), undone=count, complete=True)
 
 
-def _check_reach(revision: int, version: int, ranges: list[Range]) -> None:
+def _check_reach(revision: int, version: int, ranges: list[status.Range]) -> None:
     """Raise ConflictError, naming the revisions that can be returned to, where this one is none of them."""
-    if _is_reached(revision, ranges):
+    if status.is_reached(revision, ranges):
         return
     oldest = next((first for first, last in ranges if last > 0), 0)
     listed = ", ".join(str(first) if first == last else f"{first} to {last}" for first, last in ranges)
@@ -136,10 +112,6 @@ def _check_reach(revision: int, version: int, ranges: list[Range]) -> None:
     )
 
 
-def _is_reached(revision: int, ranges: list[Range]) -> bool:
-    return any(first <= revision <= last for first, last in ranges)
-
-
 def _to_version(learners: Learners, model: str, version: int) -> schema.RolledBack:
     if version == serving(learners.database, model):
         raise ConflictError(f"version {version} of model {model!r} serves already")
@@ -147,28 +119,10 @@ def _to_version(learners: Learners, model: str, version: int) -> schema.RolledBa
     with learners.database.transaction() as session:
         registry.serve(session, model, version)
         revised = revised_now(session, model, version)
-        complete = _is_reached(revised.revision, reachable(session, model, version))
+        complete = status.is_reached(revised.revision, status.reachable(session, model, version))
     learners.loaded.adopt(model)
     learners.process.wake(model)
     return schema.RolledBack(**revised.model_dump(), undone=0, complete=complete)
-
-
-def _without(span: Range, first: int, last: int) -> Iterator[Range]:
-    """The parts of a range that are left once first to last are taken out."""
-    for a, b in ((span[0], min(span[1], first - 1)), (max(span[0], last + 1), span[1])):
-        if a <= b:
-            yield a, b
-
-
-def _joined(ranges: list[Range]) -> list[Range]:
-    """The same numbers in as few ranges as there can be."""
-    joined: list[Range] = []
-    for first, last in sorted(ranges):
-        if joined and first <= joined[-1][1] + 1:
-            joined[-1] = (joined[-1][0], max(last, joined[-1][1]))
-        else:
-            joined.append((first, last))
-    return joined
 
 
 TIME_JUMP = CODES.index("time_jump")

@@ -16,7 +16,7 @@ from service.foundation.errors import (
     UnreadableVersionError,
     responses,
 )
-from service.learning.control import decisions, inspection, schema, status
+from service.learning.control import decisions, schema, status
 from service.learning.learners import LearnersDep
 from service.learning.schema import MOST_SEQUENCE, LearningOptions, StreamId
 from service.training import jobs
@@ -55,7 +55,7 @@ def list_observations(
     rejected: Annotated[bool, Query(description="Only batches with rows that were kept out")] = False,
 ) -> schema.ObservationPage:
     """One page of the log: which batches came and what became of their rows."""
-    return inspection.page(learners, model, page, stream_id, rejected)
+    return status.page(learners, model, page, stream_id, rejected)
 
 
 @router.get(BATCH, summary="One observation batch")
@@ -67,7 +67,7 @@ def show_observation(
     rows: Annotated[bool, Query(description="Also answer its rows, each with its code")] = False,
 ) -> schema.ObservationDetail:
     """What was said of a batch when it came, how well it was predicted, and what has become of it."""
-    return inspection.show(learners, model, stream_id, sequence, rows)
+    return status.show(learners, model, stream_id, sequence, rows)
 
 
 @router.delete(BATCH, summary="Unlearn an observation batch", responses=responses(ConflictError))

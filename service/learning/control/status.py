@@ -1,21 +1,32 @@
-"""Where the learning of a model stands, and how well the model predicts."""
+"""Where the learning of a model stands, how well the model predicts, and what its log has of batches and their rows."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from typing import Any
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from lipcore.online.batch import Rows
+from lipcore.online.record import Record
 from lipcore.vocabulary import CODES, LEARNT
+from service.foundation.errors import NotFoundError, not_found
+from service.foundation.fields import finite
 from service.journal import log, snapshots
 from service.learning import owner
-from service.learning.control import decisions, schema
-from service.learning.control.inspection import figures
+from service.learning.control import schema
+from service.learning.ingest.batches import state
 from service.learning.ingest.monitor import Window
 from service.learning.learners import Learners
-from service.storage.database import LearnerRow, StreamRow
+from service.learning.schema import ObservationResponse
+from service.models import registry
+from service.storage.database import EventRow, LearnerRow, StreamRow
+from service.web.pagination import Page
 
+Range = tuple[int, int]
 MOST_GAPS = 20
 """Gaps of a stream that are listed."""
 
@@ -39,7 +50,7 @@ def learning(learners: Learners, model: str) -> schema.Learning:
             held=owner.held(session, model),
             candidate=_candidate(session, model, version),
             streams=_streams(session, model),
-            reachable=[list(each) for each in decisions.reachable(session, model, version)],
+            reachable=[list(each) for each in reachable(session, model, version)],
             snapshots=[
                 schema.Snapshot(revision=row.number - start, created_at=row.created_at)
                 for row in snapshots.of(session, model, version)
@@ -78,7 +89,7 @@ def _candidate(session: Session, model: str, serving: int) -> schema.Candidate |
     version = session.scalar(query.order_by(LearnerRow.version.desc()).limit(1))
     if version is None:
         return None
-    return schema.Candidate(version=version, revision=decisions.current(session, model, version))
+    return schema.Candidate(version=version, revision=current(session, model, version))
 
 
 def _streams(session: Session, model: str) -> list[schema.Stream]:
@@ -95,3 +106,135 @@ def _streams(session: Session, model: str) -> list[schema.Stream]:
         )
         for row in session.scalars(query)
     ]
+
+
+FIGURES = ("nmse", "rmse", "coverage", "nlpd")
+ACKNOWLEDGED = ObservationResponse.model_fields
+"""The part of a report that acknowledged a batch; the rest is for judging what follows."""
+
+
+def page(learners: Learners, model: str, part: Page, stream_id: str | None, rejected: bool) -> schema.ObservationPage:
+    """List the batches of a model, newest first; raise NotFoundError where there is no such model."""
+    registry.find(learners.database, model, None)
+    with learners.database.session() as session:
+        events, following = log.page(session, model, part, stream_id, rejected)
+        return schema.ObservationPage(
+            items=[schema.Observation(**_outline(session, event)) for event in events], next_cursor=following
+        )
+
+
+def show(learners: Learners, model: str, stream_id: str, sequence: int, rows: bool) -> schema.ObservationDetail:
+    """Return a batch with all that is known of it; raise NotFoundError."""
+    registry.find(learners.database, model, None)
+    with learners.database.session() as session:
+        event = find(session, model, stream_id, sequence)
+        return schema.ObservationDetail(
+            **_outline(session, event),
+            report=None if event.report is None else {k: v for k, v in event.report.items() if k in ACKNOWLEDGED},
+            figures=None if event.record is None else figures(Record.from_json(event.record)),
+            replays=[_replay(session, event, each) for each in log.about(session, event, "replay")],
+            observed=_rows(log.rows_of(event)) if rows else None,
+        )
+
+
+def figures(record: Record) -> schema.Figures:
+    """Return the figures of a record, per joint."""
+    metrics = record.metrics()
+    return schema.Figures(rows=record.rows, **{name: metrics[name] for name in FIGURES})
+
+
+def find(session: Session, model: str, stream_id: str, sequence: int) -> EventRow:
+    """Return the batch of a sequence, its own or that of one of its frames; raise NotFoundError."""
+    event = log.covering(session, model, stream_id, sequence)
+    if event is not None:
+        return event
+    source = log.stream(session, model, stream_id)
+    if source is not None and log.is_forgotten(source, sequence):
+        raise NotFoundError(f"batch {sequence} of stream {stream_id!r} is no longer kept, if it has come")
+    raise not_found("batch", f"{sequence} of stream {stream_id}")
+
+
+def _outline(session: Session, event: EventRow) -> dict[str, Any]:
+    return {
+        "stream_id": event.stream_id,
+        "sequence": event.sequence,
+        "last_sequence": event.last_sequence,
+        "event": event.number,
+        "state": state(session, event),
+        "received_at": _moment(event.received),
+        "first_at": None if event.first is None else _moment(event.first),
+        "last_at": None if event.last is None else _moment(event.last),
+        "version": event.version,
+        "revision": event.revision,
+        "rows": (event.report or {}).get("rows", event.rows),
+        "accepted": event.learnt,
+        "rejected": (event.report or {}).get("rejected", {}),
+    }
+
+
+def _replay(session: Session, batch: EventRow, event: EventRow) -> schema.Replay:
+    """A replay is unlearnt with its batch; undone in another way it is by a rollback."""
+    undone = state(session, batch) if batch.void else "rolled_back"
+    return schema.Replay(
+        event=event.number,
+        replayed_at=_moment(event.received),
+        state=undone if event.void else "learnt",
+        codes=(event.detail or {})["codes"],
+        rows=event.rows,
+    )
+
+
+def _rows(rows: Rows) -> schema.ObservationRows:
+    vectors = {name: [finite(row) for row in getattr(rows, name)] for name in ("q", "dq", "ddq", "tau")}
+    return schema.ObservationRows(time=finite(rows.time), **vectors, code=[CODES[code] for code in rows.code])
+
+
+def _moment(seconds: float) -> str:
+    """Unix seconds as every other answer has times."""
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds")
+
+
+def current(session: Session, model: str, version: int) -> int:
+    """Return the revision of a version once all of the log is learnt."""
+    return log.newest(session, model) - log.start_of(session, model, version)
+
+
+def reachable(session: Session, model: str, version: int) -> list[Range]:
+    """Return the ranges [first, last] of revisions whose state can be made again, rising.
+
+    That takes the version as trained, or a snapshot, and all events from there; and no rollback may have gone back
+    behind it since: the events that a rollback has undone teach nothing any more, so that their states are gone.
+    """
+    start, newest = log.start_of(session, model, version), log.newest(session, model)
+    bases = sorted({start, *(row.number for row in snapshots.of(session, model, version) if row.number > start)})
+    ranges: list[Range] = []
+    for base, following in zip(bases, [*bases[1:], newest + 1], strict=True):
+        last = following - 1
+        ranges.append((base, last if log.is_complete(session, model, base, last) else base))
+    rollbacks = select(EventRow.number, EventRow.detail).where(EventRow.model == model, EventRow.kind == "rollback")
+    for number, detail in session.execute(rollbacks):
+        ranges = [part for each in ranges for part in _without(each, detail["to"] + 1, number - 1)]
+    return _joined([(first - start, last - start) for first, last in ranges])
+
+
+def is_reached(revision: int, ranges: list[Range]) -> bool:
+    """Whether one of the ranges has a revision."""
+    return any(first <= revision <= last for first, last in ranges)
+
+
+def _without(span: Range, first: int, last: int) -> Iterator[Range]:
+    """The parts of a range that are left once first to last are taken out."""
+    for a, b in ((span[0], min(span[1], first - 1)), (max(span[0], last + 1), span[1])):
+        if a <= b:
+            yield a, b
+
+
+def _joined(ranges: list[Range]) -> list[Range]:
+    """The same numbers in as few ranges as there can be."""
+    joined: list[Range] = []
+    for first, last in sorted(ranges):
+        if joined and first <= joined[-1][1] + 1:
+            joined[-1] = (joined[-1][0], max(last, joined[-1][1]))
+        else:
+            joined.append((first, last))
+    return joined
