@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from service.journal import log, snapshots
+from service.learning.control import status
 from tests.service.data import error, eventually
 from tests.service.learning.batches import MODEL, batch, note, opened, roll_back, write
 from tests.service.learning.lessons import apart
