@@ -24,7 +24,7 @@ def compare(loaded: LoadedModels, model: str, request: schema.CompareRequest) ->
     answers = [_answer(each, recorded.used) for each in versions]
     compared = paired.compare(recorded.used, *answers)
     outcome, verdict = _verdict(first.version, second.version, compared)
-    in_training = [recorded.in_training_of(each) for each in versions]
+    in_training = [each.has_learnt_from(recorded.id, recorded.sha256) for each in versions]
     return schema.CompareResponse(
         model=model,
         dataset=recorded.id,

@@ -68,10 +68,6 @@ class Measured:
     samples: int
     used: Samples
 
-    def in_training_of(self, served: Served) -> bool:
-        """Whether a version has learnt from it or from part of it, or from the same samples uploaded another time."""
-        return served.has_learnt_from(self.id, self.sha256)
-
 
 def measured(loaded: LoadedModels, dataset: str, *versions: Served) -> Measured:
     """Read a data set for these versions; raise NotFoundError, or InvalidRequestError where it is of other joints."""
@@ -152,7 +148,7 @@ def evaluate(
         ],
         reliability=schema.Reliability(nominal=list(RELIABILITY_LEVELS), observed=metrics.reliability.T.tolist()),
         stretches=stretches(used, answer.tau),
-        in_training=all_of_it and recorded.in_training_of(served),
+        in_training=all_of_it and served.has_learnt_from(recorded.id, recorded.sha256),
     )
 
 

@@ -66,12 +66,6 @@ def learnt_from(lineage: dict[str, Any]) -> frozenset[str]:
     return frozenset(each[field] for each in learnt for field in ("id", "sha256") if field in each)
 
 
-def training_metrics(model: TorqueModel, samples: Samples, of: int) -> dict[str, Any]:
-    """How well a model answers for the samples it was trained on, `of` so many: how well the fit went. Of motion that
-    the model has not seen only other data can tell, see `figures`."""
-    return figures(model, samples, MOST_SAMPLES, of)
-
-
 def figures(model: TorqueModel, samples: Samples, most: int, of: int) -> dict[str, Any]:
     """How well a model answers for samples, thinned evenly to at most so many of them; `of`: how many they stand for.
     Per joint: nmse (None where the torque did not vary), rmse in N·m, coverage of the 95 % interval, nlpd in nats."""

@@ -34,14 +34,6 @@ async def find(loaded: LoadedModels, turns: CapacityLimiter, name: str, version:
     return await to_thread.run_sync(_load, loaded, name, version, number, alias, limiter=turns)
 
 
-async def ready_version(loaded: LoadedModels, turns: CapacityLimiter, name: str, version: str | None) -> Served:
-    """Like `find`, but raise NotReadyError where the version cannot be loaded."""
-    try:
-        return await find(loaded, turns, name, version)
-    except UnreadableVersionError as error:
-        raise NotReadyError(error.message) from error
-
-
 def metadata(loaded: LoadedModels, served: Served) -> schema.ModelMetadata:
     """Describe a version and name all of its model; raise NotFoundError. Not for the event loop."""
     model = served.model
@@ -163,7 +155,10 @@ async def model_ready(request: Request) -> schema.ModelReady:
     loaded: LoadedModels = request.app.state.loaded
     turns = request.app.state.turns.predictions
     where = request.path_params
-    served = await ready_version(loaded, turns, where["model"], where.get("version"))
+    try:
+        served = await find(loaded, turns, where["model"], where.get("version"))
+    except UnreadableVersionError as error:
+        raise NotReadyError(error.message) from error
     return schema.ModelReady(name=served.name)
 
 

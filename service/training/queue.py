@@ -230,18 +230,14 @@ class JobQueue:
             if row.id in known:
                 continue
             ours = self.replicas.mine(row.owner)
-            if not ours and not (row.owner in free and self._may_have(row)):
+            # a job that waits and is nobody's is taken when it is handed out
+            anybodys = row.state == QUEUED and row.owner is None
+            if not ours and not (row.owner in free and (anybodys or self.replicas.take(row.id, row.owner))):
                 continue
             if row.state == QUEUED:
                 self.submit(row.id)
             else:
                 self._see_to(row, ours)
-
-    def _may_have(self, row: JobRow) -> bool:
-        """Whether a job that nobody has, or one who is gone, can be this service's."""
-        if row.state == QUEUED and row.owner is None:
-            return True  # it is taken when it is handed out
-        return self.replicas.take(row.id, row.owner)
 
     def _see_to(self, row: JobRow, ours: bool) -> None:
         """See to a job that runs, but not in a process of this service. ours: not taken over just now."""

@@ -21,7 +21,7 @@ from service.foundation.errors import ServiceError, StorageFullError, StorageUna
 from service.foundation.settings import Settings
 from service.foundation.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, JobState
 from service.models import registry
-from service.models.lineage import figures, software, training_metrics
+from service.models.lineage import MOST_SAMPLES, figures, software
 from service.storage.database import Database, JobRow, LearnerRow, now
 from service.storage.disk import Disk
 from service.storage.files import PATIENCE_S, Files
@@ -96,7 +96,7 @@ def _train(settings: Settings, database: Database, files: Files, claim: Claim) -
                 "trained_at": now(),
                 "training_process": {"seconds": round(pulse.elapsed, 1), "peak_memory_mb": _peak_memory_mb()},
                 "software": software(),
-                "training_metrics": training_metrics(trained, material.samples, material.rows),
+                "training_metrics": figures(trained, material.samples, MOST_SAMPLES, material.rows),
             }
             if material.held_out is not None:
                 pulse.stage("evaluating")

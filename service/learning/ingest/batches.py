@@ -207,7 +207,9 @@ class FramesResult:
 def observe_frames(intake: Intake, frames: Frames) -> FramesResult:
     """Log frames; once this returns they are durable. All of them or none. Raise LearningDisabledError, ConflictError
     for a sequence that was used for something else or does not rise, ExpiredError, BusyError or StorageFullError."""
-    _check_order(frames)
+    for before, sequence in pairwise(frames.sequences.tolist()):
+        if sequence <= before:
+            raise _order(frames, sequence)
     monitor = intake.monitor(frames.served)
     with intake.turn(monitor, frames.model):
         with intake.database.session() as session:
@@ -285,12 +287,6 @@ def _order(frames: Frames, sequence: int) -> ConflictError:
     return ConflictError(
         f"frame {sequence} of stream {frames.stream_id!r} comes after one of a higher sequence: sequences must rise"
     )
-
-
-def _check_order(frames: Frames) -> None:
-    for before, sequence in pairwise(frames.sequences.tolist()):
-        if sequence <= before:
-            raise _order(frames, sequence)
 
 
 def _ranges(sequences: NDArray[np.int64]) -> list[list[int]]:
