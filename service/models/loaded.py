@@ -188,12 +188,18 @@ class LoadedModels:
     def adopt(self, model: str) -> None:
         """Load the version of a model that now serves, and answer with it. Not for the event loop."""
         for serving in registry.serving(self.database, [model]).values():
-            try:
-                self._load(registry.find(self.database, model, serving.version), serving)
-            except (UnreadableVersionError, OSError) as error:  # who asks is told; the version before goes on answering
-                logger.error("%s", error)
-            except NotFoundError:  # another one serves by now, and this one has been deleted: who did that adopts it
-                logger.info("version %d of model %s was deleted before it answered", serving.version, model)
+            self._adopt(model, serving)
+
+    def _adopt(self, model: str, serving: Serving) -> bool:
+        """Load a version that serves; return whether it could be."""
+        try:
+            self._load(registry.find(self.database, model, serving.version), serving)
+            return True
+        except (UnreadableVersionError, OSError) as error:  # who asks is told; the version before goes on answering
+            logger.error("%s", error)
+        except NotFoundError:  # another one serves by now, and this one has been deleted: who did that adopts it
+            logger.info("version %d of model %s was deleted before it answered", serving.version, model)
+        return False
 
     def held(self) -> dict[Key, int | None]:
         """Versions that anyone here may answer with, and their revisions: those in memory, of streams too, and those
@@ -252,14 +258,8 @@ class LoadedModels:
     def preload(self) -> int:
         """Load the versions that serve of the models that changed last, as many as fit; return how many."""
         gc.freeze()  # what was imported, unexamined: looking through it takes 0.3 s
-        loaded = 0
-        for model, serving in registry.serving(self.database, registry.recent(self.database, self.capacity)).items():
-            try:
-                self._load(registry.find(self.database, model, serving.version), serving)
-                loaded += 1
-            except (UnreadableVersionError, OSError) as error:  # the others shall answer all the same
-                logger.error("%s", error)
-        return loaded
+        recent = registry.serving(self.database, registry.recent(self.database, self.capacity))
+        return sum(self._adopt(model, serving) for model, serving in recent.items())
 
     def _load(self, row: VersionRow, serving: Serving | None = None) -> Served:
         key = (row.model, row.version)

@@ -1,4 +1,5 @@
-"""From tensors to a query: names, datatypes, shapes and numbers are checked, and nothing is guessed."""
+"""From tensors to a query, and from that to the bytes of its answer: all is checked, nothing guessed, and nothing
+computed that was not asked for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""A stream of torque queries to one model, some of which carry torque to learn from."""
+"""One WebSocket connection: a message in, a message out, in order, and an end to clients that are gone; and streams of
+torque queries to one model, some of which carry torque to learn from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""What a job trains on: data sets, and for a refresh also what the model has observed."""
+"""What a job trains on: data sets, and for a refresh also what the model has observed.
+
+Rows of data sets count as one table, data set after data set, and are not in memory. What a fit chooses from is thinned
+evenly over all of it, what a sum goes over is divided into shards, and whatever is read is read from the part of a file
+where it lies.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""What the owner of a learning model decides: options, the end of a hold, replays; and the alarms that lead to it."""
+"""What the owner of a learning model decides: options, the end of a hold, replays, what is taken back (one batch, or
+everything since a revision that can be made again); and the alarms that lead to it."""
 
 from __future__ import annotations
 

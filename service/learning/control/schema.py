@@ -1,4 +1,4 @@
-"""What the owner of a learning model sees and decides, as the API takes and shows it."""
+"""What the owner of a learning model sees and decides, and events of a model followed live, as the API has them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""A batch on its way into the log: in the model's joint order, known again if repeated, checked, predicted, judged."""
+"""A batch on its way into the log: in the model's joint order, known again if repeated, checked, predicted, judged; and
+frames of a stream, rows that are predicted already, one a sequence, in order."""
 
 from __future__ import annotations
 

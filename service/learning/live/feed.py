@@ -1,4 +1,5 @@
-"""Models as they predict and learn, for any number of readers: each model is looked at once for all of its readers."""
+"""Models as they predict and learn, for any number of readers: each model is looked at once for all of its readers, and
+of the batches of a moment few rows are shown, but all of them counted."""
 
 from __future__ import annotations
 
