@@ -17,7 +17,7 @@ from lipcore.online.batch import Rows
 from service.foundation.errors import ConflictError, not_found
 from service.journal import log
 from service.journal.log import NewBatch
-from service.journal.retention import retain
+from service.journal.snapshots import retain
 from service.learning import owner
 from service.learning.ingest import judging
 from service.learning.ingest.judging import Verdict

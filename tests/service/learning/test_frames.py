@@ -12,7 +12,7 @@ import pytest
 from lipcore.data.independence import INDEPENDENT_HZ, stream_weights
 from lipcore.online.record import Record
 from service.foundation.errors import BusyError, ConflictError
-from service.journal import log, retention
+from service.journal import log, snapshots
 from service.learning.ingest.batches import Frames, FramesResult
 from service.learning.schema import ExpiredError, LearningDisabledError
 from tests.service.learning.lessons import apart
@@ -170,7 +170,7 @@ def test_frames_that_are_no_longer_kept_are_not_taken_for_new(school, pupil, obs
         observe(range(first, first + 5))
     with school.service.database.transaction() as session:
         event = log.find_batch(session, pupil.model, "socket", 0)
-        retention._forget(session, event)
+        snapshots._forget(session, event)
         session.delete(event)
     with pytest.raises(ExpiredError, match="whether batch 3 of stream"):
         observe([3])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.journal import log, retention
+from service.journal import log, snapshots
 from tests.service.data import error
 from tests.service.learning import lessons
 from tests.service.learning.recordings import batch, logged, part, recording, send
@@ -141,7 +141,7 @@ def test_batches_that_are_no_longer_kept_are_not_taken_for_new(school, body):
     with school.service.database.transaction() as session:
         for sequence in (0, 1, 3):
             event = log.find_batch(session, pupil.model, "arm", sequence)
-            retention._forget(session, event)
+            snapshots._forget(session, event)
             session.delete(event)
     for sequence in (0, 1, 3):
         said = refused(pupil, batch(sequence, parts[sequence]), 409, "expired")
