@@ -29,6 +29,9 @@ from service.web.access.middleware import subprotocol_of
 from service.web.observability.meters import StreamMeter
 from service.web.server.stream_protocol import StreamProtocol
 
+if TYPE_CHECKING:
+    from lipcore.data.samples import Array
+
 logger = logging.getLogger(__name__)
 
 
@@ -125,10 +128,6 @@ class Echo(Conversation):
         text = message.get("text")
         data: bytes = message["bytes"] if text is None else text.encode()
         return data
-
-
-if TYPE_CHECKING:
-    from lipcore.data.samples import Array
 
 
 class FrameReader:
