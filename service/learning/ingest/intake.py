@@ -146,7 +146,7 @@ class Intake:
                 "surprise": None if verdict.surprise is None else verdict.surprise.tolist(),
             }
             event.report = report
-        monitor.note(event, batch.stream_id, verdict, report)
+        monitor.note(event, verdict.watch.innovations)
         self._show(Judged(served, batch.stream_id, verdict.rows, screened))
         return report
 
