@@ -1,7 +1,7 @@
 """A version for use elsewhere: an archive with its files, their checksums and what made them, or its arm as a URDF.
 
-An archive is a tar file of a few plain files, by exact name and of limited size. Of `tarfile` only the reading of a
-single header is used: the rest follows links, sparse files, extended headers and numbers of any size, of which an
+An archive is a tar file of a few plain files, by exact name and of limited size. Of `tarfile` only what makes and reads
+a single header is used: the rest follows links, sparse files, extended headers and numbers of any size, of which an
 archive of a model has none, and which have been the way in for many an attack.
 """
 
@@ -12,7 +12,7 @@ import tarfile
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from io import SEEK_CUR, BytesIO
+from io import SEEK_CUR
 from pathlib import Path
 from typing import IO, Any
 
@@ -176,11 +176,11 @@ def _packed(loaded: LoadedModels, files: Mapping[str, bytes]) -> IO[bytes]:
     loaded.storage.disk.require(sum(map(len, files.values())))
     file = tempfile.TemporaryFile(dir=loaded.files.uploads)  # noqa: SIM115 - closed by who reads it
     try:
-        with tarfile.open(fileobj=file, mode="w", format=tarfile.USTAR_FORMAT) as tar:
-            for name, content in files.items():
-                info = tarfile.TarInfo(name)
-                info.size = len(content)
-                tar.addfile(info, BytesIO(content))
+        for name, content in files.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(content)
+            file.write(info.tobuf(tarfile.USTAR_FORMAT) + content + bytes(_padding(info.size)))
+        file.write(bytes(2 * BLOCK))
     except BaseException:
         file.close()
         raise

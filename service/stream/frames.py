@@ -1,4 +1,78 @@
-"""Binary frames of `WS /v1/models/{model}/stream`, layout 1, which `docs/control-loop.md` describes."""
+"""Binary frames of `WS /v1/models/{model}/stream`, layout 1.
+
+One binary message a frame, little-endian and without padding; numbers are 8-byte aligned. n is the number of joints.
+
+Request, 16 + 24 n bytes, or 16 + 32 n with tau:
+
+    offset  type     field
+    0       u32      sequence: chosen by the client, repeated in the answer
+    4       u16      flags: 1 = answer tau_std too; 2 = tau follows ddq, to be learnt from
+    6       u16      n
+    8       f64      deadline budget in s, counted from the frame's arrival in the service; 0 = none
+    16      f64 n    q, rad (prismatic: m)
+    …       f64 n    dq, rad/s (m/s)
+    …       f64 n    ddq, rad/s² (m/s²)
+    …       f64 n    with flag 2: tau, N·m (prismatic: N), as measured at this motion
+
+So the joints of a request begin at 16 (q), 16 + 8 n (dq), 16 + 16 n (ddq) and 16 + 24 n (tau).
+
+Answer, 32 + 8 n bytes, or 32 + 16 n with tau_std:
+
+    offset  type     field
+    0       u32      sequence of the request
+    4       u16      flags: 1 = tau_std follows tau; 2 = late: left after its deadline; 4 = error; 8 = no sequence
+    6       u16      n; 0 in an error
+    8       u32      version that answers
+    12      u32      answers of this connection that missed their deadlines so far
+    16      u64      revision: online updates applied to the version
+    24      f64      seconds from the frame's arrival to the answer's departure
+    32      f64 n    tau, N·m (prismatic: N): mean torque
+    …       f64 n    tau_std, N·m: standard deviation of the function, where asked for
+
+An error has the same header, and instead of numbers UTF-8 JSON: {"error": {code, message, detail}}. The connection goes
+on. Flag 8 says that the request was too short, or no binary message, so that its sequence is unknown (and 0 here).
+
+Every request has exactly one binary answer, in the order of the requests. When the connection opens, and before the
+first answer of another version, the service sends one text message, a JSON object:
+
+    {"layout": 1, "model", "version", "revision", "joint_names", "torque_convention", "noise_std", "max_position"}
+
+A frame arrives when the service has read its last byte, and an answer leaves when it is handed to the socket: what
+either waits in the network or in the sockets' buffers is not counted. An answer that had to wait for a client that
+does not read is counted as late in the header of the next.
+
+Learning. A request with flag 2 is answered like any other: the answer is made before the service learns of its torque.
+It needs `stream_id` in the address, the name of the robot or recording that the torque comes from, and no `version`:
+who pins a version only asks. Its sequence is its identity within that stream_id for good: among the requests with flag
+2 of a connection it must go up, gaps allowed. A torque that is not finite is answered, and counted as not learnt. The
+service gathers such requests and logs LIPSERVE_STREAM_FLUSH_ROWS of them at a time, or what has come when the first has
+waited for LIPSERVE_STREAM_FLUSH_S. Once they are durable it says in a text message
+
+    {"learnt": {"through": sequence, "accepted", "duplicates", "rejected": {code: count}, "revision"}}
+
+of those since the last such message, of which `through` is the newest: how many are new and learnt from, were known
+already, and were kept out by code; answers of `revision` and above contain them. What cannot be logged is told by
+
+    {"refused": {"first": sequence, "through": sequence, "error": {code, message, detail}}}
+
+Requests that got an error for an answer are in neither. These texts come between answers, after those of the requests
+they speak of; requests without flag 2 cause none. At the end of a connection what is left is logged, and not told. So
+after a lost one send again what is above the last `through`, under the same sequences: what is in the log counts as
+duplicate and is applied once. What was refused is lost, unless it is sent again under new sequences. While ten times
+LIPSERVE_STREAM_FLUSH_ROWS wait to be logged, the service reads no further.
+
+The query of the address: `version` pins one, else the newest answers as soon as it is there, between two frames;
+`std=1` answers tau_std to every frame, as if each had flag 1; `stream_id` names the source of torques to learn from, in
+up to 64 letters, digits, dots, underscores and hyphens, a letter or digit first.
+
+The service reads no further while an answer waits to be written, so a client that sends but does not read is slowed
+down by its own socket, and cut off when it reads nothing for LIPSERVE_STREAM_WRITE_S. A frame beyond
+LIPSERVE_MAX_STREAM_FRAME_BYTES ends the connection with code 1009, LIPSERVE_STREAM_IDLE_S without a frame with 1000, a
+service that stops with 1001, an API key that is revoked or expires with 1008. A connection that cannot be had is
+refused before the upgrade, in HTTP, with an error of the same shape: 401 (no API key where one is needed), 403 (a key
+without the scope `predict` or, with stream_id, `update`; a web page of another site), 404, 422 (a wrong parameter), 429
+(LIPSERVE_MAX_STREAMS are open).
+"""
 
 from __future__ import annotations
 
