@@ -33,7 +33,7 @@ from service.models import registry
 from service.models import routes as models
 from service.models.loaded import LoadedModels
 from service.oip import routes as oip
-from service.replication.replication import Replication
+from service.replication import Replication
 from service.robots import routes as robots
 from service.storage.files.store import start_sweeping
 from service.storage.home import hold_home

@@ -63,10 +63,9 @@ def fetch(name: str, url: str, version: int | None = None, alias: str | None = N
     with TemporaryDirectory(prefix="lipserve-excite-") as folder, Client(url) as client:
         path = client.export(name, Path(folder) / "model.tar", version, alias)
         try:
-            places = archive.members(path, MEMBER_LIMITS)
+            files = archive.read(path, MEMBER_LIMITS)
         except archive.ArchiveError as error:
             raise ModelFormatError(str(error), error.member) from None
-        files = {each: archive.read(path, member) for each, member in places.items()}
         for each in (archive.EXPORT, archive.CHECKSUMS):
             files.pop(each, None)
         return persistence.decode(files)

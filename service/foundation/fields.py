@@ -1,8 +1,9 @@
-"""What several rooms take of requests: names for people, rows of numbers, and what the application keeps for routes."""
+"""What several rooms take and show: names for people, numbers in lists, and what the application keeps for routes."""
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
+from math import isfinite, nan
 from typing import Annotated, Any
 
 import numpy as np
@@ -32,21 +33,53 @@ def _checked(name: str, info: ValidationInfo) -> str:
 NameForPeople = Annotated[str, Field(min_length=1, max_length=LONGEST), AfterValidator(_checked)]
 
 
-def to_array(name: str, value: Any, read: Callable[[str, list[Any]], list[float]]) -> NDArray[np.float64]:
-    """Numbers (n,) or rows of numbers (N, n) as an array; raise InvalidRequestError naming what is wrong.
+def numbers(name: str, row: list[Any], nullable: bool = False) -> list[float]:
+    """Finite numbers of a JSON list; nullable: any numbers, and null as NaN. Raise InvalidRequestError."""
+    out = []
+    for index, number in enumerate(row):
+        value, expected = None, "a number, or null where none was measured" if nullable else "a finite number"
+        if type(number) in (int, float):
+            try:
+                value = float(number)
+            except OverflowError:
+                expected = "a number of at most 1e308" if nullable else expected
+        elif number is None and nullable:
+            value = nan
+        if value is None or not (nullable or isfinite(value)):
+            raise invalid_request(f"{name}[{index}]", number, expected)
+        out.append(value)
+    return out
 
-    read: takes the name and the numbers of one row, and raises InvalidRequestError for what is none.
-    """
+
+def rows_of_numbers(nullable: bool = False) -> Callable[[Any, ValidationInfo], NDArray[np.float64]]:
+    """A validator of numbers (n,) or rows of numbers (N, n), which become an array; nullable: see `numbers`."""
+    return lambda value, info: _to_array(info.field_name or "value", value, nullable)
+
+
+def each_once(names: list[Any]) -> list[Any]:
+    """The names of components; raise InvalidRequestError where one is there twice."""
+    for index, name in enumerate(names):
+        if name in names[:index]:
+            raise invalid_request(f"components[{index}]", name, "each component once")
+    return names
+
+
+def finite(values: Sequence[float] | NDArray[np.float64]) -> list[float | None]:
+    """Numbers (n,) as JSON has them: null where there is no finite one."""
+    return [float(value) if isfinite(value) else None for value in values]
+
+
+def _to_array(name: str, value: Any, nullable: bool) -> NDArray[np.float64]:
     if not isinstance(value, list) or not value:
         raise invalid_request(name, value, "a list of numbers, or a list of such lists")
     if not isinstance(value[0], list):
-        return np.array(read(name, value))
+        return np.array(numbers(name, value, nullable))
     width = len(value[0])
     rows = []
     for index, row in enumerate(value):
         if not isinstance(row, list) or len(row) != width:
             raise invalid_request(f"{name}[{index}]", row, f"a list of {width} numbers, as {name}[0] has")
-        rows.append(read(f"{name}[{index}]", row))
+        rows.append(numbers(f"{name}[{index}]", row, nullable))
     return np.array(rows).reshape(len(rows), width)
 
 

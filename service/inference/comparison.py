@@ -8,33 +8,24 @@ from math import isfinite
 from lipcore.data import paired
 from lipcore.data.metrics import evaluate
 from lipcore.data.paired import Answer, Comparison, Difference
-from lipcore.data.samples import Array, Samples
+from lipcore.data.samples import Samples
 from service.foundation.errors import invalid_request
-from service.inference.comparison_schema import (
-    CompareRequest,
-    CompareResponse,
-    Differences,
-    JointDifferences,
-    Outcome,
-    TotalDifference,
-    VersionFigures,
-)
-from service.inference.evaluating import measured
+from service.foundation.fields import finite
+from service.inference import schema
+from service.inference.evaluating import figures, measured
 from service.models.loaded import LoadedModels, Served
 
 
-def compare(loaded: LoadedModels, model: str, request: CompareRequest) -> CompareResponse:
-    """Compare two versions; raise InvalidRequestError, NotFoundError, DamagedDataError or UnreadableVersionError.
-
-    Not for the event loop.
-    """
+def compare(loaded: LoadedModels, model: str, request: schema.CompareRequest) -> schema.CompareResponse:
+    """Compare two versions; raise InvalidRequestError, NotFoundError, DamagedDataError or UnreadableVersionError. Not
+    for the event loop."""
     first, second = versions = _versions(loaded, model, request)
     recorded = measured(loaded, request.dataset, *versions)
     answers = [_answer(each, recorded.used) for each in versions]
     compared = paired.compare(recorded.used, *answers)
     outcome, verdict = _verdict(first.version, second.version, compared)
-    in_training = [recorded.in_training_of(each) for each in versions]
-    return CompareResponse(
+    in_training = [each.has_learnt_from(recorded.id, recorded.sha256) for each in versions]
+    return schema.CompareResponse(
         model=model,
         dataset=recorded.id,
         joint_names=list(first.model.joint_names),
@@ -42,11 +33,19 @@ def compare(loaded: LoadedModels, model: str, request: CompareRequest) -> Compar
         samples_used=len(recorded.used),
         blocks=compared.blocks,
         versions=[
-            _figures(each, answer, recorded.used, trained)
+            schema.VersionFigures(
+                version=each.version,
+                revision=each.revision,
+                **figures(evaluate(recorded.used.tau, *answer)),
+                in_training=trained,
+            )
             for each, answer, trained in zip(versions, answers, in_training, strict=True)
         ],
-        differences=JointDifferences(
-            **{name: Differences(**_shown(getattr(compared, name))) for name in JointDifferences.model_fields}
+        differences=schema.JointDifferences(
+            **{
+                name: schema.Differences(**_lists(getattr(compared, name)))
+                for name in schema.JointDifferences.model_fields
+            }
         ),
         nlpd=_total(compared.total, 0),
         nmse=_total(compared.total, 1),
@@ -57,7 +56,7 @@ def compare(loaded: LoadedModels, model: str, request: CompareRequest) -> Compar
     )
 
 
-def _versions(loaded: LoadedModels, model: str, request: CompareRequest) -> tuple[Served, Served]:
+def _versions(loaded: LoadedModels, model: str, request: schema.CompareRequest) -> tuple[Served, Served]:
     first, second = (
         loaded.get(model, named, None) if isinstance(named, int) else loaded.get(model, None, named)
         for named in request.versions
@@ -72,21 +71,7 @@ def _answer(served: Served, samples: Samples) -> Answer:
     return Answer(answer.tau, answer.tau_std, answer.noise_std)
 
 
-def _figures(served: Served, answer: Answer, samples: Samples, in_training: bool) -> VersionFigures:
-    metrics = evaluate(samples.tau, *answer)
-    return VersionFigures(
-        version=served.version,
-        revision=served.revision,
-        nmse=_finite(metrics.nmse),
-        rmse=metrics.rmse.tolist(),
-        coverage=metrics.coverage.tolist(),
-        nlpd=metrics.nlpd.tolist(),
-        interval_width=metrics.width.tolist(),
-        in_training=in_training,
-    )
-
-
-def _verdict(first: int, second: int, compared: Comparison) -> tuple[Outcome, str]:
+def _verdict(first: int, second: int, compared: Comparison) -> tuple[schema.Outcome, str]:
     """What the difference says, for programs and in words."""
     if compared.blocks < paired.MIN_BLOCKS:
         return "cannot_tell", (
@@ -97,7 +82,7 @@ def _verdict(first: int, second: int, compared: Comparison) -> tuple[Outcome, st
     (density, nmse), (clear, larger_or_smaller) = total.mean.tolist(), total.significant.tolist()
     better, worse = (first, second) if density > 0 else (second, first)
     if clear:
-        outcome: Outcome = "first_better" if better == first else "second_better"
+        outcome: schema.Outcome = "first_better" if better == first else "second_better"
         text = (
             f"Version {better} predicts better than version {worse}: its negative log predictive density is lower by "
         )
@@ -136,14 +121,10 @@ def _warnings(versions: Collection[Served], in_training: Collection[bool]) -> li
     return warnings
 
 
-def _shown(difference: Difference) -> dict[str, list[float | None]]:
+def _lists(difference: Difference) -> dict[str, list[float | None]]:
     names = {"difference": difference.mean, "standard_error": difference.standard_error}
-    return {name: _finite(values) for name, values in {**names, "half_width": difference.half_width}.items()}
+    return {name: finite(values) for name, values in {**names, "half_width": difference.half_width}.items()}
 
 
-def _finite(values: Array) -> list[float | None]:
-    return [value if isfinite(value) else None for value in values.tolist()]
-
-
-def _total(difference: Difference, place: int) -> TotalDifference:
-    return TotalDifference(**{name: values[place] for name, values in _shown(difference).items()})
+def _total(difference: Difference, place: int) -> schema.TotalDifference:
+    return schema.TotalDifference(**{name: values[place] for name, values in _lists(difference).items()})

@@ -1,20 +1,29 @@
-"""Comparing a version with a data set, or with what its training held out of it: no transport here."""
+"""Comparing a version with a data set, or with what its training held out of it, in figures or row by row."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
-from lipcore.data.metrics import LEVELS, RELIABILITY_LEVELS
+from lipcore.data.metrics import LEVELS, RELIABILITY_LEVELS, Metrics
 from lipcore.data.metrics import evaluate as compare
+from lipcore.data.motion import Motion
 from lipcore.data.samples import Array, Samples
+from lipcore.model import dynamics
 from service.datasets import store
-from service.foundation.errors import InvalidRequestError, invalid_request
-from service.inference.schema import EvaluateRequest, EvaluateResponse, Interval, Reliability, Stretches
+from service.foundation.errors import invalid_request
+from service.foundation.fields import finite
+from service.inference import schema
+from service.inference.predicting import check_offered
 from service.models import registry
 from service.models.loaded import LoadedModels, Served
+from service.storage import sample_file
 from service.storage.database import DatasetRow
 from service.training import holding_out
 from service.training.holding_out import CannotHoldOutError, SetSplit
@@ -24,7 +33,7 @@ FEWEST_EPISODES, MOST_EPISODES = 5, 200
 EQUAL = 10
 
 
-def stretches(samples: Samples, mean: Array) -> Stretches:
+def stretches(samples: Samples, mean: Array) -> schema.Stretches:
     """Mean squared error of each stretch / variance of the measured torque over all samples; mean: (N, n) N·m.
 
     The variance is that of all samples: a joint that rests for a while has a variance near zero then, and any error
@@ -39,7 +48,7 @@ def stretches(samples: Samples, mean: Array) -> Stretches:
     varies = np.ptp(samples.tau, axis=0) > 0  # rounding gives a constant column a variance above zero
     variance = samples.tau.var(axis=0)
     means = np.array([squared[each].mean(axis=0) for each in episodes])
-    return Stretches(
+    return schema.Stretches(
         kind="episodes" if by_episode else "equal",
         samples=[each.stop - each.start for each in episodes],
         nmse=[
@@ -59,10 +68,6 @@ class Measured:
     samples: int
     used: Samples
 
-    def in_training_of(self, served: Served) -> bool:
-        """Whether a version has learnt from it or from part of it, or from the same samples uploaded another time."""
-        return served.has_learnt_from(self.id, self.sha256)
-
 
 def measured(loaded: LoadedModels, dataset: str, *versions: Served) -> Measured:
     """Read a data set for these versions; raise NotFoundError, or InvalidRequestError where it is of other joints."""
@@ -75,26 +80,28 @@ def held_out(loaded: LoadedModels, dataset: str, served: Served) -> Measured:
     """Read what the training of a version has held out of a data set; as `measured`, and where it was nothing raise
     InvalidRequestError."""
     row = fitting(loaded, dataset, served)
-    split = split_of(loaded, row, served)
-    try:
+    with _splitting():
+        split = _split_of(loaded, row, served)
         used = store.samples(loaded.files, row, loaded.storage.settings.max_evaluation_samples, split.held_out)
-    except CannotHoldOutError as error:
-        raise not_held_out(str(error)) from None
     return Measured(row.id, row.sha256, split.rows, used)
 
 
-def split_of(loaded: LoadedModels, row: DatasetRow, served: Served) -> SetSplit:
-    """How a data set was split for a version; raise InvalidRequestError where nothing of it was held out."""
+def _split_of(loaded: LoadedModels, row: DatasetRow, served: Served) -> SetSplit:
+    """How a data set was split for a version; raise CannotHoldOutError where nothing of it was held out."""
     version = registry.find(loaded.database, served.name, served.version)
     split = holding_out.remembered(row, version.manifest["lineage"])
     if split is None:
-        raise not_held_out(f"version {served.version} has held nothing out of data set {row.id}")
+        raise CannotHoldOutError(f"version {served.version} has held nothing out of data set {row.id}")
     return split
 
 
-def not_held_out(why: str) -> InvalidRequestError:
-    """The error of a request for a part that there is not."""
-    return invalid_request("part", "held_out", f"all, as {why}")
+@contextmanager
+def _splitting() -> Iterator[None]:
+    """Raise InvalidRequestError where there is no part that was held out."""
+    try:
+        yield
+    except CannotHoldOutError as error:
+        raise invalid_request("part", "held_out", f"all, as {error}") from None
 
 
 def fitting(loaded: LoadedModels, dataset: str, *versions: Served) -> DatasetRow:
@@ -113,12 +120,10 @@ def fitting(loaded: LoadedModels, dataset: str, *versions: Served) -> DatasetRow
 
 
 def evaluate(
-    loaded: LoadedModels, model: str, request: EvaluateRequest, served: Served | None = None
-) -> EvaluateResponse:
+    loaded: LoadedModels, model: str, request: schema.EvaluateRequest, served: Served | None = None
+) -> schema.EvaluateResponse:
     """Compare a model with a data set or what it has held out of it; raise InvalidRequestError or NotFoundError.
-
-    served: what answers, where that is found already.
-    """
+    served: what answers, where that is found already."""
     served = served or loaded.get(model, request.version, request.alias)
     known = served.model
     all_of_it = request.part == "all"
@@ -126,7 +131,7 @@ def evaluate(
     used = recorded.used
     answer = known.predict(used.q, used.dq, used.ddq)
     metrics = compare(used.tau, answer.tau, answer.tau_std, answer.noise_std)
-    return EvaluateResponse(
+    return schema.EvaluateResponse(
         model=served.name,
         version=served.version,
         revision=served.revision,
@@ -136,16 +141,108 @@ def evaluate(
         samples=recorded.samples,
         samples_used=len(used),
         level=metrics.level,
-        nmse=[None if np.isnan(value) else float(value) for value in metrics.nmse],
-        rmse=metrics.rmse.tolist(),
-        coverage=metrics.coverage.tolist(),
-        nlpd=metrics.nlpd.tolist(),
-        interval_width=metrics.width.tolist(),
+        **figures(metrics),
         coverages=[
-            Interval(level=each, coverage=coverage.tolist(), interval_width=width.tolist())
+            schema.Interval(level=each, coverage=coverage.tolist(), interval_width=width.tolist())
             for each, coverage, width in zip(LEVELS, metrics.coverages, metrics.widths, strict=True)
         ],
-        reliability=Reliability(nominal=list(RELIABILITY_LEVELS), observed=metrics.reliability.T.tolist()),
+        reliability=schema.Reliability(nominal=list(RELIABILITY_LEVELS), observed=metrics.reliability.T.tolist()),
         stretches=stretches(used, answer.tau),
-        in_training=all_of_it and recorded.in_training_of(served),
+        in_training=all_of_it and served.has_learnt_from(recorded.id, recorded.sha256),
     )
+
+
+def figures(metrics: Metrics) -> dict[str, Any]:
+    """Figures of each joint, nmse null where its torque does not vary."""
+    per_joint = {name: getattr(metrics, name).tolist() for name in ("rmse", "coverage", "nlpd")}
+    return {"nmse": finite(metrics.nmse), **per_joint, "interval_width": metrics.width.tolist()}
+
+
+Rows = NDArray[np.int64]
+
+
+def trace(loaded: LoadedModels, model: str, request: schema.TraceRequest) -> schema.TraceResponse:
+    """Follow a model along a data set or what it has held out of it. Raise InvalidRequestError, NotFoundError or
+    DamagedDataError. Not for the event loop."""
+    most = loaded.storage.settings.max_trace_points
+    if request.points > most:
+        raise invalid_request("points", request.points, f"at most {most}")
+    served = loaded.get(model, request.version, request.alias)
+    offered = dynamics.available(served.model.estimator)
+    check_offered(served.model, request.components)
+    dataset = fitting(loaded, request.dataset, served)
+    path = loaded.files.samples_file(dataset.id, dataset.sha256)
+    episode, t = (sample_file.read_array(path, name) for name in ("episode", "t"))
+    part = np.arange(len(t), dtype=np.int64)
+    if request.part == "held_out":
+        with _splitting():
+            part = np.flatnonzero(_split_of(loaded, dataset, served).held_out(episode, t)).astype(np.int64)
+    chosen = _within(part, request, len(t))
+    rows = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), request.points)).round().astype(np.int64)]
+    samples = Samples(served.model.joint_names, **sample_file.read(path, rows))
+    predicted = served.model.predict(samples.q, samples.dq, samples.ddq)
+    return schema.TraceResponse(
+        model=served.name,
+        version=served.version,
+        revision=served.revision,
+        dataset=dataset.id,
+        part=request.part,
+        joint_names=list(served.model.joint_names),
+        torque_convention=served.model.torque_convention,
+        samples=len(part),
+        in_range=len(chosen),
+        shown=len(rows),
+        rows=rows.tolist(),
+        t=samples.t.tolist(),
+        breaks=_breaks(part, episode, rows),
+        tau=samples.tau.tolist(),
+        mean=predicted.tau.tolist(),
+        std=predicted.tau_std.tolist(),
+        noise_std=predicted.noise_std.tolist(),
+        offered=[name for name in get_args(schema.TraceComponent) if name in offered],
+        components=_components(served, samples, request.components, loaded.storage.settings.max_component_batch),
+        in_training=request.part == "all" and served.has_learnt_from(dataset.id, dataset.sha256),
+    )
+
+
+def _within(part: Rows, request: schema.TraceRequest, count: int) -> Rows:
+    """Rows of a part from `start` to `stop`; raise InvalidRequestError where there are none."""
+    if request.start >= count:
+        raise invalid_request("start", request.start, f"a row of the data set, 0 to {count - 1}")
+    if request.stop is not None and request.stop <= request.start:
+        raise invalid_request("stop", request.stop, f"a row after start, {request.start}")
+    stop = count if request.stop is None else request.stop
+    chosen = part[(part >= request.start) & (part < stop)]
+    if not len(chosen):
+        expected = f"rows of which some were held out; these lie between {part[0]} and {part[-1]}"
+        raise invalid_request("start", f"{request.start}, up to {stop}", expected)
+    return chosen
+
+
+def _breaks(part: Rows, episode: NDArray[np.int64], rows: Rows) -> list[int]:
+    """Places in `rows` before which the part is interrupted or the episode changes."""
+    anew = (np.diff(part) != 1) | (np.diff(episode[part]) != 0)
+    piece = np.concatenate([[0], np.cumsum(anew)])[np.searchsorted(part, rows)]
+    return (np.flatnonzero(np.diff(piece)) + 1).tolist()
+
+
+def _components(
+    served: Served, samples: Samples, names: Sequence[schema.TraceComponent], batch: int
+) -> dict[schema.TraceComponent, schema.TraceComponentValues]:
+    """Parts of the torque at samples, so many at a time: they take far more memory than a torque."""
+    if not names:
+        return {}
+    mean: dict[schema.TraceComponent, list[Array]] = {name: [] for name in names}
+    std: dict[schema.TraceComponent, list[Array]] = {name: [] for name in names}
+    for first in range(0, len(samples), batch):
+        some = samples.rows(slice(first, first + batch))
+        estimates = dynamics.components(served.model, Motion.from_arrays(some.q, some.dq, some.ddq), names)
+        for name in names:
+            mean[name].append(estimates[name].mean.numpy())
+            std[name].append(estimates[name].std.numpy())
+    return {
+        name: schema.TraceComponentValues(
+            mean=np.concatenate(mean[name]).tolist(), std=np.concatenate(std[name]).tolist()
+        )
+        for name in names
+    }

@@ -39,9 +39,7 @@ class Query(NamedTuple):
 
     def check(self, max_position: float, expected: Callable[[str], str] = lambda _: "a finite number") -> None:
         """Raise InvalidRequestError where a number is not finite or a position beyond ±`max_position`, rad (m).
-
-        expected: says what a number of q, dq, ddq or tau has to be.
-        """
+        expected: says what a number of q, dq, ddq or tau has to be."""
         if not np.isfinite(self.values).all():
             part, row, joint = np.argwhere(~np.isfinite(self.values))[0]
             number = f"{self.values[part, row, joint]:g}"
@@ -69,6 +67,19 @@ class Query(NamedTuple):
         return f"{name}[{joint}]" if self.single else f"{name}[{row}][{joint}]"
 
 
+def check_shapes(request: Any, model: TorqueModel) -> list[Array]:
+    """The arrays q, dq, ddq and tau of a request, those left out that are None; raise InvalidRequestError where they
+    are not of the model's joints or of several shapes."""
+    parts = {name: values for name in QUANTITIES if (values := getattr(request, name)) is not None}
+    for name, values in parts.items():
+        if values.shape[-1] != model.n_joints:
+            expected = f"{model.n_joints} numbers: {', '.join(model.joint_names)}"
+            raise invalid_request(name, f"{values.shape[-1]} numbers long", expected)
+        if values.shape != request.q.shape:
+            raise invalid_request(name, f"of shape {values.shape}", f"the shape of q, {request.q.shape}")
+    return list(parts.values())
+
+
 def check_answer(name: str, values: Array) -> None:
     """Raise InvalidRequestError where a number of an answer, of any shape, is not finite."""
     if isfinite(np.vdot(values, values)):  # at one query a third of what np.isfinite takes
@@ -81,13 +92,18 @@ def check_answer(name: str, values: Array) -> None:
         raise invalid_request(field, f"{values[place]:g}", expected)
 
 
-def check_components(model: TorqueModel, request: PredictRequest, limit: int) -> None:
-    """Raise InvalidRequestError for components the model lacks, too many queries, or a torque missing or in vain."""
+def check_offered(model: TorqueModel, components: Sequence[ComponentName]) -> None:
+    """Raise InvalidRequestError for a component that the model's estimator does not offer."""
     offered = dynamics.available(model.estimator)
-    for index, name in enumerate(request.components):
+    for index, name in enumerate(components):
         if name not in offered:
             expected = f"what a model with the estimator {model.estimator.name} offers: {', '.join(offered)}"
             raise invalid_request(f"components[{index}]", name, expected)
+
+
+def check_components(model: TorqueModel, request: PredictRequest, limit: int) -> None:
+    """Raise InvalidRequestError for components the model lacks, too many queries, or a torque missing or in vain."""
+    check_offered(model, request.components)
     if request.components and request.q.ndim == 2 and len(request.q) > limit:
         raise invalid_request("q", f"{len(request.q)} queries", f"at most {limit} in one request with components")
     forward = "forward_dynamics" in request.components
@@ -127,23 +143,13 @@ class PredictBody(Struct, forbid_unknown_fields=True):
 
     def request(self) -> PredictRequest | None:
         """Return what it says with arrays (n,) or (N, n), or None where a list is ragged or a component comes twice."""
-        q, dq, ddq = _array(self.q), _array(self.dq), _array(self.ddq)
-        tau = None if self.tau is None else _array(self.tau)
-        if q is None or dq is None or ddq is None or (tau is None and self.tau is not None):
-            return None
         if len(set(self.components)) < len(self.components):
             return None
-        return PredictRequest.model_construct(
-            q=q,
-            dq=dq,
-            ddq=ddq,
-            tau=tau,
-            version=self.version,
-            alias=self.alias,
-            covariance=self.covariance,
-            components=self.components,
-            min_revision=self.min_revision,
-        )
+        try:
+            arrays = {name: to_array(values) for name in QUANTITIES if (values := getattr(self, name)) is not None}
+        except ValueError:
+            return None
+        return PredictRequest.model_construct(**(msgspec.structs.asdict(self) | arrays))
 
 
 class Prediction(Struct, omit_defaults=True):
@@ -183,11 +189,11 @@ def encode(answer: Prediction) -> bytes:
     return _encoder.encode(answer)
 
 
-def _array(values: Numbers) -> Array | None:
-    try:
-        return np.array(values, np.float64) if values else None
-    except ValueError:  # ragged
-        return None
+def to_array(values: Sequence[Any]) -> Array:
+    """Numbers (n,) or rows of them (N, n), null as NaN; raise ValueError where there are none, or rows differ."""
+    if not values:
+        raise ValueError("no rows")
+    return np.array(values, np.float64)
 
 
 def at_once(served: Served, motion: Array, max_position: float) -> Prediction | None:
@@ -204,21 +210,13 @@ def at_once(served: Served, motion: Array, max_position: float) -> Prediction | 
 
 def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: Served | None = None) -> Prediction:
     """Torque with uncertainty at the queries; raise InvalidRequestError or NotFoundError. Not for the event loop.
-
-    served: what answers, where that is found already.
-    """
+    served: what answers, where that is found already."""
     settings = loaded.storage.settings
     served = served or loaded.get(model, request.version, request.alias)
     known = served.model
     single = request.q.ndim == 1
     check_components(known, request, settings.max_component_batch)
-    parts = [values for name in QUANTITIES if (values := getattr(request, name)) is not None]
-    for name, values in zip(QUANTITIES, parts, strict=False):
-        if values.shape[-1] != known.n_joints:
-            expected = f"{known.n_joints} numbers: {', '.join(known.joint_names)}"
-            raise invalid_request(name, f"{values.shape[-1]} numbers long", expected)
-        if values.shape != request.q.shape:
-            raise invalid_request(name, f"of shape {values.shape}", f"the shape of q, {request.q.shape}")
+    parts = check_shapes(request, known)
     query = Query(np.stack([np.atleast_2d(values) for values in parts]), single)
     if (count := query.values.shape[1]) > settings.max_batch:
         raise invalid_request("q", f"{count} queries", f"at most {settings.max_batch} in one request")
@@ -236,12 +234,10 @@ def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: S
         lists[name] = shaped.tolist()
     prediction = _prediction_of(served, **lists)
     if request.components:
+        of_query = 0 if single else slice(None)
         estimates = query.components(known, request.components)
         prediction.components = {
-            name: {
-                "mean": (estimates[name].mean[0] if single else estimates[name].mean).tolist(),
-                "std": (estimates[name].std[0] if single else estimates[name].std).tolist(),
-            }
+            name: {part: getattr(estimates[name], part)[of_query].tolist() for part in ("mean", "std")}
             for name in request.components
         }
     return prediction

@@ -18,10 +18,8 @@ from service.foundation.errors import (
     UnreadableVersionError,
     responses,
 )
-from service.inference import comparison, evaluating, predicting, trace
-from service.inference.comparison_schema import CompareRequest, CompareResponse, TraceRequest, TraceResponse
+from service.inference import comparison, evaluating, predicting, schema
 from service.inference.predicting import decode, encode
-from service.inference.schema import EvaluateRequest, EvaluateResponse, PredictRequest, PredictResponse
 from service.models.loaded import LoadedModels, LoadedModelsDep
 from service.models.served import Served, reached
 from service.web.limits.requests import PredictionsDep
@@ -92,23 +90,23 @@ async def _answer(scope: Scope, body: bytes) -> Reply | None:
 
 
 async def _in_thread(
-    loaded: LoadedModels, turns: CapacityLimiter, model: str, request: PredictRequest, served: Served | None
+    loaded: LoadedModels, turns: CapacityLimiter, model: str, request: schema.PredictRequest, served: Served | None
 ) -> bytes:
-    return await to_thread.run_sync(_encoded, loaded, model, request, served, limiter=turns)
+    return await to_thread.run_sync(lambda: encode(predicting.predict(loaded, model, request, served)), limiter=turns)
 
 
-def _encoded(loaded: LoadedModels, model: str, request: PredictRequest, served: Served | None) -> bytes:
-    return encode(predicting.predict(loaded, model, request, served))
-
-
-async def _revised(loaded: LoadedModels, model: str, request: PredictRequest | EvaluateRequest) -> Served | None:
+async def _revised(
+    loaded: LoadedModels, model: str, request: schema.PredictRequest | schema.EvaluateRequest
+) -> Served | None:
     """The version that answers, where the request waits for a revision of it; None where it does not."""
     if request.min_revision is None:
         return None
     return await reached(loaded, model, request.version, request.alias, request.min_revision)
 
 
-async def predict(loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: PredictRequest) -> Response:
+async def predict(
+    loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: schema.PredictRequest
+) -> Response:
     """Answer one query or a batch. Nothing is clipped; `tau_std` grows where the model knows little."""
     # a right query has been answered before: this reads the others, to say what is wrong, or in JSON of other dialects
     served = await _revised(loaded, model, request)
@@ -120,7 +118,7 @@ hot.add_api_route(
     predict,
     methods=["POST"],
     summary="Torque at a motion, with its uncertainty",
-    response_model=PredictResponse,
+    response_model=schema.PredictResponse,
     responses=_LATE,
     route_class_override=hot_route(_answer),
 )
@@ -128,8 +126,8 @@ hot.add_api_route(
 
 @router.post("/{model}/evaluate", summary="Compare a model with a data set", responses=_LATE)
 async def evaluate(
-    loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: EvaluateRequest
-) -> EvaluateResponse:
+    loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: schema.EvaluateRequest
+) -> schema.EvaluateResponse:
     """Error, coverage and density of the model's torques against measured ones, joint by joint."""
     served = await _revised(loaded, model, request)
     return await to_thread.run_sync(evaluating.evaluate, loaded, model, request, served, limiter=turns)
@@ -137,15 +135,15 @@ async def evaluate(
 
 @router.post("/{model}/trace", summary="Follow a model along a data set", responses=responses(DamagedDataError))
 async def trace_model(
-    loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: TraceRequest
-) -> TraceResponse:
+    loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: schema.TraceRequest
+) -> schema.TraceResponse:
     """Measured torque beside the model's, row by row, for a plot: mean, both standard deviations and components.
 
     Where there are more rows than points, rows are chosen evenly. Each is shown as it was measured and predicted, and
     the share of them outside the interval is fair, but a peak between two of them is missing: ask for fewer rows to
     see all.
     """
-    return await to_thread.run_sync(trace.trace, loaded, model, request, limiter=turns)
+    return await to_thread.run_sync(evaluating.trace, loaded, model, request, limiter=turns)
 
 
 @router.post(
@@ -155,7 +153,7 @@ async def trace_model(
     responses=responses(NotFoundError, UnreadableVersionError, DamagedDataError),
 )
 async def compare(
-    loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: CompareRequest
-) -> CompareResponse:
+    loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: schema.CompareRequest
+) -> schema.CompareResponse:
     """Which of two versions predicts a data set better, joint by joint and over all, and whether that may be chance."""
     return await to_thread.run_sync(comparison.compare, loaded, model, request, limiter=turns)

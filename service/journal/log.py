@@ -6,7 +6,7 @@ dense and rise in the order of commits, and an event is durable once the transac
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
@@ -94,17 +94,8 @@ def append_batch(session: Session, model: str, batch: NewBatch, most_streams: in
     batch may have been learnt before and is no longer kept; BusyError beyond `most_streams` streams of the model. That
     no batch of this sequence is kept is checked with `find_batch` before, in the same transaction.
     """
-    event = EventRow(
-        number=newest(session, model) + 1,
-        stream_id=batch.stream_id,
-        sequence=batch.sequence,
-        last_sequence=batch.last_sequence,
-        digest=batch.digest,
-        version=batch.version,
-        revision=batch.revision,
-        report=batch.report,
-        record=batch.record,
-    )
+    names = ("stream_id", "sequence", "last_sequence", "digest", "version", "revision", "report", "record")
+    event = EventRow(number=newest(session, model) + 1, **{name: getattr(batch, name) for name in names})
     _note_arrival(session, model, batch, most_streams)
     return _append(session, event, model, "batch", batch.received, batch.rows)
 
@@ -169,42 +160,44 @@ def is_complete(session: Session, model: str, after: int, through: int) -> bool:
 
 
 def page(
-    session: Session,
-    model: str,
-    part: Page,
-    stream_id: str | None = None,
-    rejected: bool = False,
-    kinds: Collection[EventKind] | None = None,
+    session: Session, model: str, part: Page, stream_id: str | None = None, rejected: bool = False
 ) -> tuple[list[EventRow], str | None]:
-    """Events of a page, newest first, and the cursor after it; rejected: only those with rows that are not learnt."""
-    conditions = [EventRow.model == model]
+    """Batches of a page, newest first, and the cursor after it; rejected: only those with rows that are not learnt."""
+    conditions = [EventRow.model == model, EventRow.kind == "batch"]
     if stream_id is not None:
         conditions.append(EventRow.stream_id == stream_id)
     if rejected:
         conditions.append(EventRow.learnt < EventRow.rows)
-    if kinds is not None:
-        conditions.append(EventRow.kind.in_(kinds))
     return newest_rows(session, EventRow, part, *conditions)
+
+
+def about(session: Session, batch: EventRow, kind: Literal["replay", "unlearn"]) -> Sequence[EventRow]:
+    """Events that have learnt rows of a batch later, or have taken it out, in order, also those undone since."""
+    query = select(EventRow).where(
+        EventRow.model == batch.model,
+        EventRow.number > batch.number,
+        EventRow.kind == kind,
+        EventRow.detail["event"].as_integer() == batch.number,
+    )
+    return session.scalars(query.order_by(EventRow.number)).all()
+
+
+def rows_of(event: EventRow) -> Rows:
+    """The rows of a batch or a replay, which are read only now."""
+    assert event.payload is not None  # both have one for as long as they are in the log
+    return decode(event.payload)
 
 
 def unlearn(session: Session, model: str, event: EventRow, received: float) -> EventRow:
     """Take a batch and its replays out of what is learnt; return the event that says so."""
-    replays = select(EventRow.number).where(
-        EventRow.model == model,
-        EventRow.number > event.number,
-        EventRow.kind == "replay",
-        EventRow.detail["event"].as_integer() == event.number,
-    )
-    numbers = [event.number, *session.scalars(replays)]
+    numbers = [event.number, *(each.number for each in about(session, event, "replay"))]
     session.execute(update(EventRow).where(EventRow.model == model, EventRow.number.in_(numbers)).values(void=True))
     return append(session, model, "unlearn", {"event": event.number}, received)
 
 
 def rollback(session: Session, model: str, to: int, received: float) -> EventRow:
-    """Take what was learnt after event `to` out again, by every version, and what was set; return the event.
-
-    What was unlearnt stays unlearnt.
-    """
+    """Take what was learnt after event `to` out again, by every version, and what was set; return the event. What was
+    unlearnt stays unlearnt."""
     made = ("batch", "replay", "change", "settings")
     later = (EventRow.model == model, EventRow.number > to)
     session.execute(update(EventRow).where(*later, EventRow.kind.in_(made), EventRow.void.is_(False)).values(void=True))
@@ -285,10 +278,16 @@ def _note_arrival(session: Session, model: str, batch: NewBatch, most_streams: i
     source.last, source.missing = gaps.last, gaps.to_json()
 
 
+def check_kind(source: StreamRow | None, kind: StreamKind) -> None:
+    """Raise ConflictError where a stream carries something else: one sequence cannot count both."""
+    if source is not None and source.kind != kind:
+        name = f"stream {source.stream_id!r} of model {source.model!r}"
+        raise ConflictError(f"{name} carries {source.kind}, not {kind}: use another stream_id")
+
+
 def _check_stream(source: StreamRow, batch: NewBatch) -> None:
     name = f"stream {source.stream_id!r} of model {source.model!r}"
-    if source.kind != batch.kind:
-        raise ConflictError(f"{name} carries {source.kind}, not {batch.kind}: use another stream_id")
+    check_kind(source, batch.kind)
     if batch.kind == "frames" and batch.sequence <= source.last:
         raise ConflictError(f"{name} has come to frame {source.last}, frame {batch.sequence} does not go on from there")
     if is_forgotten(source, batch.sequence):

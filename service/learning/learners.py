@@ -21,8 +21,7 @@ from service.compute.process import Place
 from service.foundation.errors import BusyError
 from service.foundation.fields import of_app
 from service.foundation.states import PartState
-from service.learning.ingest.batches import observe_batch
-from service.learning.ingest.frames import Frames, FramesResult, observe_frames
+from service.learning.ingest.batches import Frames, FramesResult, observe_batch, observe_frames
 from service.learning.ingest.intake import Intake
 from service.learning.ingest.monitor import Monitor
 from service.learning.learner import publication
@@ -91,6 +90,16 @@ class Status:
     published: Published | None = None
     failed: Failed | None = None
 
+    @property
+    def novel_share(self) -> float | None:
+        """Share of the latest samples beyond the basis; None before something is learnt."""
+        return None if self.published is None else self.published.novel_share
+
+    @property
+    def failure(self) -> str | None:
+        """Why the version does not learn, None while it does."""
+        return None if self.failed is None else self.failed.error
+
 
 class Learners:
     """Learning of all models; safe from several threads. Close it before the database.
@@ -131,9 +140,7 @@ class Learners:
 
     def monitor(self, model: str) -> Monitor:
         """The monitor of a model, up to the batches that other services have logged by now. Not for the event loop.
-
-        Raise NotFoundError or UnreadableVersionError.
-        """
+        Raise NotFoundError or UnreadableVersionError."""
         monitor = self._monitor(self.loaded.get(model, None))
         self._intake.follow(monitor, model)
         return monitor
@@ -195,7 +202,9 @@ class Learners:
     def _receive(self, message: Message) -> None:
         """Act on a message of the learner process; called in its reader's thread."""
         if isinstance(message, Published):
-            self._publish(message)
+            # an immutable revision takes the place of the one before
+            self.loaded.revise(message.model, message.version, message.revision, publication.read(message.path))
+            self._note(message, published=message, failed=None)
             for call in self.when_published:
                 call(message)
         elif isinstance(message, Contested):
@@ -204,12 +213,6 @@ class Learners:
         elif isinstance(message, Failed):
             logger.error("version %s of model %s does not learn: %s", message.version, message.model, message.error)
             self._note(message, failed=message)
-
-    def _publish(self, message: Published) -> None:
-        """Answer with what a version has learnt: an immutable revision takes the place of the one before."""
-        revision = publication.read(message.path)
-        self.loaded.revise(message.model, message.version, message.revision, revision)
-        self._note(message, published=message, failed=None)
 
 
 LearnersDep = Annotated[Learners, Depends(of_app("learners"))]

@@ -10,10 +10,9 @@ from prometheus_client.registry import Collector
 from sqlalchemy import select
 
 from lipcore.vocabulary import CODES
-from service.learning.control import status, undoing
+from service.learning.control import status
 from service.learning.ingest.monitor import Monitor
 from service.learning.learners import Learners
-from service.models.loaded import Served
 from service.storage.database import StreamRow
 from service.web.observability.meters import MetricKind
 
@@ -62,27 +61,22 @@ class Learning(Collector):
             if (served := self._learners.loaded.hot(model, None)) is None:
                 continue
             revision.add_metric([model, str(served.version)], served.revision)
-            lag.add_metric([model], self._lag(served))
-            share = status.novel_share(self._learners.status(model, served.version))
-            if share is not None:
+            with self._learners.database.session() as session:
+                behind = status.current(session, model, served.version) - served.revision
+            lag.add_metric([model], max(behind, 0))
+            if (share := self._learners.status(model, served.version).novel_share) is not None:
                 novel.add_metric([model], share)
         yield from (*gauges.values(), revision, novel, lag, rows)
         yield LOADED.of([((), len(self._learners.loaded.versions()))])
 
     def _monitors(self) -> dict[str, Monitor]:
-        """Monitors by model: those there are, and of models in memory that have got observations before the start.
-
-        No model is loaded for it, which would drop another one.
-        """
+        """Monitors by model: those there are, and of models in memory that have got observations before the start. No
+        model is loaded for it, which would drop another one."""
         learners, loaded = self._learners, self._learners.loaded
         with self._learners.database.session() as session:
             learning = list(session.scalars(select(StreamRow.model).distinct()))
         fresh = {model: learners.monitor(model) for model in learning if loaded.hot(model, None) is not None}
         return dict(sorted((learners.monitors() | fresh).items()))
-
-    def _lag(self, served: Served) -> int:
-        with self._learners.database.session() as session:
-            return max(undoing.current(session, served.name, served.version) - served.revision, 0)
 
 
 def _add_quality(gauges: dict[str, GaugeMetricFamily], model: str, monitor: Monitor) -> None:

@@ -23,10 +23,8 @@ def options(session: Session, model: str) -> LearningOptions:
 
 
 def set_options(database: Database, model: str, chosen: LearningOptions, n_joints: int, received: float) -> None:
-    """Set how a model learns from now on; a new time constant of forgetting is an event of its log.
-
-    Raise NotFoundError for a model that does not exist, InvalidRequestError where `torque_limits` is not of its joints.
-    """
+    """Set how a model learns from now on; a new time constant of forgetting is an event of its log. Raise NotFoundError
+    for a model that does not exist, InvalidRequestError where `torque_limits` is not of its joints."""
     limits = chosen.torque_limits
     if limits is not None and len(limits) != n_joints:
         raise invalid_request(

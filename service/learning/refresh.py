@@ -26,7 +26,7 @@ from service.learning.owner import AlarmKind
 from service.models import registry
 from service.models.loaded import LoadedModels
 from service.storage.database import AlarmRow, Database, LearnerRow, ServingRow
-from service.training import jobs, refreshes
+from service.training import jobs
 from service.training import refresh_data as scope
 from service.training.queue import JobQueue
 from service.training.schema import Job
@@ -83,7 +83,7 @@ def consider(settings: Settings, database: Database, queue: JobQueue, published:
             return None
         why = reasons[0]
         try:
-            job = refreshes.add(session, settings, version, why.trigger)
+            job = jobs.add_refresh(session, settings, version, why.trigger)
         except ConflictError as error:
             text = f"{why.text}, but it cannot be refreshed: {error.message}"
             _raise_once(session, model, "refresh", text, why.evidence)
@@ -93,7 +93,7 @@ def consider(settings: Settings, database: Database, queue: JobQueue, published:
             return None
         owner.raise_alarm(session, model, why.trigger, f"{why.text}: it is refreshed", {**why.evidence, "job": job.id})
     queue.submit(job.id)
-    return jobs.shown(job)
+    return jobs.represent(job)
 
 
 def _is_due(session: Session, settings: Settings, published: Published) -> bool:
@@ -102,7 +102,7 @@ def _is_due(session: Session, settings: Settings, published: Published) -> bool:
     serving = session.get(ServingRow, model)
     if serving is None or serving.version != version or owner.held(session, model) is not None:
         return False
-    before = list(session.scalars(refreshes.of(model)))
+    before = list(session.scalars(jobs.refreshes_of(model)))
     if any(job.state in ACTIVE for job in before):
         return False
     contest = select(LearnerRow.version).where(LearnerRow.model == model, LearnerRow.role == CANDIDATE)
@@ -110,7 +110,7 @@ def _is_due(session: Session, settings: Settings, published: Published) -> bool:
         return False
     if not owner.options(session, model).auto_promote and _is_better_known(session, model, version):
         return False
-    ended = [_unix(job.finished_at or job.created_at) for job in before]
+    ended = [datetime.fromisoformat(job.finished_at or job.created_at).timestamp() for job in before]
     earlier = sum(job.request["refresh"]["version"] == version for job in before)
     pause = settings.refresh_pause_s * 2 ** min(max(earlier - 1, 0), MOST_DOUBLINGS)
     return not ended or time.time() - max(ended) >= pause
@@ -155,10 +155,6 @@ def _alarms(model: str, kind: AlarmKind) -> Select[int]:
     return select(AlarmRow.seq).where(AlarmRow.model == model, AlarmRow.kind == kind)
 
 
-def _unix(moment: str) -> float:
-    return datetime.fromisoformat(moment).timestamp()
-
-
 def decide(database: Database, loaded: LoadedModels, wake: Callable[[str], None], contested: Contested) -> bool:
     """Act on the verdict of a contest; return whether the candidate answers now. Not for the event loop.
 
@@ -183,29 +179,16 @@ def decide(database: Database, loaded: LoadedModels, wake: Callable[[str], None]
 def _act(session: Session, contested: Contested, learner: LearnerRow) -> bool:
     """Change roles as the verdict says, and note why; return whether the candidate serves."""
     model, old, new = contested.model, contested.serving, contested.candidate
-    learner.role = DISMISSED  # unless it serves
+    learner.role, promoted = DISMISSED, False  # unless it serves
     if contested.verdict == "dismiss":
-        _note(session, contested, f"version {new} does not predict better than version {old} and is dismissed", False)
-        return False
-    if scope.taken_back(session, model, learner.start, learner.start):
+        message = f"version {new} does not predict better than version {old} and is dismissed"
+    elif scope.taken_back(session, model, learner.start, learner.start):
         message = f"version {new} is dismissed: part of what it was trained on has been taken back since"
-        _note(session, contested, message, False)
-        return False
-    if not owner.options(session, model).auto_promote:
+    elif not owner.options(session, model).auto_promote:
         message = f"version {new} predicts better than version {old}: a rollback to version {new} lets it answer"
-        _note(session, contested, message, False)
-        return False
-    registry.serve(session, model, new)
-    _note(session, contested, f"version {new} predicts better than version {old} and answers from now on", True)
-    return True
-
-
-def _note(session: Session, contested: Contested, message: str, promoted: bool) -> None:
-    evidence: dict[str, Any] = {
-        "serving": contested.serving,
-        "candidate": contested.candidate,
-        "verdict": contested.verdict,
-        "promoted": promoted,
-        **contested.evidence,
-    }
-    owner.raise_alarm(session, contested.model, "promotion", message, evidence)
+    else:
+        registry.serve(session, model, new)
+        message, promoted = f"version {new} predicts better than version {old} and answers from now on", True
+    named = {"serving": old, "candidate": new, "verdict": contested.verdict, "promoted": promoted}
+    owner.raise_alarm(session, model, "promotion", message, {**named, **contested.evidence})
+    return promoted

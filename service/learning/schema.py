@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from math import nan
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema
 
-from service.foundation.errors import ServiceError, invalid_request
-from service.foundation.fields import to_array
+from service.foundation.errors import ServiceError
+from service.foundation.fields import numbers, rows_of_numbers
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -53,32 +52,14 @@ StreamId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 SequenceNumber = Annotated[int, Field(strict=True, ge=0, le=MOST_SEQUENCE)]
 
 
-def _to_array(value: Any, info: ValidationInfo) -> NDArray[np.float64]:
-    """JSON rows as an array, null as NaN; see `to_array`."""
-    return to_array(info.field_name or "value", value, _row)
-
-
 def _to_times(value: Any, info: ValidationInfo) -> NDArray[np.float64]:
     """One number or numbers (N,) as an array (N,), null as NaN; raise InvalidRequestError naming what is wrong."""
-    name = info.field_name or "value"
-    if not isinstance(value, list):
-        return np.array(_row(name, [value]))
-    return np.array(_row(name, value), np.float64)
+    return np.array(numbers(info.field_name or "value", value if isinstance(value, list) else [value], nullable=True))
 
 
-def _row(name: str, row: list[Any]) -> list[float]:
-    out = []
-    for index, number in enumerate(row):
-        if type(number) not in (int, float, type(None)):
-            raise invalid_request(f"{name}[{index}]", number, "a number, or null where none was measured")
-        try:
-            out.append(nan if number is None else float(number))
-        except OverflowError:
-            raise invalid_request(f"{name}[{index}]", number, "a number of at most 1e308") from None
-    return out
-
-
-Matrix = Annotated[NDArray[np.float64], PlainValidator(_to_array), WithJsonSchema({"anyOf": [_NUMBERS, _ROWS]})]
+Matrix = Annotated[
+    NDArray[np.float64], PlainValidator(rows_of_numbers(nullable=True)), WithJsonSchema({"anyOf": [_NUMBERS, _ROWS]})
+]
 """JSON array of shape (N, n), or (n,) for one row; null where there is no number."""
 Times = Annotated[
     NDArray[np.float64], PlainValidator(_to_times), WithJsonSchema({"anyOf": [{"type": "number"}, _NUMBERS]})

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from sqlalchemy import select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from service.foundation.errors import ConflictError, invalid_request, not_found
-from service.models import moves, registry
+from service.models import registry
 from service.models.loaded import LoadedModels
-from service.models.moves import SERVING
+from service.models.registry import SERVING
 from service.models.schema import Alias, AliasList, AliasMove, AliasRequest
-from service.storage.database import AliasMoveRow, AliasRow, ModelRow, VersionRow
+from service.storage.database import AliasMoveRow, AliasRow, ModelRow, VersionRow, now
 
 
 def page(loaded: LoadedModels, model: str) -> AliasList:
@@ -56,7 +56,7 @@ def remove(loaded: LoadedModels, model: str, alias: str) -> None:
                 raise ConflictError("the alias 'serving' is built in: it can be moved, and not be removed")
             if session.get(AliasRow, (model, alias)) is None:
                 raise not_found("alias", alias)
-            moves.point(session, model, alias, None)
+            point(session, model, alias, None)
         loaded.point(model, alias, None)
 
 
@@ -74,20 +74,50 @@ def _move(loaded: LoadedModels, model: str, alias: str, version: int, taken_back
                 registry.serve(session, model, version, number)
             else:
                 _check_room(loaded, session, model, alias)
-                moves.point(session, model, alias, version, number)
-            shown = _show(loaded, session, model, alias)
+                point(session, model, alias, version, number)
+            answer = _show(loaded, session, model, alias)
         if alias != SERVING:
             loaded.point(model, alias, version)
     if alias == SERVING:
         loaded.adopt(model)
         loaded.wake(model)
-    return shown
+    return answer
+
+
+def point(session: Session, model: str, alias: str, version: int | None, takes_back: int | None = None) -> None:
+    """Point an alias to a version, or to none, and note the move; nothing happens where it points there already. Not
+    for the alias `serving`, see `registry.serve`. takes_back: see `registry.note`."""
+    row = session.get(AliasRow, (model, alias))
+    before = None if row is None else row.version
+    if before == version:
+        return
+    registry.note(session, model, alias, before, version, takes_back)
+    if version is None:
+        session.delete(row)
+    elif row is None:
+        session.add(AliasRow(model=model, alias=alias, version=version, changed_at=now()))
+    else:
+        row.version, row.changed_at = version, now()
+
+
+def _history(session: Session, model: str, alias: str, count: int) -> list[AliasMoveRow]:
+    """The last moves of an alias, newest first, at most `count`."""
+    query = select(AliasMoveRow).where(AliasMoveRow.model == model, AliasMoveRow.alias == alias)
+    return list(session.scalars(query.order_by(AliasMoveRow.seq.desc()).limit(count)))
+
+
+def _standing(session: Session, model: str, alias: str) -> AliasMoveRow | None:
+    """The move that a rollback takes back: the newest that neither took one back nor was taken back itself."""
+    of_alias = (AliasMoveRow.model == model, AliasMoveRow.alias == alias)
+    undone = select(AliasMoveRow.takes_back).where(*of_alias, AliasMoveRow.takes_back.is_not(None))
+    query = select(AliasMoveRow).where(*of_alias, AliasMoveRow.takes_back.is_(None), AliasMoveRow.seq.not_in(undone))
+    return session.scalar(query.order_by(AliasMoveRow.seq.desc()).limit(1))
 
 
 def _last(session: Session, model: str, alias: str) -> AliasMoveRow:
     _check_model(session, model)
-    move = moves.standing(session, model, alias)
-    if move is None and (alias == SERVING or moves.history(session, model, alias, 1)):
+    move = _standing(session, model, alias)
+    if move is None and (alias == SERVING or _history(session, model, alias, 1)):
         raise ConflictError(f"the alias {alias!r} of model {model!r} has no move left that could be taken back")
     if move is None:
         raise not_found("alias", alias)
@@ -111,19 +141,20 @@ def _check_model(session: Session, model: str) -> None:
 
 def _check_room(loaded: LoadedModels, session: Session, model: str, alias: str) -> None:
     most = loaded.storage.settings.max_aliases
-    if session.get(AliasRow, (model, alias)) is None and moves.count(session, model) >= most:
+    known = session.scalar(select(func.count()).select_from(AliasRow).where(AliasRow.model == model)) or 0
+    if session.get(AliasRow, (model, alias)) is None and known >= most:
         raise ConflictError(f"model {model!r} has {most} aliases, the most it may have: remove one first")
 
 
 def _show(loaded: LoadedModels, session: Session, model: str, alias: str) -> Alias:
-    past = moves.history(session, model, alias, loaded.storage.settings.max_alias_moves)
+    past = _history(session, model, alias, loaded.storage.settings.max_alias_moves)
     if alias == SERVING:
         version = registry.answering(session, model)
         changed_at = past[0].at if past else session.get_one(VersionRow, (model, version)).created_at
     else:
         row = session.get_one(AliasRow, (model, alias))
         version, changed_at = row.version, row.changed_at
-    move = moves.standing(session, model, alias)
+    move = _standing(session, model, alias)
     return Alias(
         alias=alias,
         version=version,

@@ -1,19 +1,29 @@
-"""The form of an exported version: a tar file of a few plain files, by exact name and of limited size.
+"""A version for use elsewhere: an archive with its files, their checksums and what made them, or its arm as a URDF.
 
-It is written and read here and not by `tarfile`: that follows links, sparse files, extended headers and numbers of any
-size, of which an archive of a model has none, and which have been the way in for many an attack. Whatever GNU tar and
-bsdtar write of plain files with short names is read too.
+An archive is a tar file of a few plain files, by exact name and of limited size. Of `tarfile` only what makes and reads
+a single header is used: the rest follows links, sparse files, extended headers and numbers of any size, of which an
+archive of a model has none, and which have been the way in for many an attack.
 """
 
 from __future__ import annotations
 
-import re
+import json
 import tarfile
+import tempfile
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from io import SEEK_CUR
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO, Any
 
-from lipcore.files.manifest import MANIFEST, ROBOT, TENSORS
+from lipcore.files import persistence
+from lipcore.files.manifest import MANIFEST, ROBOT, TENSORS, ModelFormatError
+from lipcore.files.urdf_writer import urdf_of_parameters
+from service.foundation.errors import InvalidRequestError, UnreadableVersionError, invalid_request, problem
+from service.models import registry
+from service.models.lineage import software
+from service.models.loaded import LoadedModels
+from service.storage.database import VersionRow, now
 
 EXPORT, CHECKSUMS = "export.json", "checksums.json"
 MEMBERS = (EXPORT, CHECKSUMS, MANIFEST, TENSORS, ROBOT)
@@ -21,20 +31,15 @@ FORMAT, FORMAT_VERSION = "lipserve-archive", 1
 MEDIA_TYPE = "application/x-tar"
 BLOCK = 512
 CHUNK = 1 << 20
-_OCTAL = re.compile(rb"[ 0]*([0-7]{1,12})[ \0]*")
-_MAGIC = (b"ustar\x0000", b"ustar  \x00")
 _KINDS = {
-    b"1": "a hard link",
-    b"2": "a symbolic link",
-    b"3": "a device",
-    b"4": "a device",
-    b"5": "a folder",
-    b"6": "a pipe",
-    b"S": "a sparse file",
-    b"x": "an extended header",
-    b"g": "an extended header",
-    b"L": "a long name",
-    b"K": "a long name",
+    tarfile.LNKTYPE: "a hard link",
+    tarfile.SYMTYPE: "a symbolic link",
+    **dict.fromkeys((tarfile.CHRTYPE, tarfile.BLKTYPE), "a device"),
+    tarfile.DIRTYPE: "a folder",
+    tarfile.FIFOTYPE: "a pipe",
+    tarfile.GNUTYPE_SPARSE: "a sparse file",
+    **dict.fromkeys((tarfile.XHDTYPE, tarfile.XGLTYPE), "an extended header"),
+    **dict.fromkeys((tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK), "a long name"),
 }
 
 
@@ -46,119 +51,188 @@ class ArchiveError(ValueError):
         self.member, self.given, self.expected = member, given, expected
 
 
-class Part(NamedTuple):
-    """A member to be written: its content, whole or from a file that is read from its beginning."""
-
-    name: str
-    size: int
-    content: bytes | IO[bytes]
-
-
-class Member(NamedTuple):
-    """Where the content of a member lies in an archive."""
-
-    offset: int
-    size: int
-
-
-def size(parts: list[Part]) -> int:
-    """Bytes of the archive that `stream` makes of these parts."""
-    return sum(BLOCK + each.size + _padding(each.size) for each in parts) + 2 * BLOCK
-
-
-def stream(parts: list[Part]) -> Iterator[bytes]:
-    """The archive, piece by piece; files are closed at its end, and where it is given up."""
-    try:
-        for part in parts:
-            info = tarfile.TarInfo(part.name)
-            info.size = part.size
-            yield info.tobuf(tarfile.USTAR_FORMAT)
-            if isinstance(part.content, bytes):
-                yield part.content
-            else:
-                part.content.seek(0)
-                while piece := part.content.read(CHUNK):
-                    yield piece
-            yield bytes(_padding(part.size))
-        yield bytes(2 * BLOCK)
-    finally:
-        for part in parts:
-            if not isinstance(part.content, bytes):
-                part.content.close()
-
-
-def members(path: Path, limits: Mapping[str, int]) -> dict[str, Member]:
-    """Where the members of an archive lie, by name; nothing of them is read. limits: most bytes of each.
-
-    Raise ArchiveError for anything but plain files with these names, each once, complete and within its limit.
-    """
-    places: dict[str, Member] = {}
+def read(path: Path, limits: Mapping[str, int]) -> dict[str, bytes]:
+    """The members of an archive by name. limits: most bytes of each. Raise ArchiveError for anything but plain files
+    with these names, each once, complete and within its limit."""
+    files: dict[str, bytes] = {}
     length = path.stat().st_size
     with path.open("rb") as file:
-        while True:
-            header = file.read(BLOCK)
+        while any(header := file.read(BLOCK)) or len(header) < BLOCK:
             if len(header) < BLOCK:
                 raise ArchiveError("archive", f"cut off at byte {length}", "a complete tar file")
-            if not any(header):
-                _check_end(file)
-                return places
             name, count = _header(header)
             if name not in limits:
                 raise ArchiveError(name, "a file that no model has", f"one of {', '.join(limits)}")
-            if name in places:
+            if name in files:
                 raise ArchiveError(name, "there twice", "each file once")
             if count > limits[name]:
                 raise ArchiveError(name, f"a file of {count} bytes", f"at most {limits[name]}")
-            places[name] = Member(file.tell(), count)
-            following = file.tell() + count + _padding(count)
-            if following > length:
+            if file.tell() + count + _padding(count) > length:
                 raise ArchiveError(name, f"cut off at byte {length - file.tell()}", f"{count} bytes")
-            file.seek(following)
-
-
-def read(path: Path, member: Member) -> bytes:
-    """The content of a member."""
-    with path.open("rb") as file:
-        file.seek(member.offset)
-        return file.read(member.size)
+            files[name] = file.read(count)
+            file.seek(_padding(count), SEEK_CUR)
+        rest = file.read()
+    if any(rest):
+        raise ArchiveError("archive", "followed by more data", "nothing after its end")
+    if len(rest) < BLOCK:
+        raise ArchiveError("archive", "without its end", "a complete tar file")
+    return files
 
 
 def _padding(count: int) -> int:
     return -count % BLOCK
 
 
-def _check_end(file: IO[bytes]) -> None:
-    """After its first block of zeros an archive has at least one more, and nothing else."""
-    rest = 0
-    while piece := file.read(CHUNK):
-        rest += len(piece)
-        if any(piece):
-            raise ArchiveError("archive", "followed by more data", "nothing after its end")
-    if rest < BLOCK:
-        raise ArchiveError("archive", "without its end", "a complete tar file")
-
-
 def _header(header: bytes) -> tuple[str, int]:
     """Name and size of a plain file; raise ArchiveError."""
-    checksum = _number(header[148:156])
-    # its own field counts as spaces
-    if checksum != sum(header[:148]) + 8 * ord(" ") + sum(header[156:]):
-        raise ArchiveError("archive", "not a tar file, or damaged: a header does not have its checksum", "a tar file")
-    if header[257:265] not in _MAGIC:
-        raise ArchiveError("archive", "a tar file of an old form", "the form ustar or that of GNU tar")
-    raw, _, after = header[:100].partition(b"\0")
-    name = raw.decode("ascii", "backslashreplace")
-    if any(after) or any(header[345:500]) or not name.isprintable():
-        raise ArchiveError(ascii(name)[1:-1], "a file in a folder or with more to its name", "a plain name")
-    kind = header[156:157]
-    if kind not in (b"0", b"\0") or any(header[157:257]):
-        raise ArchiveError(name, _KINDS.get(kind, f"of the kind {kind!r}"), "a plain file")
-    count = _number(header[124:136])
-    if count is None:
+    try:
+        info = tarfile.TarInfo.frombuf(header, "ascii", "backslashreplace")
+    except tarfile.HeaderError as error:
+        raise ArchiveError("archive", f"not a tar file, or damaged: {error}", "a tar file") from None
+    name = ascii(info.name)[1:-1]
+    if info.type not in (tarfile.REGTYPE, tarfile.AREGTYPE) or info.linkname:
+        raise ArchiveError(name, _KINDS.get(info.type, f"of the kind {info.type!r}"), "a plain file")
+    size = header[124:136].strip(b" \0")  # which TarInfo takes in other forms too, and below zero
+    if not size.isdigit():
         raise ArchiveError(name, f"of the size {header[124:136]!r}", "an octal number of bytes")
-    return name, count
+    return name, info.size
 
 
-def _number(field: bytes) -> int | None:
-    match = _OCTAL.fullmatch(field)
-    return None if match is None else int(match[1], 8)
+@dataclass(frozen=True)
+class Exported:
+    """An archive that is ready to be sent. size: bytes; name: of the file."""
+
+    name: str
+    size: int
+    pieces: Iterator[bytes]
+
+
+def export(loaded: LoadedModels, model: str, version: int | None, alias: str | None, learnt: bool) -> Exported:
+    """Archive a version, the one that serves where none is named. Not for the event loop.
+
+    learnt: with what it has learnt online, else as trained. Nothing is sent before all of it has been checked. Raise
+    NotFoundError, InvalidRequestError for both a version and an alias, UnreadableVersionError for damaged files,
+    StorageFullError.
+    """
+    row = _find(loaded, model, version, alias)
+    try:
+        files, revision = _files(loaded, row, learnt)
+    except ModelFormatError as error:
+        registry.find(loaded.database, row.model, row.version)  # it may have been deleted meanwhile
+        message = f"version {row.version} of model {row.model!r} cannot be exported: {error}"
+        raise UnreadableVersionError(message) from error
+    about = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "model": row.model,
+        "version": row.version,
+        "revision": revision,
+        "learnt": revision > 0,
+        "created_at": row.created_at,
+        "exported_at": now(),
+        "software": software(),
+    }
+    files = {EXPORT: _json(about), **files}
+    sums = {name: persistence.sha256(content) for name, content in files.items()}
+    file = _packed(loaded, {CHECKSUMS: _json(sums), **files})
+    suffix = f"-r{revision}" if revision else ""
+    return Exported(f"{row.model}-v{row.version}{suffix}.tar", file.tell(), _pieces(file))
+
+
+def _find(loaded: LoadedModels, model: str, version: int | None, alias: str | None) -> VersionRow:
+    """The version of a number or of an alias, the one that serves where both are None; raise NotFoundError, and
+    InvalidRequestError for both."""
+    if version is not None and alias is not None:
+        raise invalid_request("version or alias", "both", "one of the two at most")
+    return registry.find(loaded.database, model, loaded.meant(model, version, alias)[0])
+
+
+def _files(loaded: LoadedModels, row: VersionRow, learnt: bool) -> tuple[dict[str, bytes], int]:
+    """The files of a version by name, checked, and the revision that they are of: 0 as trained."""
+    files = loaded.files.read_version(row.folder, lambda folder: _checked(folder, row))
+    if not learnt:
+        return files, 0
+    served = loaded.hot(row.model, row.version)
+    base = persistence.decode(files) if served is None else served.base
+    known = loaded.learnt.consolidated(row.model, row.version, base)
+    if known is None:
+        return files, 0
+    # of an earlier life too, where the version was imported with online updates
+    before = {} if (earlier := row.manifest["lineage"].get("learnt")) is None else {"before": earlier}
+    learnt_since = {"model": row.model, "version": row.version, "revision": known.revision, **before}
+    _, files = persistence.encode(known.model, {**row.manifest["lineage"], "learnt": learnt_since})
+    return {MANIFEST: files.pop(MANIFEST), **files}, known.revision
+
+
+def _checked(folder: Path, row: VersionRow) -> dict[str, bytes]:
+    files = persistence.read_files(folder)
+    if row.checksums is not None:
+        persistence.check(files, row.checksums)
+    return files
+
+
+def _packed(loaded: LoadedModels, files: Mapping[str, bytes]) -> IO[bytes]:
+    """The archive on disk, in a file without a name, for a client that may be slow."""
+    loaded.storage.disk.require(sum(map(len, files.values())))
+    file = tempfile.TemporaryFile(dir=loaded.files.uploads)  # noqa: SIM115 - closed by who reads it
+    try:
+        for name, content in files.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(content)
+            file.write(info.tobuf(tarfile.USTAR_FORMAT) + content + bytes(_padding(info.size)))
+        file.write(bytes(2 * BLOCK))
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def _pieces(file: IO[bytes]) -> Iterator[bytes]:
+    """What a file holds, which is closed at its end, and where it is given up."""
+    with file:
+        file.seek(0)
+        while piece := file.read(CHUNK):
+            yield piece
+
+
+def _json(value: Any) -> bytes:
+    return json.dumps(value, indent=2, allow_nan=False).encode() + b"\n"
+
+
+URDF_MEDIA_TYPE = "application/xml"
+URDF_EXAMPLE = """<?xml version="1.0"?>
+<robot name="arm-v2" xmlns:drake="http://drake.mit.edu">
+  <link name="base" />
+  <joint name="joint1" type="revolute">
+    <origin xyz="0.0 0.0 0.333" rpy="0.0 0.0 0.0" />
+    <parent link="base" />
+    <child link="joint1_link" />
+    <axis xyz="0.0 0.0 1.0" />
+    <limit lower="-2.1" upper="2.3" velocity="1.4" effort="1900.0" />
+    <dynamics damping="0.12" friction="0.41" />
+  </joint>
+  <link name="joint1_link">
+    <inertial>
+      <origin xyz="0.0 -0.02 -0.05" rpy="0.0 0.0 0.0" />
+      <mass value="2.9" />
+      <inertia ixx="0.02" ixy="0.0" ixz="0.0" iyy="0.02" iyz="0.0" izz="0.01" />
+    </inertial>
+  </link>
+</robot>
+"""
+
+
+def write_urdf(loaded: LoadedModels, model: str, version: int | None, alias: str | None) -> tuple[str, str]:
+    """The name of a file and the URDF that belongs in it, of the version that serves where none is named. Raise
+    NotFoundError, InvalidRequestError for both a version and an alias, and for a version without an arm."""
+    row = _find(loaded, model, version, alias)
+    name, manifest = f"{row.model}-v{row.version}", row.manifest
+    try:
+        text = urdf_of_parameters(
+            manifest.get("parameters", {}), manifest["joint_names"], manifest["training_range"], name
+        )
+    except ValueError as error:
+        item = problem("version", row.version, "a version with rigid bodies that holds where its joints lie")
+        message = f"version {row.version} of model {row.model!r} cannot be written as a URDF: {error}"
+        raise InvalidRequestError(message, [item]) from error
+    return f"{name}.urdf", text

@@ -84,7 +84,10 @@ def add(loaded: LoadedModels, upload: Path, name: str | None) -> Version:
     """
     settings = loaded.storage.settings
     files = _read(upload, settings)
-    about = _about(files.pop(EXPORT))
+    try:
+        about = About.model_validate(_json(EXPORT, files.pop(EXPORT)))
+    except ValidationError as error:
+        raise _invalid(EXPORT, error) from None
     manifest = _checked(files, settings)
     model = name or about.model
     manifest["lineage"] = {
@@ -105,8 +108,7 @@ def add(loaded: LoadedModels, upload: Path, name: str | None) -> Version:
         raise
     if serves:
         loaded.adopt(model)
-    came_from = f"version {about.version} of {about.model}"
-    logger.info("imported version %d of model %s, which was %s", version, model, came_from)
+    logger.info("imported version %d of model %s: version %d of %s", version, model, about.version, about.model)
     return registry.show_version(loaded.database, model, version)
 
 
@@ -131,32 +133,20 @@ def _read(upload: Path, settings: Settings) -> dict[str, bytes]:
         ROBOT: settings.max_urdf_bytes,
     }
     try:
-        places = archive.members(upload, limits)
+        files = archive.read(upload, limits)
     except ArchiveError as error:
         raise invalid_data(error.member, error.given, error.expected) from None
     for name in archive.MEMBERS:
-        if name not in places and name != ROBOT:
+        if name not in files and name != ROBOT:
             raise invalid_data(name, "missing", "a file of that name in the archive")
-    sums = _json(CHECKSUMS, archive.read(upload, places.pop(CHECKSUMS)))
-    files = {name: archive.read(upload, member) for name, member in places.items()}
-    _check_sums(files, sums)
-    return files
-
-
-def _check_sums(files: Mapping[str, bytes], sums: Any) -> None:
+    sums = _json(CHECKSUMS, files.pop(CHECKSUMS))
     if not isinstance(sums, dict) or sums.keys() != files.keys():
         given = f"of {', '.join(map(strict_json.quote, sums))}" if isinstance(sums, dict) else strict_json.quote(sums)
         raise invalid_data(CHECKSUMS, given, f"the sha256 of each of {', '.join(files)}")
     for name, content in files.items():
         if persistence.sha256(content) != sums[name]:
             raise invalid_data(name, "not what its sha256 in checksums.json says", "an undamaged file")
-
-
-def _about(content: bytes) -> About:
-    try:
-        return About.model_validate(_json(EXPORT, content))
-    except ValidationError as error:
-        raise _invalid(EXPORT, error) from None
+    return files
 
 
 def _checked(files: Mapping[str, bytes], settings: Settings) -> dict[str, Any]:
@@ -171,7 +161,8 @@ def _checked(files: Mapping[str, bytes], settings: Settings) -> dict[str, Any]:
     )
     try:
         manifest = read_manifest_bytes(files[MANIFEST], limits)
-        _check_members(files, manifest)
+        if ROBOT in files and "robot" not in manifest:
+            raise ModelFormatError(f"{ROBOT} is there, but the manifest names no robot", ROBOT)
         _check_texts(manifest)
         _check_options(manifest["options"], settings)
         Lineage.model_validate(manifest["lineage"])
@@ -188,11 +179,6 @@ def _checked(files: Mapping[str, bytes], settings: Settings) -> dict[str, Any]:
     except (ValueError, ArithmeticError) as error:  # parameters that no fit has
         raise invalid_data(TENSORS, str(error), "parameters that are finite numbers") from None
     return manifest
-
-
-def _check_members(files: Mapping[str, bytes], manifest: Mapping[str, Any]) -> None:
-    if ROBOT in files and "robot" not in manifest:
-        raise ModelFormatError(f"{ROBOT} is there, but the manifest names no robot", ROBOT)
 
 
 def _check_texts(value: Any) -> None:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection
 
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
 from service.foundation.errors import ConflictError, not_found
 from service.foundation.states import ACTIVE
-from service.models import moves, registry
+from service.models import registry
 from service.models.loaded import LoadedModels
 from service.storage.database import (
     AlarmRow,
@@ -47,8 +46,7 @@ def delete_version(loaded: LoadedModels, model: str, version: int) -> None:
         with loaded.database.transaction() as session:
             row = session.get(VersionRow, (model, version))
             if row is None:
-                known = session.scalar(select(ModelRow.name).where(ModelRow.name == model))
-                raise not_found("model", model) if known is None else not_found("version", version)
+                raise registry.missing(session, model, version)
             _check_unused(session, model, version)
             of_version = (SnapshotRow.model == model, SnapshotRow.version == version)
             snapshots = list(session.scalars(select(SnapshotRow.id).where(*of_version)))
@@ -73,7 +71,7 @@ def delete_model(loaded: LoadedModels, model: str) -> None:
             if row is None:
                 raise not_found("model", model)
             for job in _active_jobs(session, model):
-                raise ConflictError(f"job {job.id!r} of model {model!r} is {job.state}: cancel it or wait for its end")
+                raise ConflictError(f"{job.id} of model {model!r} is {job.state}: cancel it or wait for its end")
             versions = list(session.scalars(select(VersionRow).where(VersionRow.model == model)))
             snapshots = list(session.scalars(select(SnapshotRow.id).where(SnapshotRow.model == model)))
             _note_deletion(session, row, [each.version for each in versions])
@@ -90,8 +88,8 @@ def delete_model(loaded: LoadedModels, model: str) -> None:
 def _check_unused(session: Session, model: str, version: int) -> None:
     """Raise ConflictError, naming the reason, where a version is needed."""
     name = f"version {version} of model {model!r}"
-    pointing = [alias for alias in moves.pointing(session, model, version) if alias != moves.SERVING]
-    if pointing:
+    aliases = select(AliasRow.alias).where(AliasRow.model == model, AliasRow.version == version)
+    if pointing := list(session.scalars(aliases.order_by(AliasRow.alias))):
         raise ConflictError(f"{name} has the alias {', '.join(map(repr, pointing))}: move or remove it first")
     if registry.answering(session, model) == version:
         raise ConflictError(f"{name} serves: let another version serve first, or delete the model")
@@ -100,7 +98,7 @@ def _check_unused(session: Session, model: str, version: int) -> None:
         raise ConflictError(f"{name} is compared with the version that serves: wait until that is decided")
     for job in _active_jobs(session, model):
         if (job.request.get("refresh") or {}).get("version") == version:
-            raise ConflictError(f"job {job.id!r} trains {name} anew: cancel it or wait for its end")
+            raise ConflictError(f"{job.id} trains {name} anew: cancel it or wait for its end")
 
 
 def _active_jobs(session: Session, model: str) -> list[JobRow]:
@@ -118,17 +116,9 @@ def _note_deletion(session: Session, row: ModelRow, versions: Collection[int]) -
 
 def _remove_files(files: Files, folders: Collection[str], snapshots: Collection[str]) -> None:
     """Remove files that no row names any more; what cannot be removed now is at the next start."""
-    for folder in folders:
-        with _forgiven():
-            files.delete_version(folder)
-    for snapshot in snapshots:
-        with _forgiven():
-            files.delete_snapshot(snapshot)
-
-
-@contextmanager
-def _forgiven() -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        logger.warning("a file of a deleted version is left until the next start: %s", error)
+    for delete_file, names in ((files.delete_version, folders), (files.delete_snapshot, snapshots)):
+        for name in names:
+            try:
+                delete_file(name)
+            except OSError as error:
+                logger.warning("a file of a deleted version is left until the next start: %s", error)

@@ -17,6 +17,7 @@ from lipcore.data.samples import Samples
 from lipcore.files.manifest import FORMAT_VERSION
 from lipcore.model.torque_model import TorqueModel
 from service import __version__
+from service.foundation.fields import finite
 from service.storage.database import DatasetRow
 
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -65,27 +66,16 @@ def learnt_from(lineage: dict[str, Any]) -> frozenset[str]:
     return frozenset(each[field] for each in learnt for field in ("id", "sha256") if field in each)
 
 
-def training_metrics(model: TorqueModel, samples: Samples, of: int) -> dict[str, Any]:
-    """How well a model answers for the samples it was trained on, `of` so many: how well the fit went.
-
-    Of motion that the model has not seen only other data can tell, see `figures`.
-    """
-    return figures(model, samples, MOST_SAMPLES, of)
-
-
 def figures(model: TorqueModel, samples: Samples, most: int, of: int) -> dict[str, Any]:
     """How well a model answers for samples, thinned evenly to at most so many of them; `of`: how many they stand for.
-
-    Per joint: nmse (None where the torque did not vary), rmse in N·m, coverage of the 95 % interval, nlpd in nats.
-    """
+    Per joint: nmse (None where the torque did not vary), rmse in N·m, coverage of the 95 % interval, nlpd in nats."""
     count = min(len(samples), most)
     used = samples.rows(np.linspace(0, len(samples) - 1, count).round().astype(np.int64))
     # not by the compiled form of the model: a process that trains and never serves would wait for it
     answer = model.posterior.predict(used.motion())
     compared = metrics.evaluate(used.tau, answer.mean.numpy(), answer.std.numpy(), model.noise_std)
-    values = {name: getattr(compared, name) for name in ("nmse", "rmse", "coverage", "nlpd")}
-    shown = {name: [float(each) if np.isfinite(each) else None for each in values[name]] for name in values}
-    return {"samples": len(used), "of": of, **shown}
+    per_joint = {name: finite(getattr(compared, name)) for name in ("nmse", "rmse", "coverage", "nlpd")}
+    return {"samples": len(used), "of": of, **per_joint}
 
 
 @cache

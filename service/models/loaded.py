@@ -20,10 +20,9 @@ from lipcore.online.transfer import Revision
 from service.foundation.errors import NotFoundError, UnreadableVersionError, not_found
 from service.foundation.fields import of_app
 from service.foundation.states import PartState
-from service.models import moves, registry
+from service.models import registry
 from service.models.lineage import learnt_from
-from service.models.moves import SERVING
-from service.models.registry import Serving
+from service.models.registry import SERVING, Serving
 from service.models.served import Alias, Key, LearntStates, Served, Waiting
 from service.storage.database import VersionRow
 from service.storage.storage import Storage
@@ -79,7 +78,7 @@ class LoadedModels:
         self._revisions: dict[Key, tuple[int, Revision]] = {}
         self._held: WeakValueDictionary[Key, Served] = WeakValueDictionary()  # by streams too, after they are dropped
         self._revising = threading.Lock()
-        self._snapshot = Snapshot(aliases=moves.pointers(storage.database))
+        self._snapshot = Snapshot(aliases=registry.pointers(storage.database))
         self._deleted: set[Key] = set()
         self._lock = threading.Lock()
         self.moving = threading.Lock()
@@ -90,10 +89,8 @@ class LoadedModels:
         self._unreadable: dict[Key, str] = {}
 
     def hot(self, model: str, version: int | None, alias: str | None = None) -> Served | None:
-        """Return a version, or the one that an alias points to, if it is in memory; never waits.
-
-        With neither, as with the alias `serving`, it is the one that serves.
-        """
+        """Return a version, or the one that an alias points to, if it is in memory; never waits. With neither, as with
+        the alias `serving`, it is the one that serves."""
         snapshot = self._snapshot
         if version is None:
             version = snapshot.pointed(model, alias)
@@ -114,21 +111,19 @@ class LoadedModels:
         return (model, version) in self._deleted
 
     def get(self, model: str, version: int | None, alias: str | None = None) -> Served:
-        """Return a version, or the one that an alias points to, loaded if need be. Not for the event loop.
-
-        With neither it is the one that serves. Raise NotFoundError or UnreadableVersionError.
-        """
+        """Return a version, or the one that an alias points to, loaded if need be. Not for the event loop. With neither
+        it is the one that serves. Raise NotFoundError or UnreadableVersionError."""
         served = self.hot(model, version, alias)
         while served is None:
-            number, serving = self._find(model, version, alias)
+            number, serving = self.meant(model, version, alias)
             try:
                 served = self._load(registry.find(self.database, model, number), serving)
             except NotFoundError:
-                if self._find(model, version, alias)[0] == number:
+                if self.meant(model, version, alias)[0] == number:
                     raise  # else the alias has moved on, and the version before was deleted
         return served
 
-    def _find(self, model: str, version: int | None, alias: str | None) -> tuple[int | None, Serving | None]:
+    def meant(self, model: str, version: int | None, alias: str | None) -> tuple[int | None, Serving | None]:
         """The number of the version that is meant, and what serves where that is it; raise NotFoundError."""
         if version is not None:
             return version, None
@@ -193,12 +188,18 @@ class LoadedModels:
     def adopt(self, model: str) -> None:
         """Load the version of a model that now serves, and answer with it. Not for the event loop."""
         for serving in registry.serving(self.database, [model]).values():
-            try:
-                self._load(registry.find(self.database, model, serving.version), serving)
-            except (UnreadableVersionError, OSError) as error:  # who asks is told; the version before goes on answering
-                logger.error("%s", error)
-            except NotFoundError:  # another one serves by now, and this one has been deleted: who did that adopts it
-                logger.info("version %d of model %s was deleted before it answered", serving.version, model)
+            self._adopt(model, serving)
+
+    def _adopt(self, model: str, serving: Serving) -> bool:
+        """Load a version that serves; return whether it could be."""
+        try:
+            self._load(registry.find(self.database, model, serving.version), serving)
+            return True
+        except (UnreadableVersionError, OSError) as error:  # who asks is told; the version before goes on answering
+            logger.error("%s", error)
+        except NotFoundError:  # another one serves by now, and this one has been deleted: who did that adopts it
+            logger.info("version %d of model %s was deleted before it answered", serving.version, model)
+        return False
 
     def held(self) -> dict[Key, int | None]:
         """Versions that anyone here may answer with, and their revisions: those in memory, of streams too, and those
@@ -226,9 +227,7 @@ class LoadedModels:
 
     def learn_from(self, wake: Callable[[str], None]) -> None:
         """Have a learner woken, by the name of the model, whenever a version is loaded without all that its log holds.
-
-        It is woken for those that have been loaded so already.
-        """
+        It is woken for those that have been loaded so already."""
         self._wake = wake
         while self._lagging:
             wake(self._lagging.pop())
@@ -239,9 +238,7 @@ class LoadedModels:
 
     def revise(self, name: str, version: int, revision: int, learnt: Revision) -> bool:
         """Answer with what a version has learnt, from now on or once it is loaded; return whether that changed answers.
-
-        Nothing is done where a revision as high is known. Not for the event loop; it computes next to nothing.
-        """
+        Nothing is done where a revision as high is known. Not for the event loop; it computes next to nothing."""
         key = (name, version)
         with self._revising:  # one at a time, so that the highest is the last
             if key in self._deleted:
@@ -261,14 +258,8 @@ class LoadedModels:
     def preload(self) -> int:
         """Load the versions that serve of the models that changed last, as many as fit; return how many."""
         gc.freeze()  # what was imported, unexamined: looking through it takes 0.3 s
-        loaded = 0
-        for model, serving in registry.serving(self.database, registry.recent(self.database, self.capacity)).items():
-            try:
-                self._load(registry.find(self.database, model, serving.version), serving)
-                loaded += 1
-            except (UnreadableVersionError, OSError) as error:  # the others shall answer all the same
-                logger.error("%s", error)
-        return loaded
+        recent = registry.serving(self.database, registry.recent(self.database, self.capacity))
+        return sum(self._adopt(model, serving) for model, serving in recent.items())
 
     def _load(self, row: VersionRow, serving: Serving | None = None) -> Served:
         key = (row.model, row.version)

@@ -1,4 +1,4 @@
-"""Named models and their versions: publishing, finding, listing."""
+"""Named models and their versions: publishing, finding, listing, and which of them answers."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from sqlalchemy.orm import Session
 
 import lipcore
 from lipcore.files.persistence import checksums, read_manifest
-from service.foundation.errors import not_found
+from service.foundation.errors import NotFoundError, not_found
 from service.foundation.settings import shipped_models
-from service.models import moves
 from service.models.schema import Model, ModelPage, Version, VersionSummary
 from service.storage.database import (
+    AliasMoveRow,
     AliasRow,
     Database,
     DeletedModelRow,
@@ -33,6 +33,8 @@ from service.web.pagination import Page, newest
 logger = logging.getLogger(__name__)
 
 SHIPPED = "panda-sim"
+SERVING = "serving"
+"""The alias that every model has: the version that answers where none is named."""
 
 
 class Serving(NamedTuple):
@@ -101,6 +103,19 @@ def answering(session: Session, model: str) -> int:
     return _newest(session, model) if chosen is None else chosen.version
 
 
+def learning(session: Session, model: str) -> list[int]:
+    """Versions that learn: candidates for the place of the one that serves, and last that one."""
+    candidates = select(LearnerRow.version).where(LearnerRow.model == model, LearnerRow.role == "candidate")
+    serves = answering(session, model)
+    return [*(each for each in session.scalars(candidates) if each != serves), *([serves] if serves else [])]
+
+
+def missing(session: Session, model: str, version: int | None) -> NotFoundError:
+    """The error for a version that there is not: of its model, where that is none either."""
+    known = session.scalar(select(ModelRow.name).where(ModelRow.name == model))
+    return not_found("model", model) if known is None else not_found("version", version)
+
+
 def exists(session: Session, model: str, version: int) -> bool:
     """Whether there is such a version."""
     query = select(VersionRow.version).where(VersionRow.model == model, VersionRow.version == version)
@@ -110,7 +125,7 @@ def exists(session: Session, model: str, version: int) -> bool:
 def serve(session: Session, model: str, version: int, takes_back: int | None = None) -> int:
     """Let a version answer where none is named, once the session commits, and learn; return the number of the change.
 
-    The version before neither answers nor learns any more. takes_back: see `moves.point`. Raise NotFoundError where
+    The version before neither answers nor learns any more. takes_back: see `note`. Raise NotFoundError where
     there is no such version.
     """
     session.flush()
@@ -120,9 +135,9 @@ def serve(session: Session, model: str, version: int, takes_back: int | None = N
     if serving is None:
         serving = ServingRow(model=model, version=version, change=1)
         session.add(serving)
-        moves.note(session, model, moves.SERVING, None, version)
+        note(session, model, SERVING, None, version)
     elif serving.version != version:
-        moves.note(session, model, moves.SERVING, serving.version, version, takes_back)
+        note(session, model, SERVING, serving.version, version, takes_back)
         serving.version, serving.change = version, serving.change + 1
     served = (LearnerRow.model == model, LearnerRow.role == "serving", LearnerRow.version != version)
     session.execute(update(LearnerRow).where(*served).values(role="dismissed"))
@@ -132,6 +147,24 @@ def serve(session: Session, model: str, version: int, takes_back: int | None = N
     else:
         learner.role = "serving"
     return serving.change
+
+
+def note(
+    session: Session, model: str, alias: str, before: int | None, version: int | None, takes_back: int | None = None
+) -> None:
+    """Write a move of an alias down. takes_back: number of the move that this one takes back."""
+    move = AliasMoveRow(model=model, alias=alias, before=before, version=version, takes_back=takes_back, at=now())
+    session.add(move)
+    session.flush()
+
+
+def pointers(database: Database, models: Collection[str] | None = None) -> dict[tuple[str, str], int]:
+    """The version of every alias of these models, of all where None, by (model, alias), but for those that serve."""
+    query = select(AliasRow.model, AliasRow.alias, AliasRow.version)
+    if models is not None:
+        query = query.where(AliasRow.model.in_(models))
+    with database.session() as session:
+        return {(model, alias): version for model, alias, version in session.execute(query)}
 
 
 def serving(database: Database, models: Collection[str]) -> dict[str, Serving]:
@@ -184,12 +217,8 @@ def _is_missing(session: Session, source: Path) -> bool:
     made_by_user = known[0].job is not None or "imported" in known[0].manifest["lineage"]
     if made_by_user or row.last_version > known[0].version:
         return False
-    shipped = read_manifest(source)
-    return not any(_same(each, shipped) for each in known)
-
-
-def _same(version: VersionRow, manifest: dict[str, Any]) -> bool:
-    return bool(version.manifest["tensors"]["sha256"] == manifest["tensors"]["sha256"])
+    shipped = read_manifest(source)["tensors"]["sha256"]
+    return all(each.manifest["tensors"]["sha256"] != shipped for each in known)
 
 
 def find(database: Database, model: str, version: int | None) -> VersionRow:
@@ -200,8 +229,7 @@ def find(database: Database, model: str, version: int | None) -> VersionRow:
     with database.session() as session:
         row = None if version is None else session.get(VersionRow, (model, version))
         if row is None:
-            known = session.scalar(select(ModelRow).where(ModelRow.name == model))
-            raise not_found("model", model) if known is None else not_found("version", version)
+            raise missing(session, model, version)
     return row
 
 
@@ -257,10 +285,8 @@ def _show(session: Session, row: ModelRow) -> Model:
 def lost(
     database: Database, files: Files, held: Collection[tuple[str, int]], damaged: Collection[tuple[str, int]]
 ) -> tuple[int, int]:
-    """How many models have a version that serves and cannot be read, and how many there are.
-
-    held: versions in memory, which answer whatever their files are; damaged: those whose files could not be read.
-    """
+    """How many models have a version that serves and cannot be read, and how many there are. held: versions in memory,
+    which answer whatever their files are; damaged: those whose files could not be read."""
     with database.session() as session:
         names = list(session.scalars(select(ModelRow.name)))
         rows = session.execute(select(VersionRow.model, VersionRow.version, VersionRow.folder))

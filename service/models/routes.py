@@ -18,35 +18,21 @@ from service.foundation.errors import (
     UnsupportedMediaTypeError,
     responses,
 )
-from service.models import aliases, archive_import, deletion, registry
-from service.models import export as urdf
-from service.models.archive import MEDIA_TYPE
-from service.models.export import export
+from service.models import aliases, archive, archive_import, deletion, registry, schema
 from service.models.loaded import LoadedModelsDep
-from service.models.schema import (
-    Alias,
-    AliasList,
-    AliasName,
-    AliasRequest,
-    Model,
-    ModelName,
-    ModelPage,
-    Version,
-    VersionNumber,
-)
 from service.web.limits.requests import ArchivesDep
 from service.web.limits.upload import Kinds, receive_to
 from service.web.pagination import PageQuery
 from service.web.route import Route
 
-ARCHIVES = Kinds({MEDIA_TYPE: "tar"}, {".tar": "tar"})
+ARCHIVES = Kinds({archive.MEDIA_TYPE: "tar"}, {".tar": "tar"})
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 _BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
         "description": "An archive as an export writes it.",
         "content": {
-            MEDIA_TYPE: _BINARY,
+            archive.MEDIA_TYPE: _BINARY,
             "multipart/form-data": {
                 "schema": {
                     "type": "object",
@@ -58,9 +44,9 @@ _BODY: dict[str, Any] = {
     }
 }
 
-WhichVersion = Annotated[VersionNumber | None, Query(description="The version that serves by default")]
-WhichAlias = Annotated[AliasName | None, Query(description="An alias, instead of a version's number")]
-AliasPath = Annotated[AliasName, Path(description="`serving`, or a name of your own")]
+WhichVersion = Annotated[schema.VersionNumber | None, Query(description="The version that serves by default")]
+WhichAlias = Annotated[schema.AliasName | None, Query(description="An alias, instead of a version's number")]
+AliasPath = Annotated[schema.AliasName, Path(description="`serving`, or a name of your own")]
 
 router = APIRouter(prefix="/v1/models", tags=["models"], responses=responses(InvalidRequestError), route_class=Route)
 
@@ -77,8 +63,10 @@ async def import_version(
     response: Response,
     loaded: LoadedModelsDep,
     turns: ArchivesDep,
-    name: Annotated[ModelName | None, Query(description="Name of the model; that of the archive by default")] = None,
-) -> Version:
+    name: Annotated[
+        schema.ModelName | None, Query(description="Name of the model; that of the archive by default")
+    ] = None,
+) -> schema.Version:
     """Check an archive and make a new version of it, which answers where the model had none."""
     path = loaded.files.upload()
     try:
@@ -96,7 +84,7 @@ async def import_version(
     response_class=StreamingResponse,
     responses={
         **responses(NotFoundError, UnreadableVersionError),
-        200: {"description": "A tar file", "content": {MEDIA_TYPE: _BINARY}},
+        200: {"description": "A tar file", "content": {archive.MEDIA_TYPE: _BINARY}},
     },
 )
 async def export_version(
@@ -108,9 +96,9 @@ async def export_version(
     learnt: Annotated[bool, Query(description="With what it has learnt online; false: as it was trained")] = True,
 ) -> StreamingResponse:
     """One archive with all that another service needs to answer alike; `export.json` in it says what it holds."""
-    archived = await to_thread.run_sync(export, loaded, model, version, alias, learnt, limiter=turns)
+    archived = await to_thread.run_sync(archive.export, loaded, model, version, alias, learnt, limiter=turns)
     headers = {"Content-Length": str(archived.size), "Content-Disposition": f'attachment; filename="{archived.name}"'}
-    return StreamingResponse(archived.pieces, media_type=MEDIA_TYPE, headers=headers)
+    return StreamingResponse(archived.pieces, media_type=archive.MEDIA_TYPE, headers=headers)
 
 
 @router.get(
@@ -121,7 +109,7 @@ async def export_version(
         **responses(NotFoundError, InvalidRequestError),
         200: {
             "description": "A URDF",
-            "content": {urdf.URDF_MEDIA_TYPE: {"schema": {"type": "string"}, "example": urdf.URDF_EXAMPLE}},
+            "content": {archive.URDF_MEDIA_TYPE: {"schema": {"type": "string"}, "example": archive.URDF_EXAMPLE}},
         },
     },
 )
@@ -133,13 +121,13 @@ def version_urdf(
     Of estimators with rigid bodies whose geometry is known; the others answer 422. Comments in the text say what a URDF
     has no place for, and what torque does not tell.
     """
-    name, text = urdf.write_urdf(loaded, model, version, alias)
+    name, text = archive.write_urdf(loaded, model, version, alias)
     headers = {"Content-Disposition": f'attachment; filename="{name}"'}
-    return Response(text, media_type=urdf.URDF_MEDIA_TYPE, headers=headers)
+    return Response(text, media_type=archive.URDF_MEDIA_TYPE, headers=headers)
 
 
 @router.get("", summary="List models, newest first")
-def list_models(loaded: LoadedModelsDep, page: PageQuery) -> ModelPage:
+def list_models(loaded: LoadedModelsDep, page: PageQuery) -> schema.ModelPage:
     """One page of models with their versions."""
     listed = registry.page(loaded.database, page)
     loaded.announce([item.name for item in listed.items])
@@ -147,7 +135,7 @@ def list_models(loaded: LoadedModelsDep, page: PageQuery) -> ModelPage:
 
 
 @router.get("/{model}", summary="One model and its versions", responses=responses(NotFoundError))
-def show(loaded: LoadedModelsDep, model: str) -> Model:
+def show(loaded: LoadedModelsDep, model: str) -> schema.Model:
     """Which versions there are and which one answers."""
     record = registry.show(loaded.database, model)
     loaded.announce([record.name])
@@ -155,7 +143,7 @@ def show(loaded: LoadedModelsDep, model: str) -> Model:
 
 
 @router.get("/{model}/versions/{version}", summary="One version", responses=responses(NotFoundError))
-def show_version(loaded: LoadedModelsDep, model: str, version: VersionNumber) -> Version:
+def show_version(loaded: LoadedModelsDep, model: str, version: schema.VersionNumber) -> schema.Version:
     """Joints, noise, training range, options, what the fit reported, and the data it came from."""
     return registry.show_version(loaded.database, model, version)
 
@@ -166,7 +154,7 @@ def show_version(loaded: LoadedModelsDep, model: str, version: VersionNumber) ->
     summary="Delete a version",
     responses=responses(NotFoundError, ConflictError),
 )
-def delete_version(loaded: LoadedModelsDep, model: str, version: VersionNumber) -> None:
+def delete_version(loaded: LoadedModelsDep, model: str, version: schema.VersionNumber) -> None:
     """Delete a version that nothing needs: no alias, not the service, no contest and no job. Its number is not given
     again."""
     deletion.delete_version(loaded, model, version)
@@ -184,7 +172,7 @@ def delete_model(loaded: LoadedModelsDep, model: str) -> None:
 
 
 @router.get("/{model}/aliases", summary="List the aliases of a model", responses=responses(NotFoundError))
-def list_aliases(loaded: LoadedModelsDep, model: str) -> AliasList:
+def list_aliases(loaded: LoadedModelsDep, model: str) -> schema.AliasList:
     """Where each points, since when, and where it pointed before. `serving` is the version that answers by default."""
     return aliases.page(loaded, model)
 
@@ -194,7 +182,7 @@ def list_aliases(loaded: LoadedModelsDep, model: str) -> AliasList:
     summary="Point an alias to a version",
     responses=responses(NotFoundError, ConflictError, UnreadableVersionError),
 )
-def put_alias(loaded: LoadedModelsDep, model: str, alias: AliasPath, request: AliasRequest) -> Alias:
+def put_alias(loaded: LoadedModelsDep, model: str, alias: AliasPath, request: schema.AliasRequest) -> schema.Alias:
     """Make or move an alias. The version is loaded first: queries follow in one step, and none fails or waits."""
     return aliases.put(loaded, model, alias, request)
 
@@ -215,6 +203,6 @@ def remove_alias(loaded: LoadedModelsDep, model: str, alias: AliasPath) -> None:
     summary="Point an alias to where it pointed before",
     responses=responses(NotFoundError, ConflictError, UnreadableVersionError),
 )
-def rollback_alias(loaded: LoadedModelsDep, model: str, alias: AliasPath) -> Alias:
+def rollback_alias(loaded: LoadedModelsDep, model: str, alias: AliasPath) -> schema.Alias:
     """Take back the last move, the next time the one before it, and so on."""
     return aliases.rollback(loaded, model, alias)

@@ -122,10 +122,8 @@ class Waiting:
 
 
 async def reached(loaded: LoadedModels, model: str, version: int | None, alias: str | None, revision: int) -> Served:
-    """Return the version that answers once it has a revision, or a later one. For the event loop, which goes on.
-
-    Raise RevisionNotReachedError after `min_revision_wait_s`; NotFoundError or UnreadableVersionError at once.
-    """
+    """Return the version that answers once it has a revision, or a later one. For the event loop, which goes on. Raise
+    RevisionNotReachedError after `min_revision_wait_s`; NotFoundError or UnreadableVersionError at once."""
     loop = asyncio.get_running_loop()
     until, asked = loop.time() + loaded.storage.settings.min_revision_wait_s, False
     with loaded.waiting.waiter(model) as waiter:

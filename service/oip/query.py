@@ -1,4 +1,5 @@
-"""From tensors to a query: names, datatypes, shapes and numbers are checked, and nothing is guessed."""
+"""From tensors to a query, and from that to the bytes of its answer: all is checked, nothing guessed, and nothing
+computed that was not asked for."""
 
 from __future__ import annotations
 
@@ -13,9 +14,11 @@ from lipcore.model.torque_model import TorqueModel
 from lipcore.vocabulary import COMPONENTS, ComponentName
 from service.foundation.errors import invalid_request
 from service.foundation.settings import Settings
-from service.inference.predicting import Query
-from service.oip.schema import BINARY, DATATYPES, HEADER, INPUTS, TORQUE, InferInput, InferOutput, InferRequest
-from service.oip.wire import Message
+from service.inference.predicting import Query, check_answer
+from service.models.loaded import Served
+from service.oip import schema, wire
+from service.oip.wire import Headers, Message
+from service.web.route import Reply
 
 Array = NDArray[np.float64]
 Shape = tuple[int, ...]
@@ -62,7 +65,7 @@ def _shape(component: ComponentName, n: int) -> Shape:
 
 
 _DTYPES: dict[str, np.dtype[np.floating]] = {"FP64": np.dtype("<f8"), "FP32": np.dtype("<f4")}
-_NO_TENSORS = f"tensors in the body: of the extensions, {BINARY} is supported"
+_NO_TENSORS = f"tensors in the body: of the extensions, {schema.BINARY} is supported"
 
 
 class Question(NamedTuple):
@@ -100,7 +103,7 @@ def read(message: Message, body: bytes, model: TorqueModel, settings: Settings) 
     return Question(query, outputs)
 
 
-def _outputs(request: InferRequest, model: TorqueModel) -> dict[str, bool]:
+def _outputs(request: schema.InferRequest, model: TorqueModel) -> dict[str, bool]:
     usual = bool(request.parameters and request.parameters.binary_data_output)
     if not request.outputs:
         return dict.fromkeys(DEFAULT, usual)
@@ -117,7 +120,7 @@ def _outputs(request: InferRequest, model: TorqueModel) -> dict[str, bool]:
     return outputs
 
 
-def _binary(output: InferOutput, field: str, usual: bool) -> bool:
+def _binary(output: schema.InferOutput, field: str, usual: bool) -> bool:
     asked = output.parameters
     if asked is None:
         return usual
@@ -127,13 +130,13 @@ def _binary(output: InferOutput, field: str, usual: bool) -> bool:
     return usual if asked.binary_data is None else asked.binary_data
 
 
-def _inputs(request: InferRequest, forward: bool) -> tuple[str, ...]:
+def _inputs(request: schema.InferRequest, forward: bool) -> tuple[str, ...]:
     """Names of the tensors that the query needs; they are all there, each once, and no other."""
-    needed = (*INPUTS, TORQUE) if forward else INPUTS
+    needed = (*schema.INPUTS, schema.TORQUE) if forward else schema.INPUTS
     names = [tensor.name for tensor in request.inputs]
     for index, name in enumerate(names):
-        if name == TORQUE and not forward:
-            raise invalid_request(TORQUE, "given", f"no tau, or {FORWARD} among the outputs")
+        if name == schema.TORQUE and not forward:
+            raise invalid_request(schema.TORQUE, "given", f"no tau, or {FORWARD} among the outputs")
         if name not in needed:
             raise invalid_request(f"inputs[{index}].name", name, f"one of {', '.join(needed)}")
         if name in names[:index]:
@@ -141,12 +144,14 @@ def _inputs(request: InferRequest, forward: bool) -> tuple[str, ...]:
     for name in needed:
         if name not in names:
             torque = f"the torque that {FORWARD} is asked for, shaped as q"
-            raise invalid_request(name, "missing", torque if name == TORQUE else f"the inputs {', '.join(needed)}")
+            raise invalid_request(
+                name, "missing", torque if name == schema.TORQUE else f"the inputs {', '.join(needed)}"
+            )
     return needed
 
 
 def _check_shape(
-    tensor: InferInput, shape: list[int], model: TorqueModel, settings: Settings, components: bool
+    tensor: schema.InferInput, shape: list[int], model: TorqueModel, settings: Settings, components: bool
 ) -> None:
     n, field = model.n_joints, f"{tensor.name}.shape"
     if len(shape) not in (1, 2) or shape[-1] != n or shape[0] == 0:
@@ -159,20 +164,22 @@ def _check_shape(
         raise invalid_request(field, shape, expected)
 
 
-def _check_payload(request: InferRequest, present: int) -> None:
+def _check_payload(request: schema.InferRequest, present: int) -> None:
     """Compare the bytes after the JSON with those that the inputs announce."""
     announced = sum(each.parameters.binary_data_size or 0 for each in request.inputs if each.parameters)
     if announced != present:
-        expected = f"{announced} bytes, the sum of every binary_data_size, after the JSON whose length {HEADER} gives"
+        expected = (
+            f"{announced} bytes, the sum of every binary_data_size, after the JSON whose length {schema.HEADER} gives"
+        )
         raise invalid_request("the binary data", f"{present} bytes", expected)
 
 
-def _values(tensor: InferInput, body: bytes, offset: int) -> tuple[Array, int]:
+def _values(tensor: schema.InferInput, body: bytes, offset: int) -> tuple[Array, int]:
     """Numbers of a tensor, flat or in rows, and where the next one's binary data begin."""
     name, count, given = tensor.name, prod(tensor.shape), tensor.parameters
     dtype = _DTYPES.get(tensor.datatype)
     if dtype is None:
-        raise invalid_request(f"{name}.datatype", tensor.datatype, " or ".join(DATATYPES))
+        raise invalid_request(f"{name}.datatype", tensor.datatype, " or ".join(schema.DATATYPES))
     if given is not None and given.shared_memory_region is not None:
         raise invalid_request(f"{name}.parameters.shared_memory_region", given.shared_memory_region, _NO_TENSORS)
     size = None if given is None else given.binary_data_size
@@ -195,7 +202,7 @@ def _as_read(values: NDArray[np.floating], dtype: np.dtype[np.floating]) -> Arra
         return values.astype(dtype).astype(np.float64)
 
 
-def _listed(tensor: InferInput, count: int) -> Array:
+def _listed(tensor: schema.InferInput, count: int) -> Array:
     field, expected = f"{tensor.name}.data", f"{count} numbers or rows of them, as the shape {tensor.shape} has"
     try:
         values = np.array(tensor.data, np.float64)
@@ -205,3 +212,88 @@ def _listed(tensor: InferInput, count: int) -> Array:
         given = f"{values.size} numbers" if values.ndim == 1 else f"rows of shape {list(values.shape)}"
         raise invalid_request(field, given, expected)
     return values
+
+
+def compute(model: TorqueModel, query: Query, names: frozenset[str]) -> dict[str, Array]:
+    """Tensors by name, their first axis N, noise_std (n,) apart; nothing is computed that they do not need. Raise
+    InvalidRequestError where inertia cannot be inverted."""
+    tensors = _torques(model, query.values[:3], names)
+    if "noise_std" in names:
+        tensors["noise_std"] = model.noise_std
+    parts = {name: PARTS[name] for name in names if name in PARTS}
+    if parts:
+        estimates = query.components(model, sorted({part.component for part in parts.values()}))
+        for name, part in parts.items():
+            estimate = estimates[part.component]
+            values: Array = (estimate.std if part.std else estimate.mean).numpy()
+            tensors[name] = values[:, None] if values.ndim == 1 else values
+    return tensors
+
+
+def _torques(model: TorqueModel, motion: Array, names: frozenset[str]) -> dict[str, Array]:
+    """motion: q, dq and ddq, (3, N, n)."""
+    if "covariance" in names:
+        batch = model.predict(motion[0], motion[1], motion[2], covariance=True)
+        assert batch.covariance is not None  # it is asked for
+        return {"tau": batch.tau, "tau_std": batch.tau_std, "covariance": batch.covariance}
+    if "tau_std" in names and motion.shape[1] > 1:
+        batch = model.predict(motion[0], motion[1], motion[2])
+        return {"tau": batch.tau, "tau_std": batch.tau_std}
+    if "tau_std" in names:
+        tau, std = model.answer(motion[:, 0])
+        assert std is not None  # it is asked for
+        return {"tau": tau[None], "tau_std": std[None]}
+    if "tau" in names:  # the mean of one query costs less than its share of a batch with standard deviations
+        each = np.ascontiguousarray(motion.transpose(1, 0, 2))
+        return {"tau": np.stack([model.answer(one, std=False)[0] for one in each])}
+    return {}
+
+
+def infer(served: Served, body: bytes, headers: Headers, settings: Settings) -> Reply:
+    """Answer a request; raise InvalidRequestError or UnsupportedMediaTypeError. Not for the event loop."""
+    message = wire.decode(body, headers)
+    return respond(served, message.request, read_question(served, message, body, settings))
+
+
+def read_question(served: Served, message: Message, body: bytes, settings: Settings) -> Question:
+    """Check a request and read its query; raise InvalidRequestError."""
+    request = message.request
+    for field, value, expected in (
+        ("model_name", request.model_name, served.name),
+        ("model_version", request.model_version, str(served.version)),
+    ):
+        if value not in (None, expected):
+            raise invalid_request(field, value, f"that which the path leads to, {expected}")
+    return read(message, body, served.model, settings)
+
+
+def respond(served: Served, request: schema.InferRequest, question: Question) -> Reply:
+    """Compute the answer to a query and encode it; raise InvalidRequestError."""
+    values_of = compute(served.model, question.query, frozenset(question.outputs))
+    tensors: list[schema.InferTensor] = []
+    payload: list[bytes] = []
+    for name, binary in question.outputs.items():
+        values = values_of[name]
+        if question.query.single and name != "noise_std":
+            values = values[0]
+        check_answer(name, values)
+        tensors.append(_tensor(name, values, payload if binary else None))
+    response = schema.InferResponse(
+        served.name,
+        str(served.version),
+        schema.AnswerParameters(served.revision, served.model.torque_convention),
+        tensors,
+    )
+    if request.id is not None:
+        response.id = request.id
+    return wire.encode(response, payload)
+
+
+def _tensor(name: str, values: Array, payload: list[bytes] | None) -> schema.InferTensor:
+    """Describe a tensor that lies in the JSON, or at the end of the payload."""
+    shape = list(values.shape)
+    if payload is None:
+        return schema.InferTensor(name, "FP64", shape, data=values.ravel().tolist())
+    data = values.astype("<f8", copy=False).tobytes()
+    payload.append(data)
+    return schema.InferTensor(name, "FP64", shape, schema.TensorParameters(len(data)))

@@ -15,24 +15,8 @@ from service.foundation.errors import NotFoundError, NotReadyError, UnreadableVe
 from service.models import registry
 from service.models.loaded import LoadedModels, Served
 from service.models.schema import ALIAS
-from service.oip import answer, wire
+from service.oip import query, schema, wire
 from service.oip.query import FORWARD, shapes
-from service.oip.schema import (
-    BINARY,
-    INPUTS,
-    MODEL,
-    TORQUE,
-    VERSION,
-    ModelMetadata,
-    ModelReady,
-    ServerLive,
-    ServerMetadata,
-    ServerReady,
-    TensorMetadata,
-    failures,
-    infer_answer,
-    infer_body,
-)
 from service.web import health
 from service.web.observability.readiness import ReadinessDep
 from service.web.route import Reply, Route, hot_route
@@ -41,10 +25,8 @@ _LISTED = 20
 
 
 async def find(loaded: LoadedModels, turns: CapacityLimiter, name: str, version: str | None) -> Served:
-    """Return a version by its number or an alias, the one that serves where None, loaded if need be.
-
-    turns: of what loads. Raise NotFoundError naming those there are.
-    """
+    """Return a version by its number or an alias, the one that serves where None, loaded if need be. turns: of what
+    loads. Raise NotFoundError naming those there are."""
     number, alias = (None, None) if version is None else _meant(version)
     served = loaded.hot(name, number, alias)
     if served is not None:
@@ -52,27 +34,21 @@ async def find(loaded: LoadedModels, turns: CapacityLimiter, name: str, version:
     return await to_thread.run_sync(_load, loaded, name, version, number, alias, limiter=turns)
 
 
-async def ready_version(loaded: LoadedModels, turns: CapacityLimiter, name: str, version: str | None) -> Served:
-    """Like `find`, but raise NotReadyError where the version cannot be loaded."""
-    try:
-        return await find(loaded, turns, name, version)
-    except UnreadableVersionError as error:
-        raise NotReadyError(error.message) from error
-
-
-def metadata(loaded: LoadedModels, served: Served) -> ModelMetadata:
+def metadata(loaded: LoadedModels, served: Served) -> schema.ModelMetadata:
     """Describe a version and name all of its model; raise NotFoundError. Not for the event loop."""
     model = served.model
-    inputs = [TensorMetadata(name=each, shape=[-1, model.n_joints]) for each in INPUTS]
+    inputs = [schema.TensorMetadata(name=each, shape=[-1, model.n_joints]) for each in schema.INPUTS]
     outputs = shapes(model)
     if FORWARD in outputs:
-        inputs.append(TensorMetadata(name=TORQUE, shape=[-1, model.n_joints], parameters={"optional": True}))
-    return ModelMetadata(
+        inputs.append(
+            schema.TensorMetadata(name=schema.TORQUE, shape=[-1, model.n_joints], parameters={"optional": True})
+        )
+    return schema.ModelMetadata(
         name=served.name,
         versions=_known(loaded, served.name),
         platform=f"lipserve_{model.estimator.name}",
         inputs=inputs,
-        outputs=[TensorMetadata(name=each, shape=list(shape)) for each, shape in outputs.items()],
+        outputs=[schema.TensorMetadata(name=each, shape=list(shape)) for each, shape in outputs.items()],
         parameters=_parameters(served, model),
     )
 
@@ -100,13 +76,9 @@ def _load(loaded: LoadedModels, name: str, version: str | None, number: int | No
     except NotFoundError as error:
         if error.detail[0].field == "model":
             raise NotFoundError(f"no model {name[:200]!r}: GET /v1/models lists all", error.detail) from error
-        item = problem("version", version, f"one of {', '.join(_names(loaded, name)[-_LISTED:])}")
+        known = [*registry.show(loaded.database, name).aliases, *_known(loaded, name)]
+        item = problem("version", version, f"one of {', '.join(known[-_LISTED:])}")
         raise NotFoundError(f"{sentence(item)}, of model {name!r}", [item]) from error
-
-
-def _names(loaded: LoadedModels, name: str) -> list[str]:
-    """Aliases and numbers."""
-    return [*registry.show(loaded.database, name).aliases, *_known(loaded, name)]
 
 
 def _known(loaded: LoadedModels, name: str) -> list[str]:
@@ -116,7 +88,7 @@ def _known(loaded: LoadedModels, name: str) -> list[str]:
 SMALL = 16 * 1024
 """Bytes of a body that is decoded on the event loop: one query of the largest robot fits many times."""
 
-_ONE, _VERSIONED = {"parameters": [MODEL]}, {"parameters": [MODEL, VERSION]}
+_ONE, _VERSIONED = {"parameters": [schema.MODEL]}, {"parameters": [schema.MODEL, schema.VERSION]}
 _TAGS: list[str | Enum] = ["open inference protocol"]
 
 router = APIRouter(prefix="/v2", tags=_TAGS, route_class=Route)
@@ -125,39 +97,39 @@ hot = APIRouter(prefix="/v2", tags=_TAGS)
 
 
 @router.get("", summary="What serves")
-async def server_metadata() -> ServerMetadata:
+async def server_metadata() -> schema.ServerMetadata:
     """Name, version, and the extensions of the protocol that are supported."""
-    return ServerMetadata(name="lipserve", version=__version__, extensions=[BINARY])
+    return schema.ServerMetadata(name="lipserve", version=__version__, extensions=[schema.BINARY])
 
 
 @router.get("/health/live", summary="Is the server alive?")
-async def live() -> ServerLive:
+async def live() -> schema.ServerLive:
     """Answer while the event loop turns."""
-    return ServerLive()
+    return schema.ServerLive()
 
 
-@router.get("/health/ready", summary="Can the server answer?", responses=failures(503))
-def ready(readiness: ReadinessDep) -> ServerReady:
+@router.get("/health/ready", summary="Can the server answer?", responses=schema.failures(503))
+def ready(readiness: ReadinessDep) -> schema.ServerReady:
     """Answer once the models are loaded and while the database answers."""
     health.ready(readiness)
-    return ServerReady()
+    return schema.ServerReady()
 
 
 @router.get(
     "/models/{model}/versions/{version}",
     summary="The tensors of a version",
-    responses=failures(404),
+    responses=schema.failures(404),
     response_model_exclude_none=True,
     openapi_extra=_VERSIONED,
 )
 @router.get(
     "/models/{model}",
     summary="The tensors of a model",
-    responses=failures(404),
+    responses=schema.failures(404),
     response_model_exclude_none=True,
     openapi_extra=_ONE,
 )
-async def model_metadata(request: Request) -> ModelMetadata:
+async def model_metadata(request: Request) -> schema.ModelMetadata:
     """Inputs that a request brings, outputs that it may ask for, and the versions there are."""
     loaded: LoadedModels = request.app.state.loaded
     turns = request.app.state.turns.predictions
@@ -169,22 +141,25 @@ async def model_metadata(request: Request) -> ModelMetadata:
 @router.get(
     "/models/{model}/versions/{version}/ready",
     summary="Can a version answer?",
-    responses=failures(404, 503),
+    responses=schema.failures(404, 503),
     openapi_extra=_VERSIONED,
 )
 @router.get(
     "/models/{model}/ready",
     summary="Can a model answer?",
-    responses=failures(404, 503),
+    responses=schema.failures(404, 503),
     openapi_extra=_ONE,
 )
-async def model_ready(request: Request) -> ModelReady:
+async def model_ready(request: Request) -> schema.ModelReady:
     """Answer once the version is in memory; it is loaded if it is not."""
     loaded: LoadedModels = request.app.state.loaded
     turns = request.app.state.turns.predictions
     where = request.path_params
-    served = await ready_version(loaded, turns, where["model"], where.get("version"))
-    return ModelReady(name=served.name)
+    try:
+        served = await find(loaded, turns, where["model"], where.get("version"))
+    except UnreadableVersionError as error:
+        raise NotReadyError(error.message) from error
+    return schema.ModelReady(name=served.name)
 
 
 async def _answer(scope: Scope, body: bytes) -> Reply:
@@ -194,12 +169,12 @@ async def _answer(scope: Scope, body: bytes) -> Reply:
     headers, where = scope["headers"], scope["path_params"]
     served = await find(loaded, limiter, where["model"], where.get("version"))
     if len(body) > SMALL:
-        return await to_thread.run_sync(answer.infer, served, body, headers, settings, limiter=limiter)
+        return await to_thread.run_sync(query.infer, served, body, headers, settings, limiter=limiter)
     message = wire.decode(body, headers)
-    query = answer.read_question(served, message, body, settings)
-    if query.quick:
-        return answer.respond(served, message.request, query)
-    return await to_thread.run_sync(answer.respond, served, message.request, query, limiter=limiter)
+    question = query.read_question(served, message, body, settings)
+    if question.quick:
+        return query.respond(served, message.request, question)
+    return await to_thread.run_sync(query.respond, served, message.request, question, limiter=limiter)
 
 
 async def infer(request: Request) -> Response:
@@ -221,7 +196,7 @@ for _path, _summary, _documented in (
         methods=["POST"],
         summary=_summary,
         response_class=Response,
-        responses={200: infer_answer(), **failures(400, 404, 413, 415)},
-        openapi_extra=infer_body(_documented),
+        responses={200: schema.infer_answer(), **schema.failures(400, 404, 413, 415)},
+        openapi_extra=schema.infer_body(_documented),
         route_class_override=hot_route(_answer),
     )

@@ -18,7 +18,7 @@ _HEADER, _ENCODING = HEADER.lower().encode(), b"content-encoding"
 _decode = msgspec.json.Decoder(InferRequest).decode
 _encode = msgspec.json.Encoder().encode
 
-_SAID = re.compile(r"(?P<what>.*?)(?: - at `\$\.?(?P<path>.*)`)?", re.DOTALL)
+_MESSAGE = re.compile(r"(?P<what>.*?)(?: - at `\$\.?(?P<path>.*)`)?", re.DOTALL)
 _FIELD = re.compile(r"Object (?P<kind>missing required|contains unknown) field `(?P<name>.*)`")
 _PART = re.compile(r"(\w+)|\[(\d+)\]")
 _KINDS = {
@@ -45,9 +45,7 @@ class Message(NamedTuple):
 
 def decode(body: bytes, headers: Headers) -> Message:
     """Decode the JSON of a body; raise InvalidRequestError, or UnsupportedMediaTypeError where it is compressed.
-
-    headers: of the request, their names in lower case.
-    """
+    headers: of the request, their names in lower case."""
     length: bytes | None = None
     for name, value in headers:
         if name == _HEADER:
@@ -83,7 +81,7 @@ def _explain(error: Exception, text: bytes, alone: bool) -> InvalidRequestError:
     """Say what is wrong with a request's JSON. alone: nothing was said to follow it."""
     loose = _loosely(text)
     if isinstance(error, msgspec.ValidationError):
-        match = _SAID.fullmatch(str(error))
+        match = _MESSAGE.fullmatch(str(error))
         assert match is not None  # the pattern takes any text
         return _explain_value(match["what"], match["path"] or "", loose)
     for path, value in _leaves(loose):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections import deque
+from collections import Counter, deque
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 from urllib.parse import quote, urlencode, urlsplit
 
@@ -79,9 +79,7 @@ class StreamLearnt:
 
     def and_more(self, message: dict[str, Any]) -> StreamLearnt:
         """Return the totals after one more message of the service."""
-        rejected = dict(self.rejected)
-        for code, count in message["rejected"].items():
-            rejected[code] = rejected.get(code, 0) + count
+        rejected = dict(Counter(self.rejected) + Counter(message["rejected"]))
         return StreamLearnt(
             through=message["through"],
             accepted=self.accepted + message["accepted"],
@@ -106,21 +104,9 @@ def read_hello(message: dict[str, Any]) -> StreamHello:
     """Read what holds for all answers; raise StreamError where frames have another layout than this client's."""
     if message["layout"] != LAYOUT:
         raise StreamError(f"the service's frames have layout {message['layout']}, this client knows {LAYOUT}", "layout")
-    return StreamHello(
-        model=message["model"],
-        version=message["version"],
-        revision=message["revision"],
-        joint_names=tuple(message["joint_names"]),
-        torque_convention=message["torque_convention"],
-        noise_std=np.array(message["noise_std"]),
-        max_position=message["max_position"],
-    )
-
-
-def read_refusal(message: dict[str, Any]) -> StreamRefusal:
-    """Read why torques were not logged."""
-    error = message["error"]
-    return StreamRefusal(message["first"], message["through"], error["code"], error["message"], error["detail"])
+    known = {each.name: message[each.name] for each in fields(StreamHello)}
+    known |= {"joint_names": tuple(message["joint_names"]), "noise_std": np.array(message["noise_std"])}
+    return StreamHello(**known)
 
 
 def read_answer(data: bytes) -> StreamAnswer | StreamError:
@@ -135,6 +121,7 @@ def read_answer(data: bytes) -> StreamAnswer | StreamError:
 
 
 SEQUENCES = 1 << 32
+WHY = ("code", "message", "detail")
 _REFUSALS = 1000
 """Refusals kept: a robot that goes on where nothing is learnt must not fill the memory."""
 
@@ -209,8 +196,11 @@ class Exchange:
             self.learnt = self.learnt.and_more(message["learnt"])
             self._settle(message["learnt"]["through"])
         elif "refused" in message:
-            self.refusals.append(read_refusal(message["refused"]))
-            self._settle(message["refused"]["through"])
+            refused = message["refused"]
+            self.refusals.append(
+                StreamRefusal(refused["first"], refused["through"], *(refused["error"][name] for name in WHY))
+            )
+            self._settle(refused["through"])
         else:
             self.hello = read_hello(message)
 

@@ -8,13 +8,14 @@ import logging
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable
+from dataclasses import asdict
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from service.foundation.errors import ErrorBody, ServiceError, invalid_request
-from service.learning.ingest.frames import Frames, FramesResult
+from service.learning.ingest.batches import Frames
 from service.learning.learners import Learners
 from service.models.loaded import Served
 from service.stream.frames import NUMBER, REQUEST
@@ -32,10 +33,8 @@ TICK = 1e-6
 
 
 class Taught(NamedTuple):
-    """A frame to learn from. served: what answered it; arrived: time of `time.perf_counter`.
-
-    request: the whole frame; answer: bytes of mean and standard deviation, (2, n), made before it is learnt.
-    """
+    """A frame to learn from. served: what answered it; arrived: time of `time.perf_counter`. request: the whole frame;
+    answer: bytes of mean and standard deviation, (2, n), made before it is learnt."""
 
     served: Served
     sequence: int
@@ -45,13 +44,11 @@ class Taught(NamedTuple):
 
 
 class Learning:
-    """What one connection teaches. One block at a time is logged, in order; what comes meanwhile waits.
+    """What one connection teaches. One block at a time is logged, in order; what comes meanwhile waits. stream_id:
+    source of the torques; send: sends a text to the client. For the event loop; logging is done in a thread."""
 
-    stream_id: source of the torques; say: sends a text to the client. For the event loop; logging is done in a thread.
-    """
-
-    def __init__(self, learners: Learners, stream_id: str, say: Callable[[str], Awaitable[None]]) -> None:
-        self._learners, self._stream_id, self._say = learners, stream_id, say
+    def __init__(self, learners: Learners, stream_id: str, send: Callable[[str], Awaitable[None]]) -> None:
+        self._learners, self._stream_id, self._send = learners, stream_id, send
         self._most, self._wait = learners.settings.stream_flush_rows, learners.settings.stream_flush_s
         # event time goes on evenly though the clock of the host be set while the stream is open
         self._clock = time.time() - perf_counter()
@@ -113,7 +110,7 @@ class Learning:
                 outcome = await self._learn(block)
                 self._flushed.set()
                 if not self._ended:
-                    await self._say(json.dumps(outcome))
+                    await self._send(json.dumps(outcome))
         finally:
             self._task = None
             self._go_on()
@@ -130,7 +127,7 @@ class Learning:
         """Log a block; return what there is to say of it."""
         first, through = block[0].sequence, block[-1].sequence
         try:
-            result = await self._learners.threads.run(self._hand_over, block)
+            result = await self._learners.threads.run(lambda: self._learners.observe_frames(self._frames(block)))
         except ServiceError as error:
             refusal = error
         except Exception as error:  # the next block may be logged
@@ -140,40 +137,18 @@ class Learning:
             )
             refusal = known or ServiceError("an unexpected error; the service's log says more")
         else:
-            return {
-                "learnt": {
-                    "through": result.through,
-                    "accepted": result.accepted,
-                    "duplicates": result.duplicates,
-                    "rejected": result.rejected,
-                    "revision": result.revision,
-                }
-            }
+            return {"learnt": asdict(result)}
         if self._ended:
             logger.warning("frames %d to %d of stream %r are not learnt: %s", first, through, self._stream_id, refusal)
         body = ErrorBody(code=refusal.code, message=refusal.message, detail=refusal.detail)
         return {"refused": {"first": first, "through": through, "error": body.model_dump()}}
 
-    def _hand_over(self, block: list[Taught]) -> FramesResult:
-        return self._learners.observe_frames(self._frames(block))
-
     def _frames(self, block: list[Taught]) -> Frames:
         served = block[0].served
-        q, dq, ddq, tau = _columns([each.request[REQUEST.size :] for each in block], 4)
-        mean, std = _columns([each.answer for each in block], 2)
-        return Frames(
-            model=served.name,
-            stream_id=self._stream_id,
-            served=served,
-            sequences=np.array([each.sequence for each in block], np.int64),
-            time=self._times(block),
-            q=q,
-            dq=dq,
-            ddq=ddq,
-            tau=tau,
-            mean=mean,
-            std=std,
-        )
+        sequences = np.array([each.sequence for each in block], np.int64)
+        motions = _columns([each.request[REQUEST.size :] for each in block], 4)
+        answers = _columns([each.answer for each in block], 2)
+        return Frames(served.name, self._stream_id, served, sequences, self._times(block), *motions, *answers)
 
     def _times(self, block: list[Taught]) -> Array:
         """Times of arrival, Unix time in s, each later than the one before."""

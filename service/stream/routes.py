@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from typing import NamedTuple
 from urllib.parse import parse_qsl
 
@@ -12,16 +11,26 @@ from fastapi import APIRouter
 from starlette.types import Receive, Scope, Send
 from uvicorn.protocols.utils import ClientDisconnected
 
-from service.foundation.errors import BusyError, NotFoundError, NotReadyError, invalid_request
+from service.foundation.errors import NotFoundError, NotReadyError, invalid_request
 from service.inference.schema import one_choice
 from service.learning.learners import Learners
 from service.models.schema import ALIAS
 from service.models.served import reached
-from service.stream.conversation import Conversation, Echo
-from service.stream.session import Session
+from service.stream.session import Conversation, Echo, Session
+from service.web.limits.requests import Counted
 from service.web.server.stream_protocol import CONNECTION, StreamProtocol
 
 STREAM_ID = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
+NUMBER = "[0-9]{1,10}"
+PARAMETERS = {
+    "version": (NUMBER, "the number of a version"),
+    "alias": (ALIAS, f"a name that matches {ALIAS}"),
+    "std": ("[01]", "0 or 1"),
+    "stream_id": (STREAM_ID, f"a name that matches {STREAM_ID}"),
+    "min_revision": (NUMBER, "a revision of the version"),
+}
+"""What the address of a stream may say: how each is written, and that in words."""
+LEAST = {"version": 1, "min_revision": 0}
 PATH, ECHO_PATH = "/v1/models/{model}/stream", "/v1/echo/stream"
 
 
@@ -36,22 +45,10 @@ def router() -> APIRouter:
     return router
 
 
-class Streams:
+class Streams(Counted):
     """How many connections are open."""
 
-    def __init__(self) -> None:
-        self.open = 0
-
-    @contextmanager
-    def one_more(self, most: int) -> Iterator[None]:
-        """Count a connection while it lasts; raise BusyError beyond `most`."""
-        if self.open >= most:
-            raise BusyError(f"{self.open} streams are open, the most there may be: close one, or try again later")
-        self.open += 1
-        try:
-            yield
-        finally:
-            self.open -= 1
+    too_many = "{} streams are open, the most there may be: close one, or try again later"
 
 
 class EchoRoute:
@@ -113,32 +110,18 @@ class Asked(NamedTuple):
 
 def _parameters(query: bytes) -> Asked:
     """Read the query of an address; raise InvalidRequestError."""
-    version, alias, std, stream_id, min_revision = None, None, False, None, 0
+    given: dict[str, str] = {}
     for name, value in parse_qsl(query.decode("ascii", "backslashreplace"), keep_blank_values=True):
-        if name == "version":
-            if not re.fullmatch("[0-9]{1,10}", value) or not 0 < int(value) < 2**31:
-                raise invalid_request("version", value, "the number of a version")
-            version = int(value)
-        elif name == "alias":
-            if not re.fullmatch(ALIAS, value):
-                raise invalid_request("alias", value, f"a name that matches {ALIAS}")
-            alias = value
-        elif name == "std":
-            if value not in ("0", "1"):
-                raise invalid_request("std", value, "0 or 1")
-            std = value == "1"
-        elif name == "stream_id":
-            if not re.fullmatch(STREAM_ID, value):
-                raise invalid_request("stream_id", value, f"a name that matches {STREAM_ID}")
-            stream_id = value
-        elif name == "min_revision":
-            if not re.fullmatch("[0-9]{1,10}", value) or not int(value) < 2**31:
-                raise invalid_request("min_revision", value, "a revision of the version")
-            min_revision = int(value)
-        else:
+        if name not in PARAMETERS:
             raise invalid_request(name, value, "no parameter but version, alias, std, stream_id and min_revision")
-    one_choice(version, alias)
-    return Asked(version, alias, std, stream_id, min_revision)
+        pattern, expected = PARAMETERS[name]
+        if not re.fullmatch(pattern, value) or (name in LEAST and not LEAST[name] <= int(value) < 2**31):
+            raise invalid_request(name, value, expected)
+        given[name] = value
+    version = int(given["version"]) if "version" in given else None
+    one_choice(version, given.get("alias"))
+    std, revision = given.get("std") == "1", int(given.get("min_revision", 0))
+    return Asked(version, given.get("alias"), std, given.get("stream_id"), revision)
 
 
 def _connection(scope: Scope) -> StreamProtocol:

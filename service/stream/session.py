@@ -1,9 +1,14 @@
-"""A stream of torque queries to one model, some of which carry torque to learn from."""
+"""One WebSocket connection: a message in, a message out, in order, and an end to clients that are gone; and streams of
+torque queries to one model, some of which carry torque to learn from."""
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
+from abc import ABC, abstractmethod
+from collections import deque
+from contextlib import suppress
 from math import inf
 from time import perf_counter
 from typing import TYPE_CHECKING
@@ -13,30 +18,116 @@ from anyio import to_thread
 from starlette.types import Message, Receive, Send
 
 from service.foundation.errors import ErrorBody, ErrorResponse, ServiceError, invalid_request
+from service.foundation.settings import Settings
 from service.inference.predicting import Query, check_answer
 from service.learning.learners import Learners
 from service.models.loaded import Served
-from service.models.moves import SERVING
-from service.stream.conversation import Conversation
-from service.stream.frames import (
-    ANSWER,
-    ASK_LEARN,
-    ASK_STD,
-    ERROR,
-    HAS_STD,
-    LATE,
-    LAYOUT,
-    NUMBER,
-    REQUEST,
-    UNREAD,
-    request_bytes,
-)
+from service.models.registry import SERVING
+from service.stream import frames
 from service.stream.learning import Learning, Taught
+from service.web.access.middleware import subprotocol_of
 from service.web.observability.meters import StreamMeter
 from service.web.server.stream_protocol import StreamProtocol
 
 if TYPE_CHECKING:
     from lipcore.data.samples import Array
+
+logger = logging.getLogger(__name__)
+
+
+class Conversation(ABC):
+    """Answers messages one by one, reading the next when the answer is written.
+
+    ASGI's own calls rather than Starlette's WebSocket: that costs 3 µs a message, 1 µs as here.
+    left: when the last answer had been written, in seconds of `time.perf_counter`.
+    """
+
+    def __init__(self, connection: StreamProtocol, receive: Receive, send: Send, settings: Settings) -> None:
+        self.connection, self.receive, self.send, self.settings = connection, receive, send, settings
+        self.left = perf_counter()
+        self._writing = False
+        self._texts: deque[str] = deque()
+        self._closing: asyncio.Task[None] | None = None
+
+    @abstractmethod
+    async def reply(self, message: Message, arrived: float) -> bytes:
+        """Return the answer to a message that arrived at a time of `time.perf_counter`."""
+
+    async def greet(self) -> None:
+        """Say what a client has to know before it asks."""
+        return
+
+    async def run(self) -> None:
+        """Accept the connection and talk until either side ends it."""
+        receive, send, connection, reply = self.receive, self.send, self.connection, self.reply
+        await receive()
+        await send({"type": "websocket.accept", "subprotocol": subprotocol_of(connection.scope["subprotocols"])})
+        await self.greet()
+        self._watch()
+        try:
+            while True:
+                message = await receive()
+                arrived = connection.arrived
+                if message["type"] == "websocket.disconnect":
+                    return
+                answer = await reply(message, arrived)
+                self._writing = True
+                self.left = perf_counter()  # since when the answer waits, should it have to
+                await send({"type": "websocket.send", "bytes": answer})
+                self.left = perf_counter()
+                if self._texts:
+                    await self._write_texts()
+                self._writing = False
+                # neither call above lets others run when messages wait: a client that sends many must not hold up all
+                await asyncio.sleep(0)
+        finally:
+            self._timer.cancel()
+
+    async def send_text(self, text: str) -> None:
+        """Send a text between answers: now, or after the answer that is being written. One caller at a time. A client
+        that does not read it is cut off as one that does not read its answers; one that is gone misses it."""
+        self._texts.append(text)
+        if self._writing:
+            return
+        with suppress(OSError, RuntimeError):  # gone, or closing, which uvicorn says in its own way
+            try:
+                async with asyncio.timeout(self.settings.stream_write_s):
+                    await self._write_texts()
+            except TimeoutError:
+                self.connection.abort()
+
+    async def _write_texts(self) -> None:
+        while self._texts:
+            await self.send({"type": "websocket.send", "text": self._texts.popleft()})
+
+    def _watch(self) -> None:
+        period = min(self.settings.stream_idle_s, self.settings.stream_write_s)
+        self._timer = asyncio.get_running_loop().call_later(period, self._look)
+
+    def _look(self) -> None:
+        """End a connection that is idle or does not read. Looked at now and then: a timer a frame costs time."""
+        waited = perf_counter() - self.left
+        if self._writing and waited >= self.settings.stream_write_s:
+            self.connection.abort()
+        elif not self._writing and waited >= self.settings.stream_idle_s:
+            self._closing = asyncio.get_running_loop().create_task(self._close_idle())
+        else:
+            self._watch()
+
+    async def _close_idle(self) -> None:
+        reason = f"no frame for {self.settings.stream_idle_s:g} s (LIPSERVE_STREAM_IDLE_S)"
+        with suppress(OSError):  # gone already
+            await self.send({"type": "websocket.close", "code": 1000, "reason": reason})
+
+
+class Echo(Conversation):
+    """Sends back what comes: the floor that answers are compared with."""
+
+    async def reply(self, message: Message, arrived: float) -> bytes:
+        """Return the message itself."""
+        text = message.get("text")
+        data: bytes = message["bytes"] if text is None else text.encode()
+        return data
 
 
 class FrameReader:
@@ -46,38 +137,27 @@ class FrameReader:
         self.joint_names, self.n_joints, self.max_position = joint_names, len(joint_names), max_position
         self.motion: Array = np.zeros((3, self.n_joints))
         self._numbers, self._query = self.motion.reshape(-1), Query(self.motion[:, None], single=True)
-        self._length = request_bytes(self.n_joints)
-        self._learn_length = request_bytes(self.n_joints, learn=True)
+        self._lengths = {learn: frames.request_bytes(self.n_joints, learn) for learn in (False, True)}
 
     def read(self, data: bytes, flags: int, n: int, budget: float) -> Array:
-        """Return q, dq, ddq of a frame, (3, n), whose header is already read; raise InvalidRequestError.
-
-        Torque that it carries must be there, and is not looked at.
-        """
+        """Return q, dq, ddq of a frame, (3, n), whose header is already read; raise InvalidRequestError. Torque that it
+        carries must be there, and is not looked at."""
         if n != self.n_joints:
             raise invalid_request("n", n, f"{self.n_joints} joints: {', '.join(self.joint_names)}")
-        if flags > ASK_STD:
-            data = self._without_torque(data, flags)
-        if len(data) != self._length:
-            raise invalid_request("frame", f"{len(data)} bytes long", f"{self._length} bytes for {n} joints")
+        both = frames.ASK_STD | frames.ASK_LEARN
+        if flags & ~both:
+            expected = f"0, {frames.ASK_STD} to be answered tau_std, {frames.ASK_LEARN} to be learnt from, or {both}"
+            raise invalid_request("flags", flags, expected)
+        length = self._lengths[learn := flags > frames.ASK_STD]
+        if len(data) != length:
+            expected = f"{length} bytes for {n} joints{' with tau' if learn else ''}"
+            raise invalid_request("frame", f"{len(data)} bytes long", expected)
         if not 0.0 <= budget < inf:
             raise invalid_request("deadline", budget, "seconds, or 0 for none")
         # a copy, because the model takes aligned and writable memory, and the message is neither for certain
-        self._numbers[:] = np.frombuffer(data, NUMBER, offset=REQUEST.size)
+        self._numbers[:] = np.frombuffer(data, frames.NUMBER, 3 * n, frames.REQUEST.size)
         self._query.check(self.max_position)
         return self.motion
-
-    def _without_torque(self, data: bytes, flags: int) -> bytes:
-        if flags & ~(ASK_STD | ASK_LEARN):
-            expected = f"0, {ASK_STD} to be answered tau_std, {ASK_LEARN} to be learnt from, or {ASK_STD | ASK_LEARN}"
-            raise invalid_request("flags", flags, expected)
-        if len(data) != self._learn_length:
-            expected = f"{self._learn_length} bytes for {self.n_joints} joints with tau"
-            raise invalid_request("frame", f"{len(data)} bytes long", expected)
-        return data[: self._length]
-
-
-logger = logging.getLogger(__name__)
 
 
 class Session(Conversation):
@@ -107,7 +187,7 @@ class Session(Conversation):
         self._alias = None if alias == SERVING else alias
         self._std, self._late, self._due = std, 0, inf
         self._meter, self._deadline = meter, learners.settings.stream_deadline_s
-        self._learning = None if stream_id is None else Learning(learners, stream_id, self.say)
+        self._learning = None if stream_id is None else Learning(learners, stream_id, self.send_text)
         self._take(served)
 
     async def run(self) -> None:
@@ -123,7 +203,7 @@ class Session(Conversation):
         """Send what holds for all answers of the version."""
         model = self._served.model
         hello = {
-            "layout": LAYOUT,
+            "layout": frames.LAYOUT,
             "model": self._served.name,
             "version": self._served.version,
             "revision": self._served.revision,
@@ -140,21 +220,21 @@ class Session(Conversation):
             self._late += 1
             self._meter.late += 1
         self._due = inf
-        sequence, flags = 0, UNREAD
+        sequence, flags = 0, frames.UNREAD
         try:
             data = message.get("bytes")
             if data is None:
                 raise invalid_request("frame", "a text message", "a binary message")
-            if len(data) < REQUEST.size:
-                expected = f"a header of {REQUEST.size} bytes, and numbers"
+            if len(data) < frames.REQUEST.size:
+                expected = f"a header of {frames.REQUEST.size} bytes, and numbers"
                 raise invalid_request("frame", f"{len(data)} bytes long", expected)
-            sequence, asked, n, budget = REQUEST.unpack_from(data)
+            sequence, asked, n, budget = frames.REQUEST.unpack_from(data)
             flags = 0
             current = self._loaded.hot(self._name, self._pin, self._alias)
             if current is not self._served:
                 await self._follow(current)
             motion = self._reader.read(data, asked, n, budget)
-            if asked > ASK_STD:
+            if asked > frames.ASK_STD:
                 await self._admit(sequence, asked)
             tau, std = self._answer(motion, self._std or asked != 0)
             check_answer("tau", tau)
@@ -168,12 +248,12 @@ class Session(Conversation):
             return self._refuse(sequence, flags, arrived, unexpected)
         served, numbers = self._served, tau.tobytes()
         if std is not None:
-            flags = HAS_STD
+            flags = frames.HAS_STD
             numbers += std.tobytes()
-        if asked > ASK_STD:
+        if asked > frames.ASK_STD:
             assert self._learning is not None
             self._learning.add(Taught(served, sequence, arrived, data, numbers))
-            if asked == ASK_LEARN and not self._std:  # its standard deviation is for the record alone
+            if asked == frames.ASK_LEARN and not self._std:  # its standard deviation is for the record alone
                 flags, numbers = 0, tau.tobytes()
         now = perf_counter()
         seconds = now - arrived
@@ -183,21 +263,25 @@ class Session(Conversation):
             if now > self._due:
                 self._late, self._due = self._late + 1, inf
                 self._meter.late += 1
-                flags |= LATE
+                flags |= frames.LATE
         elif seconds > self._deadline:
             self._meter.late += 1
-        return ANSWER.pack(sequence, flags, n, served.version, self._late, served.revision, seconds) + numbers
+        return frames.ANSWER.pack(sequence, flags, n, served.version, self._late, served.revision, seconds) + numbers
 
     async def _admit(self, sequence: int, flags: int) -> None:
         """Wait until there is room for a frame to learn from; raise InvalidRequestError where it may not be learnt."""
         if self._pin is not None:
-            expected = f"no {ASK_LEARN}: a stream pinned to a version only asks; leave version out of the address"
+            expected = (
+                f"no {frames.ASK_LEARN}: a stream pinned to a version only asks; leave version out of the address"
+            )
             raise invalid_request("flags", flags, expected)
         if self._alias is not None:
-            expected = f"no {ASK_LEARN}: only the version that serves learns; leave alias out of the address"
+            expected = f"no {frames.ASK_LEARN}: only the version that serves learns; leave alias out of the address"
             raise invalid_request("flags", flags, expected)
         if self._learning is None:
-            expected = f"a name of the torque's source in the address, as in ?stream_id=arm-1, for flag {ASK_LEARN}"
+            expected = (
+                f"a name of the torque's source in the address, as in ?stream_id=arm-1, for flag {frames.ASK_LEARN}"
+            )
             raise invalid_request("stream_id", "missing", expected)
         await self._learning.admit(sequence)
 
@@ -205,14 +289,14 @@ class Session(Conversation):
         self._meter.refuse(error.code)
         body = ErrorResponse(error=ErrorBody(code=error.code, message=error.message, detail=error.detail))
         served, seconds = self._served, perf_counter() - arrived
-        header = ANSWER.pack(sequence, flags | ERROR, 0, served.version, self._late, served.revision, seconds)
+        header = frames.ANSWER.pack(
+            sequence, flags | frames.ERROR, 0, served.version, self._late, served.revision, seconds
+        )
         return header + body.model_dump_json().encode()
 
     async def _follow(self, current: Served | None) -> None:
-        """Take the version that is current; None: it has been dropped from memory, maybe for a newer one.
-
-        Raise NotFoundError where the version, the alias or the model has been deleted.
-        """
+        """Take the version that is current; None: it has been dropped from memory, maybe for a newer one. Raise
+        NotFoundError where the version, the alias or the model has been deleted."""
         if current is None:
             meant = self._loaded.newest(self._name, self._alias) if self._pin is None else self._pin
             if meant == self._served.version and not self._loaded.is_deleted(self._name, meant):

@@ -11,8 +11,6 @@ import logging
 import time
 from secrets import token_hex
 
-from sqlalchemy import select
-
 from service import __version__
 from service.compute import remote
 from service.compute.cluster import Cluster, needs_gpu
@@ -35,9 +33,7 @@ HOST = "service.training.hosting:host"
 
 class ClusterQueue(JobQueue):
     """Has workers of a cluster run jobs, and goes on with jobs of services that are gone; a job outlives its service.
-
-    Which service owns a job says who watches it; the one that dies is followed by another.
-    """
+    Which service owns a job says who watches it; the one that dies is followed by another."""
 
     def _places(self) -> list[Slot]:
         assert self.settings.cluster is not None
@@ -76,7 +72,7 @@ class ClusterQueue(JobQueue):
                 try:
                     future = self._away.submit(key, gpu, remote.call_named, HOST, __version__, job)
                 except ClusterUnavailableError as error:
-                    logger.warning("job %s waits: %s", job, error)
+                    logger.warning("%s waits: %s", job, error)
                     return
                 self._hands.append(Hand(job, None, future, clock, away=True))
             del self._waiting[job]
@@ -84,7 +80,7 @@ class ClusterQueue(JobQueue):
     def _announce(self, job: str) -> bool | None:
         """Make a waiting job this service's and say what it waits for: with a GPU? None where it does not."""
         with self.database.transaction() as session:
-            row = session.scalar(select(JobRow).where(JobRow.id == job))
+            row = lifecycle.row_of(session, job)
             if row is None or row.state != QUEUED or row.owner not in (None, self.replicas.id):
                 return None
             gpu = needs_gpu(row.request)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import AsyncIterator
+from contextlib import suppress
 from contextvars import Context
+from typing import ClassVar
 
 from anyio import to_thread
 from sqlalchemy import select
 
-from service.foundation.errors import BusyError
 from service.storage.database import Database, JobRow
+from service.web.limits.requests import Counted
 
 logger = logging.getLogger(__name__)
 
@@ -20,28 +21,18 @@ LOOK_S = 0.4
 """Seconds between two looks at the jobs that somebody follows."""
 
 
-class Feed:
+class Feed(Counted):
     """Followers of jobs. It belongs to the event loop."""
 
+    too_many = "events of jobs are followed {} times, the most there may be: close one, or try again later"
+    headers: ClassVar = {"Retry-After": "5"}
+
     def __init__(self, database: Database) -> None:
-        self.database, self.open = database, 0
+        super().__init__()
+        self.database = database
         self._rows: dict[str, JobRow] = {}
         self._followers: dict[str, list[asyncio.Event]] = {}
         self._reader: asyncio.Task[None] | None = None
-
-    @contextmanager
-    def one_more(self, most: int) -> Iterator[None]:
-        """Count a reader while it lasts; raise BusyError beyond `most`."""
-        if self.open >= most:
-            raise BusyError(
-                f"events of jobs are followed {self.open} times, the most there may be: close one, or try again later",
-                headers={"Retry-After": "5"},
-            )
-        self.open += 1
-        try:
-            yield
-        finally:
-            self.open -= 1
 
     async def follow(self, row: JobRow, closing: asyncio.Event) -> AsyncIterator[JobRow]:
         """The row as it is, and again whenever it has changed, until the service closes; the caller knows its end."""

@@ -25,13 +25,13 @@ UNTIMED_GUARD = 25.0
 class CannotHoldOutError(ValueError):
     """A data set cannot be split as asked for."""
 
+    code = "cannot_hold_out"
+
 
 @dataclass(frozen=True)
 class SetSplit:
-    """How one data set is split.
-
-    entire: nothing of it is learnt from; guard: in `unit`; known: rows held out and guarded where it was split before.
-    """
+    """How one data set is split. entire: nothing of it is learnt from; guard: in `unit`; known: rows held out and
+    guarded where it was split before."""
 
     dataset: str
     asked: Holdout
@@ -118,8 +118,8 @@ def hold_out(rows: Sequence[DatasetRow], clocks: Sequence[Clock], asked: Holdout
 
 def hold_out_again(rows: Sequence[DatasetRow], clocks: Sequence[Clock], lineage: dict[str, Any]) -> Divided:
     """Divide data sets of a version as they were for it, by its lineage; raise CannotHoldOutError."""
-    splits = {row.id: remembered(row, lineage) for row in rows}
-    return _divide(rows, clocks, {name: each for name, each in splits.items() if each is not None})
+    splits = {row.id: split for row in rows if (split := remembered(row, lineage)) is not None}
+    return _divide(rows, clocks, splits)
 
 
 def remembered(row: DatasetRow, lineage: dict[str, Any]) -> SetSplit | None:

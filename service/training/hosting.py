@@ -32,7 +32,7 @@ from service.compute.executors import GPU_SHARD, SHARD, placed
 from service.compute.process import Slot, training_place
 from service.foundation.errors import ServiceError
 from service.foundation.settings import Settings
-from service.foundation.states import ACTIVE, CANCELLED, QUEUED, RUNNING
+from service.foundation.states import ACTIVE, QUEUED, RUNNING
 from service.storage.database import Database, JobRow
 from service.storage.files import Files
 from service.training import lifecycle, worker
@@ -56,10 +56,8 @@ class VersionsDifferError(RuntimeError):
 
 
 def host(version: str, job: str) -> None:
-    """Run a job on this worker, and then whatever else waits that it can run. version: of the service that asks.
-
-    Work that others wait for is not left lying: the cluster gives tickets to workers before these are free.
-    """
+    """Run a job on this worker, and then whatever else waits that it can run. version: of the service that asks. Work
+    that others wait for is not left lying: the cluster gives tickets to workers before these are free."""
     if version != __version__:
         raise VersionsDifferError(f"the worker has version {__version__}, the service {version}: start them alike")
     with _one:  # a worker that has lost its scheduler and joined again may still be at work
@@ -140,7 +138,7 @@ class Host:
             try:
                 row = self._row(hand.job)
             except Exception:  # without it the process cannot go on either, but it may come back
-                logger.warning("the row of job %s could not be read", hand.job, exc_info=True)
+                logger.warning("the row of %s could not be read", hand.job, exc_info=True)
                 continue
             clock = time.monotonic()
             if row is None or row.attempts > attempt or (hand.ran is not None and row.state == QUEUED):
@@ -176,19 +174,14 @@ class Host:
 
     def _row(self, job: str) -> JobRow | None:
         with self.database.session() as session:
-            row: JobRow | None = session.scalar(select(JobRow).where(JobRow.id == job))
-        return row
+            return lifecycle.row_of(session, job)
 
     def _hand_back(self, job: str, attempt: int) -> None:
         with self.database.transaction() as session:
-            row = session.scalar(select(JobRow).where(JobRow.id == job))
+            row = lifecycle.row_of(session, job)
             if row is None or row.state != RUNNING or row.attempts != attempt:
                 return
-            if row.cancel_requested:
-                lifecycle.enter(row, CANCELLED, "cancelled: its worker was stopped while it ran")
-            else:
-                row.attempts -= 1  # handed back in order: such a start is no failed attempt
-                lifecycle.enter(row, QUEUED, "its worker was stopped while it ran: queued again")
+            lifecycle.hand_back(row, "its worker was stopped while it ran")
         lifecycle.remove_leftovers(self.database, self.files, job)
 
     def _settle(self, ended: Ended) -> None:

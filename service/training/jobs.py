@@ -1,25 +1,36 @@
-"""Making, finding and cancelling jobs."""
+"""Making, finding, cancelling and repeating jobs; and refreshes, which train the version that serves anew, on its data
+sets and on what was observed since."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Literal
 
-from sqlalchemy import func, select
+from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session
 
 from lipcore.fitting.estimators import UnknownEstimatorError, check_estimator
 from lipcore.fitting.options import FitOptions
 from lipcore.robots.library import ROBOTS, SimulationUnavailableError
 from service.datasets import store
-from service.foundation.errors import BusyError, ConflictError, InvalidRequestError, invalid_request, not_found, problem
+from service.foundation.errors import (
+    BusyError,
+    ConflictError,
+    InvalidRequestError,
+    NotFoundError,
+    invalid_request,
+    not_found,
+    problem,
+)
 from service.foundation.settings import Settings
-from service.foundation.states import ACTIVE, CANCELLED, QUEUED, RUNNING
+from service.foundation.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING
+from service.journal import log
+from service.models import registry
 from service.models.loaded import LoadedModels
 from service.robots import store as robots
-from service.storage.database import Database, DatasetRow, JobRow, RobotRow, now
+from service.storage.database import Database, DatasetRow, JobRow, RobotRow, VersionRow, now
 from service.storage.files import new_id
-from service.training import holding_out, lifecycle
+from service.training import holding_out, lifecycle, refresh_data
 from service.training.queue import JobQueue
 from service.training.schema import Job, JobPage, JobRequest, Options
 from service.web.idempotency import Identity, done, mark
@@ -31,10 +42,8 @@ USUAL_WAIT_S, LONGEST_WAIT_S = 30, 3600
 
 
 def create(queue: JobQueue, request: JobRequest, retry_of: str | None = None, named: Identity | None = None) -> Job:
-    """Check a request, store it as a queued job and hand it to the queue.
-
-    retry_of: the job that it repeats; named: the request, which is not done again where it was before.
-    """
+    """Check a request, store it as a queued job and hand it to the queue. retry_of: the job that it repeats; named: the
+    request, which is not done again where it was before."""
     if (before := done_before(queue.database, named)) is not None:
         return before
     _check_options(request.options, queue.settings)
@@ -48,7 +57,7 @@ def create(queue: JobQueue, request: JobRequest, retry_of: str | None = None, na
     _check_estimator(queue.database, request, rows[0].joint_names, joint_types)
     with queue.database.transaction() as session:
         if (row := done(session, JobRow, named)) is not None:  # the same request was faster on another connection
-            return shown(row)
+            return represent(row)
         content = {**request.model_dump(mode="json"), "joint_types": joint_types}
         job = add(session, queue.settings, request.model, content, retry_of, named)
         present = set(session.scalars(select(DatasetRow.id).where(DatasetRow.id.in_(request.datasets))))
@@ -59,14 +68,14 @@ def create(queue: JobQueue, request: JobRequest, retry_of: str | None = None, na
         if uploaded and session.scalar(select(RobotRow.id).where(RobotRow.id == request.robot)) is None:
             raise not_found("robot", request.robot)
     queue.submit(job.id)
-    return shown(job)
+    return represent(job)
 
 
 def done_before(database: Database, named: Identity | None) -> Job | None:
     """The job that a request has made before, as it is now; None where it has not. Raise ConflictError."""
     with database.session() as session:
         row = done(session, JobRow, named)
-    return None if row is None else shown(row)
+    return None if row is None else represent(row)
 
 
 def add(
@@ -97,7 +106,7 @@ def add(
         request_id=request_id.get(),
     )
     mark(job, named)
-    lifecycle.enter(job, QUEUED, "queued" if retry_of is None else f"queued to repeat job {retry_of}")
+    lifecycle.enter(job, QUEUED, "queued" if retry_of is None else f"queued to repeat {retry_of}")
     session.add(job)
     return job
 
@@ -114,7 +123,7 @@ def show(queue: JobQueue, loaded: LoadedModels, job: str) -> Job:
     row = find(queue.database, job)
     if row.version is not None:
         loaded.announce([row.model])
-    return shown(row)
+    return represent(row)
 
 
 def page(queue: JobQueue, loaded: LoadedModels, part: Page) -> JobPage:
@@ -122,13 +131,16 @@ def page(queue: JobQueue, loaded: LoadedModels, part: Page) -> JobPage:
     with queue.database.session() as session:
         rows, following = newest(session, JobRow, part)
     loaded.announce({row.model for row in rows if row.version is not None})
-    return JobPage(items=[shown(row) for row in rows], next_cursor=following)
+    return JobPage(items=[represent(row) for row in rows], next_cursor=following)
 
 
 def find(database: Database, job: str) -> JobRow:
     """Return a job's row; raise NotFoundError."""
     with database.session() as session:
-        row = session.scalar(select(JobRow).where(JobRow.id == job))
+        return _existing(lifecycle.row_of(session, job), job)
+
+
+def _existing(row: JobRow | None, job: str) -> JobRow:
     if row is None:
         raise not_found("job", job)
     return row
@@ -136,22 +148,18 @@ def find(database: Database, job: str) -> JobRow:
 
 def cancel(queue: JobQueue, job: str) -> Job:
     """Cancel a job: at once while it waits; while it runs within `job_cancel_grace_s`, with or without its consent.
-
-    Raise NotFoundError, ConflictError where it has ended.
-    """
+    Raise NotFoundError, ConflictError where it has ended."""
     queue.stop(job)  # before anything is written, for which its process may hold the lock
     with queue.database.transaction() as session:
-        row = session.scalar(select(JobRow).where(JobRow.id == job))
-        if row is None:
-            raise not_found("job", job)
+        row = _existing(lifecycle.row_of(session, job), job)
         if row.state not in ACTIVE:
-            raise ConflictError(f"job {job!r} has {row.state} already")
+            raise ConflictError(f"{job} has {row.state} already")
         if row.state == QUEUED:
             lifecycle.enter(row, CANCELLED, "cancelled while it waited")
         elif not row.cancel_requested:
             lifecycle.enter(row, RUNNING, "asked to end")
         row.cancel_requested = True
-    return shown(row)
+    return represent(row)
 
 
 def _check_joints(request: JobRequest, rows: list[DatasetRow]) -> list[str]:
@@ -193,7 +201,103 @@ def _check_options(options: Options, settings: Settings) -> None:
             raise invalid_request(f"options.{name}", getattr(options, name), f"at most {most}")
 
 
-def shown(row: JobRow) -> Job:
+def represent(row: JobRow) -> Job:
     """A job as the API shows it: columns of its row, and what its request says."""
     fields = {name: getattr(row, name, row.request.get(name)) for name in Job.model_fields}
     return Job.model_validate(fields)
+
+
+Trigger = Literal["novelty", "linearisation", "asked"]
+
+
+def refresh(
+    queue: JobQueue,
+    model: str,
+    trigger: Trigger = "asked",
+    retry_of: str | None = None,
+    named: Identity | None = None,
+) -> Job:
+    """Queue a refresh of the version that serves; return its job. Not for the event loop.
+
+    retry_of: the job that it repeats; named: the request, where its client has named it.
+    Raise NotFoundError, BusyError for a full queue, ConflictError where a refresh of the model is under way or there is
+    nothing to train on.
+    """
+    version = registry.find(queue.database, model, None)
+    with queue.database.transaction() as session:
+        if (before := done(session, JobRow, named)) is not None:
+            return represent(before)
+        job = add_refresh(session, queue.settings, version, trigger, retry_of, named)
+    queue.submit(job.id)
+    return represent(job)
+
+
+def add_refresh(
+    session: Session,
+    settings: Settings,
+    version: VersionRow,
+    trigger: Trigger,
+    retry_of: str | None = None,
+    named: Identity | None = None,
+) -> JobRow:
+    """Add the job of a refresh; raise ConflictError or BusyError."""
+    model, manifest = version.model, version.manifest
+    if not registry.exists(session, model, version.version):  # deleted since it was found
+        raise not_found("version", version.version)
+    for job in session.scalars(refreshes_of(model).where(JobRow.state.in_(ACTIVE))):
+        raise ConflictError(f"{job.id} refreshes model {model!r} already: wait for its end or cancel it")
+    through = log.newest(session, model)
+    scope = refresh_data.scope_of(session, model, through)
+    kept, left_out = refresh_data.split_datasets(session, scope, manifest["lineage"])
+    rows = refresh_data.rows_within(session, model, scope)
+    if not kept and rows < settings.min_samples:
+        raise ConflictError(_nothing(version, rows, left_out, settings.min_samples))
+    made_by = None if version.job is None else session.scalar(select(JobRow).where(JobRow.id == version.job))
+    request = {
+        "model": model,
+        "datasets": [row.id for row in kept],
+        "estimator": manifest["estimator"],
+        "joint_types": manifest["joint_types"],
+        "robot": made_by.request.get("robot") if made_by is not None and "robot" in manifest else None,
+        "options": manifest["options"],
+        "refresh": {"version": version.version, "through": through, "trigger": trigger},
+    }
+    return add(session, settings, model, request, retry_of, named)
+
+
+def _nothing(version: VersionRow, rows: int, left_out: list[dict[str, str]], least: int) -> str:
+    data = "; ".join(f"data set {each['id']!r} is left out: {each['reason']}" for each in left_out)
+    return (
+        f"version {version.version} of model {version.model!r} cannot be refreshed: its log has {rows} rows to train "
+        f"on, expected at least {least} where none of its data sets is left ({data or 'it names none'})"
+    )
+
+
+def refreshes_of(model: str) -> Select[JobRow]:
+    """Jobs that refresh a model."""
+    refreshed = JobRow.request["refresh"]["version"].as_integer()
+    return select(JobRow).where(JobRow.model == model, refreshed.is_not(None))
+
+
+def retry(queue: JobQueue, job: str, named: Identity | None = None) -> Job:
+    """Queue a job that repeats one that failed or was cancelled; a refresh starts from what serves and is known now.
+
+    named: the request, which is not done again where it was before.
+    Raise NotFoundError, ConflictError where the job has not failed or what it needs is no longer there,
+    InvalidRequestError where a limit has become lower since, BusyError for a full queue.
+    """
+    row = find(queue.database, job)
+    if (before := done_before(queue.database, named)) is not None:
+        return before
+    if row.state not in (FAILED, CANCELLED):
+        raise ConflictError(f"{job} is {row.state}: only one that has failed or was cancelled can be repeated")
+    try:
+        again = row.request.get("refresh")
+        if again is not None:
+            return refresh(queue, row.model, again["trigger"], row.id, named)
+        request = JobRequest.model_validate(
+            {name: row.request[name] for name in JobRequest.model_fields if name in row.request}  # older ones lack some
+        )
+        return create(queue, request, retry_of=row.id, named=named)
+    except NotFoundError as error:
+        raise ConflictError(f"{job} cannot be repeated: {error.message}") from None

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from sqlalchemy import select
+from sqlalchemy.orm import Session
 
 from service.foundation.settings import Settings
 from service.foundation.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, JobState
@@ -34,6 +35,21 @@ def enter(row: JobRow, state: JobState, message: str) -> None:
         row.owner = None  # any service may have it run
     elif state not in ACTIVE:
         row.finished_at = at
+
+
+def row_of(session: Session, job: str) -> JobRow | None:
+    """The row of a job, None where there is none."""
+    row: JobRow | None = session.scalar(select(JobRow).where(JobRow.id == job))
+    return row
+
+
+def hand_back(row: JobRow, why: str) -> None:
+    """Let a job wait again whose process was stopped in order: such a start is no failed attempt."""
+    if row.cancel_requested:
+        enter(row, CANCELLED, f"cancelled: {why}")
+    else:
+        row.attempts -= 1
+        enter(row, QUEUED, f"{why}: queued again")
 
 
 Why = Literal["returned", "ended", "cancelled", "silent", "too_long", "not_started", "lingering", "refused"]
@@ -136,10 +152,8 @@ def new_folder(job: str) -> str:
 
 
 def remove_leftovers(database: Database, files: Files, job: str) -> int:
-    """Delete what a job that runs nowhere has written and no version names; return how many folders.
-
-    Where several services share the files it is done once the job has ended, else when they are swept.
-    """
+    """Delete what a job that runs nowhere has written and no version names; return how many folders. Where several
+    services share the files it is done once the job has ended, else when they are swept."""
     try:
         names = files.versions_marked(_folder_mark(job))
         if not names:
@@ -153,7 +167,7 @@ def remove_leftovers(database: Database, files: Files, job: str) -> int:
         for name in left:
             files.delete_version(name)
     except OSError as error:
-        logger.warning("files that job %s did not publish are left until they are swept: %s", job, error)
+        logger.warning("files that %s did not publish are left until they are swept: %s", job, error)
         return 0
     return len(left)
 
@@ -194,7 +208,7 @@ class Settler:
         """Write what becomes of a job; raises what the database raises, and may be called again then."""
         remove_leftovers(self.database, self.files, ended.job)
         with self.database.transaction() as session:
-            row = session.scalar(select(JobRow).where(JobRow.id == ended.job))
+            row = row_of(session, ended.job)
             settled = Settled() if row is None else self._decide(row, ended)
         if settled.problem is None:
             self._starts.pop(ended.job, None)
@@ -212,7 +226,7 @@ class Settler:
         if ended.why == "cancelled" or row.cancel_requested:
             enter(row, CANCELLED, f"cancelled: {ended.message}")
             return Settled()
-        logger.error("job %s: %s", row.id, ended.message)
+        logger.error("%s: %s", row.id, ended.message)
         if ended.why == "too_long":
             fail(row, "too_long", ended.message)
             return Settled()

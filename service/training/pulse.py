@@ -153,7 +153,7 @@ class Pulse:
             raise SupersededError
         return self._stop
 
-    def shown(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, Any]:
         """The progress as it is written now."""
         left = None if self.remaining is None else self.remaining.seconds(time.monotonic())
         if self._ends is not None:
@@ -181,5 +181,5 @@ class Pulse:
     def _exchange(self) -> None:
         with self.database.transaction(self.model) as session:
             row = self.own(session)
-            row.progress, row.heartbeat_at = self.shown(), now()
+            row.progress, row.heartbeat_at = self.as_json(), now()
             self._stop = row.cancel_requested

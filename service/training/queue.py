@@ -24,7 +24,7 @@ from service.compute.cluster import Cluster
 from service.compute.process import Slot, training_place
 from service.foundation.fields import of_app
 from service.foundation.settings import Settings
-from service.foundation.states import ACTIVE, CANCELLED, QUEUED, RUNNING
+from service.foundation.states import ACTIVE, QUEUED, RUNNING
 from service.storage.database import JobRow
 from service.storage.replicas import Replicas
 from service.storage.storage import Storage
@@ -113,13 +113,8 @@ class JobQueue:
     def _hand_back(self) -> None:
         with self.database.transaction() as session:
             for row in session.scalars(select(JobRow).where(JobRow.state == RUNNING)):
-                if not self.replicas.mine(row.owner):
-                    continue
-                if row.cancel_requested:
-                    lifecycle.enter(row, CANCELLED, "cancelled: the service was stopped while it ran")
-                    continue
-                row.attempts -= 1  # handed back in order: such a start is no failed attempt
-                lifecycle.enter(row, QUEUED, "the service was stopped while it ran: queued again")
+                if self.replicas.mine(row.owner):
+                    lifecycle.hand_back(row, "the service was stopped while it ran")
 
     def _is_ready(self, row: JobRow) -> bool:
         if row.state == QUEUED and not row.cancel_requested:
@@ -235,18 +230,14 @@ class JobQueue:
             if row.id in known:
                 continue
             ours = self.replicas.mine(row.owner)
-            if not ours and not (row.owner in free and self._may_have(row)):
+            # a job that waits and is nobody's is taken when it is handed out
+            anybodys = row.state == QUEUED and row.owner is None
+            if not ours and not (row.owner in free and (anybodys or self.replicas.take(row.id, row.owner))):
                 continue
             if row.state == QUEUED:
                 self.submit(row.id)
             else:
                 self._see_to(row, ours)
-
-    def _may_have(self, row: JobRow) -> bool:
-        """Whether a job that nobody has, or one who is gone, can be this service's."""
-        if row.state == QUEUED and row.owner is None:
-            return True  # it is taken when it is handed out
-        return self.replicas.take(row.id, row.owner)
 
     def _see_to(self, row: JobRow, ours: bool) -> None:
         """See to a job that runs, but not in a process of this service. ours: not taken over just now."""
@@ -275,7 +266,7 @@ class JobQueue:
                 try:
                     settled = self._settler.settle(ended)
                 except Exception:
-                    logger.exception("what becomes of job %s could not be written: tried again", ended.job)
+                    logger.exception("what becomes of %s could not be written: tried again", ended.job)
                     self._closing.wait(AGAIN_S)
             if settled is None:
                 return

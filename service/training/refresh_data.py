@@ -70,7 +70,7 @@ def split_datasets(
 ) -> tuple[list[DatasetRow], list[dict[str, str]]]:
     """Data sets of a version's lineage that a refresh learns from, in order, and why it leaves out the others."""
     named = [item["id"] for item in lineage.get("datasets", [])]
-    known = {row.id: row for row in _datasets(session, named)}
+    known = datasets(session, named)
     kept, left_out = [], []
     for name in named:
         why = scope.left_out(known[name]) if name in known else "it has been deleted"
@@ -91,8 +91,9 @@ def taken_back(session: Session, model: str, through: int, after: int) -> bool:
     )
 
 
-def _datasets(session: Session, names: Collection[str]) -> list[DatasetRow]:
-    return list(session.scalars(select(DatasetRow).where(DatasetRow.id.in_(names))))
+def datasets(session: Session, names: Collection[str]) -> dict[str, DatasetRow]:
+    """Those of some data sets that there are, by id."""
+    return {row.id: row for row in session.scalars(select(DatasetRow).where(DatasetRow.id.in_(names)))}
 
 
 PAGE = 50
@@ -110,10 +111,8 @@ class Logged:
 def read_log(
     database: Database, model: str, joint_names: tuple[str, ...], scope: Scope, most: int, longest_step: float
 ) -> Logged:
-    """Rows in scope that teach, at most `most` of them, thinned evenly.
-
-    Sorted by stream and time; where time steps by more than `longest_step` seconds a new episode begins.
-    """
+    """Rows in scope that teach, at most `most` of them, thinned evenly. Sorted by stream and time; where time steps by
+    more than `longest_step` seconds a new episode begins."""
     kept, count = _thinned(database, model, scope, most)
     if count == 0:
         return Logged(None, 0)
@@ -133,10 +132,8 @@ def age_weights(times: Array, scope: Scope) -> Array | None:
 
 
 def _thinned(database: Database, model: str, scope: Scope, most: int) -> tuple[list[tuple[Rows, Array]], int]:
-    """Every k-th row in scope in the order of the log, each with the number of its stream, and how many there are.
-
-    One pass, and never more than twice `most` rows in memory: k doubles whenever there are that many.
-    """
+    """Every k-th row in scope in the order of the log, each with the number of its stream, and how many there are. One
+    pass, and never more than twice `most` rows in memory: k doubles whenever there are that many."""
     kept: list[tuple[Rows, Array]] = []
     streams: dict[str | None, int] = {}
     step, count, held, after = 1, 0, 0, 0
@@ -152,7 +149,7 @@ def _thinned(database: Database, model: str, scope: Scope, most: int) -> tuple[l
             count, held = count + len(rows), held + len(chosen)
             kept.append((chosen, np.full(len(chosen), streams.setdefault(event.stream_id, len(streams)))))
             if held > 2 * most:
-                kept, step = _every(kept, 2), 2 * step
+                kept, step = _where(kept, np.arange(held) % 2 == 0), 2 * step
                 held = sum(len(part) for part, _ in kept)
         if len(events) < PAGE or events[-1].number >= scope.through:
             break
@@ -163,10 +160,6 @@ def _thinned(database: Database, model: str, scope: Scope, most: int) -> tuple[l
         chosen_rows[np.linspace(0, held - 1, most).round().astype(np.int64)] = True
         kept = _where(kept, chosen_rows)
     return kept, count
-
-
-def _every(parts: list[tuple[Rows, Array]], step: int) -> list[tuple[Rows, Array]]:
-    return _where(parts, np.arange(sum(len(rows) for rows, _ in parts)) % step == 0)
 
 
 def _where(parts: list[tuple[Rows, Array]], mask: NDArray[np.bool_]) -> list[tuple[Rows, Array]]:

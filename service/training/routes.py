@@ -21,7 +21,7 @@ from service.foundation.errors import (
 from service.foundation.states import ACTIVE
 from service.models.loaded import LoadedModels, LoadedModelsDep
 from service.storage.database import JobRow
-from service.training import jobs, refreshes
+from service.training import jobs
 from service.training.queue import JobQueue, JobQueueDep
 from service.training.schema import Job, JobPage, JobRequest
 from service.web.idempotency import KeyHeader, identity
@@ -54,7 +54,7 @@ async def _events(
             continue
         if now.version is not None:  # who sees it succeed is answered by its version from then on
             await to_thread.run_sync(loaded.announce, [now.model])
-        yield ServerSentEvent(event=kind or "state", data=jobs.shown(now))
+        yield ServerSentEvent(event=kind or "state", data=jobs.represent(now))
         if now.state not in ACTIVE:
             return
         last = now
@@ -128,6 +128,6 @@ def cancel(queue: JobQueueDep, job: str) -> Job:
 )
 def retry(queue: JobQueueDep, job: str, response: Response, idempotency_key: KeyHeader = None) -> Job:
     """Queue a new job with the same request; `retry_of` names the old one. What it needs must still be there."""
-    again = refreshes.retry(queue, job, identity(idempotency_key, "retry", job))
+    again = jobs.retry(queue, job, identity(idempotency_key, "retry", job))
     response.headers["Location"] = f"/v1/jobs/{again.id}"
     return again

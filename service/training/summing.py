@@ -31,8 +31,7 @@ from service.compute.shards import summed
 from service.foundation.settings import Settings
 from service.storage.files import PATIENCE_S, Files
 from service.storage.sample_file import Reader
-from service.training.material import Material
-from service.training.rows import Shard, Table
+from service.training.material import Material, Shard, Table
 
 Made = TypeVar("Made")
 
@@ -70,8 +69,8 @@ def all_rows(
         context = Context(sent(settings), packed(model), model.joint_names, "cuda" if gpu else "cpu")
         with shard_executor(settings, gpu) as executor:
             work = partial(shard_statistics, context)
-            done = partial(_report, progress, len(table) / material.rows, len(shards))
-            total = summed(executor, work, shards, cancelled, done=done)
+            share = len(table) / material.rows / len(shards)
+            total = summed(executor, work, shards, cancelled, done=lambda done: progress(share * done))
     if material.logged is not None:
         logged = sum_samples(Summing.of(model.posterior), *material.logged, cancelled)
         total = logged if total is None else total + logged
@@ -81,7 +80,8 @@ def all_rows(
 
 def shard_statistics(context: Context, shard: Shard) -> ShardStatistics:
     """What the rows of one shard tell: done by a worker."""
-    summing = _cached(_SUMMING, _name(context), 2, lambda: _summing(context))
+    name = hashlib.sha256(b"".join(context.model.values())).hexdigest() + context.device
+    summing = _cached(_SUMMING, name, 2, lambda: _summing(context))
     samples, weights = read(placed(context.settings), context.joint_names, shard)
     return sum_samples(summing, samples, weights)
 
@@ -116,14 +116,6 @@ def packed(model: TorqueModel) -> dict[str, bytes]:
 def _summing(context: Context) -> Summing:
     files = {name: zlib.decompress(each) for name, each in context.model.items()}
     return Summing.of(persistence.decode(files).posterior, torch.device(context.device))
-
-
-def _name(context: Context) -> str:
-    return hashlib.sha256(b"".join(context.model.values())).hexdigest() + context.device
-
-
-def _report(progress: Callable[[float], None], share: float, shards: int, done: int) -> None:
-    progress(share * done / shards)
 
 
 _SUMMING: OrderedDict[str, Summing] = OrderedDict()

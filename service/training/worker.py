@@ -8,7 +8,7 @@ import sys
 from dataclasses import dataclass, replace
 from typing import Any
 
-from sqlalchemy import select, update
+from sqlalchemy import update
 from sqlalchemy.orm import Session
 
 import lipcore
@@ -21,15 +21,14 @@ from service.foundation.errors import ServiceError, StorageFullError, StorageUna
 from service.foundation.settings import Settings
 from service.foundation.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, JobState
 from service.models import registry
-from service.models.lineage import figures, software, training_metrics
+from service.models.lineage import MOST_SAMPLES, figures, software
 from service.storage.database import Database, JobRow, LearnerRow, now
 from service.storage.disk import Disk
 from service.storage.files import PATIENCE_S, Files
 from service.training import lifecycle, refresh_data
 from service.training.holding_out import CannotHoldOutError
-from service.training.material import Material, observed, recorded
+from service.training.material import CANDIDATES, Material, observed, recorded
 from service.training.pulse import Pulse, Remaining, SupersededError
-from service.training.rows import CANDIDATES
 from service.training.summing import all_rows
 from service.web import storage_errors
 from service.web.observability.logs import job_id
@@ -44,12 +43,12 @@ class StorageError(RuntimeError):
 class TakenBackError(RuntimeError):
     """What the job was training on has been unlearnt or rolled back meanwhile."""
 
+    code = "observations_taken_back"
+
 
 def run(settings: Settings, job: str) -> None:
-    """Run one queued job to its end. All outcomes are written to its row; nothing is raised for a failed fit.
-
-    Raise StorageError where the outcome could not be written, or what is needed not be read.
-    """
+    """Run one queued job to its end. All outcomes are written to its row; nothing is raised for a failed fit. Raise
+    StorageError where the outcome could not be written, or what is needed not be read."""
     token = job_id.set(job)
     database, files = Database.of(settings), Files.of(settings, PATIENCE_S)
     try:
@@ -73,7 +72,7 @@ class Claim:
 
 def _claim(settings: Settings, database: Database, job: str) -> Claim | None:
     with database.transaction() as session:
-        row = session.scalar(select(JobRow).where(JobRow.id == job))
+        row = lifecycle.row_of(session, job)
         if row is None or row.state != QUEUED:
             return None
         row.attempts += 1
@@ -86,7 +85,10 @@ def _claim(settings: Settings, database: Database, job: str) -> Claim | None:
 def _train(settings: Settings, database: Database, files: Files, claim: Claim) -> None:
     try:
         with Pulse(database, lambda session: _own(session, claim), claim.model) as pulse:
-            material = _material(settings, database, files, claim)
+            if claim.request.get("refresh") is None:
+                material = recorded(settings, database, files, claim.request)
+            else:
+                material = observed(settings, database, files, claim.model, claim.request)
             trained = _fit(settings, claim, material, pulse)
             lineage = {
                 "job": claim.job,
@@ -94,7 +96,7 @@ def _train(settings: Settings, database: Database, files: Files, claim: Claim) -
                 "trained_at": now(),
                 "training_process": {"seconds": round(pulse.elapsed, 1), "peak_memory_mb": _peak_memory_mb()},
                 "software": software(),
-                "training_metrics": training_metrics(trained, material.samples, material.rows),
+                "training_metrics": figures(trained, material.samples, MOST_SAMPLES, material.rows),
             }
             if material.held_out is not None:
                 pulse.stage("evaluating")
@@ -111,24 +113,18 @@ def _train(settings: Settings, database: Database, files: Files, claim: Claim) -
             if row.cancel_requested:
                 raise lipcore.FitCancelledError("cancelled after the last look at the flag")
             row.version = _publish(session, claim, material, folder, manifest)
-            row.progress = {**pulse.shown(), "stage": "done", "fraction": 1.0, "remaining_s": 0.0}
+            row.progress = {**pulse.as_json(), "stage": "done", "fraction": 1.0, "remaining_s": 0.0}
             lifecycle.enter(row, SUCCEEDED, f"version {row.version} is trained")
     except lipcore.FitCancelledError:
         _finish(database, files, claim, CANCELLED, "cancelled while it ran")
     except SupersededError:
-        logger.warning("job %s was taken over by another attempt", claim.job)
+        logger.warning("%s was taken over by another attempt", claim.job)
     except Exception as error:
-        logger.exception("job %s failed", claim.job)
+        logger.exception("%s failed", claim.job)
         unavailable = isinstance(error, ClusterUnavailableError)
         if unavailable or isinstance(storage_errors.translated(error), StorageUnavailableError):
             raise StorageError(str(error)) from None  # another time it may work
         _finish(database, files, claim, FAILED, f"{type(error).__name__}: {error}", _code(error))
-
-
-def _material(settings: Settings, database: Database, files: Files, claim: Claim) -> Material:
-    if claim.request.get("refresh") is None:
-        return recorded(settings, database, files, claim.request)
-    return observed(settings, database, files, claim.model, claim.request)
 
 
 def _fit(settings: Settings, claim: Claim, material: Material, pulse: Pulse) -> TorqueModel:
@@ -173,13 +169,9 @@ def _publish(session: Session, claim: Claim, material: Material, folder: str, ma
 
 def _code(error: Exception) -> str:
     """Stable word for why a job failed."""
-    if isinstance(error, TakenBackError):
-        return "observations_taken_back"
-    if isinstance(error, CannotHoldOutError):
-        return "cannot_hold_out"
     if isinstance(storage_errors.translated(error), StorageFullError):
         return StorageFullError.code
-    if isinstance(error, ServiceError):  # as of a data set that is damaged
+    if isinstance(error, (TakenBackError, CannotHoldOutError, ServiceError)):  # the last as of a damaged data set
         return error.code
     return "not_positive_definite" if isinstance(error, lipcore.NotPositiveDefiniteError) else "training_failed"
 
@@ -192,7 +184,7 @@ def _peak_memory_mb() -> int:
 
 def _own(session: Any, claim: Claim) -> JobRow:
     """Return the job's row while it still is this attempt's; a restarted service may have given it away."""
-    row: JobRow | None = session.scalar(select(JobRow).where(JobRow.id == claim.job))
+    row = lifecycle.row_of(session, claim.job)
     if row is None or row.state != RUNNING or row.attempts != claim.attempt:
         raise SupersededError(claim.job)
     return row

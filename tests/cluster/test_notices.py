@@ -10,8 +10,8 @@ import pytest
 from sqlalchemy import delete
 
 from service.journal import log
-from service.models import moves, registry
-from service.replication.replication import Listener
+from service.models import aliases, registry
+from service.replication import Listener
 from service.storage.database import AlarmRow, Database, DeletedModelRow, EventRow, ModelRow, VersionRow, now
 from service.storage.database.engine import Notice, read_notice
 from tests.cluster.servers import Postgres, Shared
@@ -61,8 +61,8 @@ def test_every_change_is_told_once_and_in_order(database):
         committed(
             database, lambda session: log.unlearn(session, MODEL, log.find_batch(session, MODEL, "robot-1", 1), 0)
         ),
-        committed(database, moves.point, OTHER, "stable", 1),
-        committed(database, moves.point, OTHER, "stable", None),
+        committed(database, aliases.point, OTHER, "stable", 1),
+        committed(database, aliases.point, OTHER, "stable", None),
         committed(database, registry.serve, OTHER, 1),
         committed(database, lambda s: s.add(DeletedModelRow(name="gone", last_version=1, deleted_at=now()))),
     ]

@@ -16,7 +16,7 @@ from anyio import to_thread
 
 from service.foundation.errors import ConflictError, invalid_request
 from service.foundation.settings import Settings
-from service.learning.ingest.frames import FramesResult
+from service.learning.ingest.batches import FramesResult
 from service.stream.session import Session
 from service.web.observability.meters import Meters
 from tests.service.data import DEADLINE

@@ -9,8 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from service.foundation.settings import Settings
-from service.stream.conversation import Echo
-from service.stream.session import Session
+from service.stream.session import Echo, Session
 from service.web.observability.meters import Meters
 from tests.service.data import DEADLINE
 from tests.service.streams import ERROR, frame, read

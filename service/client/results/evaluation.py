@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.client.results.arrays import Array, Plain, figure, html_table, reading, text_table
-from service.inference.comparison_schema import Outcome
+from service.inference.schema import Outcome
 
 
 @dataclass(frozen=True, eq=False)

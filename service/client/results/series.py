@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from service.client.call import Answer
 from service.client.results.arrays import Array, Plain, reading, shape_arrays
 from service.client.results.prediction import Component, interval
-from service.learning.live.schema import LiveLost, LiveStatus
+from service.learning.control.schema import LiveLost, LiveStatus
 
 
 @dataclass(frozen=True, eq=False)

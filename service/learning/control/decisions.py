@@ -1,4 +1,5 @@
-"""What the owner of a learning model decides: options, the end of a hold, replays; and the alarms that lead to it."""
+"""What the owner of a learning model decides: options, the end of a hold, replays, what is taken back (one batch, or
+everything since a revision that can be made again); and the alarms that lead to it."""
 
 from __future__ import annotations
 
@@ -9,29 +10,121 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES, LEARNT
-from service.foundation.errors import ConflictError, invalid_request
+from service.foundation.errors import ConflictError, invalid_request, problem
 from service.journal import log
 from service.learning import owner
-from service.learning.control import inspection, undoing
-from service.learning.control.schema import (
-    REPLAYABLE,
-    Alarm,
-    AlarmPage,
-    ChangeRequest,
-    Decided,
-    Replayed,
-    ReplayRequest,
-)
+from service.learning.control import schema, status
+from service.learning.ingest.batches import state
 from service.learning.learners import Learners
 from service.learning.schema import LearningOptions
 from service.models import registry
-from service.storage.database import AlarmRow, EventRow
+from service.storage.database import Database, EventRow, LearnerRow
 from service.web.pagination import Page
+
+WORDS = {"unlearnt": "has been unlearnt", "rolled_back": "was undone by a rollback"}
+
+
+def serving(database: Database, model: str) -> int:
+    """Return the version that answers where none is named; raise NotFoundError for an unknown model."""
+    return registry.find(database, model, None).version
+
+
+def revised_now(session: Session, model: str, version: int) -> schema.Revised:
+    """Return the revision of a version that contains everything logged so far."""
+    return schema.Revised(model=model, version=version, revision=status.current(session, model, version))
+
+
+def find_learnt(session: Session, model: str, stream_id: str, sequence: int) -> EventRow:
+    """Return the batch of exactly this sequence; raise NotFoundError, or ConflictError where it was undone."""
+    batch = status.find(session, model, stream_id, sequence)
+    if batch.sequence != sequence:
+        together = f"{batch.sequence}: frames {batch.sequence} to {batch.last_sequence} were logged together"
+        raise invalid_request("sequence", sequence, together)
+    if batch.void:
+        raise ConflictError(f"batch {sequence} of stream {stream_id!r} {WORDS[state(session, batch)]}")
+    return batch
+
+
+def unlearn(learners: Learners, model: str, stream_id: str, sequence: int) -> schema.Unlearnt:
+    """Take a batch and what was replayed of it out again; raise NotFoundError or ConflictError."""
+    version = serving(learners.database, model)
+    with learners.database.turn(model), learners.database.transaction(model) as session:
+        batch = find_learnt(session, model, stream_id, sequence)
+        rows = batch.learnt + sum(each.learnt for each in log.about(session, batch, "replay") if not each.void)
+        trained = select(LearnerRow.version).where(LearnerRow.model == model, LearnerRow.start >= batch.number)
+        versions = list(session.scalars(trained.order_by(LearnerRow.version)))
+        log.unlearn(session, model, batch, time.time())
+        revised = revised_now(session, model, version)
+    learners.process.wake(model)
+    return schema.Unlearnt(**revised.model_dump(), stream_id=stream_id, sequence=sequence, rows=rows, trained=versions)
+
+
+def rollback(learners: Learners, model: str, request: schema.RollbackRequest) -> schema.RolledBack:
+    """Go back to a revision of the version that serves, or to another version.
+
+    Raise NotFoundError, InvalidRequestError where not exactly one of the two is named or it is not older than what
+    serves, ConflictError where nothing reaches back as far.
+    """
+    if (request.revision is None) == (request.version is None):
+        given = "neither" if request.revision is None else "both"
+        raise invalid_request("revision or version", given, "exactly one of the two")
+    if request.version is not None:
+        return _to_version(learners, model, request.version)
+    assert request.revision is not None
+    return _to_revision(learners, model, request.revision)
+
+
+def _to_revision(learners: Learners, model: str, revision: int) -> schema.RolledBack:
+    version = serving(learners.database, model)
+    with learners.database.turn(model), learners.database.transaction(model) as session:
+        newest = status.current(session, model, version)
+        if revision >= newest:
+            raise invalid_request("revision", revision, f"one below {newest}, the newest of version {version}")
+        _check_reach(revision, version, status.reachable(session, model, version))
+        to = log.start_of(session, model, version) + revision
+        undone = select(func.count()).where(
+            EventRow.model == model,
+            EventRow.number > to,
+            EventRow.kind.in_(("batch", "replay")),
+            EventRow.void.is_(False),
+        )
+        count = session.scalar(undone) or 0
+        log.rollback(session, model, to, time.time())
+        revised = revised_now(session, model, version)
+    learners.process.wake(model)
+    return schema.RolledBack(**revised.model_dump(), undone=count, complete=True)
+
+
+def _check_reach(revision: int, version: int, ranges: list[status.Range]) -> None:
+    """Raise ConflictError, naming the revisions that can be returned to, where this one is none of them."""
+    if status.is_reached(revision, ranges):
+        return
+    oldest = next((first for first, last in ranges if last > 0), 0)
+    listed = ", ".join(str(first) if first == last else f"{first} to {last}" for first, last in ranges)
+    raise ConflictError(
+        f"revision {revision} of version {version} cannot be made again: no snapshot is as old and the log does not "
+        f"reach back, or a rollback has undone it. The oldest that can, but for 0 as trained, is {oldest}",
+        [problem("revision", revision, f"one of {listed}")],
+    )
+
+
+def _to_version(learners: Learners, model: str, version: int) -> schema.RolledBack:
+    if version == serving(learners.database, model):
+        raise ConflictError(f"version {version} of model {model!r} serves already")
+    learners.loaded.get(model, version)  # so that the change costs no query anything, or fails before it is made
+    with learners.database.transaction() as session:
+        registry.serve(session, model, version)
+        revised = revised_now(session, model, version)
+        complete = status.is_reached(revised.revision, status.reachable(session, model, version))
+    learners.loaded.adopt(model)
+    learners.process.wake(model)
+    return schema.RolledBack(**revised.model_dump(), undone=0, complete=complete)
+
 
 TIME_JUMP = CODES.index("time_jump")
 CHANGE = "change"
@@ -46,13 +139,13 @@ def set_options(learners: Learners, model: str, options: LearningOptions) -> Non
     learners.process.wake(model)
 
 
-def decide(learners: Learners, model: str, request: ChangeRequest) -> Decided:
+def decide(learners: Learners, model: str, request: schema.ChangeRequest) -> schema.Decided:
     """End a hold; raise NotFoundError, or ConflictError where learning is not held.
 
     The change is logged first and the hold ends last. In between, the rows that were kept out are learnt some batches
     at a time: interrupted, it goes on where it was when it is asked for again.
     """
-    version = undoing.serving(learners.database, model)
+    version = serving(learners.database, model)
     rows, done, ended = 0, None, False
     while not ended:
         # a batch is judged and logged in its turn: none is judged as held and logged after the hold
@@ -62,44 +155,46 @@ def decide(learners: Learners, model: str, request: ChangeRequest) -> Decided:
                 _log_change(session, model, held)
             done = held["event"] - 1 if done is None else done
             pending = log.events(session, model, done, CHUNK) if request.replay else []
-            rows += sum(_learn(session, event) for event in pending)
+            for event in pending:
+                if event.kind == "batch":
+                    rows += sum(admit(session, event, [CHANGE], time.time()).values())
             ended = len(pending) < CHUNK
             if ended:
                 owner.release(session, model)
             else:
                 done = pending[-1].number
-            revised = undoing.revised_now(session, model, version)
+            revised = revised_now(session, model, version)
     learners.process.wake(model)
-    return Decided(**revised.model_dump(), decision=request.decision, at=held["at"], rows=rows)
+    return schema.Decided(**revised.model_dump(), decision=request.decision, at=held["at"], rows=rows)
 
 
-def replay(learners: Learners, model: str, stream_id: str, sequence: int, request: ReplayRequest) -> Replayed:
+def replay(
+    learners: Learners, model: str, stream_id: str, sequence: int, request: schema.ReplayRequest
+) -> schema.Replayed:
     """Learn rows of a batch after all that were kept out with some codes, once each.
 
     Raise NotFoundError, InvalidRequestError where the batch has no such rows, ConflictError where it was undone or all
     of these rows have been replayed.
     """
-    version = undoing.serving(learners.database, model)
-    codes = REPLAYABLE if request.codes is None else request.codes
+    version = serving(learners.database, model)
+    codes = schema.REPLAYABLE if request.codes is None else request.codes
     with learners.database.turn(model), learners.database.transaction(model) as session:
-        batch = undoing.find_learnt(session, model, stream_id, sequence)
+        batch = find_learnt(session, model, stream_id, sequence)
         learnt = admit(session, batch, codes, time.time())
         if not learnt:
             raise _refusal(session, batch, codes)
-        revised = undoing.revised_now(session, model, version)
+        revised = revised_now(session, model, version)
     learners.process.wake(model)
-    return Replayed(
+    return schema.Replayed(
         **revised.model_dump(), stream_id=stream_id, sequence=sequence, rows=sum(learnt.values()), codes=learnt
     )
 
 
 def admit(session: Session, batch: EventRow, codes: Collection[str], received: float) -> dict[str, int]:
     """Log a replay: the rows of a batch with these codes that no earlier replay has learnt; return their counts.
-
-    Nothing is logged where there are none. Rows whose time was wrong count as of their arrival.
-    """
+    Nothing is logged where there are none. Rows whose time was wrong count as of their arrival."""
     pending = set(codes) - _replayed(session, batch)
-    rows = inspection.rows_of(batch)
+    rows = log.rows_of(batch)
     chosen = _complete(rows) & np.isin(rows.code, [CODES.index(code) for code in pending])
     taken = rows.take(chosen)
     counts = taken.rejected()
@@ -111,17 +206,19 @@ def admit(session: Session, batch: EventRow, codes: Collection[str], received: f
     return counts
 
 
-def alarms(learners: Learners, model: str, part: Page) -> AlarmPage:
+def alarms(learners: Learners, model: str, part: Page) -> schema.AlarmPage:
     """List the alarms of a model, newest first; raise NotFoundError where there is no such model."""
     registry.find(learners.database, model, None)
     with learners.database.session() as session:
         rows, following = owner.alarms(session, model, part)
-    return AlarmPage(items=[_alarm(row) for row in rows], next_cursor=following)
+    names = ("kind", "at", "message", "evidence")
+    items = [schema.Alarm(id=row.seq, **{name: getattr(row, name) for name in names}) for row in rows]
+    return schema.AlarmPage(items=items, next_cursor=following)
 
 
 def _replayed(session: Session, batch: EventRow) -> set[str]:
     """Codes whose rows are learnt by now; what a rollback has undone can be replayed again."""
-    events = inspection.replays(session, batch)
+    events = log.about(session, batch, "replay")
     return {code for event in events if not event.void for code in (event.detail or {})["codes"]}
 
 
@@ -133,9 +230,9 @@ def _complete(rows: Rows) -> NDArray[np.bool_]:
 
 def _refusal(session: Session, batch: EventRow, codes: Collection[str]) -> Exception:
     """Why no row of a batch is left that could be learnt."""
-    rows, name = inspection.rows_of(batch), f"batch {batch.sequence} of stream {batch.stream_id!r}"
+    rows, name = log.rows_of(batch), f"batch {batch.sequence} of stream {batch.stream_id!r}"
     counts = rows.take(_complete(rows)).rejected()
-    offered = [code for code in REPLAYABLE if code in counts]
+    offered = [code for code in schema.REPLAYABLE if code in counts]
     if done := [code for code in offered if code in codes and code in _replayed(session, batch)]:
         return ConflictError(f"rows of {name} with the code {', '.join(done)} have been replayed: they are learnt once")
     has = f"those of {name} whose rows can be learnt: {', '.join(offered) or 'there are none'}"
@@ -147,16 +244,6 @@ def _held(session: Session, model: str) -> dict[str, Any]:
     if held is None:
         raise ConflictError(f"model {model!r} is not held for a change: there is nothing to decide")
     return held
-
-
-def _alarm(row: AlarmRow) -> Alarm:
-    names = ("kind", "at", "message", "evidence")
-    return Alarm.model_validate({"id": row.seq} | {name: getattr(row, name) for name in names})
-
-
-def _learn(session: Session, event: EventRow) -> int:
-    """Learn the rows of a batch that were held for the change; return how many. Other events have none."""
-    return sum(admit(session, event, [CHANGE], time.time()).values()) if event.kind == "batch" else 0
 
 
 def _log_change(session: Session, model: str, held: dict[str, Any]) -> None:

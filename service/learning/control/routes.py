@@ -16,24 +16,10 @@ from service.foundation.errors import (
     UnreadableVersionError,
     responses,
 )
-from service.learning.control import decisions, inspection, status, undoing
-from service.learning.control.schema import (
-    AlarmPage,
-    ChangeRequest,
-    Decided,
-    Learning,
-    ObservationDetail,
-    ObservationPage,
-    Quality,
-    Replayed,
-    ReplayRequest,
-    RollbackRequest,
-    RolledBack,
-    Unlearnt,
-)
+from service.learning.control import decisions, schema, status
 from service.learning.learners import LearnersDep
 from service.learning.schema import MOST_SEQUENCE, LearningOptions, StreamId
-from service.training import refreshes
+from service.training import jobs
 from service.training.queue import JobQueueDep
 from service.training.schema import Job
 from service.web.pagination import PageQuery
@@ -55,7 +41,7 @@ class RefreshRequest(BaseModel):
 
 
 @router.get("/{model}/quality", summary="How well a model predicts what it has not learnt yet")
-def show_quality(learners: LearnersDep, model: str) -> Quality:
+def show_quality(learners: LearnersDep, model: str) -> schema.Quality:
     """Figures over sliding windows: every row is predicted, compared with what was measured, and learnt only then."""
     return status.quality(learners, model)
 
@@ -67,9 +53,9 @@ def list_observations(
     page: PageQuery,
     stream_id: Annotated[StreamId | None, Query(description="Only batches of this stream")] = None,
     rejected: Annotated[bool, Query(description="Only batches with rows that were kept out")] = False,
-) -> ObservationPage:
+) -> schema.ObservationPage:
     """One page of the log: which batches came and what became of their rows."""
-    return inspection.page(learners, model, page, stream_id, rejected)
+    return status.page(learners, model, page, stream_id, rejected)
 
 
 @router.get(BATCH, summary="One observation batch")
@@ -79,26 +65,26 @@ def show_observation(
     stream_id: StreamId,
     sequence: Sequence,
     rows: Annotated[bool, Query(description="Also answer its rows, each with its code")] = False,
-) -> ObservationDetail:
+) -> schema.ObservationDetail:
     """What was said of a batch when it came, how well it was predicted, and what has become of it."""
-    return inspection.show(learners, model, stream_id, sequence, rows)
+    return status.show(learners, model, stream_id, sequence, rows)
 
 
 @router.delete(BATCH, summary="Unlearn an observation batch", responses=responses(ConflictError))
-def unlearn(learners: LearnersDep, model: str, stream_id: StreamId, sequence: Sequence) -> Unlearnt:
+def unlearn(learners: LearnersDep, model: str, stream_id: StreamId, sequence: Sequence) -> schema.Unlearnt:
     """Take the rows that a batch has taught, and replayed ones, out of what is learnt, exactly. It stays in the log.
 
     Where accelerations are derived, rows at a batch's edge are learnt with the batch beside it, and stay with that.
     """
-    return undoing.unlearn(learners, model, stream_id, sequence)
+    return decisions.unlearn(learners, model, stream_id, sequence)
 
 
 @router.post(
     f"{BATCH}/replay", summary="Learn rejected rows of a batch", responses=responses(ConflictError, TooLargeError)
 )
 def replay(
-    learners: LearnersDep, model: str, stream_id: StreamId, sequence: Sequence, request: ReplayRequest
-) -> Replayed:
+    learners: LearnersDep, model: str, stream_id: StreamId, sequence: Sequence, request: schema.ReplayRequest
+) -> schema.Replayed:
     """Learn rows after all that were kept out, each once. Rows with the code `time_jump` count as of their arrival."""
     return decisions.replay(learners, model, stream_id, sequence, request)
 
@@ -108,16 +94,16 @@ def replay(
     summary="Go back to a revision or a version",
     responses=responses(ConflictError, TooLargeError, UnreadableVersionError),
 )
-def rollback(learners: LearnersDep, model: str, request: RollbackRequest) -> RolledBack:
+def rollback(learners: LearnersDep, model: str, request: schema.RollbackRequest) -> schema.RolledBack:
     """Forget what was learnt since a revision of the version that serves, or let another version serve.
 
     What was unlearnt since stays unlearnt.
     """
-    return undoing.rollback(learners, model, request)
+    return decisions.rollback(learners, model, request)
 
 
 @router.get("/{model}/learning", summary="How a model learns")
-def show_learning(learners: LearnersDep, model: str) -> Learning:
+def show_learning(learners: LearnersDep, model: str) -> schema.Learning:
     """What is set, how far learning is, what it waits for, and where it can go back to."""
     return status.learning(learners, model)
 
@@ -128,7 +114,7 @@ def show_learning(learners: LearnersDep, model: str) -> Learning:
     responses=responses(TooLargeError),
     openapi_extra={"requestBody": {"content": {"application/json": {"example": EXAMPLE}}}},
 )
-def set_learning(learners: LearnersDep, model: str, options: LearningOptions) -> Learning:
+def set_learning(learners: LearnersDep, model: str, options: LearningOptions) -> schema.Learning:
     """Set all options, those left out to their defaults. What has been learnt stays."""
     decisions.set_options(learners, model, options)
     return status.learning(learners, model)
@@ -139,13 +125,13 @@ def set_learning(learners: LearnersDep, model: str, options: LearningOptions) ->
     summary="Decide about a change of the robot",
     responses=responses(ConflictError, TooLargeError),
 )
-def decide(learners: LearnersDep, model: str, request: ChangeRequest) -> Decided:
+def decide(learners: LearnersDep, model: str, request: schema.ChangeRequest) -> schema.Decided:
     """End the hold that a detected change has led to: adapt to the changed robot, or go on as if nothing had been."""
     return decisions.decide(learners, model, request)
 
 
 @router.get("/{model}/alarms", summary="List alarms, newest first")
-def list_alarms(learners: LearnersDep, model: str, page: PageQuery) -> AlarmPage:
+def list_alarms(learners: LearnersDep, model: str, page: PageQuery) -> schema.AlarmPage:
     """One page of what the model's owner should know: changes, motion beyond what is known, new versions."""
     return decisions.alarms(learners, model, page)
 
@@ -161,6 +147,6 @@ def create(queue: JobQueueDep, model: str, request: RefreshRequest, response: Re
 
     The version that it makes learns along and answers once it has predicted better than the one that serves.
     """
-    job = refreshes.ask(queue, model)
+    job = jobs.refresh(queue, model)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job

@@ -1,72 +1,70 @@
-"""Where the learning of a model stands, and how well the model predicts."""
+"""Where the learning of a model stands, how well the model predicts, and what its log has of batches and their rows."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from typing import Any
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from lipcore.online.batch import Rows
+from lipcore.online.record import Record
 from lipcore.vocabulary import CODES, LEARNT
-from service.journal import log
+from service.foundation.errors import NotFoundError, not_found
+from service.foundation.fields import finite
+from service.journal import log, snapshots
 from service.learning import owner
-from service.learning.control import undoing
-from service.learning.control.inspection import figures
-from service.learning.control.schema import (
-    Candidate,
-    Held,
-    Learning,
-    LearningStatus,
-    Quality,
-    QualityWindow,
-    Snapshot,
-    Stream,
-)
+from service.learning.control import schema
+from service.learning.ingest.batches import state
 from service.learning.ingest.monitor import Window
-from service.learning.learners import Learners, Status
-from service.storage.database import LearnerRow, StreamRow
+from service.learning.learners import Learners
+from service.learning.schema import ObservationResponse
+from service.models import registry
+from service.storage.database import EventRow, LearnerRow, StreamRow
+from service.web.pagination import Page
 
+Range = tuple[int, int]
 MOST_GAPS = 20
 """Gaps of a stream that are listed."""
 
 
-def learning(learners: Learners, model: str) -> Learning:
+def learning(learners: Learners, model: str) -> schema.Learning:
     """Return how a model learns and where that stands; raise NotFoundError. Not for the event loop."""
     served = learners.loaded.get(model, None)
     version = served.version
     latest = learners.status(model, version)
     with learners.database.session() as session:
         start, events = log.start_of(session, model, version), log.newest(session, model)
-        held = owner.held(session, model)
-        status = LearningStatus(
+        status = schema.LearningStatus(
             version=version,
             revision=events - start,
             published=served.revision,
             lag_events=max(events - start - served.revision, 0),
             events=events,
-            novel_share=novel_share(latest),
-            linearisation_error=_linearisation(latest),
-            failure=None if latest.failed is None else latest.failed.error,
-            held=None if held is None else Held(at=held["at"], evidence=held["evidence"]),
+            novel_share=latest.novel_share,
+            linearisation_error=None if latest.published is None else latest.published.linearisation,
+            failure=latest.failure,
+            held=owner.held(session, model),
             candidate=_candidate(session, model, version),
             streams=_streams(session, model),
-            reachable=[list(each) for each in undoing.reachable(session, model, version)],
+            reachable=[list(each) for each in reachable(session, model, version)],
             snapshots=[
-                Snapshot(revision=row.number - start, created_at=row.created_at)
-                for row in undoing.snapshots(session, model, version)
+                schema.Snapshot(revision=row.number - start, created_at=row.created_at)
+                for row in snapshots.of(session, model, version)
             ],
         )
-        return Learning(model=model, options=owner.options(session, model), status=status)
+        return schema.Learning(model=model, options=owner.options(session, model), status=status)
 
 
-def quality(learners: Learners, model: str) -> Quality:
-    """Return how well a model predicts each row before it is learnt, over the windows of the settings.
-
-    Raise NotFoundError. Not for the event loop.
-    """
+def quality(learners: Learners, model: str) -> schema.Quality:
+    """Return how well a model predicts each row before it is learnt, over the windows of the settings. Raise
+    NotFoundError. Not for the event loop."""
     served = learners.loaded.get(model, None)
     now = time.time()
-    return Quality(
+    return schema.Quality(
         model=model,
         version=served.version,
         revision=served.revision,
@@ -75,51 +73,168 @@ def quality(learners: Learners, model: str) -> Quality:
     )
 
 
-def window(sums: Window, now: float) -> QualityWindow:
+def window(sums: Window, now: float) -> schema.QualityWindow:
     """Return the figures and counts of a window before a Unix time, s."""
     counts = sums.counts(now)
     accepted = counts.pop(CODES[LEARNT], 0)
-    return QualityWindow(
+    return schema.QualityWindow(
         **figures(sums.record(now)).model_dump(), seconds=sums.seconds, accepted=accepted, rejected=dict(counts)
     )
 
 
-def novel_share(latest: Status) -> float | None:
-    """Share of the latest samples beyond the basis of a version, None where the learner has not published yet."""
-    published = latest.published
-    return None if published is None else published.novel_share
-
-
-def _linearisation(latest: Status) -> list[float] | None:
-    published = latest.published
-    return None if published is None or published.linearisation is None else list(published.linearisation)
-
-
-def _candidate(session: Session, model: str, serving: int) -> Candidate | None:
+def _candidate(session: Session, model: str, serving: int) -> schema.Candidate | None:
     query = select(LearnerRow.version).where(
         LearnerRow.model == model, LearnerRow.role == "candidate", LearnerRow.version != serving
     )
     version = session.scalar(query.order_by(LearnerRow.version.desc()).limit(1))
     if version is None:
         return None
-    return Candidate(version=version, revision=undoing.current(session, model, version))
+    return schema.Candidate(version=version, revision=current(session, model, version))
 
 
-def _streams(session: Session, model: str) -> list[Stream]:
+def _streams(session: Session, model: str) -> list[schema.Stream]:
     query = select(StreamRow).where(StreamRow.model == model).order_by(StreamRow.stream_id)
-    return [_stream(row) for row in session.scalars(query)]
+    return [
+        schema.Stream(
+            stream_id=row.stream_id,
+            kind=row.kind,
+            last=row.last,
+            offset_s=row.offset,
+            gaps=row.missing["ranges"][-MOST_GAPS:],
+            missing=sum(last - first + 1 for first, last in row.missing["ranges"]),
+            forgotten=row.forgotten,
+        )
+        for row in session.scalars(query)
+    ]
 
 
-def _stream(row: StreamRow) -> Stream:
-    ranges: list[list[int]] = row.missing["ranges"]
-    return Stream.model_validate(
-        {
-            "stream_id": row.stream_id,
-            "kind": row.kind,
-            "last": row.last,
-            "offset_s": row.offset,
-            "gaps": ranges[-MOST_GAPS:],
-            "missing": sum(last - first + 1 for first, last in ranges),
-            "forgotten": row.forgotten,
-        }
+FIGURES = ("nmse", "rmse", "coverage", "nlpd")
+ACKNOWLEDGED = ObservationResponse.model_fields
+"""The part of a report that acknowledged a batch; the rest is for judging what follows."""
+
+
+def page(learners: Learners, model: str, part: Page, stream_id: str | None, rejected: bool) -> schema.ObservationPage:
+    """List the batches of a model, newest first; raise NotFoundError where there is no such model."""
+    registry.find(learners.database, model, None)
+    with learners.database.session() as session:
+        events, following = log.page(session, model, part, stream_id, rejected)
+        return schema.ObservationPage(
+            items=[schema.Observation(**_outline(session, event)) for event in events], next_cursor=following
+        )
+
+
+def show(learners: Learners, model: str, stream_id: str, sequence: int, rows: bool) -> schema.ObservationDetail:
+    """Return a batch with all that is known of it; raise NotFoundError."""
+    registry.find(learners.database, model, None)
+    with learners.database.session() as session:
+        event = find(session, model, stream_id, sequence)
+        return schema.ObservationDetail(
+            **_outline(session, event),
+            report=None if event.report is None else {k: v for k, v in event.report.items() if k in ACKNOWLEDGED},
+            figures=None if event.record is None else figures(Record.from_json(event.record)),
+            replays=[_replay(session, event, each) for each in log.about(session, event, "replay")],
+            observed=_rows(log.rows_of(event)) if rows else None,
+        )
+
+
+def figures(record: Record) -> schema.Figures:
+    """Return the figures of a record, per joint."""
+    metrics = record.metrics()
+    return schema.Figures(rows=record.rows, **{name: metrics[name] for name in FIGURES})
+
+
+def find(session: Session, model: str, stream_id: str, sequence: int) -> EventRow:
+    """Return the batch of a sequence, its own or that of one of its frames; raise NotFoundError."""
+    event = log.covering(session, model, stream_id, sequence)
+    if event is not None:
+        return event
+    source = log.stream(session, model, stream_id)
+    if source is not None and log.is_forgotten(source, sequence):
+        raise NotFoundError(f"batch {sequence} of stream {stream_id!r} is no longer kept, if it has come")
+    raise not_found("batch", f"{sequence} of stream {stream_id}")
+
+
+def _outline(session: Session, event: EventRow) -> dict[str, Any]:
+    return {
+        "stream_id": event.stream_id,
+        "sequence": event.sequence,
+        "last_sequence": event.last_sequence,
+        "event": event.number,
+        "state": state(session, event),
+        "received_at": _moment(event.received),
+        "first_at": None if event.first is None else _moment(event.first),
+        "last_at": None if event.last is None else _moment(event.last),
+        "version": event.version,
+        "revision": event.revision,
+        "rows": (event.report or {}).get("rows", event.rows),
+        "accepted": event.learnt,
+        "rejected": (event.report or {}).get("rejected", {}),
+    }
+
+
+def _replay(session: Session, batch: EventRow, event: EventRow) -> schema.Replay:
+    """A replay is unlearnt with its batch; undone in another way it is by a rollback."""
+    undone = state(session, batch) if batch.void else "rolled_back"
+    return schema.Replay(
+        event=event.number,
+        replayed_at=_moment(event.received),
+        state=undone if event.void else "learnt",
+        codes=(event.detail or {})["codes"],
+        rows=event.rows,
     )
+
+
+def _rows(rows: Rows) -> schema.ObservationRows:
+    vectors = {name: [finite(row) for row in getattr(rows, name)] for name in ("q", "dq", "ddq", "tau")}
+    return schema.ObservationRows(time=finite(rows.time), **vectors, code=[CODES[code] for code in rows.code])
+
+
+def _moment(seconds: float) -> str:
+    """Unix seconds as every other answer has times."""
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds")
+
+
+def current(session: Session, model: str, version: int) -> int:
+    """Return the revision of a version once all of the log is learnt."""
+    return log.newest(session, model) - log.start_of(session, model, version)
+
+
+def reachable(session: Session, model: str, version: int) -> list[Range]:
+    """Return the ranges [first, last] of revisions whose state can be made again, rising.
+
+    That takes the version as trained, or a snapshot, and all events from there; and no rollback may have gone back
+    behind it since: the events that a rollback has undone teach nothing any more, so that their states are gone.
+    """
+    start, newest = log.start_of(session, model, version), log.newest(session, model)
+    bases = sorted({start, *(row.number for row in snapshots.of(session, model, version) if row.number > start)})
+    ranges: list[Range] = []
+    for base, following in zip(bases, [*bases[1:], newest + 1], strict=True):
+        last = following - 1
+        ranges.append((base, last if log.is_complete(session, model, base, last) else base))
+    rollbacks = select(EventRow.number, EventRow.detail).where(EventRow.model == model, EventRow.kind == "rollback")
+    for number, detail in session.execute(rollbacks):
+        ranges = [part for each in ranges for part in _without(each, detail["to"] + 1, number - 1)]
+    return _joined([(first - start, last - start) for first, last in ranges])
+
+
+def is_reached(revision: int, ranges: list[Range]) -> bool:
+    """Whether one of the ranges has a revision."""
+    return any(first <= revision <= last for first, last in ranges)
+
+
+def _without(span: Range, first: int, last: int) -> Iterator[Range]:
+    """The parts of a range that are left once first to last are taken out."""
+    for a, b in ((span[0], min(span[1], first - 1)), (max(span[0], last + 1), span[1])):
+        if a <= b:
+            yield a, b
+
+
+def _joined(ranges: list[Range]) -> list[Range]:
+    """The same numbers in as few ranges as there can be."""
+    joined: list[Range] = []
+    for first, last in sorted(ranges):
+        if joined and first <= joined[-1][1] + 1:
+            joined[-1] = (joined[-1][0], max(last, joined[-1][1]))
+        else:
+            joined.append((first, last))
+    return joined

@@ -1,22 +1,31 @@
-"""A batch on its way into the log: in the model's joint order, known again if repeated, checked, predicted, judged."""
+"""A batch on its way into the log: in the model's joint order, known again if repeated, checked, predicted, judged; and
+frames of a stream, rows that are predicted already, one a sequence, in order."""
 
 from __future__ import annotations
 
 import hashlib
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from struct import pack
 
 import numpy as np
-from sqlalchemy import select
+from numpy.typing import NDArray
 from sqlalchemy.orm import Session
 
+from lipcore.data import independence
+from lipcore.data.samples import Array
 from lipcore.model.torque_model import TorqueModel
+from lipcore.online.batch import Rows
+from lipcore.online.gates import check_rows
 from service.foundation.errors import ConflictError, invalid_request
 from service.foundation.settings import Settings
+from service.inference.predicting import QUANTITIES, check_shapes
 from service.journal import log
+from service.journal.log import NewBatch, StreamKind, check_kind
 from service.learning.ingest import screening
-from service.learning.ingest.intake import Arrival, Intake, check_kind, enabled
+from service.learning.ingest.intake import Intake, enabled
 from service.learning.ingest.monitor import Monitor
 from service.learning.ingest.screening import Clock, Measured
 from service.learning.schema import Derivation, ExpiredError, ObservationRequest, ObservationResponse, State
@@ -25,11 +34,8 @@ from service.storage.database import EventRow
 
 
 def observe_batch(intake: Intake, model: str, request: ObservationRequest) -> ObservationResponse:
-    """Take a batch; once this returns it is durable.
-
-    Raise NotFoundError, LearningDisabledError, InvalidRequestError, ConflictError, ExpiredError, BusyError or
-    StorageFullError.
-    """
+    """Take a batch; once this returns it is durable. Raise NotFoundError, LearningDisabledError, InvalidRequestError,
+    ConflictError, ExpiredError, BusyError or StorageFullError."""
     served, received = intake.loaded.get(model, None), time.time()
     batch = measured(request, served.model, intake.settings)
     content = digest(batch)
@@ -66,24 +72,31 @@ def _take(
         rows, own, derived = dated.rows, slice(0, len(batch)), None
         if batch.ddq is None and batch.t is not None:
             rows, own, derived = screening.derive(session, *key, rows, batch.t, bounds)
-    screened = screening.predict(rows, own, derived, served.model)
-    arrival = Arrival(stream_id, "batches", sequence, sequence, content, len(batch), dated.offset, dated.span, received)
-    details = {"derived": None if derived is None else Derivation(ddq=derived).model_dump()}
-    return ObservationResponse.model_validate(intake.append(monitor, served, options, arrival, screened, details))
+    screened = screening.predict(rows, served.model, own, derived)
+    new = _new(served, stream_id, "batches", (sequence, sequence), content, rows, dated.offset, received)
+    details = {"derived": None if derived is None else Derivation(ddq=derived).model_dump(), "span": dated.span}
+    return ObservationResponse.model_validate(intake.append(monitor, served, options, new, screened, details))
+
+
+def _new(
+    served: Served,
+    stream_id: str,
+    kind: StreamKind,
+    ends: tuple[int, int],
+    content: str,
+    rows: Rows,
+    offset: float,
+    received: float,
+) -> NewBatch:
+    """A batch that is yet to be judged. ends: its first and last sequence; content: digest of it."""
+    return NewBatch(
+        stream_id, kind, *ends, content, offset, received, served.version, served.revision, rows, report={}, record=None
+    )
 
 
 def measured(request: ObservationRequest, model: TorqueModel, settings: Settings) -> Measured:
     """Check a request's shapes and joints and bring its columns in order; raise InvalidRequestError."""
-    shape = request.q.shape
-    for name in ("q", "dq", "ddq", "tau"):
-        values = getattr(request, name)
-        if values is None:
-            continue
-        if values.shape[-1] != model.n_joints:
-            expected = f"{model.n_joints} numbers: {', '.join(model.joint_names)}"
-            raise invalid_request(name, f"{values.shape[-1]} numbers long", expected)
-        if values.shape != shape:
-            raise invalid_request(name, f"of shape {values.shape}", f"the shape of q, {shape}")
+    check_shapes(request, model)
     rows = 1 if request.q.ndim == 1 else len(request.q)
     if rows > settings.max_observation_rows:
         raise invalid_request("q", f"{rows} rows", f"at most {settings.max_observation_rows} in one batch")
@@ -92,14 +105,12 @@ def measured(request: ObservationRequest, model: TorqueModel, settings: Settings
     if request.t is None and request.ddq is None:
         raise invalid_request("ddq", "missing, and t too", "accelerations, or times to derive them from dq with")
     order = slice(None) if request.joint_names is None else columns(request.joint_names, model.joint_names)
-    q, dq, ddq, tau = (
-        None if values is None else np.ascontiguousarray(np.atleast_2d(values)[:, order])
-        for values in (request.q, request.dq, request.ddq, request.tau)
-    )
-    assert q is not None
-    assert dq is not None
-    assert tau is not None
-    return Measured(request.t, q, dq, ddq, tau)
+    q, dq, tau = (_ordered(values, order) for values in (request.q, request.dq, request.tau))
+    return Measured(request.t, q, dq, None if request.ddq is None else _ordered(request.ddq, order), tau)
+
+
+def _ordered(values: Array, order: slice | list[int]) -> Array:
+    return np.ascontiguousarray(np.atleast_2d(values)[:, order])
 
 
 def columns(given: Sequence[str], joints: Sequence[str]) -> list[int]:
@@ -161,10 +172,132 @@ def state(session: Session, event: EventRow) -> State:
     """Whether a batch of the log still teaches, and if not, why."""
     if not event.void:
         return "learnt"
-    query = select(EventRow.seq).where(
-        EventRow.model == event.model,
-        EventRow.number > event.number,
-        EventRow.kind == "unlearn",
-        EventRow.detail["event"].as_integer() == event.number,
+    return "unlearnt" if log.about(session, event, "unlearn") else "rolled_back"
+
+
+@dataclass(frozen=True)
+class Frames:
+    """N frames of one stream with what `served` answered. sequences: (N,), rising; time: (N,) Unix time, s. q, dq, ddq,
+    tau, mean, std: (N, n)."""
+
+    model: str
+    stream_id: str
+    served: Served
+    sequences: NDArray[np.int64]
+    time: Array
+    q: Array
+    dq: Array
+    ddq: Array
+    tau: Array
+    mean: Array
+    std: Array
+
+
+@dataclass(frozen=True)
+class FramesResult:
+    """Durable frames. through: highest sequence of them; accepted, rejected (by code): of those that are new.
+    duplicates: frames that were in the log; revision: answers from it on contain the frames."""
+
+    through: int
+    accepted: int
+    duplicates: int
+    rejected: dict[str, int]
+    revision: int
+
+
+def observe_frames(intake: Intake, frames: Frames) -> FramesResult:
+    """Log frames; once this returns they are durable. All of them or none. Raise LearningDisabledError, ConflictError
+    for a sequence that was used for something else or does not rise, ExpiredError, BusyError or StorageFullError."""
+    for before, sequence in pairwise(frames.sequences.tolist()):
+        if sequence <= before:
+            raise _order(frames, sequence)
+    monitor = intake.monitor(frames.served)
+    with intake.turn(monitor, frames.model):
+        with intake.database.session() as session:
+            options = enabled(session, frames.model)
+            source = log.stream(session, frames.model, frames.stream_id)
+            check_kind(source, "frames")
+            last = -1 if source is None else source.last
+            before, _ = log.neighbours(session, frames.model, frames.stream_id, last + 1)
+            new = frames.sequences > last
+            repeated = Repeated(0) if new.all() else _repeated(session, frames, ~new)
+        monitor.counts["duplicates"] += repeated.frames
+        if not new.any():
+            return FramesResult(int(frames.sequences[-1]), 0, repeated.frames, {}, repeated.revision)
+        model = frames.served.model
+        bounds = screening.limits(model, options, intake.settings)
+        q, dq, ddq, tau = numbers = [np.ascontiguousarray(getattr(frames, name)[new]) for name in QUANTITIES]
+        # frames are dated by the service as they arrive, so that their times need no check
+        weights = independence.stream_weights(frames.time[new], None if before is None else before.last)
+        rows = Rows(frames.time[new], q, dq, ddq, tau, check_rows(None, q, dq, ddq, tau, bounds), weights)
+        answered = frames.mean[new], frames.std[new]
+        screened = screening.predict(rows, model, slice(0, len(rows)), answered=answered)
+        sequences = frames.sequences[new]
+        ends = int(sequences[0]), int(sequences[-1])
+        content = _digest(sequences, numbers)
+        batch = _new(frames.served, frames.stream_id, "frames", ends, content, rows, 0.0, float(frames.time[-1]))
+        details = {"derived": None, "span": None, "frames": _ranges(sequences)}
+        report = intake.append(monitor, frames.served, options, batch, screened, details)
+    intake.follow_up(monitor, frames.model)
+    return FramesResult(int(sequences[-1]), report["accepted"], repeated.frames, report["rejected"], report["revision"])
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """Frames that are in the log already. revision: from which on answers contain the last of them."""
+
+    frames: int
+    revision: int = 0
+
+
+def _repeated(session: Session, frames: Frames, old: NDArray[np.bool_]) -> Repeated:
+    """Compare frames with what the log has under their sequences; raise ConflictError or ExpiredError."""
+    places = np.flatnonzero(old)
+    event: EventRow | None = None
+    kept: dict[int, int] = {}
+    for place in places.tolist():
+        sequence = int(frames.sequences[place])
+        if event is None or event.last_sequence is None or sequence > event.last_sequence:
+            event, kept, rows = _logged(session, frames, sequence)
+        if sequence not in kept:
+            raise _order(frames, sequence)
+        there = kept[sequence]
+        for name in QUANTITIES:
+            if not np.array_equal(getattr(frames, name)[place], getattr(rows, name)[there], equal_nan=True):
+                raise ConflictError(
+                    f"frame {sequence} of stream {frames.stream_id!r} has come before with another {name}: a sequence "
+                    "is used once"
+                )
+    assert event is not None
+    start = log.start_of(session, frames.model, frames.served.version)
+    return Repeated(len(places), max(event.number - start, 0))
+
+
+def _logged(session: Session, frames: Frames, sequence: int) -> tuple[EventRow, dict[int, int], Rows]:
+    """The batch of frames that a sequence lies in, the place of each of its sequences, and its rows."""
+    event = log.covering(session, frames.model, frames.stream_id, sequence)
+    if event is None:
+        check_kept(session, frames.model, frames.stream_id, sequence)
+        raise _order(frames, sequence)
+    ranges = (event.report or {})["frames"]
+    sequences = [number for first, last in ranges for number in range(first, last + 1)]
+    return event, {number: place for place, number in enumerate(sequences)}, log.rows_of(event)
+
+
+def _order(frames: Frames, sequence: int) -> ConflictError:
+    return ConflictError(
+        f"frame {sequence} of stream {frames.stream_id!r} comes after one of a higher sequence: sequences must rise"
     )
-    return "rolled_back" if session.scalar(query.limit(1)) is None else "unlearnt"
+
+
+def _ranges(sequences: NDArray[np.int64]) -> list[list[int]]:
+    """Rising numbers as ranges [first, last]."""
+    parts = np.split(sequences, np.flatnonzero(np.diff(sequences) > 1) + 1)
+    return [[int(part[0]), int(part[-1])] for part in parts]
+
+
+def _digest(sequences: NDArray[np.int64], numbers: list[Array]) -> str:
+    content = hashlib.sha256(sequences.astype("<i8").tobytes())
+    for values in numbers:
+        content.update(values.astype("<f8").tobytes())
+    return content.hexdigest()

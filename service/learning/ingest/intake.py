@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,8 +16,8 @@ from sqlalchemy.orm import Session
 from lipcore.online.batch import Rows
 from service.foundation.errors import ConflictError, not_found
 from service.journal import log
-from service.journal.log import NewBatch, StreamKind
-from service.journal.retention import retain
+from service.journal.log import NewBatch
+from service.journal.snapshots import retain
 from service.learning import owner
 from service.learning.ingest import judging
 from service.learning.ingest.judging import Verdict
@@ -26,7 +26,7 @@ from service.learning.ingest.screening import Screened
 from service.learning.schema import LearningDisabledError, LearningOptions
 from service.models import registry
 from service.models.loaded import LoadedModels, Served
-from service.storage.database import EventRow, ModelRow, StreamRow
+from service.storage.database import EventRow, ModelRow
 
 logger = logging.getLogger(__name__)
 
@@ -41,21 +41,6 @@ CONSEQUENCES = {
     "adapt": "a new regime begins, in which what was learnt before counts less",
     "learn": "learning goes on as before",
 }
-
-
-@dataclass(frozen=True)
-class Arrival:
-    """A batch that is new. last_sequence: of its last frame; offset (s), span: see `Clock`; received: Unix time, s."""
-
-    stream_id: str
-    kind: StreamKind
-    sequence: int
-    last_sequence: int
-    digest: str
-    rows: int
-    offset: float
-    span: list[float] | None
-    received: float
 
 
 class Judged(NamedTuple):
@@ -88,10 +73,8 @@ class Intake:
 
     @contextmanager
     def turn(self, monitor: Monitor, model: str) -> Iterator[None]:
-        """Have a model's log alone, among all threads and services; its monitor is up to the log by then.
-
-        Raise StorageUnavailableError where the turn does not come within `database_timeout_s`.
-        """
+        """Have a model's log alone, among all threads and services; its monitor is up to the log by then. Raise
+        StorageUnavailableError where the turn does not come within `database_timeout_s`."""
         # the turn first: who only looks at the monitor does not wait for other services
         with self.database.turn(model), monitor.lock:
             self._follow(monitor, model)
@@ -113,54 +96,41 @@ class Intake:
         monitor: Monitor,
         served: Served,
         options: LearningOptions,
-        arrival: Arrival,
+        batch: NewBatch,
         screened: Screened,
         details: dict[str, Any],
     ) -> dict[str, Any]:
-        """Judge a batch and log it with all that follows from it, in one transaction, in a `turn` of its model.
-
-        Return the report that the log keeps of it: `details`, and what every report has. The batch is durable then.
-        """
+        """Judge a batch and log it with all that follows from it, in one transaction, in a `turn` of its model. Return
+        the report that the log keeps of it: `details`, and what every report has. The batch is durable then."""
         model = served.name
-        self.disk.take(ROW_NUMBERS * NUMBER_BYTES * served.model.n_joints * arrival.rows)
+        rows = screened.own.stop - screened.own.start
+        self.disk.take(ROW_NUMBERS * NUMBER_BYTES * served.model.n_joints * rows)
         with self.database.transaction(model) as session:
             _check_kept(session, served)
             held = owner.held(session, model) is not None
             if monitor.held and not held:
                 monitor.decided()
-            usual = partial(monitor.usual, arrival.received)
-            verdict = judging.judge(screened, monitor.watch(arrival.stream_id), held, options, usual)
+            usual = partial(monitor.usual, batch.received)
+            verdict = judging.judge(screened, monitor.watch(batch.stream_id), held, options, usual)
             if verdict.change is not None and options.on_change == "adapt":
-                log.append(session, model, "change", {"t": verdict.change.at}, arrival.received)
-            batch = NewBatch(
-                stream_id=arrival.stream_id,
-                kind=arrival.kind,
-                sequence=arrival.sequence,
-                last_sequence=arrival.last_sequence,
-                digest=arrival.digest,
-                offset=arrival.offset,
-                received=arrival.received,
-                version=served.version,
-                revision=served.revision,
-                rows=verdict.rows,
-                report={},
-                record=None if verdict.record is None else verdict.record.to_json(),
-            )
-            event = log.append_batch(session, model, batch, self.settings.max_observation_streams)
-            event.rows = arrival.rows  # without those that had waited, which other batches count
-            source = log.stream(session, model, arrival.stream_id)
+                log.append(session, model, "change", {"t": verdict.change.at}, batch.received)
+            record = None if verdict.record is None else verdict.record.to_json()
+            judged = replace(batch, rows=verdict.rows, record=record)
+            event = log.append_batch(session, model, judged, self.settings.max_observation_streams)
+            event.rows = rows  # without those that had waited, which other batches count
+            source = log.stream(session, model, batch.stream_id)
             assert source is not None
             if source.offset == 0:
-                source.offset = arrival.offset
+                source.offset = batch.offset
             if verdict.change is not None:
                 _alarm(session, served, options, verdict, event)
             report = details | {
                 "model": model,
                 "version": served.version,
                 "revision": event.number - log.start_of(session, model, served.version),
-                "stream_id": arrival.stream_id,
-                "sequence": arrival.sequence,
-                "rows": arrival.rows,
+                "stream_id": batch.stream_id,
+                "sequence": batch.sequence,
+                "rows": rows,
                 "accepted": event.learnt,
                 "duplicate": False,
                 "state": "learnt",
@@ -169,7 +139,6 @@ class Intake:
                 "held": verdict.held,
                 # for the batches that follow, for other services, and for one that starts again
                 "own": [screened.own.start, screened.own.stop],
-                "span": arrival.span,
                 "open": verdict.watch.gate.open,
                 "gate": verdict.watch.gate.to_json(),
                 "waited": held,
@@ -177,8 +146,8 @@ class Intake:
                 "surprise": None if verdict.surprise is None else verdict.surprise.tolist(),
             }
             event.report = report
-        monitor.note(event, arrival.stream_id, verdict, report)
-        self._show(Judged(served, arrival.stream_id, verdict.rows, screened))
+        monitor.note(event, verdict.watch.innovations)
+        self._show(Judged(served, batch.stream_id, verdict.rows, screened))
         return report
 
     def follow_up(self, monitor: Monitor, model: str) -> None:
@@ -197,15 +166,6 @@ def enabled(session: Session, model: str) -> LearningOptions:
     if not options.enabled:
         raise LearningDisabledError(f"learning of model {model!r} is switched off: nothing is logged")
     return options
-
-
-def check_kind(source: StreamRow | None, kind: StreamKind) -> None:
-    """Raise ConflictError where a stream carries something else: one sequence cannot count both."""
-    if source is not None and source.kind != kind:
-        raise ConflictError(
-            f"stream {source.stream_id!r} of model {source.model!r} carries {source.kind}, not {kind}: use another "
-            "stream_id"
-        )
 
 
 def _check_kept(session: Session, served: Served) -> None:

@@ -19,7 +19,7 @@ from lipcore.online.record import Record
 from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.settings import Settings
 from service.journal import log
-from service.learning.ingest.judging import ContactGate, Innovations, Verdict, Watch
+from service.learning.ingest.judging import ContactGate, Innovations, Watch
 from service.storage.database import EventRow
 
 PARTS = 60
@@ -114,16 +114,12 @@ class Monitor:
         """Record of the shortest window before a Unix time, s."""
         return min(self.windows, key=lambda window: window.seconds).record(now)
 
-    def note(self, event: EventRow, stream_id: str, verdict: Verdict, report: Mapping[str, Any]) -> None:
-        """Take in a batch that has been logged with this report; `lock` is held."""
-        received, self.number = event.received, event.number
-        counts = _counts(report)
-        self._add(verdict.record, counts, received)
-        self.counts.update({"batches": 1, **counts})
+    def note(self, event: EventRow, innovations: Innovations) -> None:
+        """Take in a batch that this service has logged; `lock` is held. innovations: those up to it."""
+        self._remember(event, True)
+        self.number, self._innovations = event.number, innovations
+        self.counts.update({"batches": 1, **_counts(event.report or {})})
         self._since_due += 1
-        self._detector, self._innovations = verdict.watch.detector, verdict.watch.innovations
-        self.held = verdict.held
-        self._keep(stream_id, verdict.watch.gate)
 
     def due(self, batches: int) -> bool:
         """Whether so many batches have been noted since the last time that this was true."""
@@ -144,7 +140,8 @@ class Monitor:
         record = None if event.record is None else Record.from_json(event.record)
         if record is not None and record.n_joints != len(self.joint_names):
             return
-        self._add(record, _counts(report), event.received)
+        for window in self.windows:
+            window.add(record, _counts(report), event.received)
         if self.held and not report.get("waited", True):
             self.decided()
         self.held, waits = report["held"], report["held"] or report["open"]
@@ -154,7 +151,10 @@ class Monitor:
             else:  # logged by an earlier release
                 gate = ContactGate.start(self._patience)
                 gate = gate.stand_back() if waits else gate
-            self._keep(event.stream_id, gate)
+            self._gates[event.stream_id] = gate
+            self._gates.move_to_end(event.stream_id)
+            if len(self._gates) > self._most_streams:
+                self._gates.popitem(last=False)
         at = report.get("until", event.last)
         if at is None or not recent:
             return
@@ -163,16 +163,6 @@ class Monitor:
             self._detector, _ = self._detector.step(judged, at)
         if not waits:
             self._detector = self._detector.acknowledged()
-
-    def _add(self, record: Record | None, counts: Mapping[str, int], received: float) -> None:
-        for window in self.windows:
-            window.add(record, counts, received)
-
-    def _keep(self, stream_id: str, gate: ContactGate) -> None:
-        self._gates[stream_id] = gate
-        self._gates.move_to_end(stream_id)
-        if len(self._gates) > self._most_streams:
-            self._gates.popitem(last=False)
 
 
 def _batches(session: Session, model: str, *conditions: ColumnElement[bool]) -> Iterator[EventRow]:

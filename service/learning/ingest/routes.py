@@ -8,7 +8,6 @@ import msgspec
 import numpy as np
 from fastapi import APIRouter
 from msgspec import Meta, Struct
-from numpy.typing import NDArray
 from starlette.types import Scope
 
 from service.foundation.errors import (
@@ -19,6 +18,7 @@ from service.foundation.errors import (
     TooLargeError,
     responses,
 )
+from service.inference.predicting import QUANTITIES, to_array
 from service.learning.learners import Learners, LearnersDep
 from service.learning.schema import (
     MOST_SEQUENCE,
@@ -29,7 +29,6 @@ from service.learning.schema import (
 )
 from service.web.route import Reply, each_once, hot_route, is_json
 
-Array = NDArray[np.float64]
 Number = float | None
 Numbers = list[Number | list[Number]]
 """One row or many; that it is one of the two, and not some of each, is left to be checked."""
@@ -50,18 +49,12 @@ class Batch(Struct, forbid_unknown_fields=True):
     def request(self) -> ObservationRequest | None:
         """Return the request with arrays, null as NaN, or None where a list is empty or ragged."""
         try:
-            return ObservationRequest.model_construct(
-                stream_id=self.stream_id,
-                sequence=self.sequence,
-                t=None if self.t is None else np.atleast_1d(np.array(self.t, np.float64)),
-                q=_array(self.q),
-                dq=_array(self.dq),
-                ddq=None if self.ddq is None else _array(self.ddq),
-                tau=_array(self.tau),
-                joint_names=self.joint_names,
-            )
+            arrays = {name: to_array(values) for name in QUANTITIES if (values := getattr(self, name)) is not None}
+            if self.t is not None:
+                arrays["t"] = np.atleast_1d(np.array(self.t, np.float64))
         except ValueError:
             return None
+        return ObservationRequest.model_construct(**(msgspec.structs.asdict(self) | arrays))
 
 
 _decoder = msgspec.json.Decoder(Batch)
@@ -75,12 +68,6 @@ def decode(body: bytes) -> ObservationRequest | None:
     except msgspec.MsgspecError:
         return None
     return batch.request() if each_once(body, *_FIELDS) else None
-
-
-def _array(values: Numbers) -> Array:
-    if not values:
-        raise ValueError("no rows")
-    return np.array(values, np.float64)
 
 
 hot = APIRouter(

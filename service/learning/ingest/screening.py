@@ -1,4 +1,5 @@
-"""The rows of a batch as they go into the log: dated, checked one by one, and predicted before they are learnt.
+"""The rows of a batch as they go into the log: dated, checked one by one, their accelerations derived where these were
+not sent, and predicted before they are learnt.
 
 Rows are dated in event time: Unix time, counted by the stream's own clock. A stream's offset is fixed once, so that the
 last row of its first batch lies at that batch's arrival. It is 0 where no batch of the stream has had times yet.
@@ -15,16 +16,18 @@ from sqlalchemy.orm import Session
 from lipcore.data import independence
 from lipcore.data.samples import Array
 from lipcore.model.torque_model import TorqueModel
+from lipcore.online import acceleration
+from lipcore.online.acceleration import JITTER, RateError
 from lipcore.online.batch import Rows
 from lipcore.online.gates import Limits, check_rows, time_span
 from lipcore.vocabulary import CODES, LEARNT
+from service.foundation.errors import invalid_request
 from service.foundation.settings import Settings
-from service.learning.ingest import derivation
-from service.learning.ingest.derivation import EDGE
+from service.journal import log
 from service.learning.schema import DerivedAcceleration, LearningOptions
 from service.storage.database import EventRow, StreamRow
 
-NON_FINITE, LIMIT, TIME_JUMP = (CODES.index(code) for code in ("non_finite", "limit", "time_jump"))
+NON_FINITE, LIMIT, TIME_JUMP, EDGE = (CODES.index(code) for code in ("non_finite", "limit", "time_jump", "edge"))
 
 FAR_AHEAD = 86400.0
 """How far ahead of its arrival a row may be dated, s: as long a recording may be sent in one go."""
@@ -84,9 +87,7 @@ class Clock:
 
     def leaps(self, t: Array, usable: NDArray[np.bool_], offset: float, gap: float) -> NDArray[np.bool_]:
         """Rows (N,) dated later than now, right after a gap, and before another one or at the end: most likely wrong.
-
-        Taken for true, such a time would be the present for all rows to come.
-        """
+        Taken for true, such a time would be the present for all rows to come."""
         leaping = np.zeros(len(t), dtype=np.bool_)
         times = t[usable]
         start = self.after if self.adjacent and self.after is not None else times[:1]
@@ -166,10 +167,8 @@ def limits(model: TorqueModel, options: LearningOptions, settings: Settings) -> 
 
 
 def dated(measured: Measured, clock: Clock, bounds: Limits, previous: float | None) -> Dated:
-    """Check, date and weigh rows. previous: event time of the row right before them, s, where it is known.
-
-    Weights come from the batch itself where it has a spacing, so that they do not depend on the order of arrival.
-    """
+    """Check, date and weigh rows. previous: event time of the row right before them, s, where it is known. Weights come
+    from the batch itself where it has a spacing, so that they do not depend on the order of arrival."""
     t = measured.t
     numbers = measured.q, measured.dq, measured.ddq, measured.tau
     codes = check_rows(t, *numbers, bounds, clock.after, clock.before)
@@ -188,46 +187,28 @@ def dated(measured: Measured, clock: Clock, bounds: Limits, previous: float | No
     return Dated(rows, offset, span(t, codes))
 
 
-def derive(
-    session: Session, model: str, stream_id: str, sequence: int, rows: Rows, t: Array, bounds: Limits
-) -> tuple[Rows, slice, DerivedAcceleration]:
-    """Derive the accelerations of a batch; return its rows with those that it completes, and which are its own.
-
-    t: (N,) by the stream's own clock, s. Raise InvalidRequestError where accelerations cannot be derived.
-    """
-    derived = derivation.complete(session, model, stream_id, sequence, rows, t)
-    everything = derived.rows
-    codes = everything.code.copy()
-    unknown = ~np.isfinite(everything.ddq).all(axis=1)
-    codes[unknown & (codes == LEARNT)] = EDGE
-    codes[derived.decided] = LEARNT
-    fresh = codes == LEARNT
-    again = everything.take(fresh)
-    codes[fresh] = check_rows(None, again.q, again.dq, again.ddq, again.tau, bounds)
-    chosen = derived.decided.copy()
-    chosen[derived.own] = True
-    first = int(derived.decided[: derived.own.start].sum())
-    summary = DerivedAcceleration(
-        delay_s=derived.delay_s, window=derived.window, rate_hz=derived.rate, carried=int(derived.decided.sum())
-    )
-    checked = replace(everything, code=codes)
-    return checked.take(chosen), slice(first, first + len(rows)), summary
-
-
-def predict(rows: Rows, own: slice, derived: DerivedAcceleration | None, model: TorqueModel) -> Screened:
-    """Let a model predict the rows that passed; those it has no finite answer for are beyond its limits."""
-    good = rows.take(rows.code == LEARNT)
-    mean, bare = _answers(good, model)
-    std = np.sqrt(np.maximum(bare**2, model.posterior.floor.numpy()))
-    return _screened(rows, own, derived, mean, std, bare, model)
-
-
-def answered(rows: Rows, mean: Array, std: Array, model: TorqueModel) -> Screened:
-    """Rows whose predictions are known, since a stream has answered them: mean, std (N, n)."""
-    good = rows.code == LEARNT
-    mean, std = mean[good], std[good]
-    bare = _answers(rows.take(good), model)[1] if model.posterior.floor.any() else std
-    return _screened(rows, slice(0, len(rows)), None, mean, std, bare, model)
+def predict(
+    rows: Rows,
+    model: TorqueModel,
+    own: slice,
+    derived: DerivedAcceleration | None = None,
+    answered: tuple[Array, Array] | None = None,
+) -> Screened:
+    """Let a model predict the rows that passed; those it has no finite answer for are beyond its limits. answered: mean
+    and std, (N, n) each, of all rows, where a stream has answered them already."""
+    codes, predicted = rows.code.copy(), rows.code == LEARNT
+    good, floor = rows.take(predicted), model.posterior.floor.numpy()
+    if answered is None:
+        mean, bare = _answers(good, model)
+        std = np.sqrt(np.maximum(bare**2, floor))
+    else:
+        mean, std = (values[predicted] for values in answered)
+        bare = _answers(good, model)[1] if floor.any() else std
+    known = np.isfinite(mean).all(axis=1) & np.isfinite(std).all(axis=1)
+    codes[predicted] = np.where(known, LEARNT, LIMIT)
+    predicted[predicted] = known
+    checked = replace(rows, code=codes)
+    return Screened(checked, own, derived, predicted, mean[known], std[known], bare[known], model.noise_std)
 
 
 def _answers(rows: Rows, model: TorqueModel) -> tuple[Array, Array]:
@@ -237,18 +218,114 @@ def _answers(rows: Rows, model: TorqueModel) -> tuple[Array, Array]:
     return mean, std
 
 
-def _screened(
-    rows: Rows,
-    own: slice,
-    derived: DerivedAcceleration | None,
-    mean: Array,
-    std: Array,
-    bare: Array,
-    model: TorqueModel,
-) -> Screened:
-    codes, predicted = rows.code.copy(), rows.code == LEARNT
-    known = np.isfinite(mean).all(axis=1) & np.isfinite(std).all(axis=1)
-    codes[predicted] = np.where(known, LEARNT, LIMIT)
-    predicted[predicted] = known
-    checked = replace(rows, code=codes)
-    return Screened(checked, own, derived, predicted, mean[known], std[known], bare[known], model.noise_std)
+def derive(
+    session: Session, model: str, stream_id: str, sequence: int, rows: Rows, t: Array, bounds: Limits
+) -> tuple[Rows, slice, DerivedAcceleration]:
+    """Derive the accelerations of a batch of rows, across the batches next to it in its stream.
+
+    An acceleration stands on the velocities of `half` rows on either side of its row. At the ends of a batch they are
+    those of the batches before and after. A row waits, coded `edge`, until both are there, in whatever order; it is
+    decided with the later one, so that it is learnt exactly once, and as if the stream were one batch.
+
+    rows: their `ddq` is not looked at; t: (N,) by the stream's own clock, s. Return the rows with those of other
+    batches that they complete, and which are the batch's own. Raise InvalidRequestError where the rows are too slow or
+    too uneven for it.
+    """
+    rate = _rate(t)
+    key = session, model, stream_id, sequence
+    half = _window(*key) or acceleration.window(rate)
+    head, tail = (_around(*key, way, 2 * half) for way in (-1, 1))
+    everything = Rows.concatenate([*head, rows, *tail])
+    own = np.zeros(len(everything), np.bool_)
+    first = sum(map(len, head))
+    own[first : first + len(rows)] = True
+    everything = replace(everything, ddq=_slopes(everything, half, rate))
+    known = np.isfinite(everything.ddq).all(axis=1)
+    codes = everything.code.copy()
+    # 2 half rows on either side are so few that every window that is complete reaches into the batch: none was before
+    decided = known & ~own & (codes == EDGE)
+    codes[~known & (codes == LEARNT)] = EDGE
+    codes[decided] = LEARNT
+    fresh = codes == LEARNT
+    again = everything.take(fresh)
+    codes[fresh] = check_rows(None, again.q, again.dq, again.ddq, again.tau, bounds)
+    before, carried = int(decided[:first].sum()), int(decided.sum())
+    summary = DerivedAcceleration(delay_s=half / rate, window=half, rate_hz=rate, carried=carried)
+    return replace(everything, code=codes).take(decided | own), slice(before, before + len(rows)), summary
+
+
+def _rate(t: Array) -> float:
+    """Rows a second, in the longest stretch without a gap: event time is too coarse to tell, to 0.2 µs today. Raise
+    InvalidRequestError where accelerations cannot be derived at this rate, or time is too uneven."""
+    finite = t[np.isfinite(t)]
+    if len(finite) < 2:
+        raise invalid_request("t", f"{len(finite)} times", "at least 2 rows with times, to derive ddq from dq with")
+    steps = np.diff(finite)
+    rising = steps[steps > 0]
+    step = float(np.median(rising)) if len(rising) else 0.0
+    run = max(_runs(t, np.isfinite(t), step), key=len)
+    if len(run) < 2 or 2 * np.count_nonzero(_even(steps, step)) < len(steps):
+        spread = f"uneven, with steps from {steps.min():.3g} to {steps.max():.3g} s"
+        raise invalid_request("t", spread, f"steps that differ by at most {JITTER:.0%}, to derive ddq from dq with")
+    rate = (len(run) - 1) / float(t[run[-1]] - t[run[0]])
+    try:
+        acceleration.window(rate * (1 - 1e-9))  # so that rounding leads to no other answer later
+    except RateError:
+        expected = f"measured accelerations, or at least {acceleration.MIN_RATE:g} rows a second to derive them from"
+        raise invalid_request("ddq", f"missing, with {rate:.3g} rows a second", expected) from None
+    return rate
+
+
+def _runs(t: Array, usable: NDArray[np.bool_], step: float) -> list[NDArray[np.int64]]:
+    """Places of rows that follow each other evenly, run after run."""
+    joined = usable[:-1] & usable[1:]
+    joined[joined] = _even(t[1:][joined] - t[:-1][joined], step)
+    return np.split(np.arange(len(t)), np.flatnonzero(~joined) + 1)
+
+
+def _even(steps: Array, step: float) -> NDArray[np.bool_]:
+    return np.asarray((steps > 0) & (np.abs(steps - step) <= JITTER * step))
+
+
+def _slopes(rows: Rows, half: int, rate: float) -> Array:
+    """Accelerations of all rows in the middle of 2·half + 1 even ones, NaN for the others: (N, n)."""
+    ddq = np.full_like(rows.dq, np.nan)
+    usable = np.isfinite(rows.time) & np.isfinite(rows.dq).all(axis=1)
+    for run in _runs(rows.time, usable, 1 / rate):
+        if len(run) > 2 * half:
+            # a controller samples more evenly than it stamps, and event time is coarse
+            slopes = acceleration.derive(np.arange(len(run)) / rate, rows.dq[run], half)
+            ddq[run[slopes.first : slopes.first + len(slopes.ddq)]] = slopes.ddq
+    return ddq
+
+
+def _window(session: Session, model: str, stream_id: str, sequence: int) -> int | None:
+    """Window of the batches next to this one: a stream has one, however its rate is measured."""
+    for other in (sequence - 1, sequence + 1):
+        event = _neighbour(session, model, stream_id, other)
+        if event is not None and event.report is not None:
+            return int(event.report["derived"]["ddq"]["window"])
+    return None
+
+
+def _neighbour(session: Session, model: str, stream_id: str, sequence: int) -> EventRow | None:
+    """The batch of a sequence, if its accelerations were derived and it still teaches."""
+    event = log.find_batch(session, model, stream_id, sequence)
+    if event is None or event.void or event.report is None or event.report["derived"] is None:
+        return None
+    return event
+
+
+def _around(session: Session, model: str, stream_id: str, sequence: int, way: int, count: int) -> list[Rows]:
+    """Rows next after (way 1) or before (−1) a batch, without a gap of sequences, in order, at most `count`."""
+    parts: list[Rows] = []
+    while count > 0:
+        sequence += way
+        event = _neighbour(session, model, stream_id, sequence)
+        if event is None:
+            break
+        first, last = (event.report or {})["own"]  # without those that had waited for it
+        part = log.rows_of(event).take(slice(first, last))
+        parts.append(part.take(slice(0, count) if way > 0 else slice(max(len(part) - count, 0), None)))
+        count -= len(part)
+    return parts[::way]

@@ -23,6 +23,7 @@ from lipcore.data.paired import BLOCK_S, MAX_BLOCKS, Answer, Difference, of_bloc
 from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
 from lipcore.online.record import Record
+from service.foundation.fields import finite
 from service.foundation.settings import Settings
 from service.learning.learner.follower import Follower
 from service.learning.learner.publication import Contested
@@ -74,10 +75,8 @@ class Contest:
         return cls(Record.empty(n_joints), Record.empty(n_joints), {})
 
     def step(self, time: Array, tau: Array, serving: Answer, candidate: Answer, at: float) -> Contest:
-        """Add rows with event times (N,) s, measured torques (N, n), and the predictions of both versions.
-
-        at: Unix time, s.
-        """
+        """Add rows with event times (N,) s, measured torques (N, n), and the predictions of both versions. at: Unix
+        time, s."""
         difference = (surprise(tau, serving) - surprise(tau, candidate)).sum(axis=1)
         blocks = dict(self.blocks)
         for number, value in zip(
@@ -171,7 +170,7 @@ def _paired(blocks: Mapping[int, Block]) -> dict[int, Block]:
 def _figures(record: Record) -> dict[str, list[float | None]]:
     """nMSE and coverage per joint; null where the torque did not vary."""
     figures = {"nmse": record.nmse, "coverage": record.coverage}
-    return {name: [v if np.isfinite(v) else None for v in values.tolist()] for name, values in figures.items()}
+    return {name: finite(values) for name, values in figures.items()}
 
 
 @dataclass(frozen=True)

@@ -64,10 +64,8 @@ class RewoundError(Exception):
 
 
 def ahead(session: Session, model: str, start: int, number: int, last: int) -> Stretch:
-    """What follows event `number` up to `last` at most; start: that of the version. Raise RewoundError.
-
-    Where a rollback leads back to this event, the stretch is that rollback: what it undoes is not learnt in vain.
-    """
+    """What follows event `number` up to `last` at most; start: that of the version. Raise RewoundError. Where a
+    rollback leads back to this event, the stretch is that rollback: what it undoes is not learnt in vain."""
     rollbacks = _rollbacks(session, model, start, number, last)
     if earlier := [to for to, *_ in rollbacks if to < number]:
         raise RewoundError(min(earlier))
@@ -97,10 +95,8 @@ def takings_since(session: Session, model: str, start: int, number: int, end: in
 
 
 def left_out(session: Session, model: str, start: int, batch: int, end: int) -> dict[int, int]:
-    """The batches to leave out where the log up to `end` is learnt anew without one; `end` by their numbers.
-
-    Besides it those that are unlearnt on the way: then nothing is learnt that would have to be taken out again.
-    """
+    """The batches to leave out where the log up to `end` is learnt anew without one; `end` by their numbers. Besides it
+    those that are unlearnt on the way: then nothing is learnt that would have to be taken out again."""
     batches = {batch}
     while True:
         query = select(EventRow.detail).where(*_span(model, min(batches), end), EventRow.kind == "unlearn")

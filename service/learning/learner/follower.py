@@ -140,10 +140,8 @@ class Follower:
         return self._stored_at + self.settings.snapshot_every_s
 
     def store_in_turn(self) -> None:
-        """Store the state, unless another service has stored what this version has learnt since it was due last.
-
-        The first one does it for all: they learn the same.
-        """
+        """Store the state, unless another service has stored what this version has learnt since it was due last. The
+        first one does it for all: they learn the same."""
         if self.database.shared:
             with self.database.session() as session:
                 last = snapshots.last_stored(session, self.model, self.version)
@@ -154,10 +152,8 @@ class Follower:
         self.store()
 
     def store(self) -> None:
-        """Store the state, unless it is stored, or a later one, or it is a stage on the way to another one.
-
-        Where there is no room for it, learning goes on all the same: the log has everything.
-        """
+        """Store the state, unless it is stored, or a later one, or it is a stage on the way to another one. Where there
+        is no room for it, learning goes on all the same: the log has everything."""
         if self.number == self._stored or not self.known.settled or self._is_stored():
             return
         self._stored_at = time.monotonic()
@@ -192,16 +188,14 @@ class Follower:
     def _solve(self, floor: Array) -> Revision:
         """The arrays of the state; those of the last time where nothing but the number has changed."""
         online = self.known.online
-        if self._revision is None or self._solved is None or not self._is_solved(online, floor):
+        known, at = self._solved or (None, floor)
+        if self._revision is None or known is not online or not np.array_equal(at, floor):
             self.answering = online.model(floor)
             self._revision, self._solved = Revision.of(self.answering), (online, floor)
             error = linearisation_error(self.answering)
             # a joint whose errors are no larger than stated needs nothing mended
             self._linearisation = None if error is None else tuple(np.where(floor > 0, error, 0.0).tolist())
         return self._revision
-
-    def _is_solved(self, online: OnlineModel, floor: Array) -> bool:
-        return self._solved is not None and self._solved[0] is online and np.array_equal(self._solved[1], floor)
 
     def _watch(self, arrivals: Sequence[Arrival]) -> None:
         for watcher in self.watchers:

@@ -70,10 +70,8 @@ class LearntVersions:
         self._database, self._files = database, files
 
     def find(self, model: str, version: int, base: TorqueModel) -> Learnt | None:
-        """Return what a version has learnt, None where that is nothing. base: the version as trained.
-
-        One that neither serves nor is a candidate no longer learns: its last snapshot, less what was unlearnt since.
-        """
+        """Return what a version has learnt, None where that is nothing. base: the version as trained. One that neither
+        serves nor is a candidate no longer learns: its last snapshot, less what was unlearnt since."""
         state = _restored(self._database, self._files, model, version, base, MOST_ROWS)
         if state is None:
             return None
@@ -85,10 +83,8 @@ class LearntVersions:
         return Learnt(known.online.model(variance), known.number - start, behind)
 
     def consolidated(self, model: str, version: int, base: TorqueModel) -> Learnt | None:
-        """Return all that a version has learnt as a model that can be saved, None where that is nothing; see `find`.
-
-        It takes the time to learn the log since the last snapshot.
-        """
+        """Return all that a version has learnt as a model that can be saved, None where that is nothing; see `find`. It
+        takes the time to learn the log since the last snapshot."""
         state = _restored(self._database, self._files, model, version, base, None)
         if state is None or state[0].number == state[1]:
             return None

@@ -7,19 +7,18 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
-import os
 import signal
 import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import TYPE_CHECKING
 
-from service.compute.process import Place, call, start_process, training_cpus
+from service.compute.process import Place, call, start_process, training_place
 from service.foundation.settings import Settings
-from service.web.observability import logs
 
 if TYPE_CHECKING:  # numerics, see above
     from service.learning.learner.publication import Message
@@ -34,17 +33,12 @@ END_SECONDS = 5.0
 
 def learner_place(settings: Settings) -> Place:
     """The place of the learner process: on the CPUs of training, before it, one thread."""
-    cpus = None
-    if hasattr(os, "sched_getaffinity"):  # Linux
-        cpus = training_cpus(os.sched_getaffinity(0), settings.training_cpus)
-    return Place(threads=1, niceness=settings.learner_niceness, cpus=cpus, log=logs.current())
+    return replace(training_place(settings), threads=1, niceness=settings.learner_niceness, policy="other")
 
 
 class LearnerProcess:
-    """Started when a model is woken for the first time.
-
-    on_message: called in a thread of its own, with one message after the other, in the order in which they were sent.
-    """
+    """Started when a model is woken for the first time. on_message: called in a thread of its own, with one message
+    after the other, in the order in which they were sent."""
 
     def __init__(self, settings: Settings, on_message: Callable[[Message], None]) -> None:
         self.settings, self.on_message = settings, on_message

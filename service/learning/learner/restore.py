@@ -11,8 +11,8 @@ snapshot and in however many steps; so services that share a log answer alike. I
 * a rollback leads to the state after the event that it names, less what was unlearnt between that and the rollback.
   Events that it undoes are passed over where that is known before they are learnt.
 
-It holds for as long as the log has what is needed. Where `retention` has deleted it, the newest snapshot is gone on
-from, whoever stored it; without one, what is left of the log is learnt, and a batch that only the log could take out
+It holds for as long as the log has what is needed. Where `snapshots.retain` has deleted it, the newest snapshot is
+gone on from, whoever stored it; without one, what is left of the log is learnt, and a batch that only the log could take out
 stays in what is learnt. It also takes the same arithmetic: the same release, kind of processor and number of threads.
 
 Pages of the log are bounded, so that what comes of one can be published, and others have their turn, in between.
@@ -116,11 +116,8 @@ def advance(
     watch: Watch | None = None,
     novel: Novel | None = None,
 ) -> Restored:
-    """Return the state after the next page of events, the very same one where nothing is new.
-
-    watch: called with the batches of the page before they are learnt; novel: see `OnlineModel.learn`.
-    Raise RewoundError.
-    """
+    """Return the state after the next page of events, the very same one where nothing is new. watch: called with the
+    batches of the page before they are learnt; novel: see `OnlineModel.learn`. Raise RewoundError."""
     with database.session() as session:
         newest = log.newest(session, known.model)
         last = newest if at_most is None else min(at_most, newest)
@@ -200,15 +197,13 @@ def _learn(
 
 def _take(database: Database, known: Restored, online: OnlineModel, taking: Taking, end: int) -> OnlineModel:
     """Take a batch and its replays out again, for the sake of event `end`; raise RewoundError where that takes the log.
-
-    online: one whose sums nobody else has.
-    """
+    online: one whose sums nobody else has."""
     if _is_without(known, taking.batch, taking.number) or not taking.events:
         return online
     try:
         if taking.reweighed:
             raise ForgottenError("forgetting has changed since")
-        every = [decode(each.payload or b"") for each in taking.events]
+        every = [log.rows_of(each) for each in taking.events]
         for rows in every:
             online.check_unlearn(rows)
         for rows in every:

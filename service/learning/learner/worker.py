@@ -9,8 +9,6 @@ from contextlib import suppress
 from math import inf
 from multiprocessing.connection import Connection
 
-from sqlalchemy import select
-
 from service.foundation.settings import Settings
 from service.journal import snapshots
 from service.learning.learner import publication
@@ -145,17 +143,13 @@ class Learner:
 
     def _learning(self, model: str) -> list[int]:
         """Versions of a model that learn; the one that serves last, so that it is the last to be dropped."""
-        serving = registry.serving(self.database, [model]).get(model)
-        if serving is None:
-            return []
         with self.database.session() as session:
-            candidates = select(LearnerRow.version).where(LearnerRow.model == model, LearnerRow.role == "candidate")
-            known = session.get(LearnerRow, (model, serving.version))
-            others = [version for version in session.scalars(candidates) if version != serving.version]
-        if known is None:  # trained before there was a log
+            versions = registry.learning(session, model)
+            known = session.get(LearnerRow, (model, versions[-1])) if versions else None
+        if versions and known is None:  # trained before there was a log
             with self.database.transaction() as session:
-                registry.serve(session, model, serving.version)
-        return [*others, serving.version]
+                registry.serve(session, model, versions[-1])
+        return versions
 
     def _follow(self, key: Key) -> Follower:
         while len(self.followers) >= self.settings.max_learning_models:

@@ -15,9 +15,8 @@ from service.foundation.errors import BusyError, InvalidRequestError, NotFoundEr
 from service.journal import log
 from service.learning import owner
 from service.learning.control import decisions, status
-from service.learning.control.schema import Held
+from service.learning.control.schema import LiveAnswers, LiveNovelty, LiveStatus
 from service.learning.learners import Learners, LearnersDep
-from service.learning.live.schema import LiveAnswers, LiveNovelty, LiveStatus
 from service.web.observability.meters import OTHER, Meters, MetersDep, StreamMeter
 from service.web.observability.readiness import StoppingDep
 from service.web.pagination import Page
@@ -54,9 +53,9 @@ class LiveLook:
             learns=options.enabled,
             on_change=options.on_change,
             contact_threshold=options.contact_threshold,
-            held=None if held is None else Held(at=held["at"], evidence=held["evidence"]),
-            failure=None if latest.failed is None else latest.failed.error,
-            novel_share=status.novel_share(latest),
+            held=held,
+            failure=latest.failure,
+            novel_share=latest.novel_share,
             novel=novel,
             counts={name: monitor.counts[name] for name in COUNTS},
             windows=[status.window(each, now) for each in monitor.windows],

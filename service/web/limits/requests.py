@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from ipaddress import IPv6Address, ip_address
 from math import ceil
 from time import monotonic
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from anyio import CapacityLimiter
 from fastapi import Depends, Request
@@ -43,6 +44,27 @@ class Gate:
         self.open += 1
         try:
             await self.app(scope, receive, send)
+        finally:
+            self.open -= 1
+
+
+class Counted:
+    """Counts what is open. too_many: the message beyond the most, with a place for the number; headers: go with it."""
+
+    too_many: ClassVar[str]
+    headers: ClassVar[dict[str, str]] = {}
+
+    def __init__(self) -> None:
+        self.open = 0
+
+    @contextmanager
+    def one_more(self, most: int) -> Iterator[None]:
+        """Count one while it lasts; raise BusyError beyond `most`."""
+        if self.open >= most:
+            raise BusyError(self.too_many.format(self.open), headers=self.headers)
+        self.open += 1
+        try:
+            yield
         finally:
             self.open -= 1
 

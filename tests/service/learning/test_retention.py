@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from service.foundation.settings import Settings
-from service.journal import log, retention
+from service.journal import log, snapshots
 from service.journal.log import encode
 from service.storage.database import LearnerRow, ServingRow, SnapshotRow, now
 from tests.service.learning.batches import MODEL, OTHER, batch, everything, note, rows, source, take_back, write
@@ -25,7 +25,7 @@ def learner(database, version, start, role):
 
 def retain(database, batches=10**6, age=1e12, at=0.0, model=MODEL):
     settings = Settings(observation_retention_bytes=max(batches * SIZE, 1), observation_retention_s=age)
-    return retention.retain(database, settings, model, at)
+    return snapshots.retain(database, settings, model, at)
 
 
 def kept(database, model=MODEL):
@@ -51,7 +51,7 @@ def test_those_that_are_too_old_go(database):
 
 
 def test_more_go_than_one_transaction_deletes(database, monkeypatch):
-    monkeypatch.setattr(retention, "CHUNK", 3)
+    monkeypatch.setattr(snapshots, "CHUNK", 3)
     write(database, *(batch(k) for k in range(12)))
     snapshot(database, 12)
     assert retain(database, batches=1) == 11

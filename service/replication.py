@@ -12,7 +12,7 @@ from sqlalchemy import func, select
 
 from service.foundation.errors import ServiceError
 from service.learning.learners import Learners
-from service.models import moves
+from service.models import registry
 from service.storage.database import Database, EventRow, LearnerRow, VersionRow
 from service.storage.database.engine import Notice
 
@@ -150,9 +150,7 @@ class Listener:
 
 def look(learners: Learners, models: Collection[str] | None) -> None:
     """Take in which versions of these models serve, have aliases or are gone; of all that are known here where None.
-
-    Not for the event loop: versions are loaded before they answer.
-    """
+    Not for the event loop: versions are loaded before they answer."""
     known = {model for model, _ in learners.loaded.held()} | learners.monitors().keys()
     here = known if models is None else known & set(models)
     learners.loaded.announce(here)
@@ -180,7 +178,7 @@ def _point(learners: Learners, models: Collection[str] | None) -> None:
     """Let aliases point where the database says, to versions in memory where the model is in use here."""
     loaded = learners.loaded
     used = {model for model, _ in loaded.versions()}
-    moved = moves.pointers(learners.database, models).items() - loaded.aliases().items()
+    moved = registry.pointers(learners.database, models).items() - loaded.aliases().items()
     for (model, _), version in moved:
         if model in used:
             try:
@@ -188,7 +186,7 @@ def _point(learners: Learners, models: Collection[str] | None) -> None:
             except ServiceError as error:  # the next query for it is answered with the error
                 logger.warning("version %d of model %s, which an alias points to now: %s", version, model, error)
     with loaded.moving:  # read again: aliases moved here meanwhile are in the database by now
-        loaded.repoint(moves.pointers(learners.database, models), models)
+        loaded.repoint(registry.pointers(learners.database, models), models)
 
 
 def _forget(learners: Learners, models: Collection[str]) -> None:

@@ -1,1 +1,0 @@
-"""Several services on one database: what one has changed, the others take in."""
