@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from service.cli import completion
+from service.cli import connecting
 from service.cli.connecting import connected
 from service.cli.consoles import out, print_json, say
 from service.cli.options import DatasetId, Json, Limit, Url, Yes, confirm, names, pairs
@@ -131,7 +131,7 @@ def show(dataset: DatasetId, url: Url = DEFAULT_URL, as_json: Json = False) -> N
 
 @app.command()
 def delete(
-    datasets: Annotated[list[str], typer.Argument(help="Ids of data sets.", autocompletion=completion.datasets)],
+    datasets: Annotated[list[str], typer.Argument(help="Ids of data sets.", autocompletion=connecting.datasets)],
     yes: Yes = False,
     url: Url = DEFAULT_URL,
     as_json: Json = False,

@@ -15,7 +15,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from service import __version__
 from service.cli.consoles import explain, print_error, say
-from service.foundation.importing import imported
+from service.compute.remote import imported
 
 
 class Entry(NamedTuple):

@@ -11,7 +11,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from service.cli import completion
+from service.cli import connecting
 from service.cli.connecting import connected, dataset_of
 from service.cli.consoles import CommandError, note, out, print_json, say
 from service.cli.options import Alias, Data, Json, Limit, Model, Url, Version, Yes, confirm
@@ -29,8 +29,8 @@ app = typer.Typer(
     help="Models: list, show, promote, roll back, compare, export, import and delete them.",
 )
 SERVING = "serving"
-Which = Annotated[str, typer.Argument(help="A version, by its number or an alias.", autocompletion=completion.versions)]
-AliasName = Annotated[str, typer.Option("--alias", help="Which alias.", autocompletion=completion.aliases)]
+Which = Annotated[str, typer.Argument(help="A version, by its number or an alias.", autocompletion=connecting.versions)]
+AliasName = Annotated[str, typer.Option("--alias", help="Which alias.", autocompletion=connecting.aliases)]
 
 
 @app.command("list")
@@ -123,11 +123,11 @@ def rollback(
 @app.command()
 def alias(
     model: Model,
-    name: Annotated[str, typer.Argument(help="The alias.", autocompletion=completion.aliases)],
+    name: Annotated[str, typer.Argument(help="The alias.", autocompletion=connecting.aliases)],
     version: Annotated[
         str | None,
         typer.Argument(
-            help="The version it is to name, by number or another alias.", autocompletion=completion.versions
+            help="The version it is to name, by number or another alias.", autocompletion=connecting.versions
         ),
     ] = None,
     remove: Annotated[bool, typer.Option("--remove", help="Remove it; its version stays.")] = False,

@@ -9,8 +9,8 @@ from urllib.parse import quote
 
 import typer
 
-from service.cli import completion
-from service.cli.completion import UNIX, ask
+from service.cli import connecting
+from service.cli.connecting import UNIX, ask
 from service.cli.consoles import START, CommandError, print_json, say
 from service.cli.options import Json, Url
 from service.foundation.settings import DEFAULT_URL
@@ -21,7 +21,7 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 @app.command("open")
 def open_(
     model: Annotated[
-        str | None, typer.Argument(help="A model, for its page.", autocompletion=completion.models)
+        str | None, typer.Argument(help="A model, for its page.", autocompletion=connecting.models)
     ] = None,
     live: Annotated[bool, typer.Option("--live", help="The page that follows what is streamed.")] = False,
     browser: Annotated[bool, typer.Option("--browser", help="Also open it in this machine's browser.")] = False,

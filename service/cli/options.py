@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli import completion
+from service.cli import connecting
 from service.cli.consoles import CommandError
 
 ROBOTS = [
@@ -24,18 +24,18 @@ Url = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 Limit = Annotated[int, typer.Option(min=1, help="Most that are listed.")]
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask whether that is meant.")]
-Model = Annotated[str, typer.Argument(help="Name of the model.", autocompletion=completion.models)]
-DatasetId = Annotated[str, typer.Argument(help="Id of a data set.", autocompletion=completion.datasets)]
-JobId = Annotated[str, typer.Argument(help="Id of a job.", autocompletion=completion.jobs)]
+Model = Annotated[str, typer.Argument(help="Name of the model.", autocompletion=connecting.models)]
+DatasetId = Annotated[str, typer.Argument(help="Id of a data set.", autocompletion=connecting.datasets)]
+JobId = Annotated[str, typer.Argument(help="Id of a job.", autocompletion=connecting.jobs)]
 Data = Annotated[
     str,
-    typer.Argument(help="A recording, which is uploaded, or the id of a data set.", autocompletion=completion.datasets),
+    typer.Argument(help="A recording, which is uploaded, or the id of a data set.", autocompletion=connecting.datasets),
 ]
 Version = Annotated[
     int | None,
-    typer.Option(help="A version; the one that serves by default.", autocompletion=completion.versions),
+    typer.Option(help="A version; the one that serves by default.", autocompletion=connecting.versions),
 ]
-Alias = Annotated[str | None, typer.Option(help="A version by its alias.", autocompletion=completion.aliases)]
+Alias = Annotated[str | None, typer.Option(help="A version by its alias.", autocompletion=connecting.aliases)]
 
 
 def numbers(option: str, text: str) -> list[float]:

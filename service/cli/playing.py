@@ -29,7 +29,7 @@ from service.datasets.options import UploadOptions
 from service.datasets.staging import Staged, prepare
 from service.foundation.errors import ServiceError
 from service.foundation.settings import Settings
-from service.storage.disk import Disk
+from service.storage.storage import Disk
 from service.stream.exchange import StreamAnswer, StreamLearnt
 
 BAND = 1.959963984540054

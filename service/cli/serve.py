@@ -15,8 +15,7 @@ from service.foundation.settings import Settings
 from service.storage.home import HomeError, check_home
 from service.web.observability import logs
 from service.web.server import sockets
-from service.web.server.connections import guarded
-from service.web.server.stream_protocol import StreamProtocol
+from service.web.server.connections import StreamProtocol, guarded
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 ERRORS = (HomeError,)

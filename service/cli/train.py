@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from lipcore.vocabulary import CHOICES, DEFAULT_ESTIMATOR
-from service.cli import completion
+from service.cli import connecting
 from service.cli.connecting import connected, dataset_of, watch
 from service.cli.consoles import INTERRUPTED, CommandError, note, out, print_json, say
 from service.cli.models import print_selection
@@ -24,12 +24,12 @@ def train(
     data: Annotated[
         list[str],
         typer.Argument(
-            help="Recordings, which are uploaded, and ids of data sets.", autocompletion=completion.datasets
+            help="Recordings, which are uploaded, and ids of data sets.", autocompletion=connecting.datasets
         ),
     ],
     model: Annotated[
         str,
-        typer.Option(help="Name of the model; a new version of it is made.", autocompletion=completion.models),
+        typer.Option(help="Name of the model; a new version of it is made.", autocompletion=connecting.models),
     ],
     url: Url = DEFAULT_URL,
     estimator: Annotated[

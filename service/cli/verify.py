@@ -23,7 +23,7 @@ from service.foundation.errors import DamagedDataError
 from service.foundation.settings import Settings
 from service.journal.log import decode
 from service.storage.database import Database, DatasetRow, EventRow, RobotRow, SnapshotRow, VersionRow
-from service.storage.database.sqlite import FILE
+from service.storage.database.engine import FILE
 from service.storage.files import Files, FilesUnreachableError
 from service.storage.home import HomeError, usable
 

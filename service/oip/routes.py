@@ -33,7 +33,7 @@ from service.oip.schema import (
     infer_answer,
     infer_body,
 )
-from service.web import health
+from service.web.observability import readiness as health
 from service.web.observability.readiness import ReadinessDep
 from service.web.route import Reply, Route, hot_route
 

@@ -11,9 +11,8 @@ from typing import IO
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.foundation.settings import Settings
-from service.storage.database.engine import Database, DriverMissingError
+from service.storage.database.engine import FILE, Database, DriverMissingError
 from service.storage.database.migrations import DatabaseVersionError
-from service.storage.database.sqlite import FILE
 from service.storage.files import Files, FilesUnreachableError
 
 

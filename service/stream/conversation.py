@@ -12,7 +12,7 @@ from starlette.types import Message, Receive, Send
 
 from service.foundation.settings import Settings
 from service.web.access.middleware import subprotocol_of
-from service.web.server.stream_protocol import StreamProtocol
+from service.web.server.connections import StreamProtocol
 
 
 class Conversation(ABC):

@@ -19,7 +19,7 @@ from service.models.schema import ALIAS
 from service.models.served import reached
 from service.stream.conversation import Conversation, Echo
 from service.stream.session import Session
-from service.web.server.stream_protocol import CONNECTION, StreamProtocol
+from service.web.server.connections import CONNECTION, StreamProtocol
 
 STREAM_ID = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
 PATH, ECHO_PATH = "/v1/models/{model}/stream", "/v1/echo/stream"

@@ -33,7 +33,7 @@ from service.stream.frames import (
 )
 from service.stream.learning import Learning, Taught
 from service.web.observability.meters import StreamMeter
-from service.web.server.stream_protocol import StreamProtocol
+from service.web.server.connections import StreamProtocol
 
 if TYPE_CHECKING:
     from lipcore.data.samples import Array

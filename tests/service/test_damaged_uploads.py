@@ -15,7 +15,7 @@ from service.datasets.options import ReadOptions, UploadOptions
 from service.datasets.staging import prepare, staging
 from service.foundation.errors import InvalidDataError, TooLargeError
 from service.foundation.settings import Settings
-from service.storage.disk import Disk
+from service.storage.storage import Disk
 from tests.service.data import arrays, columns, csv, npz, stream
 
 SAMPLES = stream(samples=60, rate=50.0)

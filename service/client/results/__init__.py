@@ -2,8 +2,7 @@
 
 from service.client.results.arm import Arm, Frames, Version
 from service.client.results.evaluation import Comparison, Evaluation, Interval, Reliability, VersionFigures
-from service.client.results.prediction import Component, Prediction
-from service.client.results.series import Live, LivePart, LiveRows, Preview, PreviewColumn, Trace
+from service.client.results.series import Component, Live, LivePart, LiveRows, Prediction, Preview, PreviewColumn, Trace
 
 __all__ = [
     "Arm",

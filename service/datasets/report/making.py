@@ -11,19 +11,22 @@ from lipcore.data.samples import Array
 from lipcore.preparation.recipe import Recipe
 from lipcore.profiles import Profile
 from service.datasets.report.advice import advice, in_words, warnings
-from service.datasets.report.excitation import SELDOM, joint_excitation, weights
-from service.datasets.report.fit import make_fit
-from service.datasets.report.lag import Lags, no_lags, shifts
-from service.datasets.report.rigid_body import RigidExcitation, judge_rigid_bodies
+from service.datasets.report.excitation import SELDOM, RigidExcitation, joint_excitation, judge_rigid_bodies, weights
+from service.datasets.report.fit import Lags, make_fit, no_lags, shifts
 from service.datasets.report.signals import (
+    Clock,
     Limits,
     against_limits,
+    bounds,
     limits_of,
+    look_at_clock,
     noise_or_share,
+    number_parts,
     saturation,
+    spread,
+    thin,
     white_noise,
 )
-from service.datasets.report.timing import Clock, bounds, look_at_clock, number_parts, spread, thin
 from service.datasets.schema import (
     DatasetReport,
     Excitation,

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from service.web.limits.body import BodyLimit
+from service.web.limits.requests import BodyLimit
 
 __all__ = ["BodyLimit"]

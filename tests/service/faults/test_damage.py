@@ -15,7 +15,7 @@ from fastapi.testclient import TestClient
 from lipcore.files.persistence import MANIFEST, TENSORS
 from service.app import create_app
 from service.foundation.settings import Settings
-from service.storage.database.sqlite import FILE
+from service.storage.database.engine import FILE
 from service.storage.home import HomeError, check_home
 from tests.service.data import ended, error, eventually, queue, stream, upload
 from tests.service.faults.damage import HARM, cut, empty, flip, zero

@@ -13,7 +13,7 @@ from lipcore.preparation.recipe import Recipe
 from service.datasets.staging import QUANTITIES, Staged, column, prepare
 from service.foundation.errors import InvalidDataError
 from service.foundation.settings import Settings
-from service.storage.disk import Disk
+from service.storage.storage import Disk
 
 RATE = 90.0
 ROWS = 900

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.datasets.report.lag import shifts
+from service.datasets.report.fit import shifts
 from tests.service.recordings.report_data import recording, report_on
 
 NAMES = ("a", "b")

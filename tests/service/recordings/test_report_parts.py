@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 from lipcore.data.signals import noise_level
 from service.datasets.preview import extremes, make_preview
-from service.datasets.report.signals import noise_or_share, white_noise
-from service.datasets.report.timing import bounds, number_parts, thin
+from service.datasets.report.signals import bounds, noise_or_share, number_parts, thin, white_noise
 
 LENGTHS = st.lists(st.integers(1, 40), min_size=1, max_size=12)
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from lipcore.preparation.recipe import Recipe
-from service.datasets.report.signals import against_limits, limits_of, saturation
-from service.datasets.report.timing import look_at_clock
+from service.datasets.report.signals import against_limits, limits_of, look_at_clock, saturation
 from service.datasets.schema import DatasetReport
 from tests.service.recordings.report_data import FakeProfile, recording, report_on, staged
 
