@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
-from sqlalchemy import Connection, Engine, inspect, text
+from sqlalchemy import (
+    BigInteger,
+    Column,
+    Connection,
+    Engine,
+    ForeignKeyConstraint,
+    Integer,
+    PrimaryKeyConstraint,
+    String,
+    inspect,
+    text,
+)
 
 HEAD = "0004"
 """The revision that this release needs."""
@@ -55,3 +67,27 @@ def _upgrade(connection: Connection, found: str | None) -> None:
             "start that one, or set LIPSERVE_HOME, or LIPSERVE_DATABASE_URL, to another"
         )
     command.upgrade(config, HEAD)
+
+
+NUMBER = BigInteger().with_variant(Integer(), "sqlite")
+
+
+def needed(kind: Any, *names: str) -> Iterator[Column[Any]]:
+    """Columns of one type that no row goes without."""
+    return (Column(name, kind, nullable=False) for name in names)
+
+
+def optional(kind: Any, *names: str) -> Iterator[Column[Any]]:
+    """Columns of one type that may be null."""
+    return (Column(name, kind, nullable=True) for name in names)
+
+
+def numbered() -> list[Any]:
+    """Column and primary key of a table whose rows are counted."""
+    return [Column("seq", NUMBER, autoincrement=True, nullable=False), PrimaryKeyConstraint("seq")]
+
+
+def of_model(*key: str) -> list[Any]:
+    """Column of the model that rows belong to; key: primary key, where it is one."""
+    named = Column("model", String(64), nullable=False)
+    return [named, ForeignKeyConstraint(["model"], ["models.name"]), *([PrimaryKeyConstraint(*key)] if key else [])]
