@@ -148,13 +148,13 @@ def delete(
 
 
 def _print(dataset: Dataset) -> None:
-    from service.datasets.report import tables  # noqa: PLC0415 - takes long to import; help needs none
+    from service.cli import tables  # noqa: PLC0415 - takes long to import; help needs none
 
     report = dataset.report
     out.print(f"[bold]{dataset.id}[/bold]  {escape(dataset.name)}  torque: {dataset.torque_convention}")
-    for said in tables.overview(report):
-        say(f"  {said}")
-    for table in tables.tables(report, dataset.joint_names):
+    for line in tables.overview(report):
+        say(f"  {line}")
+    for table in tables.report_tables(report, dataset.joint_names):
         out.print(table)
     if report.excitation is not None:
         say(f"  {report.excitation.text}")

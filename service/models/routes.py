@@ -36,8 +36,8 @@ from service.models.schema import (
 )
 from service.web.limits.requests import ArchivesDep
 from service.web.limits.upload import Kinds, receive_to
-from service.web.pagination import PageQuery
 from service.web.route import Route
+from service.web.rows import PageQuery
 
 ARCHIVES = Kinds({MEDIA_TYPE: "tar"}, {".tar": "tar"})
 _BINARY = {"schema": {"type": "string", "format": "binary"}}

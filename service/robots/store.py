@@ -30,7 +30,7 @@ from service.foundation.states import ACTIVE
 from service.robots.schema import ProfileJoint, Robot, RobotPage, RobotProfile
 from service.storage.database import Database, JobRow, RobotRow, now
 from service.storage.files import new_id
-from service.web.pagination import Page, newest
+from service.web.rows import Page, newest
 
 
 def add(database: Database, content: bytes, name: str | None) -> Robot:

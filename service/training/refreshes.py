@@ -17,7 +17,7 @@ from service.storage.database import JobRow, VersionRow
 from service.training import jobs, refresh_data
 from service.training.queue import JobQueue
 from service.training.schema import Job, JobRequest
-from service.web.idempotency import Identity, done
+from service.web.rows import Identity, done
 
 Trigger = Literal["novelty", "linearisation", "asked"]
 

@@ -16,8 +16,7 @@ from benchmarks.scale.part import Results
 from benchmarks.scale.peaks import KINDS, Peaks
 from benchmarks.workload import BenchError
 from lipcore.training.conditioning import SHARD, with_statistics
-from service.compute.executors import Inline
-from service.compute.shards import summed
+from service.compute.executors import Inline, summed
 from service.foundation.settings import shipped_models
 
 COSTS = {

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from lipcore.fitting.hyperparameters import FitCancelledError
-from service.compute.executors import ClusterUnavailableError, Processes, lost, sent, shard_executor
-from service.compute.shards import summed
+from service.compute.executors import ClusterUnavailableError, Processes, lost, sent, shard_executor, summed
 from service.foundation.settings import Settings
 from tests.cluster.sums import home, once_lost, told
 from tests.cluster.workers import cluster

@@ -31,7 +31,7 @@ from service.learning.learners import Learners
 from service.learning.schema import LearningOptions
 from service.models import registry
 from service.storage.database import AlarmRow, EventRow
-from service.web.pagination import Page
+from service.web.rows import Page
 
 TIME_JUMP = CODES.index("time_jump")
 CHANGE = "change"

@@ -30,7 +30,7 @@ from service.learning.learners import Learners
 from service.learning.schema import ObservationResponse
 from service.models import registry
 from service.storage.database import EventRow
-from service.web.pagination import Page
+from service.web.rows import Page
 
 BATCHES: tuple[EventKind] = ("batch",)
 FIGURES = ("nmse", "rmse", "coverage", "nlpd")

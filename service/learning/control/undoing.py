@@ -17,7 +17,7 @@ from service.learning.ingest.batches import state
 from service.learning.learners import Learners
 from service.models import registry
 from service.storage.database import Database, EventRow, LearnerRow, SnapshotRow
-from service.web.pagination import Page
+from service.web.rows import Page
 
 Range = tuple[int, int]
 PAGE = 100

@@ -20,8 +20,8 @@ from service.learning.learners import Learners, LearnersDep
 from service.learning.live.schema import LiveAnswers, LiveNovelty, LiveStatus
 from service.web.observability.meters import OTHER, Meters, MetersDep, StreamMeter
 from service.web.observability.readiness import StoppingDep
-from service.web.pagination import Page
 from service.web.route import Route
+from service.web.rows import Page
 
 MOST_ALARMS = 5
 COUNTS = (*CODES, "batches", "duplicates")

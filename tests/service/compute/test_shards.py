@@ -14,8 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lipcore.fitting.hyperparameters import FitCancelledError
-from service.compute.executors import Inline, shard_executor
-from service.compute.shards import AHEAD, ShardFailedError, summed
+from service.compute.executors import AHEAD, Inline, ShardFailedError, shard_executor, summed
 from service.foundation.settings import Settings
 from tests.service.compute.work import dying, numbers
 

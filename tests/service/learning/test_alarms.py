@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from service.learning import owner
-from service.web.pagination import Page
+from service.web.rows import Page
 from tests.service.learning.batches import MODEL, OTHER, opened
 
 

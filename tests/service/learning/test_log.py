@@ -11,7 +11,7 @@ import pytest
 from service.journal import log
 from service.journal.log import decode, encode
 from service.storage.database import LearnerRow
-from service.web.pagination import Page
+from service.web.rows import Page
 from tests.service.learning.batches import MODEL, OTHER, batch, everything, note, opened, rows, take_back, write
 
 

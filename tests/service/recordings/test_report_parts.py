@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lipcore.data.signals import noise_level
-from service.datasets.preview import extremes, make_preview
 from service.datasets.report.signals import bounds, noise_or_share, number_parts, thin, white_noise
+from service.datasets.store import extremes, make_preview
 
 LENGTHS = st.lists(st.integers(1, 40), min_size=1, max_size=12)
 
