@@ -39,6 +39,15 @@ def print_json(value: Any, one_line: bool = False) -> None:
     sys.stdout.flush()
 
 
+def tell(value: Any, as_json: bool, *lines: str) -> None:
+    """Print a result: as JSON, or else in lines."""
+    if as_json:
+        print_json(value)
+        return
+    for line in lines:
+        say(line)
+
+
 def plain(value: Any) -> Any:
     """Return records, arrays, paths and numbers as JSON knows them; numbers that are not finite become null."""
     if hasattr(value, "model_dump"):  # a record of the API

@@ -11,20 +11,15 @@ from rich.markup import escape
 
 from service.cli import connecting
 from service.cli.connecting import connected
-from service.cli.consoles import out, print_json, say
-from service.cli.options import DatasetId, Json, Limit, Url, Yes, confirm, names, pairs
+from service.cli.consoles import out, print_json, say, tell
+from service.cli.options import DatasetId, Json, Limit, Url, Yes, confirm, group, names, pairs
 from service.datasets.asking import SUFFIXES, Reading
 from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
     from service.datasets.schema import Dataset
 
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    help="Recordings and their reports: add, list, show and delete them.",
-)
+app = group("Recordings and their reports: add, list, show and delete them.")
 PREPARATION = "Preparation"
 
 
@@ -141,10 +136,7 @@ def delete(
     with connected(url) as client:
         for each in datasets:
             client.delete_dataset(each)
-    if as_json:
-        print_json({"deleted": datasets})
-    else:
-        say(f"{', '.join(datasets)} deleted")
+    tell({"deleted": datasets}, as_json, f"{', '.join(datasets)} deleted")
 
 
 def _print(dataset: Dataset) -> None:

@@ -21,6 +21,7 @@ from lipcore.data.samples import Samples
 from lipcore.robots.library import Robot, SimulationUnavailableError, load_robot
 from lipcore.robots.simulation import FAST, Stream, simulate
 from service.cli.consoles import out
+from service.cli.options import alone
 from service.cli.plotting import draw_torque
 from service.cli.simulate import write_recording
 from service.client import ApiError, Client, Evaluation, Prediction
@@ -185,7 +186,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = alone()
 ERRORS = (ApiError, DemoError, SimulationUnavailableError)
 
 

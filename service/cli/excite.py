@@ -30,7 +30,7 @@ from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import JointType
 from service.cli import plotting
 from service.cli.consoles import err, print_json
-from service.cli.options import Json
+from service.cli.options import Json, alone
 from service.client import ApiError, Client
 from service.foundation.settings import DEFAULT_URL
 from service.models import archive
@@ -164,7 +164,7 @@ def fetch(name: str, url: str, version: int | None = None, alias: str | None = N
         return persistence.decode(files)
 
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = alone()
 ERRORS = (ApiError, NotPositiveDefiniteError, SimulationUnavailableError, plotting.PlotUnavailableError)
 """What a user is told without a traceback, beside ValueError and OSError."""
 COMPARED = 5

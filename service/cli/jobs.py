@@ -11,18 +11,13 @@ from rich.table import Column, Table
 
 from service.cli.connecting import connected, watch
 from service.cli.consoles import INTERRUPTED, CommandError, note, out, print_json, say
-from service.cli.options import JobId, Json, Limit, Url
+from service.cli.options import JobId, Json, Limit, Url, group
 from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
     from service.training.schema import Job
 
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    help="Training jobs: list, show, follow, cancel and retry them.",
-)
+app = group("Training jobs: list, show, follow, cancel and retry them.")
 
 
 @app.command("list")

@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from service.cli.consoles import note, out, print_json
-from service.cli.options import Json
+from service.cli.options import Json, group
 from service.foundation.errors import InvalidRequestError
 from service.foundation.settings import Settings
 from service.storage.database import ApiKeyRow, Database
@@ -21,12 +21,7 @@ from service.storage.home import HomeError, usable
 from service.web.access import keys
 from service.web.access.scopes import SCOPES
 
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    help="API keys of the home LIPSERVE_HOME.",
-)
+app = group("API keys of the home LIPSERVE_HOME.")
 ERRORS = (HomeError, InvalidRequestError)
 LONGEST_DAYS = 36_500.0
 

@@ -107,7 +107,7 @@ class Commands(LazyGroup):
         "stream": Entry("service.cli.stream", "Play a motion to a model in real time, and teach it.", ANSWERS),
         "simulate": Entry("service.cli.simulate", "Simulate a robot's stream and write it as a recording.", ROBOT),
         "excite": Entry("service.cli.excite", "Plan the motion that tells most of what is not known.", ROBOT),
-        "bench": Entry("service.cli.bench", "Time the answers of a service on this machine.", CHECK),
+        "bench": Entry("service.cli.answers", "Time the answers of a service on this machine.", CHECK, "bench_app"),
     }
 
 

@@ -13,21 +13,16 @@ from rich.table import Table
 
 from service.cli import connecting
 from service.cli.connecting import connected, dataset_of
-from service.cli.consoles import CommandError, note, out, print_json, say
-from service.cli.options import Alias, Data, Json, Limit, Model, Url, Version, Yes, confirm
+from service.cli.consoles import CommandError, note, out, print_json, say, tell
+from service.cli.options import Alias, Data, Json, Limit, Model, Url, Version, Yes, confirm, group
 from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
-    from service.client.results import Version as VersionRecord
+    from service.client.results.arm import Version as VersionRecord
     from service.models.schema import Alias as AliasRecord
     from service.models.schema import Selection
 
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    help="Models: list, show, promote, roll back, compare, export, import and delete them.",
-)
+app = group("Models: list, show, promote, roll back, compare, export, import and delete them.")
 SERVING = "serving"
 Which = Annotated[str, typer.Argument(help="A version, by its number or an alias.", autocompletion=connecting.versions)]
 AliasName = Annotated[str, typer.Option("--alias", help="Which alias.", autocompletion=connecting.aliases)]
@@ -114,10 +109,7 @@ def rollback(
             _moved(model, client.rollback_alias(model, alias), as_json)
             return
         back = client.rollback(model, revision=revision)
-    if as_json:
-        print_json(back)
-    else:
-        say(f"{model} is back at revision {revision}: {back.undone} batches do not teach any more")
+    tell(back, as_json, f"{model} is back at revision {revision}: {back.undone} batches do not teach any more")
 
 
 @app.command()
@@ -140,7 +132,7 @@ def alias(
     with connected(url) as client:
         if remove:
             client.remove_alias(model, name)
-            print_json({"removed": name}) if as_json else say(f"alias {name} of {model} is removed")
+            tell({"removed": name}, as_json, f"alias {name} of {model} is removed")
             return
         if version is not None:
             _moved(model, client.set_alias(model, name, _which(version)), as_json)
@@ -148,13 +140,12 @@ def alias(
         aliases = [each for each in client.aliases(model) if each.alias == name]
     if not aliases:
         raise CommandError(f"no alias {name!r} of {model}", f"`lipserve models alias {model} {name} VERSION` makes it")
-    if as_json:
-        print_json(aliases[0])
-        return
-    say(f"{name} of {model} names version {aliases[0].version}")
-    for move in aliases[0].history:
-        back = " (rolled back)" if move.rollback else ""
-        say(f"  {move.at[:19].replace('T', ' ')}  {_or_none(move.before)} → {_or_none(move.version)}{back}")
+    moves = (
+        f"  {move.at[:19].replace('T', ' ')}  {move.before or 'none'} → {move.version or 'none'}"
+        + (" (rolled back)" if move.rollback else "")
+        for move in aliases[0].history
+    )
+    tell(aliases[0], as_json, f"{name} of {model} names version {aliases[0].version}", *moves)
 
 
 @app.command()
@@ -193,10 +184,12 @@ def export_(
     """Write a version as an archive that another service imports."""
     with connected(url) as client:
         written = client.export(model, path, version, alias, learnt)
-    if as_json:
-        print_json({"file": written, "bytes": written.stat().st_size})
-    else:
-        say(f"{written}: {written.stat().st_size:,} bytes; `lipserve models import {written}` reads it")
+    size = written.stat().st_size
+    tell(
+        {"file": written, "bytes": size},
+        as_json,
+        f"{written}: {size:,} bytes; `lipserve models import {written}` reads it",
+    )
 
 
 @app.command()
@@ -222,10 +215,8 @@ def import_(
     """Make a new version of an exported archive. It answers where the model had none before."""
     with connected(url) as client:
         made = client.import_model(path, name)
-    if as_json:
-        print_json(made)
-    else:
-        say(f"{made.model} version {made.version} is imported: `lipserve models promote {made.model} {made.version}`")
+    promote = f"`lipserve models promote {made.model} {made.version}`"
+    tell(made, as_json, f"{made.model} version {made.version} is imported: {promote}")
 
 
 @app.command()
@@ -240,18 +231,11 @@ def delete(
             client.delete_model(model)
         else:
             client.delete_version(model, version)
-    if as_json:
-        print_json({"deleted": {"model": model, "version": version}})
-    else:
-        say(f"{what} is deleted")
+    tell({"deleted": {"model": model, "version": version}}, as_json, f"{what} is deleted")
 
 
 def _which(text: str) -> int | str:
     return int(text) if text.isdecimal() else text
-
-
-def _or_none(version: int | None) -> str:
-    return "none" if version is None else str(version)
 
 
 def _moved(model: str, moved: AliasRecord, as_json: bool) -> None:

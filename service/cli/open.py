@@ -11,11 +11,11 @@ import typer
 
 from service.cli import connecting
 from service.cli.connecting import UNIX, ask
-from service.cli.consoles import START, CommandError, print_json, say
-from service.cli.options import Json, Url
+from service.cli.consoles import START, CommandError, tell
+from service.cli.options import Json, Url, alone
 from service.foundation.settings import DEFAULT_URL
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = alone()
 
 
 @app.command("open")
@@ -37,9 +37,6 @@ def open_(
         raise CommandError(f"no service answers at {url}: {error}", START) from error
     page = "live" if live else "models" if model else ""
     address = f"{url.rstrip('/')}/#/{page}" + (f"/{quote(model, safe='')}" if model else "")
-    if as_json:
-        print_json({"url": address})
-    else:
-        say(address)
+    tell({"url": address}, as_json, address)
     if browser:
         webbrowser.open(address)

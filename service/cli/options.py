@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from pydantic import ValidationError
 
 from service.cli import connecting
 from service.cli.consoles import CommandError
+from service.foundation.settings import Settings
 
 ROBOTS = [
     *("panda", "ur3", "ur5", "ur10", "xarm7", "kinova", "z1", "so100", "so101", "baxter-left", "baxter-right"),
@@ -36,6 +38,25 @@ Version = Annotated[
     typer.Option(help="A version; the one that serves by default.", autocompletion=connecting.versions),
 ]
 Alias = Annotated[str | None, typer.Option(help="A version by its alias.", autocompletion=connecting.aliases)]
+
+
+def group(help_: str) -> typer.Typer:
+    """An application of several commands."""
+    return typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=help_)
+
+
+def alone() -> typer.Typer:
+    """An application of one command."""
+    return typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+def settings_of(**given: Any) -> Settings:
+    """Settings, those that are given and else those of the environment; raise CommandError."""
+    try:
+        return Settings(**{name: value for name, value in given.items() if value is not None})
+    except ValidationError as error:
+        faults = (f"{'.'.join(map(str, each['loc'])) or 'settings'}: {each['msg']}" for each in error.errors())
+        raise CommandError("; ".join(faults)) from None
 
 
 def numbers(option: str, text: str) -> list[float]:

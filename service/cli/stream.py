@@ -11,14 +11,14 @@ from rich.table import Table
 
 from service.cli.connecting import connected
 from service.cli.consoles import INTERRUPTED, CommandError, note, out, print_json, say
-from service.cli.options import ROBOTS, Alias, Json, Model, Url, Version
+from service.cli.options import ROBOTS, Alias, Json, Model, Url, Version, alone
 from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
     from service.cli.playing import Motion, Tally
     from service.client.stream import StreamClient
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = alone()
 SECONDS = 60.0
 SIMULATION = "Simulation"
 

@@ -9,7 +9,9 @@ from numpy.typing import ArrayLike
 from rich.markup import escape
 from rich.table import Table
 
-from service.client.results import Arm, Comparison, Evaluation, Prediction
+from service.client.results.arm import Arm
+from service.client.results.evaluation import Comparison, Evaluation
+from service.client.results.series import Prediction
 from service.datasets.schema import DatasetReport, JointExcitation, Weight
 from service.models.schema import Selection
 

@@ -13,10 +13,10 @@ from service.cli import connecting
 from service.cli.connecting import connected, dataset_of, watch
 from service.cli.consoles import INTERRUPTED, CommandError, note, out, print_json, say
 from service.cli.models import print_selection
-from service.cli.options import HELD_OUT_BY, Json, Url, names, pairs
+from service.cli.options import HELD_OUT_BY, Json, Url, alone, names, pairs
 from service.foundation.settings import DEFAULT_URL
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = alone()
 
 
 @app.command()

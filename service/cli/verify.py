@@ -18,7 +18,7 @@ from lipcore.files import persistence
 from lipcore.files.probing import probe
 from lipcore.online import transfer as state
 from service.cli.consoles import err, print_json, say
-from service.cli.options import Json
+from service.cli.options import Json, alone
 from service.foundation.errors import DamagedDataError
 from service.foundation.settings import Settings
 from service.journal.log import decode
@@ -199,7 +199,7 @@ _CHECKS: dict[str, Callable[[Database, Files], Iterator[_Finding]]] = {
 }
 
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = alone()
 ERRORS = (HomeError,)
 
 

@@ -11,7 +11,6 @@ from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 import httpx
 
-from service.client.async_stream import AsyncStreamClient
 from service.client.call import Answer, Call, Page, bound
 from service.client.methods import POLL_SECONDS, Calls, Followed, Listed, One, looking
 from service.client.sending import (
@@ -24,6 +23,7 @@ from service.client.sending import (
     drafted,
     request_of,
 )
+from service.client.stream import AsyncStreamClient
 from service.learning.control.schema import Learning
 from service.training.schema import Job
 

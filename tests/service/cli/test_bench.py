@@ -4,7 +4,7 @@ import json
 
 from typer.testing import CliRunner
 
-from service.cli.bench import app
+from service.cli.answers import bench_app as app
 from tests.service.conftest import Streaming
 
 

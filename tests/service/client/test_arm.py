@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from service.client import results
+from service.client.results import arm as results
 from service.client.results.arm import Arm, read_arm
 from service.models.schema import Version
 from tests.lipcore.arms import parameters_of
