@@ -184,6 +184,6 @@ def watch(client: Client, job: Job, cancels: bool) -> tuple[Job, bool]:
     except KeyboardInterrupt:
         if not cancels:
             return client.job(job.id), True
-        note(f"cancelling job {job.id} …")
+        note(f"cancelling {job.id} …")
         client.cancel(job.id)
         return client.wait(job.id), True

@@ -71,10 +71,10 @@ def follow(job: JobId, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
         ended, interrupted = watch(client, client.job(job), cancels=False)
     _print(ended, as_json)
     if interrupted:
-        note(f"job {ended.id} goes on: `lipserve jobs cancel {ended.id}` ends it")
+        note(f"{ended.id} goes on: `lipserve jobs cancel {ended.id}` ends it")
         raise typer.Exit(INTERRUPTED)
     if ended.state != "succeeded":
-        raise CommandError(f"job {ended.id} has {ended.state}" + (f": {ended.error.message}" if ended.error else ""))
+        raise CommandError(f"{ended.id} has {ended.state}" + (f": {ended.error.message}" if ended.error else ""))
 
 
 def _print(job: Job, as_json: bool) -> None:

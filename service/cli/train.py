@@ -102,15 +102,15 @@ def train(
     if as_json:
         print_json(job)
     if interrupted and job.version is None:
-        note(f"job {job.id} is cancelled")
+        note(f"{job.id} is cancelled")
         raise typer.Exit(INTERRUPTED)
     if wait and job.version is None:
-        message = f"job {job.id} has {job.state}" + (f": {job.error.message}" if job.error else "")
+        message = f"{job.id} has {job.state}" + (f": {job.error.message}" if job.error else "")
         raise CommandError(message, f"`lipserve jobs show {job.id}` tells its history")
     if as_json:
         return
     if not wait:
-        say(f"job {job.id} is queued: `lipserve jobs follow {job.id}`")
+        say(f"{job.id} is queued: `lipserve jobs follow {job.id}`")
         return
     say(f"{model} version {job.version} is trained and answers")
     if made is not None and made.selection is not None:

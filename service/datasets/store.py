@@ -125,7 +125,7 @@ def delete(storage: Storage, dataset: str) -> None:
             raise not_found("dataset", dataset)
         for job in session.scalars(select(JobRow).where(JobRow.state.in_(ACTIVE))):
             if dataset in job.request["datasets"]:
-                raise ConflictError(f"data set {dataset!r} is in use by job {job.id!r}: cancel it or wait for its end")
+                raise ConflictError(f"data set {dataset!r} is in use by {job.id}: cancel it or wait for its end")
         session.delete(row)
     storage.files.delete_samples(dataset)
 

@@ -73,7 +73,7 @@ def delete_model(loaded: LoadedModels, model: str) -> None:
             if row is None:
                 raise not_found("model", model)
             for job in _active_jobs(session, model):
-                raise ConflictError(f"job {job.id!r} of model {model!r} is {job.state}: cancel it or wait for its end")
+                raise ConflictError(f"{job.id} of model {model!r} is {job.state}: cancel it or wait for its end")
             versions = list(session.scalars(select(VersionRow).where(VersionRow.model == model)))
             snapshots = list(session.scalars(select(SnapshotRow.id).where(SnapshotRow.model == model)))
             _note_deletion(session, row, [each.version for each in versions])
@@ -100,7 +100,7 @@ def _check_unused(session: Session, model: str, version: int) -> None:
         raise ConflictError(f"{name} is compared with the version that serves: wait until that is decided")
     for job in _active_jobs(session, model):
         if (job.request.get("refresh") or {}).get("version") == version:
-            raise ConflictError(f"job {job.id!r} trains {name} anew: cancel it or wait for its end")
+            raise ConflictError(f"{job.id} trains {name} anew: cancel it or wait for its end")
 
 
 def _active_jobs(session: Session, model: str) -> list[JobRow]:

@@ -94,7 +94,7 @@ def delete(database: Database, robot: str) -> None:
             raise not_found("robot", robot)
         for job in session.scalars(select(JobRow).where(JobRow.state.in_(ACTIVE))):
             if job.request.get("robot") == robot:
-                raise ConflictError(f"robot {robot!r} is in use by job {job.id!r}: cancel it or wait for its end")
+                raise ConflictError(f"robot {robot!r} is in use by {job.id}: cancel it or wait for its end")
         session.delete(row)
 
 

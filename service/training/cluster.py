@@ -76,7 +76,7 @@ class ClusterQueue(JobQueue):
                 try:
                     future = self._away.submit(key, gpu, remote.call_named, HOST, __version__, job)
                 except ClusterUnavailableError as error:
-                    logger.warning("job %s waits: %s", job, error)
+                    logger.warning("%s waits: %s", job, error)
                     return
                 self._hands.append(Hand(job, None, future, clock, away=True))
             del self._waiting[job]

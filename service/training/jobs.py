@@ -96,7 +96,7 @@ def add(
         request_id=request_id.get(),
     )
     mark(job, named)
-    lifecycle.enter(job, QUEUED, "queued" if retry_of is None else f"queued to repeat job {retry_of}")
+    lifecycle.enter(job, QUEUED, "queued" if retry_of is None else f"queued to repeat {retry_of}")
     session.add(job)
     return job
 
@@ -144,7 +144,7 @@ def cancel(queue: JobQueue, job: str) -> Job:
         if row is None:
             raise not_found("job", job)
         if row.state not in ACTIVE:
-            raise ConflictError(f"job {job!r} has {row.state} already")
+            raise ConflictError(f"{job} has {row.state} already")
         if row.state == QUEUED:
             lifecycle.enter(row, CANCELLED, "cancelled while it waited")
         elif not row.cancel_requested:

@@ -212,7 +212,7 @@ class Settler:
         if ended.why == "cancelled" or row.cancel_requested:
             enter(row, CANCELLED, f"cancelled: {ended.message}")
             return Settled()
-        logger.error("job %s: %s", row.id, ended.message)
+        logger.error("%s: %s", row.id, ended.message)
         if ended.why == "too_long":
             fail(row, "too_long", ended.message)
             return Settled()

@@ -57,7 +57,7 @@ def add(
     if not registry.exists(session, model, version.version):  # deleted since it was found
         raise not_found("version", version.version)
     for job in session.scalars(of(model).where(JobRow.state.in_(ACTIVE))):
-        raise ConflictError(f"job {job.id!r} refreshes model {model!r} already: wait for its end or cancel it")
+        raise ConflictError(f"{job.id} refreshes model {model!r} already: wait for its end or cancel it")
     through = log.newest(session, model)
     scope = refresh_data.scope_of(session, model, through)
     kept, left_out = refresh_data.split_datasets(session, scope, manifest["lineage"])
@@ -102,7 +102,7 @@ def retry(queue: JobQueue, job: str, named: Identity | None = None) -> Job:
     if (before := jobs.done_before(queue.database, named)) is not None:
         return before
     if row.state not in (FAILED, CANCELLED):
-        raise ConflictError(f"job {job!r} is {row.state}: only one that has failed or was cancelled can be repeated")
+        raise ConflictError(f"{job} is {row.state}: only one that has failed or was cancelled can be repeated")
     try:
         again = row.request.get("refresh")
         if again is not None:
@@ -112,4 +112,4 @@ def retry(queue: JobQueue, job: str, named: Identity | None = None) -> Job:
         )
         return jobs.create(queue, request, retry_of=row.id, named=named)
     except NotFoundError as error:
-        raise ConflictError(f"job {job!r} cannot be repeated: {error.message}") from None
+        raise ConflictError(f"{job} cannot be repeated: {error.message}") from None

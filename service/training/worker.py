@@ -116,9 +116,9 @@ def _train(settings: Settings, database: Database, files: Files, claim: Claim) -
     except lipcore.FitCancelledError:
         _finish(database, files, claim, CANCELLED, "cancelled while it ran")
     except SupersededError:
-        logger.warning("job %s was taken over by another attempt", claim.job)
+        logger.warning("%s was taken over by another attempt", claim.job)
     except Exception as error:
-        logger.exception("job %s failed", claim.job)
+        logger.exception("%s failed", claim.job)
         unavailable = isinstance(error, ClusterUnavailableError)
         if unavailable or isinstance(storage_errors.translated(error), StorageUnavailableError):
             raise StorageError(str(error)) from None  # another time it may work

@@ -42,7 +42,7 @@ def test_ctrl_c_in_train_cancels_the_job(lipserve, server, long, interrupted):
     assert code == 130
     found = json.loads(said)
     assert found["state"] == "cancelled"
-    assert f"job {found['id']} is cancelled" in err
+    assert f"{found['id']} is cancelled" in err
 
 
 def test_ctrl_c_while_the_job_is_queued_cancels_it(lipserve, server, long, monkeypatch):

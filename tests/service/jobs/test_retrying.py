@@ -31,7 +31,7 @@ def test_a_repeated_job_is_a_new_one_with_the_same_request(no_worker, cancelled)
     assert answer.headers["location"] == f"/v1/jobs/{again['id']}"
     assert again["id"] != name
     assert (again["retry_of"], again["state"], again["attempts"]) == (name, "queued", 0)
-    assert [entry["message"] for entry in again["history"]] == [f"queued to repeat job {name}"]
+    assert [entry["message"] for entry in again["history"]] == [f"queued to repeat {name}"]
     for field in ("model", "datasets", "estimator", "robot", "refresh"):
         assert again[field] == before[field]
     assert (before["state"], before["retry_of"]) == ("cancelled", None)

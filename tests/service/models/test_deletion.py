@@ -136,9 +136,9 @@ def test_a_candidate_in_contest_stays(api, arm):
 
 def test_what_a_job_trains_anew_stays(api, arm):
     name = job(api, arm, RUNNING, refresh={"version": 1, "through": 0, "trigger": "asked"})
-    assert f"job '{name}' trains version 1" in refusal(api, f"{arm}/versions/1")
+    assert f"{name} trains version 1" in refusal(api, f"{arm}/versions/1")
     assert delete(api, f"{arm}/versions/2").status_code == 204
-    assert f"job '{name}' of model '{arm}' is running" in refusal(api, arm)
+    assert f"{name} of model '{arm}' is running" in refusal(api, arm)
     end(api, name)
     assert delete(api, f"{arm}/versions/1").status_code == 204
     assert delete(api, arm).status_code == 204
