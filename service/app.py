@@ -36,8 +36,7 @@ from service.oip import routes as oip
 from service.replication.replication import Replication
 from service.robots import routes as robots
 from service.storage.files.store import start_sweeping
-from service.storage.home import hold_home
-from service.storage.storage import Storage, look_database, look_files, look_home
+from service.storage.storage import Storage, hold_home, look_database, look_files, look_home
 from service.stream import routes as stream
 from service.training import metrics as jobs_metrics
 from service.training import routes as training

@@ -17,7 +17,7 @@ from service.cli.options import Json, group
 from service.foundation.errors import InvalidRequestError
 from service.foundation.settings import Settings
 from service.storage.database import ApiKeyRow, Database
-from service.storage.home import HomeError, usable
+from service.storage.storage import HomeError, usable
 from service.web.access import keys
 from service.web.access.scopes import SCOPES
 

@@ -10,7 +10,7 @@ import uvicorn
 
 from service.app import create_app
 from service.cli.options import alone, settings_of
-from service.storage.home import HomeError, check_home
+from service.storage.storage import HomeError, check_home
 from service.web.observability import logs
 from service.web.server import sockets
 from service.web.server.connections import StreamProtocol, guarded

@@ -25,7 +25,7 @@ from service.journal.log import decode
 from service.storage.database import Database, DatasetRow, EventRow, RobotRow, SnapshotRow, VersionRow
 from service.storage.database.engine import FILE
 from service.storage.files import Files, FilesUnreachableError
-from service.storage.home import HomeError, usable
+from service.storage.storage import HomeError, usable
 
 FAULTS = 20
 """Faults of the database that are told, at most."""

@@ -14,7 +14,7 @@ from service import cli
 from service.foundation.errors import StorageFullError, StorageUnavailableError
 from service.foundation.settings import Settings
 from service.storage.database import Database
-from service.storage.home import HomeError, check_home
+from service.storage.storage import HomeError, check_home
 from service.web.storage_errors import translated
 
 PASSWORD = "correct-horse"

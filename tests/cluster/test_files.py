@@ -18,7 +18,7 @@ from service.models import registry
 from service.models.archive import MEDIA_TYPE
 from service.storage.database import Database, VersionRow
 from service.storage.files import Files, FilesUnreachableError
-from service.storage.home import HomeError, check_home
+from service.storage.storage import HomeError, check_home
 from tests.cluster.servers import BUCKET, Shared
 from tests.service.data import ADDRESS, arrays, error, npz, post, service_of, stream, upload
 

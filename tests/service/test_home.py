@@ -15,7 +15,7 @@ from service.foundation.settings import Settings, shipped_models
 from service.models import registry
 from service.storage.database import Database, JobRow, VersionRow, now
 from service.storage.files import Files
-from service.storage.home import HomeInUseError
+from service.storage.storage import HomeInUseError
 from tests.service.data import ADDRESS, QUICK, ended, error, job, stream, train, upload
 
 QUERY = {"q": [0.3, -0.2], "dq": [0.1, 0.4], "ddq": [1.0, -0.5], "covariance": True}

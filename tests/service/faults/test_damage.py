@@ -16,7 +16,7 @@ from lipcore.files.persistence import MANIFEST, TENSORS
 from service.app import create_app
 from service.foundation.settings import Settings
 from service.storage.database.engine import FILE
-from service.storage.home import HomeError, check_home
+from service.storage.storage import HomeError, check_home
 from tests.service.data import ended, error, eventually, queue, stream, upload
 from tests.service.faults.damage import HARM, cut, empty, flip, zero
 from tests.service.faults.house import furnish

@@ -22,7 +22,7 @@ from service.foundation.settings import Settings
 from service.storage.database import Database
 from service.storage.database.engine import FILE
 from service.storage.files import Files
-from service.storage.home import HomeError, check_home
+from service.storage.storage import HomeError, check_home
 from service.web.storage_errors import translated
 from tests.service.data import arrays, error, npz, service_of, stream
 from tests.service.faults.storage import small_disk
