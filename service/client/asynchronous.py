@@ -149,8 +149,8 @@ class AsyncClient(Calls, makers={One: _async, Listed: _listed, Followed: _follow
         if call.save_to is not None:
             return await self._save(call, call.save_to)
         with content_of(call) as content:
-            awaited = {name: _awaited(pieces) for name, pieces in content.items()}
-            response = await self._http.request(**request_of(call), **awaited)
+            awaited = None if content is None else _awaited(content)
+            response = await self._http.request(**request_of(call), content=awaited)
         return answer_of(response, response.content)
 
     async def _save(self, call: Call[Any], path: Path) -> Answer:

@@ -94,8 +94,6 @@ def request_of(call: Call[Any]) -> dict[str, Any]:
     asked: dict[str, Any] = {"method": call.method, "url": call.path, "params": call.params, "headers": call.headers}
     if call.json is not None:
         asked["json"] = call.json
-    if call.content is not None:
-        asked["content"] = call.content
     if call.timeout is not None:
         asked["timeout"] = call.timeout
     return asked
@@ -107,19 +105,19 @@ def answer_of(response: httpx.Response, body: bytes = b"") -> Answer:
 
 
 @contextmanager
-def content_of(call: Call[Any]) -> Iterator[dict[str, Iterator[bytes]]]:
-    """The file that a call sends, in pieces, as httpx is given it, with a bar where that is to be shown."""
+def content_of(call: Call[Any]) -> Iterator[Iterator[bytes] | None]:
+    """The file that a call sends, in pieces, with a bar where that is to be shown; None where it sends none."""
     if call.file is None:
-        yield {}
+        yield None
         return
     with ExitStack() as stack:
         file = stack.enter_context(call.file.open("rb"))
-        content = iter(partial(file.read, CHUNK), b"")
+        content: Iterator[bytes] = iter(partial(file.read, CHUNK), b"")
         if call.shown is not None:
             from service.client.progress import upload_bar  # noqa: PLC0415 - rich, for those who look
 
             content = stack.enter_context(upload_bar(call.shown, call.file.stat().st_size))(content)
-        yield {"content": content}
+        yield content
 
 
 @contextmanager

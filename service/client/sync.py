@@ -150,7 +150,7 @@ class Client(Calls, makers={One: _sync, Listed: _listed, Followed: _followed}):
         if call.save_to is not None:
             return self._save(call, call.save_to)
         with content_of(call) as content:
-            response = self._http.request(**request_of(call), **content)
+            response = self._http.request(**request_of(call), content=content)
         return answer_of(response, response.content)
 
     def _save(self, call: Call[Any], path: Path) -> Answer:
