@@ -137,7 +137,7 @@ MEMBER_LIMITS: Mapping[str, int] = {
 }
 
 
-def find_model(given: str, url: str, version: int | None = None, alias: str | None = None) -> TorqueModel:
+def find_model(given: str, url: str) -> TorqueModel:
     """The model in a folder of that path, or of that name from the service at `url`.
 
     Raise ModelFormatError for what is no model, ApiError or ServiceUnreachableError where the service has none.
@@ -147,13 +147,13 @@ def find_model(given: str, url: str, version: int | None = None, alias: str | No
         return lipcore.load(folder)
     if folder.is_dir():
         raise ModelFormatError(f"{given} holds no {MANIFEST}, expected the folder of a saved model", MANIFEST)
-    return fetch(given, url, version, alias)
+    return fetch(given, url)
 
 
-def fetch(name: str, url: str, version: int | None = None, alias: str | None = None) -> TorqueModel:
+def fetch(name: str, url: str) -> TorqueModel:
     """A served model as it is now, with all that it has learnt online."""
     with TemporaryDirectory(prefix="lipserve-excite-") as folder, Client(url) as client:
-        path = client.export(name, Path(folder) / "model.tar", version, alias)
+        path = client.export(name, Path(folder) / "model.tar")
         try:
             places = archive.members(path, MEMBER_LIMITS)
         except archive.ArchiveError as error:
