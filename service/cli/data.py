@@ -54,8 +54,7 @@ def add(
     ] = None,
     rate: Annotated[float | None, typer.Option(help="Of the samples, Hz.", rich_help_panel=PREPARATION)] = None,
     gap: Annotated[
-        float | None,
-        typer.Option(help="Steps that a gap is longer than; 1.5 by default.", rich_help_panel=PREPARATION),
+        float | None, typer.Option(help="Steps that a gap is longer than; 1.5 by default.", rich_help_panel=PREPARATION)
     ] = None,
     trim: Annotated[
         float | None, typer.Option(help="Cut off at both ends of every part, s.", rich_help_panel=PREPARATION)
@@ -94,11 +93,7 @@ def add(
 
 
 @app.command("list")
-def list_(
-    limit: Limit = 50,
-    url: Url = DEFAULT_URL,
-    as_json: Json = False,
-) -> None:
+def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
     """List data sets, newest first."""
     with connected(url) as client:
         datasets = list(islice(client.datasets(), limit))

@@ -188,8 +188,7 @@ class Random:
 def excite(
     out: Annotated[Path, typer.Option(help="CSV file to write: t, q1…, dq1…, ddq1….", dir_okay=False)],
     model: Annotated[
-        str | None,
-        typer.Option(help="What is known already: a saved model's folder, or the name of a served model."),
+        str | None, typer.Option(help="What is known already: a saved model's folder, or the name of a served model.")
     ] = None,
     robot: Annotated[
         str | None,

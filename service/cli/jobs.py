@@ -27,11 +27,7 @@ app = group("Training jobs: list, show, follow, cancel and retry them.")
 
 
 @app.command("list")
-def list_(
-    limit: Limit = 50,
-    url: Url = DEFAULT_URL,
-    as_json: Json = False,
-) -> None:
+def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
     """List jobs, newest first."""
     with connected(url) as client:
         jobs = list(islice(client.jobs(), limit))
@@ -110,8 +106,7 @@ def train(
         ),
     ],
     model: Annotated[
-        str,
-        typer.Option(help="Name of the model; a new version of it is made.", autocompletion=connecting.models),
+        str, typer.Option(help="Name of the model; a new version of it is made.", autocompletion=connecting.models)
     ],
     url: Url = DEFAULT_URL,
     estimator: Annotated[

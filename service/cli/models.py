@@ -29,11 +29,7 @@ AliasName = Annotated[str, typer.Option("--alias", help="Which alias.", autocomp
 
 
 @app.command("list")
-def list_(
-    limit: Limit = 50,
-    url: Url = DEFAULT_URL,
-    as_json: Json = False,
-) -> None:
+def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
     """List models, newest first."""
     with connected(url) as client:
         models = list(islice(client.models(), limit))
@@ -80,11 +76,7 @@ def show(model: Model, version: Version = None, url: Url = DEFAULT_URL, as_json:
 
 @app.command()
 def promote(
-    model: Model,
-    version: Which,
-    alias: AliasName = SERVING,
-    url: Url = DEFAULT_URL,
-    as_json: Json = False,
+    model: Model, version: Which, alias: AliasName = SERVING, url: Url = DEFAULT_URL, as_json: Json = False
 ) -> None:
     """Let a version answer where none is named; with --alias, point that alias to it instead."""
     with connected(url) as client:
@@ -150,12 +142,7 @@ def alias(
 
 @app.command()
 def compare(
-    model: Model,
-    data: Data,
-    first: Which,
-    second: Which,
-    url: Url = DEFAULT_URL,
-    as_json: Json = False,
+    model: Model, data: Data, first: Which, second: Which, url: Url = DEFAULT_URL, as_json: Json = False
 ) -> None:
     """Compare two versions on a recording: which is better, as far as the data can tell."""
     with connected(url) as client:

@@ -34,8 +34,7 @@ Data = Annotated[
     typer.Argument(help="A recording, which is uploaded, or the id of a data set.", autocompletion=connecting.datasets),
 ]
 Version = Annotated[
-    int | None,
-    typer.Option(help="A version; the one that serves by default.", autocompletion=connecting.versions),
+    int | None, typer.Option(help="A version; the one that serves by default.", autocompletion=connecting.versions)
 ]
 Alias = Annotated[str | None, typer.Option(help="A version by its alias.", autocompletion=connecting.aliases)]
 

@@ -30,8 +30,7 @@ def stream(
         Path | None, typer.Argument(help="A recording with times, q, dq, ddq and tau, or from which these are derived.")
     ] = None,
     simulate: Annotated[
-        str | None,
-        typer.Option(help="Play a simulated robot instead, such as panda.", autocompletion=lambda: ROBOTS),
+        str | None, typer.Option(help="Play a simulated robot instead, such as panda.", autocompletion=lambda: ROBOTS)
     ] = None,
     learn: Annotated[
         bool,
@@ -87,12 +86,7 @@ def stream(
         step = motion.step if deadline is None else deadline / 1e3
         _announce(motion, opened, source)
         total = play(
-            opened,
-            motion,
-            learn,
-            step,
-            stop,
-            lambda second, part: _tell_second(second, part, opened, learn, as_json),
+            opened, motion, learn, step, stop, lambda second, part: _tell_second(second, part, opened, learn, as_json)
         )
         if learn:
             opened.flush()

@@ -162,10 +162,7 @@ class Slot:
 
     def _new_pool(self) -> ProcessPoolExecutor:
         return ProcessPoolExecutor(
-            1,
-            mp_context=multiprocessing.get_context("spawn"),
-            initializer=start_process,
-            initargs=(self.place,),
+            1, mp_context=multiprocessing.get_context("spawn"), initializer=start_process, initargs=(self.place,)
         )
 
 

@@ -5,15 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from service.datasets.report.excitation import SELDOM, SLOW
-from service.datasets.schema import (
-    Excitation,
-    JointExcitation,
-    JointLimits,
-    JointNoise,
-    JointSaturation,
-    Lag,
-    Timing,
-)
+from service.datasets.schema import Excitation, JointExcitation, JointLimits, JointNoise, JointSaturation, Lag, Timing
 
 TERMS = (("viscous friction", "viscous"), ("Coulomb friction", "coulomb"), ("constant torque", "offset"))
 STILL = 0.02
@@ -58,11 +50,7 @@ def warnings(
         )
     if timing.missing_rows > MISSING * rows:
         out.append(f"{timing.missing_rows} of {rows} rows lack a value and were left out")
-    for what, field in (
-        ("positions", "beyond_range"),
-        ("velocities", "beyond_speed"),
-        ("torques", "beyond_torque"),
-    ):
+    for what, field in (("positions", "beyond_range"), ("velocities", "beyond_speed"), ("torques", "beyond_torque")):
         shares = {each.joint: getattr(each, field) or 0.0 for each in limits}
         beyond = {joint: share for joint, share in shares.items() if share > BEYOND}
         if beyond:
