@@ -44,8 +44,7 @@ from service.training.queue import JobQueue, queue_of
 from service.web import openapi, storage_errors
 from service.web.access.keys import Keyring
 from service.web.access.middleware import KeyAccess, LocalAccess
-from service.web.limits import BodyLimit
-from service.web.limits.requests import Gate, RateLimit, Turns
+from service.web.limits.requests import BodyLimit, Gate, RateLimit, Turns
 from service.web.observability import metrics, readiness, requests
 from service.web.observability.meters import Meters
 from service.web.observability.metrics import System, Traffic

@@ -48,6 +48,7 @@ ORDER = (
 SLUGS = {"reproduction/results.md": "reproduction"}
 """Addresses of pages that are not called as their file is."""
 _COMMENT = re.compile(r"^<!--.*?-->\n?", re.MULTILINE)
+_SCROLLED = '<div class="scroll" role="region" aria-label="Table, may be scrolled" tabindex="0"><table>\n'
 _ELSEWHERE = re.compile(r"[a-z][a-z0-9+.-]*:|//|#", re.IGNORECASE)
 
 
@@ -130,8 +131,8 @@ def _markdown() -> MarkdownIt:
 
     made = MarkdownIt("commonmark", {"html": False}).enable("table")
     made.core.ruler.push("guide", _adapt)
-    made.add_render_rule("table_open", _table_open)
-    made.add_render_rule("table_close", _table_close)
+    made.add_render_rule("table_open", lambda *_: _SCROLLED)
+    made.add_render_rule("table_close", lambda *_: "</table></div>\n")
     return made
 
 
@@ -160,14 +161,6 @@ def _redirect(token: Token, file: str) -> None:
 
 def _text(inline: Token) -> str:
     return "".join(child.content for child in inline.children or ())
-
-
-def _table_open(*_: Any) -> str:
-    return f'<div class="scroll" role="region" aria-label="{escape("Table, may be scrolled")}" tabindex="0"><table>\n'
-
-
-def _table_close(*_: Any) -> str:
-    return "</table></div>\n"
 
 
 ADDRESS, FILES = "/guide", "/guide/files"

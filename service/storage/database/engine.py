@@ -12,10 +12,10 @@ from itertools import chain
 from pathlib import Path
 from secrets import token_hex
 from sqlite3 import connect
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from urllib.parse import quote
 
-from sqlalchemy import Connection, Engine, create_engine, event, text
+from sqlalchemy import Connection, create_engine, event, text
 from sqlalchemy.orm import Session, sessionmaker
 
 from service.foundation.settings import CONNECTIONS, Settings
@@ -29,6 +29,9 @@ from service.storage.database.tables import (
     ServingRow,
     VersionRow,
 )
+
+if TYPE_CHECKING:  # its driver is an extra
+    from service.storage.database.postgresql import Postgresql
 
 FILE = "lipserve.sqlite3"
 MOST_CONNECTIONS = 64
@@ -164,35 +167,6 @@ class DriverMissingError(RuntimeError):
     """What PostgreSQL needs is not installed."""
 
 
-class Adapter(Protocol):
-    """What SQLite and PostgreSQL do differently."""
-
-    engine: Engine
-    shared: bool
-    """Whether other services may write to it too."""
-
-    def lock(self, connection: Connection, model: str | None) -> None:
-        """Begin a transaction of a writer: the only one of a model, or the only one of all where None."""
-
-    def turn(self, model: str) -> AbstractContextManager[None]:
-        """Be the only one, of all services, that takes something for a model while the block runs."""
-
-    def changes_of_others(self, pause_s: float) -> Iterator[str | None]:
-        """What other services tell, see `Database.changes_of_others`."""
-
-    def close(self) -> None:
-        """Close all connections."""
-
-    def check(self, seconds: float) -> None:
-        """Raise an error unless the database can be read and written within so many seconds."""
-
-    def damage(self, most: int = 1) -> list[str]:
-        """What the database finds wrong with itself, at most so many faults; empty where it is whole."""
-
-    def inconsistencies(self, most: int) -> list[str]:
-        """As `damage`, looked at more closely, and rows that refer to none."""
-
-
 class Database:
     """Sessions on one database; safe to share between threads. timeout_s: longest wait for another writer.
 
@@ -263,11 +237,11 @@ class Database:
         self.adapter.close()
 
 
-def _adapter(home: Path, timeout_s: float, url: str | None, connections: int) -> Adapter:
+def _adapter(home: Path, timeout_s: float, url: str | None, connections: int) -> Sqlite | Postgresql:
     if url is None:
         return Sqlite(home, timeout_s)
     try:
-        from service.storage.database.postgresql import Postgresql  # noqa: PLC0415 - its driver is an extra
+        from service.storage.database import postgresql  # noqa: PLC0415
     except ModuleNotFoundError as error:
         raise DriverMissingError("LIPSERVE_DATABASE_URL needs more: pip install 'lipserve[cluster]'") from error
-    return Postgresql(url, timeout_s, connections)
+    return postgresql.Postgresql(url, timeout_s, connections)

@@ -52,7 +52,7 @@ class System(Collector):
     def collect(self) -> Iterator[Metric]:
         """Yield every metric."""
         yield BUILD.of([([__version__], 1)])
-        parts = self._readiness.report().checks
+        parts = self._readiness.report()
         yield PARTS.of(([part.name], float(part.state != "failed")) for part in parts)
         files, usage = self._storage.files, self._storage.disk.usage()
         used = {what: measure(folder) for what, folder in files.folders.items()}

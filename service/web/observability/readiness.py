@@ -53,18 +53,6 @@ class Check:
     message: str
 
 
-@dataclass(frozen=True)
-class Report:
-    """All parts, as they were when they were looked at last."""
-
-    checks: tuple[Check, ...]
-
-    @property
-    def failed(self) -> list[Check]:
-        """Parts that keep the service from being ready."""
-        return [each for each in self.checks if each.state == "failed"]
-
-
 class Readiness:
     """Looks at the parts of a service, at most once every KEPT_S; safe from several threads, not for the event loop.
 
@@ -76,17 +64,17 @@ class Readiness:
     ) -> None:
         self.looks, self._stopping = looks, stopping
         self._clock, self._lock = clock, threading.Lock()
-        self._report, self._until = Report(()), -float("inf")
+        self._report, self._until = tuple[Check, ...](), -float("inf")
         self._wrong_since: dict[str, float] = {}
 
-    def report(self) -> Report:
-        """How the parts are, just now or within the last KEPT_S; never raises."""
+    def report(self) -> tuple[Check, ...]:
+        """How all parts are, just now or within the last KEPT_S; never raises."""
         with self._lock:
             if self._clock() >= self._until:
-                self._report = Report(tuple(self._check(name, look) for name, look in self.looks.items()))
+                self._report = tuple(self._check(name, look) for name, look in self.looks.items())
                 self._until = self._clock() + KEPT_S
             if self._stopping.begun:
-                return Report((Check("stopping", "failed", "the service is stopping"), *self._report.checks))
+                return Check("stopping", "failed", "the service is stopping"), *self._report
             return self._report
 
     def forget(self) -> None:
@@ -149,8 +137,8 @@ def ready(readiness: ReadinessDep) -> Ready:
     and the service is not stopping. Otherwise `detail` names the parts that do not. Looked at once a second at most.
     """
     report = readiness.report()
-    if report.failed:
-        message = "; ".join(f"{each.name}: {each.message}" for each in report.failed)
-        raise NotReadyError(message, [problem(each.name, each.message, "ok") for each in report.failed])
-    checks = [Part(name=each.name, state=each.state, message=each.message) for each in report.checks]
+    if failed := [each for each in report if each.state == "failed"]:
+        message = "; ".join(f"{each.name}: {each.message}" for each in failed)
+        raise NotReadyError(message, [problem(each.name, each.message, "ok") for each in failed])
+    checks = [Part(name=each.name, state=each.state, message=each.message) for each in report]
     return Ready(version=__version__, checks=checks)
