@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from service.client.call import Answer, Call, Route, document, given, record, route
-from service.client.results.arrays import Array, array
+from service.client.results import Array, array
 from service.client.results.evaluation import Comparison, Evaluation, read_comparison, read_evaluation
 from service.client.results.series import Prediction, Trace, read_prediction, read_trace
 from service.oip.schema import ModelMetadata, ModelReady, ServerLive, ServerMetadata, ServerReady

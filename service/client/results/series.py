@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.client.call import Answer
-from service.client.results.arrays import Array, Plain, reading, shape_arrays
+from service.client.results import Array, Plain, reading, shape_arrays
 from service.learning.live.schema import LiveLost, LiveStatus
 
 

@@ -30,7 +30,7 @@ from service.storage.database.tables import (
     VersionRow,
 )
 
-if TYPE_CHECKING:  # its driver is an extra
+if TYPE_CHECKING:
     from service.storage.database.postgresql import Postgresql
 
 FILE = "lipserve.sqlite3"
@@ -241,7 +241,7 @@ def _adapter(home: Path, timeout_s: float, url: str | None, connections: int) ->
     if url is None:
         return Sqlite(home, timeout_s)
     try:
-        from service.storage.database import postgresql  # noqa: PLC0415
+        from service.storage.database.postgresql import Postgresql  # noqa: PLC0415 - its driver is an extra
     except ModuleNotFoundError as error:
         raise DriverMissingError("LIPSERVE_DATABASE_URL needs more: pip install 'lipserve[cluster]'") from error
-    return postgresql.Postgresql(url, timeout_s, connections)
+    return Postgresql(url, timeout_s, connections)
