@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from service.cli import connecting
 from service.cli.connecting import connected
-from service.cli.consoles import out, print_json, say, tell
+from service.cli.consoles import echo, out, print_json, print_result
 from service.cli.options import DatasetId, Json, Limit, Url, Yes, confirm, group, names, pairs
 from service.datasets.asking import SUFFIXES, Reading
 from service.foundation.settings import DEFAULT_URL
@@ -101,11 +101,11 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
         print_json(datasets)
         return
     if not datasets:
-        say("no data set yet: `lipserve data add FILE` uploads a recording")
+        echo("no data set yet: `lipserve data add FILE` uploads a recording")
     for each in datasets:
         rate = "" if each.report.rate_hz is None else f" at {each.report.rate_hz:.4g} Hz"
         joints = f"{len(each.joint_names)} joints"
-        say(f"{each.id}  {each.created_at[:19]}  {each.name}: {each.report.rows:,} samples{rate}, {joints}")
+        echo(f"{each.id}  {each.created_at[:19]}  {each.name}: {each.report.rows:,} samples{rate}, {joints}")
 
 
 @app.command()
@@ -131,7 +131,7 @@ def delete(
     with connected(url) as client:
         for each in datasets:
             client.delete_dataset(each)
-    tell({"deleted": datasets}, as_json, f"{', '.join(datasets)} deleted")
+    print_result({"deleted": datasets}, as_json, f"{', '.join(datasets)} deleted")
 
 
 def _print(dataset: Dataset) -> None:
@@ -140,11 +140,11 @@ def _print(dataset: Dataset) -> None:
     report = dataset.report
     out.print(f"[bold]{dataset.id}[/bold]  {escape(dataset.name)}  torque: {dataset.torque_convention}")
     for line in tables.overview(report):
-        say(f"  {line}")
+        echo(f"  {line}")
     for table in tables.report_tables(report, dataset.joint_names):
         out.print(table)
     if report.excitation is not None:
-        say(f"  {report.excitation.text}")
+        echo(f"  {report.excitation.text}")
     for line in report.warnings:
         out.print(f"[yellow]warning:[/yellow] {escape(line)}", highlight=False)
     for line in report.advice:

@@ -238,7 +238,7 @@ def excite(
         plotting.draw_motion(plot, made)
     random = random_motion(made)
     if as_json:
-        print_json(shown(made, random, out, plot))
+        print_json(document(made, random, out, plot))
         return
     console.print(table(made, random), highlight=False)
     console.print(summary(made, "the model" if known is not None else f"a {estimator} prior"), highlight=False)
@@ -272,7 +272,7 @@ def random_motion(made: Plan) -> Random:
     return Random(left(1.0), left(FAST))
 
 
-def shown(made: Plan, random: Random, out: Path, plot: Path | None) -> dict[str, Any]:
+def document(made: Plan, random: Random, out: Path, plot: Path | None) -> dict[str, Any]:
     """The plan for JSON: per joint the shares of variance expected to be left, and of the limits that are used."""
     start = made.series.at(np.zeros(1))[0][0]
     return {

@@ -14,7 +14,7 @@ from rich.table import Column, Table
 from lipcore.vocabulary import CHOICES, DEFAULT_ESTIMATOR
 from service.cli import connecting
 from service.cli.connecting import connected, dataset_of, watch
-from service.cli.consoles import INTERRUPTED, CommandError, note, out, print_json, say
+from service.cli.consoles import INTERRUPTED, CommandError, echo, note, out, print_json
 from service.cli.models import print_selection
 from service.cli.options import HELD_OUT_BY, JobId, Json, Limit, Url, alone, group, names, pairs
 from service.foundation.settings import DEFAULT_URL
@@ -35,7 +35,7 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
         print_json(jobs)
         return
     if not jobs:
-        say("no job yet: `lipserve train FILE --model NAME` queues one")
+        echo("no job yet: `lipserve train FILE --model NAME` queues one")
         return
     table = Table(Column("id", no_wrap=True), "model", "estimator", "state", "done", "version", "queued")
     for job in jobs:
@@ -84,14 +84,14 @@ def _print(job: Job, as_json: bool) -> None:
         print_json(job)
         return
     made = "" if job.version is None else f", version {job.version}"
-    say(f"{job.id}  {job.model} ({job.estimator}): {job.state}{made}")
+    echo(f"{job.id}  {job.model} ({job.estimator}): {job.state}{made}")
     at = job.progress
     left = "" if not at.remaining_s else f", at most about {at.remaining_s:.0f} s left"
-    say(f"  {at.stage}, {at.fraction:.0%} after {at.elapsed_s:.0f} s{left}; data sets {', '.join(job.datasets)}")
+    echo(f"  {at.stage}, {at.fraction:.0%} after {at.elapsed_s:.0f} s{left}; data sets {', '.join(job.datasets)}")
     for change in job.history:
-        say(f"  {change.at[:19].replace('T', ' ')}  {change.state}: {change.message}")
+        echo(f"  {change.at[:19].replace('T', ' ')}  {change.state}: {change.message}")
     if job.error is not None:
-        say(f"  failed: {job.error.message} ({job.error.code})")
+        echo(f"  failed: {job.error.message} ({job.error.code})")
 
 
 train_app = alone()
@@ -187,9 +187,9 @@ def train(
     if as_json:
         return
     if not wait:
-        say(f"{job.id} is queued: `lipserve jobs follow {job.id}`")
+        echo(f"{job.id} is queued: `lipserve jobs follow {job.id}`")
         return
-    say(f"{model} version {job.version} is trained and answers")
+    echo(f"{model} version {job.version} is trained and answers")
     if made is not None and made.selection is not None:
         print_selection(made.selection)
     if made is not None and asked:

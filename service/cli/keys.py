@@ -43,7 +43,7 @@ def create(
         scopes = [part.strip() for given in scope for part in given.split(",")]
         row, secret = keys.create(database, name, scopes, expires)
     if as_json:
-        print_json({**_shown(row), "key": secret})
+        print_json({**_document(row), "key": secret})
         return
     typer.echo(secret)
     until = f"until {row.expires_at}" if row.expires_at else "until it is revoked"
@@ -58,13 +58,13 @@ def list_(as_json: Json = False) -> None:
     with _database() as (database, _):
         rows = keys.stored(database)
     if as_json:
-        print_json([_shown(row) for row in rows])
+        print_json([_document(row) for row in rows])
         return
     table = Table(Column("id", no_wrap=True), "name", "scopes", "state", "made", "expires", "last used")
     for row in rows:
-        shown = _shown(row)
-        times = (_minute(shown[field]) for field in ("created_at", "expires_at", "used_at"))
-        table.add_row(row.id, escape(row.name), ", ".join(row.scopes), shown["state"], *times)
+        document = _document(row)
+        times = (_minute(document[field]) for field in ("created_at", "expires_at", "used_at"))
+        table.add_row(row.id, escape(row.name), ", ".join(row.scopes), document["state"], *times)
     out.print(table)
 
 
@@ -77,7 +77,7 @@ def revoke(
     with _database() as (database, settings):
         row = keys.revoke(database, key)
     if as_json:
-        print_json(_shown(row))
+        print_json(_document(row))
         return
     note(f"{row.id} is revoked; a running service refuses it after {settings.keys_refresh_s:g} s")
 
@@ -89,7 +89,7 @@ def _database() -> Iterator[tuple[Database, Settings]]:
         yield database, settings
 
 
-def _shown(row: ApiKeyRow) -> dict[str, Any]:
+def _document(row: ApiKeyRow) -> dict[str, Any]:
     fields = ("id", "name", "scopes", "created_at", "expires_at", "revoked_at", "used_at")
     return {**{field: getattr(row, field) for field in fields}, "state": keys.state_of(row, time.time())}
 

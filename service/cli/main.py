@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from service import __version__
-from service.cli.consoles import explain, print_error, say
+from service.cli.consoles import echo, explain, print_error
 from service.compute.remote import imported
 
 
@@ -129,5 +129,5 @@ def main() -> None:
 @app.callback(invoke_without_command=True)
 def _root(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
     if version:
-        say(__version__)
+        echo(__version__)
         raise typer.Exit

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from service.cli import connecting
 from service.cli.connecting import connected, dataset_of
-from service.cli.consoles import CommandError, note, out, print_json, say, tell
+from service.cli.consoles import CommandError, echo, note, out, print_json, print_result
 from service.cli.options import Alias, Data, Json, Limit, Model, Url, Version, Yes, confirm, group
 from service.foundation.settings import DEFAULT_URL
 
@@ -37,7 +37,7 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
         print_json(models)
         return
     if not models:
-        say("no model yet: `lipserve train FILE --model NAME` makes one")
+        echo("no model yet: `lipserve train FILE --model NAME` makes one")
         return
     table = Table("model", "serving", "versions", "estimator", "aliases", "made")
     for model in models:
@@ -59,11 +59,11 @@ def show(model: Model, version: Version = None, url: Url = DEFAULT_URL, as_json:
     """Print a model with its versions, and what one of them stands on: the one that serves, or one that is named."""
     with connected(url) as client:
         record = client.model(model)
-        shown = client.version(model, version or record.serving_version)
+        detail = client.version(model, version or record.serving_version)
     if as_json:
-        print_json({"model": record.model_dump(mode="json"), "version": shown.model_dump(mode="json")})
+        print_json({"model": record.model_dump(mode="json"), "version": detail.model_dump(mode="json")})
         return
-    say(f"{record.name}: version {record.serving_version} serves, {record.latest_version} is the newest")
+    echo(f"{record.name}: version {record.serving_version} serves, {record.latest_version} is the newest")
     table = Table("version", "estimator", "made", "named")
     for each in record.versions:
         named = [name for name, at in record.aliases.items() if at == each.version]
@@ -71,7 +71,7 @@ def show(model: Model, version: Version = None, url: Url = DEFAULT_URL, as_json:
         at = each.created_at[:16].replace("T", " ")
         table.add_row(str(each.version), each.estimator, at, escape(", ".join(named)) or "-")
     out.print(table)
-    _print_version(shown)
+    _print_version(detail)
 
 
 @app.command()
@@ -101,7 +101,7 @@ def rollback(
             _moved(model, client.rollback_alias(model, alias), as_json)
             return
         back = client.rollback(model, revision=revision)
-    tell(back, as_json, f"{model} is back at revision {revision}: {back.undone} batches do not teach any more")
+    print_result(back, as_json, f"{model} is back at revision {revision}: {back.undone} batches do not teach any more")
 
 
 @app.command()
@@ -124,7 +124,7 @@ def alias(
     with connected(url) as client:
         if remove:
             client.remove_alias(model, name)
-            tell({"removed": name}, as_json, f"alias {name} of {model} is removed")
+            print_result({"removed": name}, as_json, f"alias {name} of {model} is removed")
             return
         if version is not None:
             _moved(model, client.set_alias(model, name, _which(version)), as_json)
@@ -137,7 +137,7 @@ def alias(
         + (" (rolled back)" if move.rollback else "")
         for move in aliases[0].history
     )
-    tell(aliases[0], as_json, f"{name} of {model} names version {aliases[0].version}", *moves)
+    print_result(aliases[0], as_json, f"{name} of {model} names version {aliases[0].version}", *moves)
 
 
 @app.command()
@@ -153,7 +153,7 @@ def compare(
     from service.cli.tables import comparison_table  # noqa: PLC0415 - takes long to import; help needs none
 
     out.print(comparison_table(comparison))
-    say(comparison.verdict)
+    echo(comparison.verdict)
     for warning in comparison.warnings:
         out.print(f"[yellow]careful:[/yellow] {escape(warning)}", highlight=False)
 
@@ -172,7 +172,7 @@ def export_(
     with connected(url) as client:
         written = client.export(model, path, version, alias, learnt)
     size = written.stat().st_size
-    tell(
+    print_result(
         {"file": written, "bytes": size},
         as_json,
         f"{written}: {size:,} bytes; `lipserve models import {written}` reads it",
@@ -203,7 +203,7 @@ def import_(
     with connected(url) as client:
         made = client.import_model(path, name)
     promote = f"`lipserve models promote {made.model} {made.version}`"
-    tell(made, as_json, f"{made.model} version {made.version} is imported: {promote}")
+    print_result(made, as_json, f"{made.model} version {made.version} is imported: {promote}")
 
 
 @app.command()
@@ -218,7 +218,7 @@ def delete(
             client.delete_model(model)
         else:
             client.delete_version(model, version)
-    tell({"deleted": {"model": model, "version": version}}, as_json, f"{what} is deleted")
+    print_result({"deleted": {"model": model, "version": version}}, as_json, f"{what} is deleted")
 
 
 def _which(text: str) -> int | str:
@@ -230,7 +230,7 @@ def _moved(model: str, moved: AliasRecord, as_json: bool) -> None:
         print_json(moved)
         return
     did = "answers where none is named" if moved.alias == SERVING else f"is what {moved.alias} names"
-    say(f"{model}: version {moved.version} {did}")
+    echo(f"{model}: version {moved.version} {did}")
     if moved.previous is not None:
         note(f"`lipserve models rollback {model} --alias {moved.alias}` goes back to version {moved.previous}")
 
@@ -240,31 +240,33 @@ def print_selection(selection: Selection) -> None:
     from service.cli.tables import selection_table  # noqa: PLC0415 - takes long to import; help needs none
 
     out.print(selection_table(selection))
-    say(f"  {selection.chosen} is chosen: {selection.reason}")
+    echo(f"  {selection.chosen} is chosen: {selection.reason}")
     if selection.held_out.repeats:
-        say("  all of the motion repeats itself, also what was held out: these figures flatter")
+        echo("  all of the motion repeats itself, also what was held out: these figures flatter")
 
 
-def _print_version(shown: VersionRecord) -> None:
-    say(f"version {shown.version}: {shown.estimator}, {len(shown.joint_names)} joints: {', '.join(shown.joint_names)}")
-    noise = ", ".join(f"{value:.3g}" for value in shown.noise_std)
-    say(f"  torque {shown.torque_convention.replace('_', ' ')}, noise of a measurement {noise} N·m")
-    if shown.selection is not None:
-        print_selection(shown.selection)
-    lineage: dict[str, Any] = shown.lineage
+def _print_version(version: VersionRecord) -> None:
+    echo(
+        f"version {version.version}: {version.estimator}, {len(version.joint_names)} joints: {', '.join(version.joint_names)}"
+    )
+    noise = ", ".join(f"{value:.3g}" for value in version.noise_std)
+    echo(f"  torque {version.torque_convention.replace('_', ' ')}, noise of a measurement {noise} N·m")
+    if version.selection is not None:
+        print_selection(version.selection)
+    lineage: dict[str, Any] = version.lineage
     sets = [each.get("name") or each.get("id") for each in lineage.get("datasets") or () if isinstance(each, dict)]
     if sets:
-        say(f"  trained on {', '.join(map(str, sets))}")
+        echo(f"  trained on {', '.join(map(str, sets))}")
     held = lineage.get("holdout")
     if held is not None:
         from service.cli.tables import figures_table  # noqa: PLC0415 - takes long to import; help needs none
 
-        out.print(figures_table(f"on {held['samples']} samples held out", shown.joint_names, held))
+        out.print(figures_table(f"on {held['samples']} samples held out", version.joint_names, held))
     else:
-        say("  nothing was held out of its data: `lipserve evaluate` on a recording it has not seen tells how good")
-    for warning in shown.warnings:
+        echo("  nothing was held out of its data: `lipserve evaluate` on a recording it has not seen tells how good")
+    for warning in version.warnings:
         out.print(f"[yellow]careful:[/yellow] {escape(warning)}", highlight=False)
-    arm = shown.arm
+    arm = version.arm
     if arm is not None:
         from service.cli.tables import arm_tables  # noqa: PLC0415 - as above
         from service.client.results.arm import LIMITS  # noqa: PLC0415
@@ -272,4 +274,4 @@ def _print_version(shown: VersionRecord) -> None:
         for table in arm_tables(arm):
             out.print(table)
         for text in LIMITS:
-            say(text)
+            echo(text)

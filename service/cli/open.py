@@ -11,7 +11,7 @@ import typer
 
 from service.cli import connecting
 from service.cli.connecting import UNIX, ask
-from service.cli.consoles import START, CommandError, tell
+from service.cli.consoles import START, CommandError, print_result
 from service.cli.options import Json, Url, alone
 from service.foundation.settings import DEFAULT_URL
 
@@ -37,6 +37,6 @@ def open_(
         raise CommandError(f"no service answers at {url}: {error}", START) from error
     page = "live" if live else "models" if model else ""
     address = f"{url.rstrip('/')}/#/{page}" + (f"/{quote(model, safe='')}" if model else "")
-    tell({"url": address}, as_json, address)
+    print_result({"url": address}, as_json, address)
     if browser:
         webbrowser.open(address)

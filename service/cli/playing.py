@@ -70,7 +70,7 @@ class Tally:
         self._trips.extend(other._trips)
         self._sums += other._sums
 
-    def shown(self) -> dict[str, Any]:
+    def figures(self) -> dict[str, Any]:
         """The figures for JSON: rmse in N·m over all joints, coverage of the 95 % band; None without answers.
 
         All compare answers with torque that the model had not learnt yet when it answered.
@@ -103,7 +103,7 @@ class Tally:
         ]
 
 
-def learnt_shown(learnt: StreamLearnt) -> dict[str, Any]:
+def learnt_figures(learnt: StreamLearnt) -> dict[str, Any]:
     """What has become of the torques that were sent, for JSON."""
     return {
         "accepted": learnt.accepted,

@@ -11,7 +11,7 @@ import typer
 from lipcore.data.samples import Samples
 from lipcore.robots.library import ROBOTS, SimulationUnavailableError, load_robot
 from lipcore.robots.simulation import FAST, Payload, Stream, simulate
-from service.cli.consoles import tell
+from service.cli.consoles import print_result
 from service.cli.options import Json, alone
 
 
@@ -68,4 +68,4 @@ def simulate_(
     data = simulate(load_robot(robot), stream, seed)
     write_recording(output, data)
     document = {"file": output, "samples": len(data), "rate_hz": rate, "joint_names": data.joint_names}
-    tell(document, as_json, f"{output}: {len(data)} samples of {', '.join(data.joint_names)}")
+    print_result(document, as_json, f"{output}: {len(data)} samples of {', '.join(data.joint_names)}")

@@ -17,7 +17,7 @@ import lipcore
 from lipcore.files import persistence
 from lipcore.files.probing import probe
 from lipcore.online import transfer as state
-from service.cli.consoles import err, print_json, say
+from service.cli.consoles import echo, err, print_json
 from service.cli.options import Json, alone
 from service.foundation.errors import DamagedDataError
 from service.foundation.settings import Settings
@@ -51,7 +51,7 @@ class Verified:
     read: dict[str, int] = field(default_factory=dict)
     damages: list[Damage] = field(default_factory=list)
 
-    def shown(self) -> dict[str, Any]:
+    def document(self) -> dict[str, Any]:
         """The findings for JSON."""
         return {"read": self.read, "damaged": [each._asdict() for each in self.damages]}
 
@@ -210,11 +210,11 @@ def verify(as_json: Json = False) -> None:
     with usable(settings):
         findings = verify_home(settings)
     if as_json:
-        print_json(findings.shown())
+        print_json(findings.document())
     else:
         for damage in findings.damages:
             err.print(f"[red]damaged:[/red] {escape(str(damage))}", highlight=False, soft_wrap=True)
         counts = ", ".join(f"{count} {kind}" for kind, count in findings.read.items())
-        say(f"read {counts}: {len(findings.damages) or 'nothing'} damaged")
+        echo(f"read {counts}: {len(findings.damages) or 'nothing'} damaged")
     if findings.damages:
         raise typer.Exit(1)

@@ -186,8 +186,8 @@ def page(page: str) -> Response:
         missing = (
             '<h1>There is no such page</h1>\n<p>The guide has those on its list, <a href="/guide">from here on</a>.</p>'
         )
-        return _shown("Not found", missing, None, 404)
-    return _shown(known.title, content(page), page)
+        return _framed("Not found", missing, None, 404)
+    return _framed(known.title, content(page), page)
 
 
 def file(name: str) -> Response:
@@ -198,7 +198,7 @@ def file(name: str) -> Response:
     return FileResponse(path, headers=HEADERS)
 
 
-def _shown(title: str, content: str, current: str | None, status: int = 200) -> HTMLResponse:
+def _framed(title: str, content: str, current: str | None, status: int = 200) -> HTMLResponse:
     lines = []
     for slug, each in pages().items():
         here = ' aria-current="page"' if slug == current else ""

@@ -76,8 +76,8 @@ def left_out(names: Sequence[str], reason: str) -> list[str]:
     """The fact that columns are left out, as a list of one sentence or none; long lists are cut."""
     if not names:
         return []
-    shown = ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
-    return [f"left out, as {reason}: {shown}"]
+    listed = ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
+    return [f"left out, as {reason}: {listed}"]
 
 
 NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"

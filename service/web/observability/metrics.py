@@ -35,7 +35,7 @@ CPU = MetricKind(
 )
 SYSTEM_KINDS = (BUILD, PARTS, USED, FREE, MEMORY, CPU)
 LEARNER = "lipserve-learner"
-_SHOWN = {"process_resident_memory_bytes": MEMORY, "process_cpu_seconds": CPU}
+_OF_PROCESSES = {"process_resident_memory_bytes": MEMORY, "process_cpu_seconds": CPU}
 
 
 class System(Collector):
@@ -69,10 +69,10 @@ def _processes() -> Iterator[Metric]:
     for process in multiprocessing.active_children():
         name, pid = "learner" if process.name == LEARNER else "training", process.pid
         for family in ProcessCollector(pid=lambda pid=pid: pid, registry=None).collect():  # type: ignore[misc]
-            if family.name in _SHOWN:
+            if family.name in _OF_PROCESSES:
                 figures[family.name][name] += family.samples[0].value
-    for shown, kind in _SHOWN.items():
-        yield kind.of(([name], value) for name, value in figures[shown].items())
+    for metric, kind in _OF_PROCESSES.items():
+        yield kind.of(([name], value) for name, value in figures[metric].items())
 
 
 DURATION = MetricKind(

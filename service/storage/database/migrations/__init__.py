@@ -52,7 +52,7 @@ def revision(connection: Connection) -> str | None:
     return number
 
 
-def _upgrade(connection: Connection, found: str | None) -> None:
+def _upgrade(connection: Connection, prior: str | None) -> None:
     from alembic import command  # noqa: PLC0415 - needed once a release, by none of the processes that train or learn
     from alembic.config import Config  # noqa: PLC0415
     from alembic.script import ScriptDirectory  # noqa: PLC0415
@@ -61,9 +61,9 @@ def _upgrade(connection: Connection, found: str | None) -> None:
     config.set_main_option("script_location", str(Path(__file__).parent).replace("%", "%%"))
     config.attributes["connection"] = connection
     known = {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}
-    if found is not None and found not in known:
+    if prior is not None and prior not in known:
         raise DatabaseVersionError(
-            f"the database has revision {found!r}, expected at most {HEAD!r}: a later release of LIPServe has used it; "
+            f"the database has revision {prior!r}, expected at most {HEAD!r}: a later release of LIPServe has used it; "
             "start that one, or set LIPSERVE_HOME, or LIPSERVE_DATABASE_URL, to another"
         )
     command.upgrade(config, HEAD)
