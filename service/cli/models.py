@@ -261,7 +261,7 @@ def _print_version(version: VersionRecord) -> None:
     if held is not None:
         from service.cli.tables import figures_table  # noqa: PLC0415 - takes long to import; help needs none
 
-        out.print(figures_table(f"on {held['samples']} samples held out", version.joint_names, held))
+        out.print(figures_table(f"on {held['samples']} samples held out", names, held))
     else:
         echo("  nothing was held out of its data: `lipserve evaluate` on a recording it has not seen tells how good")
     for warning in version.warnings:
