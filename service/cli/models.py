@@ -246,9 +246,8 @@ def print_selection(selection: Selection) -> None:
 
 
 def _print_version(version: VersionRecord) -> None:
-    echo(
-        f"version {version.version}: {version.estimator}, {len(version.joint_names)} joints: {', '.join(version.joint_names)}"
-    )
+    names = version.joint_names
+    echo(f"version {version.version}: {version.estimator}, {len(names)} joints: {', '.join(names)}")
     noise = ", ".join(f"{value:.3g}" for value in version.noise_std)
     echo(f"  torque {version.torque_convention.replace('_', ' ')}, noise of a measurement {noise} N·m")
     if version.selection is not None:
