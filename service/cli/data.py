@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -20,7 +20,10 @@ if TYPE_CHECKING:
     from service.datasets.schema import Dataset
 
 app = group("Recordings and their reports: add, list, show and delete them.")
-PREPARATION = "Preparation"
+
+
+def _preparation(help_: str) -> Any:
+    return typer.Option(help=help_, rich_help_panel="Preparation")
 
 
 @app.command()
@@ -43,22 +46,12 @@ def add(
     unit: Annotated[list[str] | None, typer.Option(help="Unit of a quantity: q=deg, t=ms; repeat.")] = None,
     topic: Annotated[str | None, typer.Option(help="Of a bag.")] = None,
     delimiter: Annotated[str | None, typer.Option(help="Of a CSV.")] = None,
-    cutoff: Annotated[
-        float | None, typer.Option(help="Of the low-pass, Hz; 4 by default.", rich_help_panel=PREPARATION)
-    ] = None,
-    filtering: Annotated[
-        str | None, typer.Option(help="derived (default), always or never.", rich_help_panel=PREPARATION)
-    ] = None,
-    form: Annotated[
-        str | None, typer.Option(help="acausal (default), or causal as on a live stream.", rich_help_panel=PREPARATION)
-    ] = None,
-    rate: Annotated[float | None, typer.Option(help="Of the samples, Hz.", rich_help_panel=PREPARATION)] = None,
-    gap: Annotated[
-        float | None, typer.Option(help="Steps that a gap is longer than; 1.5 by default.", rich_help_panel=PREPARATION)
-    ] = None,
-    trim: Annotated[
-        float | None, typer.Option(help="Cut off at both ends of every part, s.", rich_help_panel=PREPARATION)
-    ] = None,
+    cutoff: Annotated[float | None, _preparation("Of the low-pass, Hz; 4 by default.")] = None,
+    filtering: Annotated[str | None, _preparation("derived (default), always or never.")] = None,
+    form: Annotated[str | None, _preparation("acausal (default), or causal as on a live stream.")] = None,
+    rate: Annotated[float | None, _preparation("Of the samples, Hz.")] = None,
+    gap: Annotated[float | None, _preparation("Steps that a gap is longer than; 1.5 by default.")] = None,
+    trim: Annotated[float | None, _preparation("Cut off at both ends of every part, s.")] = None,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:

@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 
 app = alone()
 SECONDS = 60.0
-SIMULATION = "Simulation"
+
+
+def _simulation(help_: str, *names: str, **limits: Any) -> Any:
+    return typer.Option(*names, help=help_, rich_help_panel="Simulation", **limits)
 
 
 @app.command()
@@ -47,15 +50,11 @@ def stream(
     ] = None,
     version: Version = None,
     alias: Alias = None,
-    rate: Annotated[float, typer.Option(min=1, max=2000, help="Hz.", rich_help_panel=SIMULATION)] = 100.0,
-    seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal motions.", rich_help_panel=SIMULATION)] = 0,
-    fast: Annotated[
-        bool, typer.Option("--fast", help="The faster-moving variant.", rich_help_panel=SIMULATION)
-    ] = False,
-    payload: Annotated[
-        float, typer.Option(min=0, help="Payload that the robot takes up, kg.", rich_help_panel=SIMULATION)
-    ] = 0.0,
-    payload_at: Annotated[float, typer.Option(min=0, help="When it does, s.", rich_help_panel=SIMULATION)] = 0.0,
+    rate: Annotated[float, _simulation("Hz.", min=1, max=2000)] = 100.0,
+    seed: Annotated[int, _simulation("Equal seeds give equal motions.", min=0)] = 0,
+    fast: Annotated[bool, _simulation("The faster-moving variant.", "--fast")] = False,
+    payload: Annotated[float, _simulation("Payload that the robot takes up, kg.", min=0)] = 0.0,
+    payload_at: Annotated[float, _simulation("When it does, s.", min=0)] = 0.0,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
