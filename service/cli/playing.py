@@ -56,7 +56,7 @@ class Tally:
         self.late += answer.late
         self.behind_s = max(self.behind_s, behind_s)
         self._trips.append(seconds)
-        inside = np.zeros_like(tau)
+        inside = np.zeros(tau.shape, np.bool_)
         if answer.tau_std is not None:
             inside = np.abs(error) <= BAND * np.hypot(answer.tau_std, self._noise)
         self._sums += np.array((inside, error**2, tau, tau**2))
