@@ -10,18 +10,9 @@ from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 import httpx
 
+from service.client import sending
 from service.client.call import Answer, Call, Page, bound
 from service.client.methods import POLL_SECONDS, Calls, Followed, Listed, One, looking
-from service.client.sending import (
-    ApiError,
-    Attempts,
-    Events,
-    ServiceUnreachableError,
-    answer_of,
-    content_of,
-    drafted,
-    request_of,
-)
 from service.client.stream import AsyncStreamClient
 from service.learning.control.schema import Learning
 from service.training.schema import Job
@@ -85,7 +76,7 @@ class AsyncClient(Calls, makers={One: _async, Listed: _listed, Followed: _follow
         """Whether the service can answer queries now."""
         try:
             await self.health()
-        except (ApiError, ServiceUnreachableError):
+        except (sending.ApiError, sending.ServiceUnreachableError):
             return False
         return True
 
@@ -111,7 +102,7 @@ class AsyncClient(Calls, makers={One: _async, Listed: _listed, Followed: _follow
 
     async def send(self, call: Call[T]) -> T:
         """Make a call and return its result; repeat it where that is safe and helps."""
-        attempts = Attempts(call, self._reach)
+        attempts = sending.Attempts(call, self._reach)
         while True:
             try:
                 answer = await self._exchange(call)
@@ -125,14 +116,14 @@ class AsyncClient(Calls, makers={One: _async, Listed: _listed, Followed: _follow
 
     async def follow(self, call: Call[T]) -> AsyncIterator[T]:
         """Make a call and yield what its server-sent events say, until the service ends them; as `Client.follow`."""
-        attempts, begun = Attempts(call, self._reach), False
+        attempts, begun = sending.Attempts(call, self._reach), False
         while not begun:
             try:
-                async with self._http.stream(**request_of(call)) as response:
+                async with self._http.stream(**sending.request_of(call)) as response:
                     body = b"" if response.is_success else await response.aread()
-                    pause = attempts.answered(answer_of(response, body))
+                    pause = attempts.answered(sending.answer_of(response, body))
                     if pause is None:
-                        begun, events = True, Events()
+                        begun, events = True, sending.Events()
                         async for line in response.aiter_lines():
                             if (event := events.take(line)) is not None:
                                 yield call.read(event)
@@ -145,19 +136,19 @@ class AsyncClient(Calls, makers={One: _async, Listed: _listed, Followed: _follow
         """Make one attempt at a call."""
         if call.save_to is not None:
             return await self._save(call, call.save_to)
-        with content_of(call) as content:
+        with sending.content_of(call) as content:
             awaited = None if content is None else _awaited(content)
-            response = await self._http.request(**request_of(call), content=awaited)
-        return answer_of(response, response.content)
+            response = await self._http.request(**sending.request_of(call), content=awaited)
+        return sending.answer_of(response, response.content)
 
     async def _save(self, call: Call[Any], path: Path) -> Answer:
-        async with self._http.stream(**request_of(call)) as response:
+        async with self._http.stream(**sending.request_of(call)) as response:
             if not response.is_success:
-                return answer_of(response, await response.aread())
-            with drafted(path) as file:
+                return sending.answer_of(response, await response.aread())
+            with sending.drafted(path) as file:
                 async for piece in response.aiter_bytes():
                     await asyncio.to_thread(file.write, piece)
-        return answer_of(response)
+        return sending.answer_of(response)
 
 
 async def _awaited(content: Iterator[bytes]) -> AsyncIterator[bytes]:

@@ -10,18 +10,9 @@ from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 import httpx
 
+from service.client import sending
 from service.client.call import Answer, Call, Page, bound
 from service.client.methods import POLL_SECONDS, Calls, Followed, Listed, One, looking
-from service.client.sending import (
-    ApiError,
-    Attempts,
-    Events,
-    ServiceUnreachableError,
-    answer_of,
-    content_of,
-    drafted,
-    request_of,
-)
 from service.client.stream import StreamClient
 from service.learning.control.schema import Learning
 from service.training.schema import Job
@@ -87,7 +78,7 @@ class Client(Calls, makers={One: _sync, Listed: _listed, Followed: _followed}):
         """Whether the service can answer queries now."""
         try:
             self.health()
-        except (ApiError, ServiceUnreachableError):
+        except (sending.ApiError, sending.ServiceUnreachableError):
             return False
         return True
 
@@ -109,7 +100,7 @@ class Client(Calls, makers={One: _sync, Listed: _listed, Followed: _followed}):
 
     def send(self, call: Call[T]) -> T:
         """Make a call and return its result; repeat it where that is safe and helps."""
-        attempts = Attempts(call, self._reach)
+        attempts = sending.Attempts(call, self._reach)
         while True:
             try:
                 answer = self._exchange(call)
@@ -127,13 +118,15 @@ class Client(Calls, makers={One: _sync, Listed: _listed, Followed: _followed}):
         The start is repeated as that of any other call; where the connection is lost later, ServiceUnreachableError
         is raised: ask again then.
         """
-        attempts, begun = Attempts(call, self._reach), False
+        attempts, begun = sending.Attempts(call, self._reach), False
         while not begun:
             try:
-                with self._http.stream(**request_of(call)) as response:
-                    pause = attempts.answered(answer_of(response, b"" if response.is_success else response.read()))
+                with self._http.stream(**sending.request_of(call)) as response:
+                    pause = attempts.answered(
+                        sending.answer_of(response, b"" if response.is_success else response.read())
+                    )
                     if pause is None:
-                        begun, events = True, Events()
+                        begun, events = True, sending.Events()
                         for line in response.iter_lines():
                             if (event := events.take(line)) is not None:
                                 yield call.read(event)
@@ -146,15 +139,15 @@ class Client(Calls, makers={One: _sync, Listed: _listed, Followed: _followed}):
         """Make one attempt at a call."""
         if call.save_to is not None:
             return self._save(call, call.save_to)
-        with content_of(call) as content:
-            response = self._http.request(**request_of(call), content=content)
-        return answer_of(response, response.content)
+        with sending.content_of(call) as content:
+            response = self._http.request(**sending.request_of(call), content=content)
+        return sending.answer_of(response, response.content)
 
     def _save(self, call: Call[Any], path: Path) -> Answer:
-        with self._http.stream(**request_of(call)) as response:
+        with self._http.stream(**sending.request_of(call)) as response:
             if not response.is_success:
-                return answer_of(response, response.read())
-            with drafted(path) as file:
+                return sending.answer_of(response, response.read())
+            with sending.drafted(path) as file:
                 for piece in response.iter_bytes():
                     file.write(piece)
-        return answer_of(response)
+        return sending.answer_of(response)

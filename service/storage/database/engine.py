@@ -19,16 +19,8 @@ from sqlalchemy import Connection, create_engine, event, text
 from sqlalchemy.orm import Session, sessionmaker
 
 from service.foundation.settings import CONNECTIONS, Settings
+from service.storage.database import tables
 from service.storage.database.migrations import migrate
-from service.storage.database.tables import (
-    AliasRow,
-    Base,
-    DeletedModelRow,
-    EventRow,
-    LearnerRow,
-    ServingRow,
-    VersionRow,
-)
 
 if TYPE_CHECKING:
     from service.storage.database.postgresql import Postgresql
@@ -105,13 +97,13 @@ def _configure(connection: Any, _: object) -> None:
 
 CHANNEL = "lipserve"
 Kind = Literal["log", "model"]
-KINDS: dict[type[Base], Kind] = {
-    EventRow: "log",
-    VersionRow: "model",
-    ServingRow: "model",
-    AliasRow: "model",
-    LearnerRow: "model",
-    DeletedModelRow: "model",
+KINDS: dict[type[tables.Base], Kind] = {
+    tables.EventRow: "log",
+    tables.VersionRow: "model",
+    tables.ServingRow: "model",
+    tables.AliasRow: "model",
+    tables.LearnerRow: "model",
+    tables.DeletedModelRow: "model",
 }
 _KEY = "notices"
 
@@ -147,7 +139,7 @@ def collect_notices(session: Session, _: Any) -> None:
     row: Any
     for row in chain(session.new, session.dirty, session.deleted):
         if type(row) in KINDS:
-            model = row.name if isinstance(row, DeletedModelRow) else row.model
+            model = row.name if isinstance(row, tables.DeletedModelRow) else row.model
             changes.add((KINDS[type(row)], model))
 
 
