@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # one thread a process: the tests' matrices are small, and several processes run side by side
 TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 # as many as run side by side, here and in `make test-all`; tests that share a service stay together: tests/conftest.py
-WORKERS ?= 2
+WORKERS ?= 3
 SHARE := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test warm-lip warm-chain bytecode test-all screenshots lint install serve image clean

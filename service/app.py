@@ -36,18 +36,16 @@ from service.oip import routes as oip
 from service.replication import Replication
 from service.robots import routes as robots
 from service.storage.files.store import start_sweeping
-from service.storage.home import hold_home
-from service.storage.storage import Storage, look_database, look_files, look_home
+from service.storage.storage import Storage, hold_home, look_database, look_files, look_home
 from service.stream import routes as stream
 from service.training import metrics as jobs_metrics
 from service.training import routes as training
 from service.training.queue import JobQueue, queue_of
-from service.web import health, openapi, storage_errors
+from service.web import openapi, storage_errors
 from service.web.access.keys import Keyring
 from service.web.access.middleware import KeyAccess, LocalAccess
-from service.web.limits import BodyLimit
-from service.web.limits.requests import Gate, RateLimit, Turns
-from service.web.observability import metrics, requests
+from service.web.limits.requests import BodyLimit, Gate, RateLimit, Turns
+from service.web.observability import metrics, readiness, requests
 from service.web.observability.meters import Meters
 from service.web.observability.metrics import System, Traffic
 from service.web.observability.readiness import Look, Readiness, Stopping
@@ -110,7 +108,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     storage_errors.install(app)
     _add_middleware(app, settings, keyring, meters, hot)
     openapi.install(app, settings.keys_needed)
-    app.include_router(health.router)
+    app.include_router(readiness.router)
     app.include_router(metrics.router)
     app.include_router(datasets.router)
     app.include_router(robots.router)

@@ -25,8 +25,7 @@ from lipcore.data.samples import Samples
 from lipcore.posterior.summing import Summing
 from lipcore.training.conditioning import SHARD, ShardStatistics, sum_samples
 from service.compute import executors
-from service.compute.executors import Processes
-from service.compute.shards import summed
+from service.compute.executors import Processes, summed
 from service.foundation.settings import Settings, shipped_models
 
 NAME = "pass"

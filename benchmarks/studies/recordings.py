@@ -16,10 +16,10 @@ from typing import Any
 
 from rich.console import Console
 
+from service.cli import tables
 from service.cli.demo import ServiceProcess
 from service.client import Client
 from service.datasets.asking import Reading
-from service.datasets.report import tables
 from service.datasets.schema import Dataset
 from service.foundation.states import SUCCEEDED
 
@@ -35,7 +35,7 @@ def tell(dataset: Dataset, console: Console) -> None:
     console.print(f"\n[bold]{dataset.name}[/bold]")
     for said in tables.overview(dataset.report):
         console.print(f"  {said}", highlight=False, markup=False, soft_wrap=True)
-    for table in tables.tables(dataset.report, dataset.joint_names):
+    for table in tables.report_tables(dataset.report, dataset.joint_names):
         console.print(table)
     if dataset.report.excitation is not None:
         console.print(f"  {dataset.report.excitation.text}", highlight=False, markup=False, soft_wrap=True)

@@ -22,7 +22,7 @@ out = Console(soft_wrap=True, width=None if sys.stdout.isatty() else PIPE_WIDTH)
 err = Console(stderr=True, soft_wrap=True)
 
 
-def say(text: str) -> None:
+def echo(text: str) -> None:
     """Print a line of a result as it is: neither marked up, nor coloured, nor wrapped."""
     out.print(escape(text), highlight=False, soft_wrap=True)
 
@@ -37,6 +37,15 @@ def print_json(value: Any, one_line: bool = False) -> None:
     sys.stdout.write(json.dumps(plain(value), indent=None if one_line else 2, ensure_ascii=False, allow_nan=False))
     sys.stdout.write("\n")
     sys.stdout.flush()
+
+
+def print_result(value: Any, as_json: bool, *lines: str) -> None:
+    """Print a result: as JSON, or else in lines."""
+    if as_json:
+        print_json(value)
+        return
+    for line in lines:
+        echo(line)
 
 
 def plain(value: Any) -> Any:

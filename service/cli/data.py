@@ -4,28 +4,26 @@ from __future__ import annotations
 
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
 
-from service.cli import completion
+from service.cli import connecting
 from service.cli.connecting import connected
-from service.cli.consoles import out, print_json, say
-from service.cli.options import DatasetId, Json, Limit, Url, Yes, confirm, names, pairs
+from service.cli.consoles import echo, out, print_json, print_result
+from service.cli.options import DatasetId, Json, Limit, Url, Yes, confirm, group, names, pairs
 from service.datasets.asking import SUFFIXES, Reading
 from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
     from service.datasets.schema import Dataset
 
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    help="Recordings and their reports: add, list, show and delete them.",
-)
-PREPARATION = "Preparation"
+app = group("Recordings and their reports: add, list, show and delete them.")
+
+
+def _preparation(help_: str) -> Any:
+    return typer.Option(help=help_, rich_help_panel="Preparation")
 
 
 @app.command()
@@ -48,23 +46,12 @@ def add(
     unit: Annotated[list[str] | None, typer.Option(help="Unit of a quantity: q=deg, t=ms; repeat.")] = None,
     topic: Annotated[str | None, typer.Option(help="Of a bag.")] = None,
     delimiter: Annotated[str | None, typer.Option(help="Of a CSV.")] = None,
-    cutoff: Annotated[
-        float | None, typer.Option(help="Of the low-pass, Hz; 4 by default.", rich_help_panel=PREPARATION)
-    ] = None,
-    filtering: Annotated[
-        str | None, typer.Option(help="derived (default), always or never.", rich_help_panel=PREPARATION)
-    ] = None,
-    form: Annotated[
-        str | None, typer.Option(help="acausal (default), or causal as on a live stream.", rich_help_panel=PREPARATION)
-    ] = None,
-    rate: Annotated[float | None, typer.Option(help="Of the samples, Hz.", rich_help_panel=PREPARATION)] = None,
-    gap: Annotated[
-        float | None,
-        typer.Option(help="Steps that a gap is longer than; 1.5 by default.", rich_help_panel=PREPARATION),
-    ] = None,
-    trim: Annotated[
-        float | None, typer.Option(help="Cut off at both ends of every part, s.", rich_help_panel=PREPARATION)
-    ] = None,
+    cutoff: Annotated[float | None, _preparation("Of the low-pass, Hz; 4 by default.")] = None,
+    filtering: Annotated[str | None, _preparation("derived (default), always or never.")] = None,
+    form: Annotated[str | None, _preparation("acausal (default), or causal as on a live stream.")] = None,
+    rate: Annotated[float | None, _preparation("Of the samples, Hz.")] = None,
+    gap: Annotated[float | None, _preparation("Steps that a gap is longer than; 1.5 by default.")] = None,
+    trim: Annotated[float | None, _preparation("Cut off at both ends of every part, s.")] = None,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
@@ -99,11 +86,7 @@ def add(
 
 
 @app.command("list")
-def list_(
-    limit: Limit = 50,
-    url: Url = DEFAULT_URL,
-    as_json: Json = False,
-) -> None:
+def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
     """List data sets, newest first."""
     with connected(url) as client:
         datasets = list(islice(client.datasets(), limit))
@@ -111,11 +94,11 @@ def list_(
         print_json(datasets)
         return
     if not datasets:
-        say("no data set yet: `lipserve data add FILE` uploads a recording")
+        echo("no data set yet: `lipserve data add FILE` uploads a recording")
     for each in datasets:
         rate = "" if each.report.rate_hz is None else f" at {each.report.rate_hz:.4g} Hz"
         joints = f"{len(each.joint_names)} joints"
-        say(f"{each.id}  {each.created_at[:19]}  {each.name}: {each.report.rows:,} samples{rate}, {joints}")
+        echo(f"{each.id}  {each.created_at[:19]}  {each.name}: {each.report.rows:,} samples{rate}, {joints}")
 
 
 @app.command()
@@ -131,7 +114,7 @@ def show(dataset: DatasetId, url: Url = DEFAULT_URL, as_json: Json = False) -> N
 
 @app.command()
 def delete(
-    datasets: Annotated[list[str], typer.Argument(help="Ids of data sets.", autocompletion=completion.datasets)],
+    datasets: Annotated[list[str], typer.Argument(help="Ids of data sets.", autocompletion=connecting.datasets)],
     yes: Yes = False,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
@@ -141,23 +124,20 @@ def delete(
     with connected(url) as client:
         for each in datasets:
             client.delete_dataset(each)
-    if as_json:
-        print_json({"deleted": datasets})
-    else:
-        say(f"{', '.join(datasets)} deleted")
+    print_result({"deleted": datasets}, as_json, f"{', '.join(datasets)} deleted")
 
 
 def _print(dataset: Dataset) -> None:
-    from service.datasets.report import tables  # noqa: PLC0415 - takes long to import; help needs none
+    from service.cli import tables  # noqa: PLC0415 - takes long to import; help needs none
 
     report = dataset.report
     out.print(f"[bold]{dataset.id}[/bold]  {escape(dataset.name)}  torque: {dataset.torque_convention}")
-    for said in tables.overview(report):
-        say(f"  {said}")
-    for table in tables.tables(report, dataset.joint_names):
+    for line in tables.overview(report):
+        echo(f"  {line}")
+    for table in tables.report_tables(report, dataset.joint_names):
         out.print(table)
     if report.excitation is not None:
-        say(f"  {report.excitation.text}")
+        echo(f"  {report.excitation.text}")
     for line in report.warnings:
         out.print(f"[yellow]warning:[/yellow] {escape(line)}", highlight=False)
     for line in report.advice:

@@ -9,7 +9,6 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from types import TracebackType
 from typing import Annotated, Self
 
 import numpy as np
@@ -21,6 +20,7 @@ from lipcore.data.samples import Samples
 from lipcore.robots.library import Robot, SimulationUnavailableError, load_robot
 from lipcore.robots.simulation import FAST, Stream, simulate
 from service.cli.consoles import out
+from service.cli.options import alone
 from service.cli.plotting import draw_torque
 from service.cli.simulate import write_recording
 from service.client import ApiError, Client, Evaluation, Prediction
@@ -69,9 +69,7 @@ class ServiceProcess:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, *_: object) -> None:
         if kind is not None and self.process.poll() is None:
             self.stop()
 
@@ -185,7 +183,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = alone()
 ERRORS = (ApiError, DemoError, SimulationUnavailableError)
 
 

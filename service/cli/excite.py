@@ -1,10 +1,10 @@
-"""The model that a motion is planned for: saved in a folder, or served under a name."""
+"""`lipserve excite`: the motion that tells most of what a model does not know, within the limits of its robot."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
@@ -15,24 +15,116 @@ from rich.console import Console
 from rich.table import Table
 
 import lipcore
-from lipcore import TorqueModel
+from lipcore import profiles
 from lipcore.data.samples import Array
 from lipcore.excitation import Belief, Limits, Plan, PlanOptions, plan
 from lipcore.files import persistence
 from lipcore.files.manifest import DEFAULT_LIMITS, MANIFEST, ROBOT, TENSORS, ModelFormatError
 from lipcore.fitting.estimators import ESTIMATORS
+from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.linalg import NotPositiveDefiniteError
-from lipcore.profiles import names
-from lipcore.robots.library import Robot, SimulationUnavailableError
+from lipcore.profiles import Profile, names
+from lipcore.robots.library import ROBOTS, Robot, SimulationUnavailableError, load_robot
 from lipcore.robots.simulation import FAST, Stream, sinusoids
+from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import JointType
 from service.cli import plotting
 from service.cli.consoles import err, print_json
-from service.cli.excite_robot import Arm, find
-from service.cli.options import Json
+from service.cli.options import Json, alone
 from service.client import ApiError, Client
 from service.foundation.settings import DEFAULT_URL
 from service.models import archive
+
+MAX_URDF_BYTES = 16 * 1024 * 1024
+
+
+@dataclass(frozen=True)
+class Arm:
+    """What is known of a robot. robot: its dynamics, None without a URDF; bodies: for estimators of rigid bodies."""
+
+    name: str
+    limits: Limits
+    robot: Robot | None
+    bodies: RigidBody | None
+
+
+def find(given: str | None, model: TorqueModel | None) -> Arm:
+    """The robot that is given, by name or as a .urdf file, or else the one that the model's joints tell.
+
+    Its joints are called as the model's. Raise ValueError or OSError where there is no such robot or it does not fit.
+    """
+    if given is None:
+        if model is None:
+            raise ValueError("neither --robot nor --model is given, expected one of them: whose limits are to be kept?")
+        return _of_model(model)
+    if not given.endswith(".urdf"):
+        return _named(given, model)
+    path = Path(given)
+    if (size := path.stat().st_size) > MAX_URDF_BYTES:
+        raise ValueError(f"{given} has {size} bytes, expected at most {MAX_URDF_BYTES}")
+    profile = profiles.from_urdf(path.read_text(encoding="utf-8"), path.stem)
+    names = profile.joint_names
+    if model is not None and set(model.joint_names) <= set(names):  # others, as of grippers, stand still
+        names = model.joint_names
+    return _of_urdf(profile, names, None if model is None else model.joint_names)
+
+
+def _of_model(model: TorqueModel) -> Arm:
+    if model.robot is not None:
+        profile = profiles.from_urdf(model.robot.urdf, model.robot.name)
+        return _of_urdf(profile, model.robot.urdf_joints, model.joint_names)
+    names = profiles.recognise(model.joint_names)
+    if len(names) != 1:
+        fit = f"several robots have: {', '.join(names)}" if names else "no robot that is known has"
+        raise ValueError(
+            f"the model has the joints {', '.join(model.joint_names)}, which {fit}. Name the robot by --robot: "
+            f"a .urdf file or one of {', '.join(profiles.names())}"
+        )
+    return _named(names[0], model)
+
+
+def _named(name: str, model: TorqueModel | None) -> Arm:
+    profile = profiles.profile(name)
+    names = profile.joint_names if model is None else model.joint_names
+    _check(profile, profile.joint_names, names)
+    limits = replace(Limits.of_profile(profile), joint_names=names)
+    robot, bodies = None, None
+    if name in ROBOTS:
+        try:
+            robot = load_robot(name)
+        except SimulationUnavailableError:  # limits are known all the same
+            return Arm(name, limits, None, None)
+        bodies = RigidBody.from_profile(name, robot.joint_names, robot.joint_types)
+    return Arm(name, limits, robot, bodies)
+
+
+def _of_urdf(profile: Profile, joints: Sequence[str], names: tuple[str, ...] | None) -> Arm:
+    """joints: of the URDF, those that move; names: what the data call them."""
+    if profile.urdf is None:
+        raise ValueError(f"robot {profile.name!r} has no URDF")
+    places = [profile.joint_names.index(joint) for joint in joints]
+    types = [profile.joint_types[place] for place in places]
+    bodies = RigidBody.from_urdf(profile.urdf, joints, types, name=profile.name)
+    if bodies.order != tuple(range(len(bodies.order))):
+        raise ValueError(f"the joints of {profile.name!r} are {', '.join(joints)}, expected them from base to tip")
+    called = bodies.joint_names if names is None else names
+    _check(profile, bodies.joint_names, called)
+    every = Limits.of_profile(profile)
+    parts = (getattr(every, name)[places] for name in ("lower", "upper", "speed", "acceleration", "torque"))
+    limits = Limits(called, *parts)
+    robot = Robot(profile.name, bodies.model, called, bodies.joint_types, limits.lower, limits.upper, limits.speed)
+    return Arm(profile.name, limits, robot, replace(bodies, joint_names=called))
+
+
+def _check(profile: Profile, own: Sequence[str], called: Sequence[str]) -> None:
+    """The model's joints are the robot's, in the same order, whatever they are called."""
+    known = profile.called(called)
+    if len(own) != len(called) or (known is not None and known != tuple(own)):
+        raise ValueError(
+            f"robot {profile.name!r} has the joints {', '.join(own)}; the model has {', '.join(called)}, expected as "
+            "many in the same order"
+        )
+
 
 MAX_TENSOR_BYTES = 1 << 30
 SMALL = 64 * 1024
@@ -45,7 +137,7 @@ MEMBER_LIMITS: Mapping[str, int] = {
 }
 
 
-def find_model(given: str, url: str, version: int | None = None, alias: str | None = None) -> TorqueModel:
+def find_model(given: str, url: str) -> TorqueModel:
     """The model in a folder of that path, or of that name from the service at `url`.
 
     Raise ModelFormatError for what is no model, ApiError or ServiceUnreachableError where the service has none.
@@ -55,13 +147,13 @@ def find_model(given: str, url: str, version: int | None = None, alias: str | No
         return lipcore.load(folder)
     if folder.is_dir():
         raise ModelFormatError(f"{given} holds no {MANIFEST}, expected the folder of a saved model", MANIFEST)
-    return fetch(given, url, version, alias)
+    return fetch(given, url)
 
 
-def fetch(name: str, url: str, version: int | None = None, alias: str | None = None) -> TorqueModel:
+def fetch(name: str, url: str) -> TorqueModel:
     """A served model as it is now, with all that it has learnt online."""
     with TemporaryDirectory(prefix="lipserve-excite-") as folder, Client(url) as client:
-        path = client.export(name, Path(folder) / "model.tar", version, alias)
+        path = client.export(name, Path(folder) / "model.tar")
         try:
             files = archive.read(path, MEMBER_LIMITS)
         except archive.ArchiveError as error:
@@ -71,7 +163,7 @@ def fetch(name: str, url: str, version: int | None = None, alias: str | None = N
         return persistence.decode(files)
 
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = alone()
 ERRORS = (ApiError, NotPositiveDefiniteError, SimulationUnavailableError, plotting.PlotUnavailableError)
 """What a user is told without a traceback, beside ValueError and OSError."""
 COMPARED = 5
@@ -95,8 +187,7 @@ class Random:
 def excite(
     out: Annotated[Path, typer.Option(help="CSV file to write: t, q1…, dq1…, ddq1….", dir_okay=False)],
     model: Annotated[
-        str | None,
-        typer.Option(help="What is known already: a saved model's folder, or the name of a served model."),
+        str | None, typer.Option(help="What is known already: a saved model's folder, or the name of a served model.")
     ] = None,
     robot: Annotated[
         str | None,
@@ -146,7 +237,7 @@ def excite(
         plotting.draw_motion(plot, made)
     random = random_motion(made)
     if as_json:
-        print_json(shown(made, random, out, plot))
+        print_json(document(made, random, out, plot))
         return
     console.print(table(made, random), highlight=False)
     console.print(summary(made, "the model" if known is not None else f"a {estimator} prior"), highlight=False)
@@ -180,7 +271,7 @@ def random_motion(made: Plan) -> Random:
     return Random(left(1.0), left(FAST))
 
 
-def shown(made: Plan, random: Random, out: Path, plot: Path | None) -> dict[str, Any]:
+def document(made: Plan, random: Random, out: Path, plot: Path | None) -> dict[str, Any]:
     """The plan for JSON: per joint the shares of variance expected to be left, and of the limits that are used."""
     start = made.series.at(np.zeros(1))[0][0]
     return {

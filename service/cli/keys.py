@@ -13,20 +13,15 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from service.cli.consoles import note, out, print_json
-from service.cli.options import Json
+from service.cli.options import Json, group
 from service.foundation.errors import InvalidRequestError
 from service.foundation.settings import Settings
 from service.storage.database import ApiKeyRow, Database
-from service.storage.home import HomeError, usable
+from service.storage.storage import HomeError, usable
 from service.web.access import keys
 from service.web.access.scopes import SCOPES
 
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    help="API keys of the home LIPSERVE_HOME.",
-)
+app = group("API keys of the home LIPSERVE_HOME.")
 ERRORS = (HomeError, InvalidRequestError)
 LONGEST_DAYS = 36_500.0
 
@@ -48,7 +43,7 @@ def create(
         scopes = [part.strip() for given in scope for part in given.split(",")]
         row, secret = keys.create(database, name, scopes, expires)
     if as_json:
-        print_json({**_shown(row), "key": secret})
+        print_json({**_document(row), "key": secret})
         return
     typer.echo(secret)
     until = f"until {row.expires_at}" if row.expires_at else "until it is revoked"
@@ -63,13 +58,13 @@ def list_(as_json: Json = False) -> None:
     with _database() as (database, _):
         rows = keys.stored(database)
     if as_json:
-        print_json([_shown(row) for row in rows])
+        print_json([_document(row) for row in rows])
         return
     table = Table(Column("id", no_wrap=True), "name", "scopes", "state", "made", "expires", "last used")
     for row in rows:
-        shown = _shown(row)
-        times = (_minute(shown[field]) for field in ("created_at", "expires_at", "used_at"))
-        table.add_row(row.id, escape(row.name), ", ".join(row.scopes), shown["state"], *times)
+        document = _document(row)
+        times = (_minute(document[field]) for field in ("created_at", "expires_at", "used_at"))
+        table.add_row(row.id, escape(row.name), ", ".join(row.scopes), document["state"], *times)
     out.print(table)
 
 
@@ -82,7 +77,7 @@ def revoke(
     with _database() as (database, settings):
         row = keys.revoke(database, key)
     if as_json:
-        print_json(_shown(row))
+        print_json(_document(row))
         return
     note(f"{row.id} is revoked; a running service refuses it after {settings.keys_refresh_s:g} s")
 
@@ -94,7 +89,7 @@ def _database() -> Iterator[tuple[Database, Settings]]:
         yield database, settings
 
 
-def _shown(row: ApiKeyRow) -> dict[str, Any]:
+def _document(row: ApiKeyRow) -> dict[str, Any]:
     fields = ("id", "name", "scopes", "created_at", "expires_at", "revoked_at", "used_at")
     return {**{field: getattr(row, field) for field in fields}, "state": keys.state_of(row, time.time())}
 

@@ -7,15 +7,15 @@ Ctrl-C.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
 from service import __version__
-from service.cli.consoles import explain, print_error, say
-from service.foundation.importing import imported
+from service.cli.consoles import echo, explain, print_error
+from service.compute.remote import imported
 
 
 class Entry(NamedTuple):
@@ -93,7 +93,7 @@ class Commands(LazyGroup):
         "keys": Entry("service.cli.keys", "API keys of the home LIPSERVE_HOME: create, list, revoke.", RUN),
         "verify": Entry("service.cli.verify", "Read all that the home stores and report what is damaged.", RUN),
         "data": Entry("service.cli.data", "Recordings and their reports: add, list, show, delete.", DATA),
-        "train": Entry("service.cli.train", "Train a model on recordings. Ctrl-C cancels the job.", MODELS),
+        "train": Entry("service.cli.jobs", "Train a model on recordings. Ctrl-C cancels the job.", MODELS, "train_app"),
         "jobs": Entry("service.cli.jobs", "Training jobs: list, show, follow, cancel, retry.", MODELS),
         "models": Entry(
             "service.cli.models",
@@ -107,7 +107,7 @@ class Commands(LazyGroup):
         "stream": Entry("service.cli.stream", "Play a motion to a model in real time, and teach it.", ANSWERS),
         "simulate": Entry("service.cli.simulate", "Simulate a robot's stream and write it as a recording.", ROBOT),
         "excite": Entry("service.cli.excite", "Plan the motion that tells most of what is not known.", ROBOT),
-        "bench": Entry("service.cli.bench", "Time the answers of a service on this machine.", CHECK),
+        "bench": Entry("service.cli.answers", "Time the answers of a service on this machine.", CHECK, "bench_app"),
     }
 
 
@@ -129,33 +129,5 @@ def main() -> None:
 @app.callback(invoke_without_command=True)
 def _root(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
     if version:
-        say(__version__)
+        echo(__version__)
         raise typer.Exit
-
-
-PROGRAM = "lipserve"
-
-
-class Command(NamedTuple):
-    """A command or a group of them. path: words that call it; command: as Typer knows it; context: to ask it."""
-
-    path: tuple[str, ...]
-    command: Any
-    context: Any
-
-
-def commands() -> Iterator[Command]:
-    """All commands, groups before what is in them, in the order of their lists."""
-    root = typer.main.get_command(app)
-    yield from _below(Command((PROGRAM,), root, root.make_context(PROGRAM, [], resilient_parsing=True)))
-
-
-def _below(at: Command) -> Iterator[Command]:
-    yield at
-    if not hasattr(at.command, "list_commands"):
-        return
-    load = getattr(at.command, "load", None)
-    for name in at.command.list_commands(at.context):
-        command = at.command.get_command(at.context, name) if load is None else load(name)
-        context = command.make_context(name, [], parent=at.context, resilient_parsing=True)
-        yield from _below(Command((*at.path, name), command, context))

@@ -11,34 +11,25 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from service.cli import completion
+from service.cli import connecting
 from service.cli.connecting import connected, dataset_of
-from service.cli.consoles import CommandError, note, out, print_json, say
-from service.cli.options import Alias, Data, Json, Limit, Model, Url, Version, Yes, confirm
+from service.cli.consoles import CommandError, echo, note, out, print_json, print_result
+from service.cli.options import Alias, Data, Json, Limit, Model, Url, Version, Yes, confirm, group
 from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
-    from service.client.results import Version as VersionRecord
+    from service.client.results.arm import Version as VersionRecord
     from service.models.schema import Alias as AliasRecord
     from service.models.schema import Selection
 
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    help="Models: list, show, promote, roll back, compare, export, import and delete them.",
-)
+app = group("Models: list, show, promote, roll back, compare, export, import and delete them.")
 SERVING = "serving"
-Which = Annotated[str, typer.Argument(help="A version, by its number or an alias.", autocompletion=completion.versions)]
-AliasName = Annotated[str, typer.Option("--alias", help="Which alias.", autocompletion=completion.aliases)]
+Which = Annotated[str, typer.Argument(help="A version, by its number or an alias.", autocompletion=connecting.versions)]
+AliasName = Annotated[str, typer.Option("--alias", help="Which alias.", autocompletion=connecting.aliases)]
 
 
 @app.command("list")
-def list_(
-    limit: Limit = 50,
-    url: Url = DEFAULT_URL,
-    as_json: Json = False,
-) -> None:
+def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
     """List models, newest first."""
     with connected(url) as client:
         models = list(islice(client.models(), limit))
@@ -46,7 +37,7 @@ def list_(
         print_json(models)
         return
     if not models:
-        say("no model yet: `lipserve train FILE --model NAME` makes one")
+        echo("no model yet: `lipserve train FILE --model NAME` makes one")
         return
     table = Table("model", "serving", "versions", "estimator", "aliases", "made")
     for model in models:
@@ -68,11 +59,11 @@ def show(model: Model, version: Version = None, url: Url = DEFAULT_URL, as_json:
     """Print a model with its versions, and what one of them stands on: the one that serves, or one that is named."""
     with connected(url) as client:
         record = client.model(model)
-        shown = client.version(model, version or record.serving_version)
+        detail = client.version(model, version or record.serving_version)
     if as_json:
-        print_json({"model": record.model_dump(mode="json"), "version": shown.model_dump(mode="json")})
+        print_json({"model": record.model_dump(mode="json"), "version": detail.model_dump(mode="json")})
         return
-    say(f"{record.name}: version {record.serving_version} serves, {record.latest_version} is the newest")
+    echo(f"{record.name}: version {record.serving_version} serves, {record.latest_version} is the newest")
     table = Table("version", "estimator", "made", "named")
     for each in record.versions:
         named = [name for name, at in record.aliases.items() if at == each.version]
@@ -80,16 +71,12 @@ def show(model: Model, version: Version = None, url: Url = DEFAULT_URL, as_json:
         at = each.created_at[:16].replace("T", " ")
         table.add_row(str(each.version), each.estimator, at, escape(", ".join(named)) or "-")
     out.print(table)
-    _print_version(shown)
+    _print_version(detail)
 
 
 @app.command()
 def promote(
-    model: Model,
-    version: Which,
-    alias: AliasName = SERVING,
-    url: Url = DEFAULT_URL,
-    as_json: Json = False,
+    model: Model, version: Which, alias: AliasName = SERVING, url: Url = DEFAULT_URL, as_json: Json = False
 ) -> None:
     """Let a version answer where none is named; with --alias, point that alias to it instead."""
     with connected(url) as client:
@@ -114,20 +101,17 @@ def rollback(
             _moved(model, client.rollback_alias(model, alias), as_json)
             return
         back = client.rollback(model, revision=revision)
-    if as_json:
-        print_json(back)
-    else:
-        say(f"{model} is back at revision {revision}: {back.undone} batches do not teach any more")
+    print_result(back, as_json, f"{model} is back at revision {revision}: {back.undone} batches do not teach any more")
 
 
 @app.command()
 def alias(
     model: Model,
-    name: Annotated[str, typer.Argument(help="The alias.", autocompletion=completion.aliases)],
+    name: Annotated[str, typer.Argument(help="The alias.", autocompletion=connecting.aliases)],
     version: Annotated[
         str | None,
         typer.Argument(
-            help="The version it is to name, by number or another alias.", autocompletion=completion.versions
+            help="The version it is to name, by number or another alias.", autocompletion=connecting.versions
         ),
     ] = None,
     remove: Annotated[bool, typer.Option("--remove", help="Remove it; its version stays.")] = False,
@@ -140,7 +124,7 @@ def alias(
     with connected(url) as client:
         if remove:
             client.remove_alias(model, name)
-            print_json({"removed": name}) if as_json else say(f"alias {name} of {model} is removed")
+            print_result({"removed": name}, as_json, f"alias {name} of {model} is removed")
             return
         if version is not None:
             _moved(model, client.set_alias(model, name, _which(version)), as_json)
@@ -148,23 +132,17 @@ def alias(
         aliases = [each for each in client.aliases(model) if each.alias == name]
     if not aliases:
         raise CommandError(f"no alias {name!r} of {model}", f"`lipserve models alias {model} {name} VERSION` makes it")
-    if as_json:
-        print_json(aliases[0])
-        return
-    say(f"{name} of {model} names version {aliases[0].version}")
-    for move in aliases[0].history:
-        back = " (rolled back)" if move.rollback else ""
-        say(f"  {move.at[:19].replace('T', ' ')}  {_or_none(move.before)} → {_or_none(move.version)}{back}")
+    moves = (
+        f"  {move.at[:19].replace('T', ' ')}  {move.before or 'none'} → {move.version or 'none'}"
+        + (" (rolled back)" if move.rollback else "")
+        for move in aliases[0].history
+    )
+    print_result(aliases[0], as_json, f"{name} of {model} names version {aliases[0].version}", *moves)
 
 
 @app.command()
 def compare(
-    model: Model,
-    data: Data,
-    first: Which,
-    second: Which,
-    url: Url = DEFAULT_URL,
-    as_json: Json = False,
+    model: Model, data: Data, first: Which, second: Which, url: Url = DEFAULT_URL, as_json: Json = False
 ) -> None:
     """Compare two versions on a recording: which is better, as far as the data can tell."""
     with connected(url) as client:
@@ -175,7 +153,7 @@ def compare(
     from service.cli.tables import comparison_table  # noqa: PLC0415 - takes long to import; help needs none
 
     out.print(comparison_table(comparison))
-    say(comparison.verdict)
+    echo(comparison.verdict)
     for warning in comparison.warnings:
         out.print(f"[yellow]careful:[/yellow] {escape(warning)}", highlight=False)
 
@@ -193,10 +171,12 @@ def export_(
     """Write a version as an archive that another service imports."""
     with connected(url) as client:
         written = client.export(model, path, version, alias, learnt)
-    if as_json:
-        print_json({"file": written, "bytes": written.stat().st_size})
-    else:
-        say(f"{written}: {written.stat().st_size:,} bytes; `lipserve models import {written}` reads it")
+    size = written.stat().st_size
+    print_result(
+        {"file": written, "bytes": size},
+        as_json,
+        f"{written}: {size:,} bytes; `lipserve models import {written}` reads it",
+    )
 
 
 @app.command()
@@ -222,10 +202,8 @@ def import_(
     """Make a new version of an exported archive. It answers where the model had none before."""
     with connected(url) as client:
         made = client.import_model(path, name)
-    if as_json:
-        print_json(made)
-    else:
-        say(f"{made.model} version {made.version} is imported: `lipserve models promote {made.model} {made.version}`")
+    promote = f"`lipserve models promote {made.model} {made.version}`"
+    print_result(made, as_json, f"{made.model} version {made.version} is imported: {promote}")
 
 
 @app.command()
@@ -240,18 +218,11 @@ def delete(
             client.delete_model(model)
         else:
             client.delete_version(model, version)
-    if as_json:
-        print_json({"deleted": {"model": model, "version": version}})
-    else:
-        say(f"{what} is deleted")
+    print_result({"deleted": {"model": model, "version": version}}, as_json, f"{what} is deleted")
 
 
 def _which(text: str) -> int | str:
     return int(text) if text.isdecimal() else text
-
-
-def _or_none(version: int | None) -> str:
-    return "none" if version is None else str(version)
 
 
 def _moved(model: str, moved: AliasRecord, as_json: bool) -> None:
@@ -259,7 +230,7 @@ def _moved(model: str, moved: AliasRecord, as_json: bool) -> None:
         print_json(moved)
         return
     did = "answers where none is named" if moved.alias == SERVING else f"is what {moved.alias} names"
-    say(f"{model}: version {moved.version} {did}")
+    echo(f"{model}: version {moved.version} {did}")
     if moved.previous is not None:
         note(f"`lipserve models rollback {model} --alias {moved.alias}` goes back to version {moved.previous}")
 
@@ -269,31 +240,32 @@ def print_selection(selection: Selection) -> None:
     from service.cli.tables import selection_table  # noqa: PLC0415 - takes long to import; help needs none
 
     out.print(selection_table(selection))
-    say(f"  {selection.chosen} is chosen: {selection.reason}")
+    echo(f"  {selection.chosen} is chosen: {selection.reason}")
     if selection.held_out.repeats:
-        say("  all of the motion repeats itself, also what was held out: these figures flatter")
+        echo("  all of the motion repeats itself, also what was held out: these figures flatter")
 
 
-def _print_version(shown: VersionRecord) -> None:
-    say(f"version {shown.version}: {shown.estimator}, {len(shown.joint_names)} joints: {', '.join(shown.joint_names)}")
-    noise = ", ".join(f"{value:.3g}" for value in shown.noise_std)
-    say(f"  torque {shown.torque_convention.replace('_', ' ')}, noise of a measurement {noise} N·m")
-    if shown.selection is not None:
-        print_selection(shown.selection)
-    lineage: dict[str, Any] = shown.lineage
+def _print_version(version: VersionRecord) -> None:
+    names = version.joint_names
+    echo(f"version {version.version}: {version.estimator}, {len(names)} joints: {', '.join(names)}")
+    noise = ", ".join(f"{value:.3g}" for value in version.noise_std)
+    echo(f"  torque {version.torque_convention.replace('_', ' ')}, noise of a measurement {noise} N·m")
+    if version.selection is not None:
+        print_selection(version.selection)
+    lineage: dict[str, Any] = version.lineage
     sets = [each.get("name") or each.get("id") for each in lineage.get("datasets") or () if isinstance(each, dict)]
     if sets:
-        say(f"  trained on {', '.join(map(str, sets))}")
+        echo(f"  trained on {', '.join(map(str, sets))}")
     held = lineage.get("holdout")
     if held is not None:
         from service.cli.tables import figures_table  # noqa: PLC0415 - takes long to import; help needs none
 
-        out.print(figures_table(f"on {held['samples']} samples held out", shown.joint_names, held))
+        out.print(figures_table(f"on {held['samples']} samples held out", names, held))
     else:
-        say("  nothing was held out of its data: `lipserve evaluate` on a recording it has not seen tells how good")
-    for warning in shown.warnings:
+        echo("  nothing was held out of its data: `lipserve evaluate` on a recording it has not seen tells how good")
+    for warning in version.warnings:
         out.print(f"[yellow]careful:[/yellow] {escape(warning)}", highlight=False)
-    arm = shown.arm
+    arm = version.arm
     if arm is not None:
         from service.cli.tables import arm_tables  # noqa: PLC0415 - as above
         from service.client.results.arm import LIMITS  # noqa: PLC0415
@@ -301,4 +273,4 @@ def _print_version(shown: VersionRecord) -> None:
         for table in arm_tables(arm):
             out.print(table)
         for text in LIMITS:
-            say(text)
+            echo(text)

@@ -9,19 +9,19 @@ from urllib.parse import quote
 
 import typer
 
-from service.cli import completion
-from service.cli.completion import UNIX, ask
-from service.cli.consoles import START, CommandError, print_json, say
-from service.cli.options import Json, Url
+from service.cli import connecting
+from service.cli.connecting import UNIX, ask
+from service.cli.consoles import START, CommandError, print_result
+from service.cli.options import Json, Url, alone
 from service.foundation.settings import DEFAULT_URL
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = alone()
 
 
 @app.command("open")
 def open_(
     model: Annotated[
-        str | None, typer.Argument(help="A model, for its page.", autocompletion=completion.models)
+        str | None, typer.Argument(help="A model, for its page.", autocompletion=connecting.models)
     ] = None,
     live: Annotated[bool, typer.Option("--live", help="The page that follows what is streamed.")] = False,
     browser: Annotated[bool, typer.Option("--browser", help="Also open it in this machine's browser.")] = False,
@@ -37,9 +37,6 @@ def open_(
         raise CommandError(f"no service answers at {url}: {error}", START) from error
     page = "live" if live else "models" if model else ""
     address = f"{url.rstrip('/')}/#/{page}" + (f"/{quote(model, safe='')}" if model else "")
-    if as_json:
-        print_json({"url": address})
-    else:
-        say(address)
+    print_result({"url": address}, as_json, address)
     if browser:
         webbrowser.open(address)

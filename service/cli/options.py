@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from pydantic import ValidationError
 
-from service.cli import completion
+from service.cli import connecting
 from service.cli.consoles import CommandError
+from service.foundation.settings import Settings
 
 ROBOTS = [
     *("panda", "ur3", "ur5", "ur10", "xarm7", "kinova", "z1", "so100", "so101", "baxter-left", "baxter-right"),
@@ -24,18 +26,36 @@ Url = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 Limit = Annotated[int, typer.Option(min=1, help="Most that are listed.")]
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask whether that is meant.")]
-Model = Annotated[str, typer.Argument(help="Name of the model.", autocompletion=completion.models)]
-DatasetId = Annotated[str, typer.Argument(help="Id of a data set.", autocompletion=completion.datasets)]
-JobId = Annotated[str, typer.Argument(help="Id of a job.", autocompletion=completion.jobs)]
+Model = Annotated[str, typer.Argument(help="Name of the model.", autocompletion=connecting.models)]
+DatasetId = Annotated[str, typer.Argument(help="Id of a data set.", autocompletion=connecting.datasets)]
+JobId = Annotated[str, typer.Argument(help="Id of a job.", autocompletion=connecting.jobs)]
 Data = Annotated[
     str,
-    typer.Argument(help="A recording, which is uploaded, or the id of a data set.", autocompletion=completion.datasets),
+    typer.Argument(help="A recording, which is uploaded, or the id of a data set.", autocompletion=connecting.datasets),
 ]
 Version = Annotated[
-    int | None,
-    typer.Option(help="A version; the one that serves by default.", autocompletion=completion.versions),
+    int | None, typer.Option(help="A version; the one that serves by default.", autocompletion=connecting.versions)
 ]
-Alias = Annotated[str | None, typer.Option(help="A version by its alias.", autocompletion=completion.aliases)]
+Alias = Annotated[str | None, typer.Option(help="A version by its alias.", autocompletion=connecting.aliases)]
+
+
+def group(help_: str) -> typer.Typer:
+    """An application of several commands."""
+    return typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=help_)
+
+
+def alone() -> typer.Typer:
+    """An application of one command."""
+    return typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+def settings_of(**given: Any) -> Settings:
+    """Settings, those that are given and else those of the environment; raise CommandError."""
+    try:
+        return Settings(**{name: value for name, value in given.items() if value is not None})
+    except ValidationError as error:
+        faults = (f"{'.'.join(map(str, each['loc'])) or 'settings'}: {each['msg']}" for each in error.errors())
+        raise CommandError("; ".join(faults)) from None
 
 
 def numbers(option: str, text: str) -> list[float]:

@@ -29,7 +29,7 @@ from service.datasets.options import UploadOptions
 from service.datasets.staging import Staged, prepare
 from service.foundation.errors import ServiceError
 from service.foundation.settings import Settings
-from service.storage.disk import Disk
+from service.storage.storage import Disk
 from service.stream.exchange import StreamAnswer, StreamLearnt
 
 BAND = 1.959963984540054
@@ -44,7 +44,7 @@ class Tally:
         self.rows, self.late, self.behind_s = 0, 0, 0.0
         self.refused = Counter[str]()
         self._trips = array("d")
-        self._inside, self._squared, self._sum, self._sum_squared = np.zeros((4, len(noise_std)))
+        self._sums = np.zeros((4, len(noise_std)))  # answers inside the band, squared errors, torques, squared torques
 
     def add(self, answer: StreamAnswer, tau: Array, seconds: float, behind_s: float) -> None:
         """Count an answer with its std.
@@ -56,11 +56,10 @@ class Tally:
         self.late += answer.late
         self.behind_s = max(self.behind_s, behind_s)
         self._trips.append(seconds)
-        self._squared += error**2
-        self._sum += tau
-        self._sum_squared += tau**2
+        inside = np.zeros(tau.shape, np.bool_)
         if answer.tau_std is not None:
-            self._inside += np.abs(error) <= BAND * np.hypot(answer.tau_std, self._noise)
+            inside = np.abs(error) <= BAND * np.hypot(answer.tau_std, self._noise)
+        self._sums += np.array((inside, error**2, tau, tau**2))
 
     def merge(self, other: Tally) -> None:
         """Add the figures of another stretch of the same stream."""
@@ -69,12 +68,9 @@ class Tally:
         self.behind_s = max(self.behind_s, other.behind_s)
         self.refused.update(other.refused)
         self._trips.extend(other._trips)
-        self._inside += other._inside
-        self._squared += other._squared
-        self._sum += other._sum
-        self._sum_squared += other._sum_squared
+        self._sums += other._sums
 
-    def shown(self) -> dict[str, Any]:
+    def figures(self) -> dict[str, Any]:
         """The figures for JSON: rmse in N·m over all joints, coverage of the 95 % band; None without answers.
 
         All compare answers with torque that the model had not learnt yet when it answered.
@@ -86,16 +82,16 @@ class Tally:
             "round_trip_ms": {"p50": p50, "p99": p99},
             "late": self.late,
             "behind_s": self.behind_s,
-            "rmse": float(np.sqrt(self._squared.mean() / self.rows)) if self.rows else None,
-            "coverage": float(self._inside.mean() / self.rows) if self.rows else None,
+            "rmse": float(np.sqrt(self._sums[1].mean() / self.rows)) if self.rows else None,
+            "coverage": float(self._sums[0].mean() / self.rows) if self.rows else None,
         }
 
     def joints(self, joint_names: Sequence[str]) -> list[dict[str, Any]]:
         """Figures of each joint: rmse N·m, nmse (None where the torque does not vary), coverage of the 95 % band."""
         if not self.rows:
             return []
-        squared, coverage = self._squared / self.rows, self._inside / self.rows
-        variance = self._sum_squared / self.rows - (self._sum / self.rows) ** 2
+        coverage, squared, mean, mean_square = self._sums / self.rows
+        variance = mean_square - mean**2
         return [
             {
                 "joint": name,
@@ -107,7 +103,7 @@ class Tally:
         ]
 
 
-def learnt_shown(learnt: StreamLearnt) -> dict[str, Any]:
+def learnt_figures(learnt: StreamLearnt) -> dict[str, Any]:
     """What has become of the torques that were sent, for JSON."""
     return {
         "accepted": learnt.accepted,

@@ -34,11 +34,7 @@ def draw_motion(path: Path, made: Plan) -> None:
     """Draw each joint's position, speed and acceleration with their limits, and what is expected to be left."""
     plt, limits = pyplot(), made.limits
     t, *parts = made.table()
-    bounds = (
-        (limits.lower, limits.upper),
-        (-limits.speed, limits.speed),
-        (-limits.acceleration, limits.acceleration),
-    )
+    bounds = ((limits.lower, limits.upper), (-limits.speed, limits.speed), (-limits.acceleration, limits.acceleration))
     figure, axes = plt.subplots(
         limits.n_joints, 3, sharex=True, squeeze=False, figsize=(11, 1.3 * limits.n_joints + 0.6)
     )

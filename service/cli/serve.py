@@ -7,18 +7,15 @@ from typing import Annotated
 
 import typer
 import uvicorn
-from pydantic import ValidationError
 
 from service.app import create_app
-from service.cli.consoles import CommandError
-from service.foundation.settings import Settings
-from service.storage.home import HomeError, check_home
+from service.cli.options import alone, settings_of
+from service.storage.storage import HomeError, check_home
 from service.web.observability import logs
 from service.web.server import sockets
-from service.web.server.connections import guarded
-from service.web.server.stream_protocol import StreamProtocol
+from service.web.server.connections import StreamProtocol, guarded
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = alone()
 ERRORS = (HomeError,)
 
 
@@ -29,12 +26,7 @@ def serve(
     uds: Annotated[Path | None, typer.Option(help="Unix-domain socket to listen on too (LIPSERVE_UDS).")] = None,
 ) -> None:
     """Serve models and run training jobs."""
-    given = {name: value for name, value in (("host", host), ("port", port), ("uds", uds)) if value is not None}
-    try:
-        settings = Settings(**given)  # type: ignore[arg-type]  # validated here
-    except ValidationError as error:
-        faults = (f"{'.'.join(map(str, each['loc'])) or 'settings'}: {each['msg']}" for each in error.errors())
-        raise CommandError("; ".join(faults)) from None
+    settings = settings_of(host=host, port=port, uds=uds)
     logs.configure(logs.LogOptions(settings.log_level, settings.log_format))
     check_home(settings)  # before the app opens it for good: what is wrong is said without a traceback
     served = create_app(settings)

@@ -11,8 +11,8 @@ import typer
 from lipcore.data.samples import Samples
 from lipcore.robots.library import ROBOTS, SimulationUnavailableError, load_robot
 from lipcore.robots.simulation import FAST, Payload, Stream, simulate
-from service.cli.consoles import print_json, say
-from service.cli.options import Json
+from service.cli.consoles import print_result
+from service.cli.options import Json, alone
 
 
 def write_recording(path: Path, samples: Samples) -> None:
@@ -32,7 +32,7 @@ def write_recording(path: Path, samples: Samples) -> None:
         raise ValueError(f"file is {path.name!r}, expected the ending .csv or .npz")
 
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = alone()
 ERRORS = (SimulationUnavailableError,)
 
 
@@ -67,7 +67,5 @@ def simulate_(
     )
     data = simulate(load_robot(robot), stream, seed)
     write_recording(output, data)
-    if as_json:
-        print_json({"file": output, "samples": len(data), "rate_hz": rate, "joint_names": data.joint_names})
-    else:
-        say(f"{output}: {len(data)} samples of {', '.join(data.joint_names)}")
+    document = {"file": output, "samples": len(data), "rate_hz": rate, "joint_names": data.joint_names}
+    print_result(document, as_json, f"{output}: {len(data)} samples of {', '.join(data.joint_names)}")

@@ -10,17 +10,20 @@ import typer
 from rich.table import Table
 
 from service.cli.connecting import connected
-from service.cli.consoles import INTERRUPTED, CommandError, note, out, print_json, say
-from service.cli.options import ROBOTS, Alias, Json, Model, Url, Version
+from service.cli.consoles import INTERRUPTED, CommandError, echo, note, out, print_json
+from service.cli.options import ROBOTS, Alias, Json, Model, Url, Version, alone
 from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
     from service.cli.playing import Motion, Tally
     from service.client.stream import StreamClient
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = alone()
 SECONDS = 60.0
-SIMULATION = "Simulation"
+
+
+def _simulation(help_: str, *names: str, **limits: Any) -> Any:
+    return typer.Option(*names, help=help_, rich_help_panel="Simulation", **limits)
 
 
 @app.command()
@@ -30,8 +33,7 @@ def stream(
         Path | None, typer.Argument(help="A recording with times, q, dq, ddq and tau, or from which these are derived.")
     ] = None,
     simulate: Annotated[
-        str | None,
-        typer.Option(help="Play a simulated robot instead, such as panda.", autocompletion=lambda: ROBOTS),
+        str | None, typer.Option(help="Play a simulated robot instead, such as panda.", autocompletion=lambda: ROBOTS)
     ] = None,
     learn: Annotated[
         bool,
@@ -48,15 +50,11 @@ def stream(
     ] = None,
     version: Version = None,
     alias: Alias = None,
-    rate: Annotated[float, typer.Option(min=1, max=2000, help="Hz.", rich_help_panel=SIMULATION)] = 100.0,
-    seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal motions.", rich_help_panel=SIMULATION)] = 0,
-    fast: Annotated[
-        bool, typer.Option("--fast", help="The faster-moving variant.", rich_help_panel=SIMULATION)
-    ] = False,
-    payload: Annotated[
-        float, typer.Option(min=0, help="Payload that the robot takes up, kg.", rich_help_panel=SIMULATION)
-    ] = 0.0,
-    payload_at: Annotated[float, typer.Option(min=0, help="When it does, s.", rich_help_panel=SIMULATION)] = 0.0,
+    rate: Annotated[float, _simulation("Hz.", min=1, max=2000)] = 100.0,
+    seed: Annotated[int, _simulation("Equal seeds give equal motions.", min=0)] = 0,
+    fast: Annotated[bool, _simulation("The faster-moving variant.", "--fast")] = False,
+    payload: Annotated[float, _simulation("Payload that the robot takes up, kg.", min=0)] = 0.0,
+    payload_at: Annotated[float, _simulation("When it does, s.", min=0)] = 0.0,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
@@ -87,16 +85,11 @@ def stream(
         step = motion.step if deadline is None else deadline / 1e3
         _announce(motion, opened, source)
         total = play(
-            opened,
-            motion,
-            learn,
-            step,
-            stop,
-            lambda second, part: _tell_second(second, part, opened, learn, as_json),
+            opened, motion, learn, step, stop, lambda second, part: _print_second(second, part, opened, learn, as_json)
         )
         if learn:
             opened.flush()
-        _tell_all(total, opened, learn, as_json)
+        _print_all(total, opened, learn, as_json)
     if stop.asked:
         raise typer.Exit(INTERRUPTED)
 
@@ -124,59 +117,59 @@ def _announce(motion: Motion, stream: StreamClient, source: str | None) -> None:
     note(f"{length} to {hello.model} version {hello.version}{taught}")
 
 
-def _tell_second(second: int, part: Tally, stream: StreamClient, learn: bool, as_json: bool) -> None:
-    from service.cli.playing import learnt_shown  # noqa: PLC0415 - as above
+def _print_second(second: int, part: Tally, stream: StreamClient, learn: bool, as_json: bool) -> None:
+    from service.cli.playing import learnt_figures  # noqa: PLC0415 - as above
 
-    shown = {"second": second, **part.shown(), "version": stream.hello.version}
+    figures = {"second": second, **part.figures(), "version": stream.hello.version}
     if learn:
-        shown["learnt"] = learnt_shown(stream.learnt)
+        figures["learnt"] = learnt_figures(stream.learnt)
     if as_json:
-        print_json(shown, one_line=True)
+        print_json(figures, one_line=True)
     else:
-        say(f"{second:4d} s  {_line(shown)}")
+        echo(f"{second:4d} s  {_line(figures)}")
 
 
-def _tell_all(total: Tally, stream: StreamClient, learn: bool, as_json: bool) -> None:
-    from service.cli.playing import learnt_shown  # noqa: PLC0415 - as above
+def _print_all(total: Tally, stream: StreamClient, learn: bool, as_json: bool) -> None:
+    from service.cli.playing import learnt_figures  # noqa: PLC0415 - as above
 
-    shown = {**total.shown(), "joints": total.joints(stream.hello.joint_names)}
+    figures = {**total.figures(), "joints": total.joints(stream.hello.joint_names)}
     if learn:
-        shown["learnt"] = learnt_shown(stream.learnt)
-        shown["not_logged"] = [
+        figures["learnt"] = learnt_figures(stream.learnt)
+        figures["not_logged"] = [
             {"first": each.first, "through": each.through, "code": each.code, "message": each.message}
             for each in stream.refusals
         ]
     if as_json:
-        print_json({"summary": shown}, one_line=True)
+        print_json({"summary": figures}, one_line=True)
         return
-    if shown["joints"]:
+    if figures["joints"]:
         title = "answers against measured torque" + (", each given before its row was learnt" if learn else "")
         table = Table("joint", "nMSE", "RMSE N·m", "coverage of 95%", title=title)
-        for each in shown["joints"]:
+        for each in figures["joints"]:
             nmse = "-" if each["nmse"] is None else f"{each['nmse']:.2e}"
             table.add_row(each["joint"], nmse, f"{each['rmse']:.4f}", f"{each['coverage']:.1%}")
         out.print(table)
-    say(f"in all  {_line(shown)}")
-    for each in shown.get("not_logged", ()):
+    echo(f"in all  {_line(figures)}")
+    for each in figures.get("not_logged", ()):
         note(f"rows {each['first']} to {each['through']} were not logged: {each['message']} ({each['code']})")
 
 
-def _line(shown: dict[str, Any]) -> str:
+def _line(figures: dict[str, Any]) -> str:
     """Figures of a second, or of all, on one line."""
-    parts = [f"{shown['rows']} rows"]
-    if shown["rows"]:
-        trip = shown["round_trip_ms"]
+    parts = [f"{figures['rows']} rows"]
+    if figures["rows"]:
+        trip = figures["round_trip_ms"]
         parts += [
             f"round trip p50 {trip['p50']:.2f} ms, p99 {trip['p99']:.2f} ms",
-            f"{shown['late']} late",
-            f"error {shown['rmse']:.4f} N·m, {shown['coverage']:.1%} in the 95 % band",
+            f"{figures['late']} late",
+            f"error {figures['rmse']:.4f} N·m, {figures['coverage']:.1%} in the 95 % band",
         ]
-    if shown["behind_s"] > 0.1:
-        parts.append(f"{shown['behind_s']:.1f} s behind")
-    if shown["refused"]:
-        parts.append("refused " + _counts(shown["refused"]))
-    if "learnt" in shown:
-        learnt = shown["learnt"]
+    if figures["behind_s"] > 0.1:
+        parts.append(f"{figures['behind_s']:.1f} s behind")
+    if figures["refused"]:
+        parts.append("refused " + _counts(figures["refused"]))
+    if "learnt" in figures:
+        learnt = figures["learnt"]
         parts.append(f"learnt {learnt['accepted']}")
         if learnt["kept_out"]:
             parts.append("kept out " + _counts(learnt["kept_out"]))

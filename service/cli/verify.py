@@ -17,15 +17,15 @@ import lipcore
 from lipcore.files import persistence
 from lipcore.files.probing import probe
 from lipcore.online import transfer as state
-from service.cli.consoles import err, print_json, say
-from service.cli.options import Json
+from service.cli.consoles import echo, err, print_json
+from service.cli.options import Json, alone
 from service.foundation.errors import DamagedDataError
 from service.foundation.settings import Settings
 from service.journal.log import decode
 from service.storage.database import Database, DatasetRow, EventRow, RobotRow, SnapshotRow, VersionRow
-from service.storage.database.sqlite import FILE
+from service.storage.database.engine import FILE
 from service.storage.files import Files, FilesUnreachableError
-from service.storage.home import HomeError, usable
+from service.storage.storage import HomeError, usable
 
 FAULTS = 20
 """Faults of the database that are told, at most."""
@@ -51,7 +51,7 @@ class Verified:
     read: dict[str, int] = field(default_factory=dict)
     damages: list[Damage] = field(default_factory=list)
 
-    def shown(self) -> dict[str, Any]:
+    def document(self) -> dict[str, Any]:
         """The findings for JSON."""
         return {"read": self.read, "damaged": [each._asdict() for each in self.damages]}
 
@@ -199,7 +199,7 @@ _CHECKS: dict[str, Callable[[Database, Files], Iterator[_Finding]]] = {
 }
 
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = alone()
 ERRORS = (HomeError,)
 
 
@@ -210,11 +210,11 @@ def verify(as_json: Json = False) -> None:
     with usable(settings):
         findings = verify_home(settings)
     if as_json:
-        print_json(findings.shown())
+        print_json(findings.document())
     else:
         for damage in findings.damages:
             err.print(f"[red]damaged:[/red] {escape(str(damage))}", highlight=False, soft_wrap=True)
         counts = ", ".join(f"{count} {kind}" for kind, count in findings.read.items())
-        say(f"read {counts}: {len(findings.damages) or 'nothing'} damaged")
+        echo(f"read {counts}: {len(findings.damages) or 'nothing'} damaged")
     if findings.damages:
         raise typer.Exit(1)

@@ -6,14 +6,13 @@ import os
 from typing import Annotated
 
 import typer
-from pydantic import ValidationError
 
 from service.cli.consoles import CommandError
+from service.cli.options import alone, settings_of
 from service.compute.process import THREAD_VARIABLES
-from service.foundation.settings import Settings
 from service.web.observability import logs
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = alone()
 
 
 @app.command()
@@ -25,11 +24,7 @@ def worker(
 
     It needs the same LIPSERVE_DATABASE_URL and LIPSERVE_FILES_URL as they, and a home of its own for copies of files.
     """
-    try:
-        settings = Settings()
-    except ValidationError as error:
-        faults = (f"{'.'.join(map(str, each['loc'])) or 'settings'}: {each['msg']}" for each in error.errors())
-        raise CommandError("; ".join(faults)) from None
+    settings = settings_of()
     if settings.cluster is None:
         raise CommandError("LIPSERVE_CLUSTER is not set, expected the address of a scheduler such as tcp://host:8786")
     logs.configure(logs.LogOptions(settings.log_level, settings.log_format))

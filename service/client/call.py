@@ -41,7 +41,7 @@ class Answer:
 class Call(Generic[T]):
     """One request, and `read`, which makes its result of the answer.
 
-    path: filled in and quoted; json: body as JSON, content: as bytes, file: as those of a file; repeatable: whether it
+    path: filled in and quoted; json: body as JSON; file: body as the bytes of a file; repeatable: whether it
     may be sent again when its answer is lost; removes: repeated, it has succeeded where nothing is found any more;
     timeout: longest wait for the answer in s, that of the client where None; save_to: file that the answer is written
     to, whole or not at all; shown: what a progress bar says, none where None.
@@ -53,7 +53,6 @@ class Call(Generic[T]):
     params: Mapping[str, Any] = field(default_factory=dict)
     headers: Mapping[str, str] = field(default_factory=dict)
     json: Any = None
-    content: bytes | None = None
     file: Path | None = None
     repeatable: bool = False
     removes: bool = False

@@ -11,7 +11,9 @@ import json
 import os
 import random
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -92,8 +94,6 @@ def request_of(call: Call[Any]) -> dict[str, Any]:
     asked: dict[str, Any] = {"method": call.method, "url": call.path, "params": call.params, "headers": call.headers}
     if call.json is not None:
         asked["json"] = call.json
-    if call.content is not None:
-        asked["content"] = call.content
     if call.timeout is not None:
         asked["timeout"] = call.timeout
     return asked
@@ -104,15 +104,32 @@ def answer_of(response: httpx.Response, body: bytes = b"") -> Answer:
     return Answer(response.status_code, body, response.headers)
 
 
-def pieces(file: BinaryIO) -> Iterator[bytes]:
-    """A file in pieces."""
-    while piece := file.read(CHUNK):
-        yield piece
+@contextmanager
+def content_of(call: Call[Any]) -> Iterator[Iterator[bytes] | None]:
+    """The file that a call sends, in pieces, with a bar where that is to be shown; None where it sends none."""
+    if call.file is None:
+        yield None
+        return
+    with ExitStack() as stack:
+        file = stack.enter_context(call.file.open("rb"))
+        content: Iterator[bytes] = iter(partial(file.read, CHUNK), b"")
+        if call.shown is not None:
+            from service.client.progress import upload_bar  # noqa: PLC0415 - rich, for those who look
+
+            content = stack.enter_context(upload_bar(call.shown, call.file.stat().st_size))(content)
+        yield content
 
 
-def draft_of(path: Path) -> Path:
-    """Where a file is written until it is whole."""
-    return path.with_name(f"{path.name}.part")
+@contextmanager
+def drafted(path: Path) -> Iterator[BinaryIO]:
+    """A file to be written in the block, which is there once it is whole, or not at all."""
+    draft = path.with_name(f"{path.name}.part")
+    try:
+        with draft.open("wb") as file:
+            yield file
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
 
 
 class Events:
@@ -160,11 +177,13 @@ class Attempts:
         self._made = 0
         self._lost = False
 
-    def lost(self, error: httpx.TransportError) -> float:
+    def lost(self, error: httpx.TransportError, begun: bool = False) -> float:
         """Return after how many seconds to try again; raise ServiceUnreachableError where that is no use.
 
-        What takes too long is not asked again: that would only add to the load.
+        What takes too long is not asked again: that would only add to the load. begun: events had come already.
         """
+        if begun:
+            raise ServiceUnreachableError(f"the service at {self._reach.url} is lost ({error})") from error
         timed_out = isinstance(error, httpx.TimeoutException)
         unknown = isinstance(error, httpx.ConnectError) and not self._reach.reached
         if not self._call.repeatable or timed_out or unknown or self._made >= self._reach.retries:
@@ -188,12 +207,7 @@ class Attempts:
         patient = self._call.repeatable and self._made < self._reach.retries
         if answer.status in LATER and patient and after is not None and after <= LONGEST_PAUSE_S:
             return max(after, self._pause())
-        raise self.refusal(answer)
-
-    @staticmethod
-    def refusal(answer: Answer) -> ApiError:
-        """The error that an answer tells."""
-        return refused(answer.status, answer.body, _retry_after(answer.headers))
+        raise refused(answer.status, answer.body, after)
 
     def _pause(self) -> float:
         """Twice as long each time, and never the same: many clients lose a service at once."""

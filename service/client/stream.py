@@ -1,15 +1,17 @@
-"""A synchronous client of torque streams, for controllers on the same host or network."""
+"""Clients of torque streams, for controllers on the same host or network: one that waits, and one that is awaited."""
 
 from __future__ import annotations
 
+import asyncio
 import socket
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from time import monotonic
-from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from numpy.typing import ArrayLike
+from websockets.asyncio import client as awaited
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 from websockets.sync.client import connect
 
@@ -30,20 +32,19 @@ from service.stream.exchange import (
     unsettled,
 )
 
-__all__ = ["StreamAnswer", "StreamClient", "StreamError", "StreamHello", "StreamLearnt", "StreamRefusal"]
+__all__ = [
+    "AsyncStreamClient",
+    "StreamAnswer",
+    "StreamClient",
+    "StreamError",
+    "StreamHello",
+    "StreamLearnt",
+    "StreamRefusal",
+]
 
 
-class StreamClient(StreamSide):
-    """One stream; use it as a context manager or close it. Not to be shared between threads.
-
-    model: its name; unix: path of the service's Unix-domain socket, instead of host and port of the address; version:
-    pins one, alias: follows what that points to, else the version that serves answers; timeout: longest wait for the
-    connection, and for one answer, in s; stream_id: name of the source of the torques that are sent to learn from, None
-    where only answers are wanted; first_sequence: of the first frame: to send frames again after a lost connection,
-    take the first of them above `learnt.through`; key: API key, that of the environment variable LIPSERVE_KEY where
-    None.
-    Raise StreamError where the service cannot be reached or refuses.
-    """
+class _Stream(StreamSide):
+    """What both clients do alike; arguments: see `StreamClient`."""
 
     def __init__(
         self,
@@ -58,33 +59,68 @@ class StreamClient(StreamSide):
         key: str | None = None,
     ) -> None:
         headers = headers_of(key)
-        self.timeout = timeout
-        self._exchange, self._stack = Exchange(stream_id, first_sequence), ExitStack()
-        address, host, port = destination(url, model, version=version, alias=alias, stream_id=stream_id)
+        self.timeout, self._url, self._unix = timeout, url, unix
+        self._exchange = Exchange(stream_id, first_sequence)
+        self._destination = destination(url, model, version=version, alias=alias, stream_id=stream_id)
+        self._options: dict[str, Any] = {
+            "compression": None,
+            "open_timeout": timeout,
+            "close_timeout": 1.0,
+            "additional_headers": headers,
+        }
+        self._begin()
+
+    def _begin(self) -> None:
+        """Open the stream where making a client does so."""
+
+    @contextmanager
+    def _opening(self) -> Iterator[None]:
+        """Raise StreamError for what keeps the block from connecting."""
         try:
-            made = _connect(host, port, unix, timeout)
-            self._socket = self._stack.enter_context(
-                connect(
-                    address,
-                    sock=made,
-                    compression=None,
-                    open_timeout=timeout,
-                    close_timeout=1.0,
-                    additional_headers=headers,
-                )
-            )
+            yield
         except InvalidStatus as error:
             raise refused(error.response.status_code, error.response.body) from error
         except (OSError, InvalidHandshake) as error:
-            raise StreamError(f"no service answers at {unix or url}: {error}", "unreachable") from error
-        self._take(timeout)
+            raise StreamError(f"no service answers at {self._unix or self._url}: {error}", "unreachable") from error
+
+    def _answer_to(self, sequence: int) -> StreamAnswer | None:
+        """The answer to a query if it has come, those before it dropped; raise StreamError where it was refused."""
+        while self._exchange.answers:
+            try:
+                answer = self._exchange.answer()
+            except StreamError as error:
+                if error.sequence is None or error.sequence == sequence:
+                    raise
+                continue
+            if answer.sequence == sequence:
+                return answer
+        return None
+
+
+class StreamClient(_Stream):
+    """One stream; use it as a context manager or close it. Not to be shared between threads.
+
+    model: its name; unix: path of the service's Unix-domain socket, instead of host and port of the address; version:
+    pins one, alias: follows what that points to, else the version that serves answers; timeout: longest wait for the
+    connection, and for one answer, in s; stream_id: name of the source of the torques that are sent to learn from, None
+    where only answers are wanted; first_sequence: of the first frame: to send frames again after a lost connection,
+    take the first of them above `learnt.through`; key: API key, that of the environment variable LIPSERVE_KEY where
+    None.
+    Raise StreamError where the service cannot be reached or refuses.
+    """
+
+    def _begin(self) -> None:
+        self._stack = ExitStack()
+        address, host, port = self._destination
+        with self._opening():
+            made = _connect(host, port, self._unix, self.timeout)
+            self._socket = self._stack.enter_context(connect(address, sock=made, **self._options))
+        self._take(self.timeout)
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -108,15 +144,9 @@ class StreamClient(StreamSide):
         time: an answer that comes after all is dropped by the next call.
         """
         sequence = self.send(q, dq, ddq, std, deadline, tau)
-        while True:
-            try:
-                answer = self.receive()
-            except StreamError as error:
-                if error.sequence is None or error.sequence == sequence:
-                    raise
-                continue
-            if answer.sequence == sequence:
-                return answer
+        while (answer := self._answer_to(sequence)) is None:
+            self._take(self.timeout)
+        return answer
 
     def send(
         self,
@@ -171,6 +201,105 @@ class StreamClient(StreamSide):
         except StreamError:  # of a layout that this client cannot read
             self.close()
             raise
+
+
+class AsyncStreamClient(_Stream):
+    """One stream, open while `async with` lasts. Not to be shared between tasks.
+
+    Arguments, methods and errors are those of `StreamClient`; methods that wait are awaited.
+    """
+
+    _connection: awaited.ClientConnection | None = None
+
+    async def __aenter__(self) -> Self:
+        address = self._destination.address
+        with self._opening():
+            if self._unix is None:
+                # the proxy that an environment may name is not for controllers
+                self._connection = await awaited.connect(address, proxy=None, **self._options)
+            else:
+                self._connection = await awaited.unix_connect(str(self._unix), address, **self._options)
+        try:
+            await self._take(self.timeout)
+        except BaseException:
+            await self.close()
+            raise
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Close the connection."""
+        if self._connection is not None:
+            await self._connection.close()
+
+    async def ask(
+        self,
+        q: ArrayLike,
+        dq: ArrayLike,
+        ddq: ArrayLike,
+        std: bool = True,
+        deadline: float = 0.0,
+        tau: ArrayLike | None = None,
+    ) -> StreamAnswer:
+        """Return the torque at one motion; see `StreamClient.ask`. Where the task is cancelled meanwhile, the answer is
+        dropped by the next call."""
+        sequence = await self.send(q, dq, ddq, std, deadline, tau)
+        while (answer := self._answer_to(sequence)) is None:
+            await self._take(self.timeout)
+        return answer
+
+    async def send(
+        self,
+        q: ArrayLike,
+        dq: ArrayLike,
+        ddq: ArrayLike,
+        std: bool = True,
+        deadline: float = 0.0,
+        tau: ArrayLike | None = None,
+    ) -> int:
+        """Send one query, with torque to learn from or without, and return its sequence; `receive` has its answer."""
+        sequence, frame = self._exchange.frame(q, dq, ddq, std, deadline, tau)
+        try:
+            await self._open().send(frame)
+        except ConnectionClosed as error:
+            raise closed(error) from error
+        return sequence
+
+    async def receive(self) -> StreamAnswer:
+        """Return the answer to the oldest query without one; raise StreamError where it was refused."""
+        while not self._exchange.answers:
+            await self._take(self.timeout)
+        return self._exchange.answer()
+
+    async def flush(self, timeout: float | None = None) -> StreamLearnt:
+        """Wait until every torque sent is acknowledged or refused; see `StreamClient.flush`."""
+        timeout = self.timeout if timeout is None else timeout
+        try:
+            async with asyncio.timeout(timeout):
+                while self._exchange.unsettled:
+                    await self._take(None)
+        except TimeoutError as error:
+            raise unsettled(len(self._exchange.unsettled), timeout) from error
+        return self._exchange.learnt
+
+    async def _take(self, timeout: float | None) -> None:
+        """Read one message."""
+        try:
+            async with asyncio.timeout(timeout):
+                message = await self._open().recv()
+        except TimeoutError as error:
+            assert timeout is not None
+            raise unanswered(timeout) from error
+        except ConnectionClosed as error:
+            raise closed(error) from error
+        self._exchange.take(message)
+
+    def _open(self) -> awaited.ClientConnection:
+        if self._connection is None:
+            raise StreamError("the stream is not open: use `async with`", "closed")
+        return self._connection
 
 
 def _connect(host: str, port: int, unix: Path | None, timeout: float) -> socket.socket:

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from typing import Any, Literal
 
-from service.foundation.importing import imported
+from service.compute.remote import imported
 from service.foundation.settings import Settings
 from service.web.observability import logs
 from service.web.observability.logs import LogOptions
@@ -162,10 +162,7 @@ class Slot:
 
     def _new_pool(self) -> ProcessPoolExecutor:
         return ProcessPoolExecutor(
-            1,
-            mp_context=multiprocessing.get_context("spawn"),
-            initializer=start_process,
-            initargs=(self.place,),
+            1, mp_context=multiprocessing.get_context("spawn"), initializer=start_process, initargs=(self.place,)
         )
 
 

@@ -13,6 +13,7 @@ from lipcore.preparation.recipe import Filtering, Form, Recipe
 from lipcore.vocabulary import TorqueConvention
 from service.datasets.asking import MEDIA_TYPES, SUFFIXES
 from service.foundation.errors import invalid_request
+from service.foundation.fields import BINARY, upload_body
 from service.web.route import read_json
 
 Effort = Literal["measured", "commanded", "current"]
@@ -69,38 +70,22 @@ Names = Annotated[str | None, Query(max_length=MOST_TEXT)]
 Positive = Annotated[float | None, Query(gt=0, le=1e6, allow_inf_nan=False)]
 
 
-_BINARY = {"schema": {"type": "string", "format": "binary"}}
-UPLOAD_BODY: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "description": "A recording with at least positions, torques and times. Canonical columns are `t` (s), "
-        "`q1..qn`, `dq1..`, `ddq1..`, `tau1..`, optional `episode`, in SI units; other names and units are recognised "
-        "or declared by `columns` and `units`. `dq` and `ddq` may be absent and are then derived. NPZ holds `q`, `dq`, "
-        "`ddq`, `tau` (N, n), `t` or `dt`, `episode`, `joint_names`; bags hold `sensor_msgs/JointState` or the states "
-        "of a Franka; a zip is the directory of a LeRobot data set or of a rosbag2.",
-        "content": {
-            "text/csv": {"schema": {"type": "string"}, "example": "t,q1,dq1,ddq1,tau1\n0.0,0.1,0.0,0.2,1.5\n"},
-            "application/x-ndjson": {
-                "schema": {"type": "string"},
-                "example": '{"t": 0.0, "q": [0.1], "dq": [0.0], "tau": [1.5]}\n',
-            },
-            **{kind: _BINARY for kind in MEDIA_TYPES if kind not in ("text/csv", "application/x-ndjson")},
-            "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "required": ["file"],
-                    "properties": {
-                        "file": {
-                            "type": "string",
-                            "format": "binary",
-                            "description": f"A file whose name ends in {', '.join(SUFFIXES)}",
-                        }
-                    },
-                }
-            },
+UPLOAD_BODY = upload_body(
+    "A recording with at least positions, torques and times. Canonical columns are `t` (s), `q1..qn`, `dq1..`, "
+    "`ddq1..`, `tau1..`, optional `episode`, in SI units; other names and units are recognised or declared by "
+    "`columns` and `units`. `dq` and `ddq` may be absent and are then derived. NPZ holds `q`, `dq`, `ddq`, `tau` "
+    "(N, n), `t` or `dt`, `episode`, `joint_names`; bags hold `sensor_msgs/JointState` or the states of a Franka; a "
+    "zip is the directory of a LeRobot data set or of a rosbag2.",
+    {
+        "text/csv": {"schema": {"type": "string"}, "example": "t,q1,dq1,ddq1,tau1\n0.0,0.1,0.0,0.2,1.5\n"},
+        "application/x-ndjson": {
+            "schema": {"type": "string"},
+            "example": '{"t": 0.0, "q": [0.1], "dq": [0.0], "tau": [1.5]}\n',
         },
-    }
-}
+        **{kind: {"schema": BINARY} for kind in MEDIA_TYPES if kind not in ("text/csv", "application/x-ndjson")},
+    },
+    f"A file whose name ends in {', '.join(SUFFIXES)}",
+)
 
 
 async def upload_options(

@@ -11,8 +11,7 @@ from fastapi import APIRouter, Depends, Query, Request, Response, status
 from service.datasets import store
 from service.datasets.asking import MEDIA_TYPES, SUFFIXES
 from service.datasets.options import UPLOAD_BODY, UploadOptions, upload_options
-from service.datasets.preview import MOST_POINTS, Preview
-from service.datasets.schema import Dataset, DatasetPage
+from service.datasets.schema import Dataset, DatasetPage, Preview
 from service.datasets.staging import QUANTITIES
 from service.foundation.errors import (
     ConflictError,
@@ -27,11 +26,10 @@ from service.foundation.errors import (
 )
 from service.foundation.fields import NameForPeople
 from service.storage.storage import StorageDep
-from service.web.idempotency import KeyHeader, identity
 from service.web.limits.requests import UploadsDep
 from service.web.limits.upload import Kinds, receive_to
-from service.web.pagination import PageQuery
 from service.web.route import Route
+from service.web.rows import KeyHeader, PageQuery, identity
 
 KINDS = Kinds(MEDIA_TYPES, SUFFIXES)
 
@@ -93,7 +91,9 @@ def preview(
     quantities: Annotated[
         str, Query(max_length=100, description="Any of q, dq, ddq, tau, separated by commas")
     ] = ",".join(QUANTITIES),
-    points: Annotated[int, Query(ge=2, le=MOST_POINTS, description="Most points of one column")] = MOST_POINTS,
+    points: Annotated[
+        int, Query(ge=2, le=store.MOST_POINTS, description="Most points of one column")
+    ] = store.MOST_POINTS,
 ) -> Preview:
     """Columns thinned so that the largest and smallest values stay."""
     names = [name.strip() for name in quantities.split(",")]

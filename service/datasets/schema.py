@@ -13,6 +13,9 @@ Verdict = Literal["well", "poorly", "not determined"]
 
 Share = float
 
+MOST_STARTS = 2000
+"""Most starts of episodes in a preview."""
+
 
 class Gap(BaseModel):
     """A pause within a recording."""
@@ -176,3 +179,24 @@ class DatasetPage(BaseModel):
 
     items: list[Dataset]
     next_cursor: str | None
+
+
+class PreviewColumn(BaseModel):
+    """Points of one quantity of one joint, in order of rows."""
+
+    quantity: str = Field(description="q, dq, ddq or tau")
+    joint: str
+    unit: str
+    rows: list[int] = Field(description="Rows that the points are, counted from 0")
+    t: list[float] = Field(description="Their times, s")
+    values: list[float]
+
+
+class Preview(BaseModel):
+    """Columns of a data set, thinned so that no extreme is lost."""
+
+    samples: int = Field(description="Rows of the data set")
+    starts: list[int] = Field(
+        description=f"First rows of the episodes, for breaks in the lines; at most {MOST_STARTS}, evenly chosen"
+    )
+    columns: list[PreviewColumn]

@@ -17,7 +17,7 @@ from lipcore.data.samples import Array
 from lipcore.preparation.plan import plan
 from lipcore.preparation.recipe import PreparationError, Recipe
 from service.foundation.errors import invalid_data
-from service.storage.disk import Disk
+from service.storage.storage import Disk
 
 TIME, EPISODE = "t", "episode"
 QUANTITIES = ("q", "dq", "ddq", "tau")

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import safe_open
 from sqlalchemy import select
 from sqlalchemy.exc import SQLAlchemyError
 
-from lipcore.data.samples import Samples
+from lipcore.data.samples import Array, Samples
 from lipcore.profiles import Profile
 from lipcore.vocabulary import JointType
 from service.datasets.mapping.reading import read
 from service.datasets.options import UploadOptions
-from service.datasets.preview import Preview, preview_file
 from service.datasets.report.making import make_report
-from service.datasets.schema import Dataset, DatasetPage
+from service.datasets.schema import MOST_STARTS, Dataset, DatasetPage, Preview, PreviewColumn
 from service.datasets.staging import Staged, column, prepare, staging
 from service.foundation.errors import ConflictError, not_found
 from service.foundation.states import ACTIVE
@@ -28,8 +29,7 @@ from service.storage.database import Database, DatasetRow, JobRow, now
 from service.storage.files import Files, new_id
 from service.storage.sample_file import PartOf
 from service.storage.storage import Storage
-from service.web.idempotency import Identity, done, mark
-from service.web.pagination import Page, newest
+from service.web.rows import Identity, Page, done, mark, newest
 from service.web.storage_errors import undecided
 
 
@@ -125,7 +125,7 @@ def delete(storage: Storage, dataset: str) -> None:
             raise not_found("dataset", dataset)
         for job in session.scalars(select(JobRow).where(JobRow.state.in_(ACTIVE))):
             if dataset in job.request["datasets"]:
-                raise ConflictError(f"data set {dataset!r} is in use by job {job.id!r}: cancel it or wait for its end")
+                raise ConflictError(f"data set {dataset!r} is in use by {job.id}: cancel it or wait for its end")
         session.delete(row)
     storage.files.delete_samples(dataset)
 
@@ -149,3 +149,72 @@ def _array(staged: Staged, name: str) -> NDArray[np.float64] | NDArray[np.int64]
 
 def _show(row: DatasetRow) -> Dataset:
     return Dataset.model_validate(row, from_attributes=True)
+
+
+MOST_POINTS = 2000
+"""Most points of a column."""
+UNITS = {"q": "rad or m", "dq": "rad/s or m/s", "ddq": "rad/s² or m/s²", "tau": "N·m or N"}
+
+ReadRows = Callable[[str, int, int], Array]
+"""(quantity, first row, row after the last) → these rows of all joints, (rows, n)."""
+
+
+def make_preview(
+    t: Array,
+    episode: NDArray[np.int64] | Array,
+    joint_names: Sequence[str],
+    quantities: Sequence[str],
+    read: ReadRows,
+    points: int = MOST_POINTS,
+) -> Preview:
+    """Thin the quantities of all joints to at most `points` points a column, at least 2; t, episode: (N,)."""
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(episode)) + 1])
+    if len(starts) > MOST_STARTS:
+        starts = starts[np.linspace(0, len(starts) - 1, MOST_STARTS).astype(np.int64)]
+    columns = []
+    for quantity in quantities:
+        for name, (rows, values) in zip(joint_names, extremes(len(t), quantity, read, points), strict=True):
+            columns.append(
+                PreviewColumn(
+                    quantity=quantity,
+                    joint=name,
+                    unit=UNITS[quantity],
+                    rows=rows.tolist(),
+                    t=t[rows].tolist(),
+                    values=values.tolist(),
+                )
+            )
+    return Preview(samples=len(t), starts=starts.tolist(), columns=columns)
+
+
+def extremes(count: int, quantity: str, read: ReadRows, points: int) -> list[tuple[NDArray[np.int64], Array]]:
+    """For each joint ascending rows, at most `points`, and their values: all, or the extremes of stretches."""
+    if points < 2:
+        raise ValueError(f"points is {points}, expected at least 2")
+    if count <= points:
+        every_row = read(quantity, 0, count)
+        return [(np.arange(count, dtype=np.int64), column) for column in every_row.T]
+    rows, values = [], []
+    for first, last in pairwise(np.linspace(0, count, points // 2 + 1).astype(np.int64).tolist()):
+        stretch = read(quantity, first, last)
+        both = np.sort([stretch.argmin(axis=0), stretch.argmax(axis=0)], axis=0)
+        rows.append(first + both)
+        values.append(np.take_along_axis(stretch, both, axis=0))
+    at, what = np.concatenate(rows).T, np.concatenate(values).T
+    # a stretch whose smallest value is its largest gives one point
+    new = [np.concatenate([[True], np.diff(each) > 0]) for each in at]
+    return [(a[keep].astype(np.int64), b[keep]) for a, b, keep in zip(at, what, new, strict=True)]
+
+
+def preview_file(path: Path, joint_names: Sequence[str], quantities: Sequence[str], points: int) -> Preview:
+    """Preview of stored samples, see sample_file.py; no more than the times and a stretch of rows are held."""
+    with safe_open(path, framework="numpy") as file:
+        slices = {quantity: file.get_slice(quantity) for quantity in quantities}
+        return make_preview(
+            file.get_tensor("t"),
+            file.get_tensor("episode"),
+            joint_names,
+            quantities,
+            lambda quantity, first, last: np.asarray(slices[quantity][first:last]),
+            points,
+        )

@@ -209,10 +209,7 @@ def responses(*errors: type[ServiceError]) -> dict[int | str, dict[str, Any]]:
         meaning = (error.__doc__ or "").strip()
         known = out.get(error.status)
         text = f"`{error.code}`: {meaning}"
-        out[error.status] = {
-            "model": ErrorResponse,
-            "description": f"{known['description']} {text}" if known else text,
-        }
+        out[error.status] = {"model": ErrorResponse, "description": f"{known['description']} {text}" if known else text}
     return out
 
 

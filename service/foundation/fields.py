@@ -90,3 +90,13 @@ def of_app(name: str) -> Callable[[Request], Awaitable[Any]]:
         return getattr(request.app.state, name)
 
     return kept
+
+
+BINARY: dict[str, Any] = {"type": "string", "format": "binary"}
+
+
+def upload_body(description: str, content: dict[str, Any], file: str) -> dict[str, Any]:
+    """What the OpenAPI document says of the body of an upload: by media type, or as a form with a file of this kind."""
+    form = {"type": "object", "required": ["file"], "properties": {"file": {**BINARY, "description": file}}}
+    every = {**content, "multipart/form-data": {"schema": form}}
+    return {"requestBody": {"required": True, "description": description, "content": every}}

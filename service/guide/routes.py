@@ -48,6 +48,7 @@ ORDER = (
 SLUGS = {"reproduction/results.md": "reproduction"}
 """Addresses of pages that are not called as their file is."""
 _COMMENT = re.compile(r"^<!--.*?-->\n?", re.MULTILINE)
+_SCROLLED = '<div class="scroll" role="region" aria-label="Table, may be scrolled" tabindex="0"><table>\n'
 _ELSEWHERE = re.compile(r"[a-z][a-z0-9+.-]*:|//|#", re.IGNORECASE)
 
 
@@ -130,8 +131,8 @@ def _markdown() -> MarkdownIt:
 
     made = MarkdownIt("commonmark", {"html": False}).enable("table")
     made.core.ruler.push("guide", _adapt)
-    made.add_render_rule("table_open", _table_open)
-    made.add_render_rule("table_close", _table_close)
+    made.add_render_rule("table_open", lambda *_: _SCROLLED)
+    made.add_render_rule("table_close", lambda *_: "</table></div>\n")
     return made
 
 
@@ -162,58 +163,8 @@ def _text(inline: Token) -> str:
     return "".join(child.content for child in inline.children or ())
 
 
-def _table_open(*_: Any) -> str:
-    return f'<div class="scroll" role="region" aria-label="{escape("Table, may be scrolled")}" tabindex="0"><table>\n'
-
-
-def _table_close(*_: Any) -> str:
-    return "</table></div>\n"
-
-
 ADDRESS, FILES = "/guide", "/guide/files"
-STYLE = "guide.css"
-_PAGE = """<!doctype html>
-<html lang="en">
-  <head>
-    <meta charset="utf-8">
-    <meta name="viewport" content="width=device-width, initial-scale=1">
-    <meta name="color-scheme" content="light dark">
-    <title>{title} · LIPServe</title>
-    <link rel="icon" href="/dashboard/icon.svg" type="image/svg+xml">
-    <link rel="stylesheet" href="/dashboard/style.css">
-    <link rel="stylesheet" href="/guide/files/guide.css">
-    <script src="/dashboard/theme.js"></script>
-  </head>
-  <body>
-    <a class="skip" href="#main">Skip to content</a>
-    <header class="bar">
-      <a class="brand" href="/"><img src="/dashboard/icon.svg" alt="" width="22" height="22"> LIPServe</a>
-      <nav aria-label="Pages">
-        <a href="/#/">Overview</a>
-        <a href="/#/data">Data</a>
-        <a href="/#/jobs">Training</a>
-        <a href="/#/models">Models</a>
-        <a href="/#/live">Live</a>
-      </nav>
-      <span class="grow"></span>
-      <nav aria-label="Help">
-        <a href="/guide" aria-current="page">Guide</a>
-        <a href="/docs">API</a>
-      </nav>
-    </header>
-    <div class="guide">
-      <nav class="contents" aria-label="Guide">
-        <ul>
-{contents}
-        </ul>
-      </nav>
-      <main id="main" tabindex="-1">
-{content}
-      </main>
-    </div>
-  </body>
-</html>
-"""
+STYLE, PAGE = HERE / "guide.css", HERE / "page.html"
 
 
 def install(app: FastAPI) -> None:
@@ -235,22 +186,22 @@ def page(page: str) -> Response:
         missing = (
             '<h1>There is no such page</h1>\n<p>The guide has those on its list, <a href="/guide">from here on</a>.</p>'
         )
-        return _shown("Not found", missing, None, 404)
-    return _shown(known.title, content(page), page)
+        return _framed("Not found", missing, None, 404)
+    return _framed(known.title, content(page), page)
 
 
 def file(name: str) -> Response:
     """A picture or the style sheet, by its name in the guide; nothing else can be named."""
-    path = Path(__file__).with_name(STYLE) if name == STYLE else images().get(name)
+    path = STYLE if name == STYLE.name else images().get(name)
     if path is None:
         return Response(status_code=404, headers=HEADERS)
     return FileResponse(path, headers=HEADERS)
 
 
-def _shown(title: str, content: str, current: str | None, status: int = 200) -> HTMLResponse:
+def _framed(title: str, content: str, current: str | None, status: int = 200) -> HTMLResponse:
     lines = []
     for slug, each in pages().items():
         here = ' aria-current="page"' if slug == current else ""
         lines.append(f'          <li><a href="{each.address}"{here}>{escape(each.title)}</a></li>')
-    text = _PAGE.format(title=escape(title), contents="\n".join(lines), content=content)
+    text = PAGE.read_text("utf-8").format(title=escape(title), contents="\n".join(lines), content=content)
     return HTMLResponse(text, status, HEADERS)

@@ -20,8 +20,8 @@ from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.errors import BusyError, ConflictError
 from service.storage.database import EventRow, LearnerRow, LearningRow, SnapshotRow, StreamRow, now
-from service.web.pagination import Page
-from service.web.pagination import newest as newest_rows
+from service.web.rows import Page
+from service.web.rows import newest as newest_rows
 
 StreamKind = Literal["batches", "frames"]
 EventKind = Literal["batch", "replay", "unlearn", "rollback", "change", "settings"]

@@ -11,7 +11,7 @@ from service.foundation.errors import invalid_request, not_found
 from service.journal import log
 from service.learning.schema import LearningOptions
 from service.storage.database import AlarmRow, Database, LearningRow, ModelRow, now
-from service.web.pagination import Page, newest
+from service.web.rows import Page, newest
 
 AlarmKind = Literal["change", "novelty", "linearisation", "refresh", "promotion"]
 

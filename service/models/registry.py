@@ -28,7 +28,7 @@ from service.storage.database import (
     now,
 )
 from service.storage.files import Files, new_id
-from service.web.pagination import Page, newest
+from service.web.rows import Page, newest
 
 logger = logging.getLogger(__name__)
 

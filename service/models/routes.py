@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from anyio import to_thread
 from fastapi import APIRouter, Path, Query, Request, Response, status
@@ -18,31 +18,17 @@ from service.foundation.errors import (
     UnsupportedMediaTypeError,
     responses,
 )
+from service.foundation.fields import BINARY, upload_body
 from service.models import aliases, archive, archive_import, deletion, registry, schema
 from service.models.loaded import LoadedModelsDep
 from service.web.limits.requests import ArchivesDep
 from service.web.limits.upload import Kinds, receive_to
-from service.web.pagination import PageQuery
 from service.web.route import Route
+from service.web.rows import PageQuery
 
 ARCHIVES = Kinds({archive.MEDIA_TYPE: "tar"}, {".tar": "tar"})
-_BINARY = {"schema": {"type": "string", "format": "binary"}}
-_BODY: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "description": "An archive as an export writes it.",
-        "content": {
-            archive.MEDIA_TYPE: _BINARY,
-            "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "required": ["file"],
-                    "properties": {"file": {"type": "string", "format": "binary", "description": "A .tar file"}},
-                }
-            },
-        },
-    }
-}
+_BINARY = {"schema": BINARY}
+_BODY = upload_body("An archive as an export writes it.", {archive.MEDIA_TYPE: _BINARY}, "A .tar file")
 
 WhichVersion = Annotated[schema.VersionNumber | None, Query(description="The version that serves by default")]
 WhichAlias = Annotated[schema.AliasName | None, Query(description="An alias, instead of a version's number")]

@@ -17,7 +17,7 @@ from service.models.loaded import LoadedModels, Served
 from service.models.schema import ALIAS
 from service.oip import query, schema, wire
 from service.oip.query import FORWARD, shapes
-from service.web import health
+from service.web.observability import readiness as health
 from service.web.observability.readiness import ReadinessDep
 from service.web.route import Reply, Route, hot_route
 

@@ -21,8 +21,8 @@ from service.robots import store
 from service.robots.schema import UPLOAD_BODY, ProfileList, Robot, RobotPage, RobotProfile
 from service.storage.storage import StorageDep
 from service.web.limits.upload import Kinds, receive
-from service.web.pagination import PageQuery
 from service.web.route import Route
+from service.web.rows import PageQuery
 
 KINDS = Kinds({"application/xml": "urdf", "text/xml": "urdf"}, {".urdf": "urdf", ".xml": "urdf"})
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from pydantic import BaseModel, Field
 
 from lipcore.vocabulary import EffortMeaning, JointType
+from service.foundation.fields import upload_body
 
 
 class RobotJoint(BaseModel):
@@ -69,26 +68,17 @@ class ProfileList(BaseModel):
     next_cursor: str | None = None
 
 
-UPLOAD_BODY: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "description": "A URDF with a fixed base. Meshes are not needed. Joints are matched to the data by name.",
-        "content": {
-            "application/xml": {
-                "schema": {"type": "string"},
-                "example": '<robot name="arm"><link name="base"/><link name="tip"><inertial><mass value="1"/>'
-                '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>'
-                '<joint name="joint1" type="continuous"><parent link="base"/><child link="tip"/>'
-                '<axis xyz="0 1 0"/></joint></robot>',
-            },
-            "text/xml": {"schema": {"type": "string"}},
-            "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "required": ["file"],
-                    "properties": {"file": {"type": "string", "format": "binary", "description": "A .urdf file"}},
-                }
-            },
+UPLOAD_BODY = upload_body(
+    "A URDF with a fixed base. Meshes are not needed. Joints are matched to the data by name.",
+    {
+        "application/xml": {
+            "schema": {"type": "string"},
+            "example": '<robot name="arm"><link name="base"/><link name="tip"><inertial><mass value="1"/>'
+            '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>'
+            '<joint name="joint1" type="continuous"><parent link="base"/><child link="tip"/>'
+            '<axis xyz="0 1 0"/></joint></robot>',
         },
-    }
-}
+        "text/xml": {"schema": {"type": "string"}},
+    },
+    "A .urdf file",
+)

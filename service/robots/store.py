@@ -30,7 +30,7 @@ from service.foundation.states import ACTIVE
 from service.robots.schema import ProfileJoint, Robot, RobotPage, RobotProfile
 from service.storage.database import Database, JobRow, RobotRow, now
 from service.storage.files import new_id
-from service.web.pagination import Page, newest
+from service.web.rows import Page, newest
 
 
 def add(database: Database, content: bytes, name: str | None) -> Robot:
@@ -94,7 +94,7 @@ def delete(database: Database, robot: str) -> None:
             raise not_found("robot", robot)
         for job in session.scalars(select(JobRow).where(JobRow.state.in_(ACTIVE))):
             if job.request.get("robot") == robot:
-                raise ConflictError(f"robot {robot!r} is in use by job {job.id!r}: cancel it or wait for its end")
+                raise ConflictError(f"robot {robot!r} is in use by {job.id}: cancel it or wait for its end")
         session.delete(row)
 
 
@@ -148,6 +148,13 @@ def _show(row: RobotRow) -> Robot:
     return Robot.model_validate(row, from_attributes=True)
 
 
+_NUMBERS = {
+    **{"lower": "lower", "upper": "upper", "max_speed": "speed", "max_acceleration": "acceleration"},
+    **{"max_torque": "torque", "torque_constant": "torque_constants"},
+}
+"""Fields of a profile by those that the API shows them as."""
+
+
 def _show_profile(profile: Profile) -> RobotProfile:
     """A profile as the API shows it: what is infinite or not known is null."""
     joints = [
@@ -156,25 +163,14 @@ def _show_profile(profile: Profile) -> RobotProfile:
             type=profile.joint_types[joint],
             aliases=list(profile.joint_aliases[joint]),
             turns_freely=bool(math.isinf(profile.lower[joint]) and math.isinf(profile.upper[joint])),
-            lower=_number(profile.lower, joint),
-            upper=_number(profile.upper, joint),
-            max_speed=_number(profile.speed, joint),
-            max_acceleration=_number(profile.acceleration, joint),
-            max_torque=_number(profile.torque, joint),
-            torque_constant=_number(profile.torque_constants, joint),
+            **{field: _number(getattr(profile, of), joint) for field, of in _NUMBERS.items()},
         )
         for joint, name in enumerate(profile.joint_names)
     ]
-    return RobotProfile(
-        name=profile.name,
-        title=profile.title,
-        joints=joints,
-        effort=profile.effort,
-        effort_note=profile.effort_note,
-        source=profile.source,
-        urdf_available=profile.urdf is not None,
-        urdf_note=None if profile.urdf is not None else profile.why_no_urdf(),
-    )
+    same = {each: getattr(profile, each) for each in ("name", "title", "effort", "effort_note", "source")}
+    available = profile.urdf is not None
+    note = None if available else profile.why_no_urdf()
+    return RobotProfile(joints=joints, urdf_available=available, urdf_note=note, **same)
 
 
 def _number(values: Array | None, joint: int) -> float | None:

@@ -18,7 +18,7 @@ from service.models.schema import ALIAS
 from service.models.served import reached
 from service.stream.session import Conversation, Echo, Session
 from service.web.limits.requests import Counted
-from service.web.server.stream_protocol import CONNECTION, StreamProtocol
+from service.web.server.connections import CONNECTION, StreamProtocol
 
 STREAM_ID = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
 NUMBER = "[0-9]{1,10}"

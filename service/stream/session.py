@@ -27,7 +27,7 @@ from service.stream import frames
 from service.stream.learning import Learning, Taught
 from service.web.access.middleware import subprotocol_of
 from service.web.observability.meters import StreamMeter
-from service.web.server.stream_protocol import StreamProtocol
+from service.web.server.connections import StreamProtocol
 
 if TYPE_CHECKING:
     from lipcore.data.samples import Array

@@ -33,9 +33,8 @@ from service.storage.files import new_id
 from service.training import holding_out, lifecycle, refresh_data
 from service.training.queue import JobQueue
 from service.training.schema import Job, JobPage, JobRequest, Options
-from service.web.idempotency import Identity, done, mark
 from service.web.observability.logs import request_id
-from service.web.pagination import Page, newest
+from service.web.rows import Identity, Page, done, mark, newest
 
 USUAL_WAIT_S, LONGEST_WAIT_S = 30, 3600
 """Seconds after which who finds the queue full may try again: where nothing is known of the jobs that run, and most."""

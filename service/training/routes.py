@@ -24,10 +24,9 @@ from service.storage.database import JobRow
 from service.training import jobs
 from service.training.queue import JobQueue, JobQueueDep
 from service.training.schema import Job, JobPage, JobRequest
-from service.web.idempotency import KeyHeader, identity
 from service.web.observability.readiness import StoppingDep
-from service.web.pagination import PageQuery
 from service.web.route import Route
+from service.web.rows import KeyHeader, PageQuery, identity
 
 
 def _row(queue: JobQueueDep, job: str) -> JobRow:

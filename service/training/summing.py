@@ -26,8 +26,7 @@ from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.statistics import empty
 from lipcore.posterior.summing import Summing
 from lipcore.training.conditioning import ShardStatistics, sum_samples, with_statistics
-from service.compute.executors import placed, sent, shard_executor
-from service.compute.shards import summed
+from service.compute.executors import placed, sent, shard_executor, summed
 from service.foundation.settings import Settings
 from service.storage.files import PATIENCE_S, Files
 from service.storage.sample_file import Reader

@@ -23,8 +23,8 @@ from service.foundation.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEE
 from service.models import registry
 from service.models.lineage import MOST_SAMPLES, figures, software
 from service.storage.database import Database, JobRow, LearnerRow, now
-from service.storage.disk import Disk
 from service.storage.files import PATIENCE_S, Files
+from service.storage.storage import Disk
 from service.training import lifecycle, refresh_data
 from service.training.holding_out import CannotHoldOutError
 from service.training.material import CANDIDATES, Material, observed, recorded

@@ -60,7 +60,7 @@ WRITING = (errors.StorageFullError,)
 PURE = ("/predict", "/evaluate", "/trace", "/compare", "/echo", "/infer")
 """Ends of the paths of POST routes that store nothing."""
 BEFORE_ROUTES = {
-    (405, "method_not_allowed"): "The path is there, the method is not: the header `Allow` lists those that are.",
+    (405, "method_not_allowed"): "The path is there, the method is not: the header `Allow` lists those that are."
 }
 """Errors that are no class, because no route raises them."""
 

@@ -72,6 +72,7 @@ def test_while_the_server_is_away_clients_are_told_to_come_again(service, postgr
     eventually(lambda: client.get("/health/ready").status_code == 200)
 
 
+@pytest.mark.slow
 def test_restarts_under_load_lose_nothing_that_was_acknowledged(shared, postgres):
     settings = shared.settings("before")
     database = Database.of(settings)

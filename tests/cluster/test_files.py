@@ -46,7 +46,7 @@ def states(api):
     """Of each part of a service, by its name."""
     found = service_of(api)
     found.readiness.forget()
-    return {each.name: each.state for each in found.readiness.report().checks}
+    return {each.name: each.state for each in found.readiness.report()}
 
 
 def test_an_outage_of_the_bucket_is_told_and_ends_by_itself(shared, caplog):

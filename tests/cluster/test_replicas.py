@@ -13,10 +13,10 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import select
 
+from service import replication
 from service.app import create_app
 from service.learning import refresh
 from service.learning.learner.publication import Contested
-from service.replication import replication
 from service.storage.database import AlarmRow, Database, EventRow, LearnerRow, ServingRow
 from tests.cluster.pairs import HARMLESS, Pair, answers, both, folder_store, made, train
 from tests.cluster.servers import S3, Postgres, Shared, sharing

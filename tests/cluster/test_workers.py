@@ -7,8 +7,7 @@ from functools import partial
 import pytest
 
 from lipcore.fitting.hyperparameters import FitCancelledError
-from service.compute.executors import ClusterUnavailableError, lost, sent, shard_executor
-from service.compute.shards import summed
+from service.compute.executors import ClusterUnavailableError, lost, sent, shard_executor, summed
 from service.foundation.settings import Settings
 from tests.cluster.workers import cluster
 from tests.service.compute.work import dying, home, numbers

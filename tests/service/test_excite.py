@@ -11,8 +11,7 @@ from lipcore.profiles import profile
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
 from service.cli import excite as command
-from service.cli.excite import fetch
-from service.cli.excite_robot import find
+from service.cli.excite import fetch, find
 from tests.service.data import QUICK, stream, train, upload
 from tests.service.server import free_port
 

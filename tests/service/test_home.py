@@ -18,7 +18,7 @@ from service.foundation.settings import Settings, shipped_models
 from service.models import registry
 from service.storage.database import Database, JobRow, VersionRow, now
 from service.storage.files import Files
-from service.storage.home import HomeInUseError
+from service.storage.storage import HomeInUseError
 from tests.service.data import ADDRESS, DEADLINE, QUICK, ended, error, job, stream, train, upload
 from tests.service.server import free_port
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lipcore.model import dynamics
-from service.oip import answer as answering
+from service.oip import query as answering
 from tests.service.data import ADDRESS
 from tests.service.oip import message, path_of, refused
 

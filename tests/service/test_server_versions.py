@@ -14,9 +14,8 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from service.web.server import HOLDS_FOR
-from service.web.server.connections import GuardedProtocol
+from service.web.server.connections import GuardedProtocol, StreamProtocol
 from service.web.server.sockets import Server
-from service.web.server.stream_protocol import StreamProtocol
 
 PYPROJECT = Path(__file__).parents[2] / "pyproject.toml"
 REPLACED = {

@@ -38,7 +38,7 @@ def test_listing_commands_imports_none_of_them():
 
 
 def test_help_and_completion_of_what_asks_a_service_import_neither_numerics_nor_a_client():
-    names = ("answers", "data", "jobs", "models", "open", "stream", "train")
+    names = ("answers", "data", "jobs", "models", "open", "stream")
     result = imported("\n".join(f"import service.cli.{name}" for name in names))
     assert result.isdisjoint((*NUMERICS, *CLIENTS, "fastapi"))
 

@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from service.client.call import Answer, Call, Route, document, given, record, route
-from service.client.results.arrays import Array, array
+from service.client.results import Array, array
 from service.client.results.evaluation import Comparison, Evaluation, read_comparison, read_evaluation
-from service.client.results.prediction import Prediction, read_prediction
-from service.client.results.series import Trace, read_trace
+from service.client.results.series import Prediction, Trace, read_prediction, read_trace
 from service.oip.schema import ModelMetadata, ModelReady, ServerLive, ServerMetadata, ServerReady
-from service.web.health import Live, Ready
+from service.web.observability.readiness import Live, Ready
 
 
 @route("POST", "/v1/models/{model}/predict", repeatable=True)

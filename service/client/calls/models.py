@@ -164,10 +164,5 @@ def import_model(at: Route, path: Path | str, name: str | None = None) -> Call[V
     """
     headers = {"content-type": "application/x-tar"}
     return at(
-        record(Version),
-        names={},
-        params=given(name=name),
-        headers=headers,
-        file=Path(path),
-        timeout=ARCHIVE_TIMEOUT,
+        record(Version), names={}, params=given(name=name), headers=headers, file=Path(path), timeout=ARCHIVE_TIMEOUT
     )

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from service.client.results.arrays import Array, Plain, array, html_table, text_table
+from service.client.results import Array, Plain, array, html_table, text_table
 from service.models import schema
 
 LIMITS = (

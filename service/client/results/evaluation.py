@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.client.results.arrays import Array, Plain, figure, html_table, reading, text_table
+from service.client.results import Array, Plain, figure, html_table, reading, text_table
 from service.inference.schema import Outcome
 
 

@@ -14,7 +14,7 @@ from typing import IO, Any
 import numpy as np
 
 from lipcore.data.samples import Array
-from service.datasets.formats.json_rows import decode
+from service.datasets.formats.json import decode
 from service.datasets.formats.parquet import ParquetSource
 from service.datasets.formats.table import Table, checked_names, first_line
 from service.datasets.formats.zips import ERRORS, by_numbers, measure, open_zip

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import cast
 
 from service.datasets.formats.csv import open_csv
-from service.datasets.formats.json import open_json, open_json_lines
-from service.datasets.formats.json_rows import decode
+from service.datasets.formats.json import decode, open_json, open_json_lines
 from service.datasets.formats.lerobot import open_lerobot, root_of
 from service.datasets.formats.npz import open_npz
 from service.datasets.formats.parquet import open_parquet

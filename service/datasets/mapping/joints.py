@@ -149,7 +149,7 @@ def _find(joints: tuple[Joint, ...], name: str, option: str) -> Joint:
     for joint in joints:
         if name.lower() in (joint.name.lower(), joint.label.lower()):
             return joint
-    raise invalid_data(option, name, f"joints of the file: {_shown([joint.name for joint in joints])}")
+    raise invalid_data(option, name, f"joints of the file: {_listed([joint.name for joint in joints])}")
 
 
 def _as_robot(
@@ -173,16 +173,16 @@ def _as_robot(
     others = [joint for joint in chosen if joint not in ordered]
     if options.joints is not None:
         if [joint for joint in chosen if joint in kept] != kept:
-            expected = f"the order of {robot.name}: {_shown([joint.name for joint in kept])}"
+            expected = f"the order of {robot.name}: {_listed([joint.name for joint in kept])}"
             raise invalid_request("joints", ", ".join(options.joints), expected)
         kept, others = list(chosen), []
     if others:
-        notes.append(f"left out, as {robot.name} has no such joints: {_shown([joint.name for joint in others])}")
+        notes.append(f"left out, as {robot.name} has no such joints: {_listed([joint.name for joint in others])}")
     if options.read.joint_names is None:
         renamed = [replace(j, name=names[called[j.index]]) if j.index in called else j for j in kept]
         if any(a.name != b.name for a, b in zip(kept, renamed, strict=True)):
             pairs = [f"{a.name} is {b.name}" for a, b in zip(kept, renamed, strict=True) if a.name != b.name]
-            notes.append(f"joints get the names that {robot.name} has: {_shown(pairs)}")
+            notes.append(f"joints get the names that {robot.name} has: {_listed(pairs)}")
         kept = renamed
     known = constants is not None and all(joint.index in called for joint in kept)
     values = tuple(float(constants[called[joint.index]]) for joint in kept) if known and constants else None
@@ -192,8 +192,8 @@ def _as_robot(
 def _mismatch(robot: Profile, chosen: Sequence[Joint]) -> InvalidDataError:
     return invalid_data(
         "joints",
-        _shown([joint.name for joint in chosen]),
-        f"those of {robot.name}, {_shown(robot.joint_names)}: say joint_names as the robot has them, in the file's "
+        _listed([joint.name for joint in chosen]),
+        f"those of {robot.name}, {_listed(robot.joint_names)}: say joint_names as the robot has them, in the file's "
         "order, or leave other joints out with drop_joints",
     )
 
@@ -204,5 +204,5 @@ def _alphabetical(joints: Sequence[Joint]) -> bool:
     return len(names) > 2 and not numbered and names == sorted(names)
 
 
-def _shown(names: Sequence[str]) -> str:
+def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:_SHOWN]) + (" …" if len(names) > _SHOWN else "")

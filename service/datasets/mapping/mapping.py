@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from lipcore.profiles import Profile
-from service.datasets.mapping.choice import choose, source, source_or_none
-from service.datasets.mapping.effort import Torque, torque
+from service.datasets.mapping.choice import Torque, choose, source, source_or_none, torque
 from service.datasets.mapping.joints import Joint, arrange
 from service.datasets.mapping.recognition import CANONICAL, Family, clocks, is_episode
 from service.datasets.mapping.vocabulary import KNOWN, factor

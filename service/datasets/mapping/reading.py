@@ -22,7 +22,7 @@ from service.datasets.options import UploadOptions
 from service.datasets.staging import EPISODE, TIME, Staged, column
 from service.foundation.errors import invalid_data
 from service.foundation.settings import Settings
-from service.storage.disk import Disk
+from service.storage.storage import Disk
 
 
 @dataclass(frozen=True)

@@ -5,15 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from service.datasets.report.excitation import SELDOM, SLOW
-from service.datasets.schema import (
-    Excitation,
-    JointExcitation,
-    JointLimits,
-    JointNoise,
-    JointSaturation,
-    Lag,
-    Timing,
-)
+from service.datasets.schema import Excitation, JointExcitation, JointLimits, JointNoise, JointSaturation, Lag, Timing
 
 TERMS = (("viscous friction", "viscous"), ("Coulomb friction", "coulomb"), ("constant torque", "offset"))
 STILL = 0.02
@@ -40,10 +32,10 @@ SHORT_S = 60.0
 
 def listed(names: Iterable[str], most: int = 8) -> str:
     """Names as in a sentence; of many only the first."""
-    shown = list(names)
-    if len(shown) > most:
-        shown = [*shown[:most], f"{len(shown) - most} more"]
-    return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}"
+    parts = list(names)
+    if len(parts) > most:
+        parts = [*parts[:most], f"{len(parts) - most} more"]
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
 
 
 def warnings(
@@ -58,11 +50,7 @@ def warnings(
         )
     if timing.missing_rows > MISSING * rows:
         out.append(f"{timing.missing_rows} of {rows} rows lack a value and were left out")
-    for what, field in (
-        ("positions", "beyond_range"),
-        ("velocities", "beyond_speed"),
-        ("torques", "beyond_torque"),
-    ):
+    for what, field in (("positions", "beyond_range"), ("velocities", "beyond_speed"), ("torques", "beyond_torque")):
         shares = {each.joint: getattr(each, field) or 0.0 for each in limits}
         beyond = {joint: share for joint, share in shares.items() if share > BEYOND}
         if beyond:

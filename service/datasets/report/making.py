@@ -10,28 +10,23 @@ import numpy as np
 from lipcore.data.samples import Array
 from lipcore.preparation.recipe import Recipe
 from lipcore.profiles import Profile
+from service.datasets import schema
 from service.datasets.report.advice import advice, in_words, warnings
-from service.datasets.report.excitation import SELDOM, joint_excitation, weights
-from service.datasets.report.fit import make_fit
-from service.datasets.report.lag import Lags, no_lags, shifts
-from service.datasets.report.rigid_body import RigidExcitation, judge_rigid_bodies
+from service.datasets.report.excitation import SELDOM, RigidExcitation, joint_excitation, judge_rigid_bodies, weights
+from service.datasets.report.fit import Lags, make_fit, no_lags, shifts
 from service.datasets.report.signals import (
+    Clock,
     Limits,
     against_limits,
+    bounds,
     limits_of,
+    look_at_clock,
     noise_or_share,
+    number_parts,
     saturation,
+    spread,
+    thin,
     white_noise,
-)
-from service.datasets.report.timing import Clock, bounds, look_at_clock, number_parts, spread, thin
-from service.datasets.schema import (
-    DatasetReport,
-    Excitation,
-    JointExcitation,
-    JointLimits,
-    JointNoise,
-    JointSaturation,
-    Lag,
 )
 from service.datasets.staging import EPISODE, QUANTITIES, Prepared, Staged, column
 from service.foundation.settings import Settings
@@ -75,7 +70,7 @@ def make_report(
         reading.append(f"joints were taken for those of robot {profile.name} by their order")
     if isinstance(rigid, str):
         reading.append(rigid)
-    report = DatasetReport(
+    report = schema.DatasetReport(
         rows_uploaded=raw.rows,
         rows=prepared.staged.rows,
         episodes=prepared.episodes,
@@ -110,9 +105,9 @@ def make_report(
 class _Recorded:
     """What the signals as recorded show, joint by joint."""
 
-    saturation: list[JointSaturation]
-    limits: list[JointLimits]
-    noise: list[JointNoise]
+    saturation: list[schema.JointSaturation]
+    limits: list[schema.JointLimits]
+    noise: list[schema.JointNoise]
 
 
 @dataclass(frozen=True)
@@ -127,8 +122,8 @@ class _Samples:
     left: Array
     speeds: Array
     torques: Array
-    lags: list[Lag]
-    excitation: list[JointExcitation]
+    lags: list[schema.Lag]
+    excitation: list[schema.JointExcitation]
     motion: tuple[Array, Array, Array]
 
 
@@ -144,7 +139,7 @@ def _look_at_raw(raw: Staged, clock: Clock, limits: Limits | None) -> _Recorded:
         out.saturation.append(saturation(joint, name, columns["q"], columns["tau"], limits))
         torque, velocity = noise["tau"], noise.get("dq")
         out.noise.append(
-            JointNoise(
+            schema.JointNoise(
                 joint=name,
                 torque=torque,
                 torque_share=_share(torque, columns["tau"]),
@@ -211,10 +206,10 @@ def _rigid_bodies(
     )
 
 
-def _excitation(samples: _Samples, rigid: RigidExcitation | str | None) -> Excitation:
+def _excitation(samples: _Samples, rigid: RigidExcitation | str | None) -> schema.Excitation:
     """What motion alone says, and instead of its judgement of friction that beside rigid bodies where there are any."""
     if not isinstance(rigid, RigidExcitation):
-        out = Excitation(friction_beside="any motion", joints=samples.excitation, whole=None, text="")
+        out = schema.Excitation(friction_beside="any motion", joints=samples.excitation, whole=None, text="")
     else:
         joints = [
             each.model_copy(update=weights(stds, speed, torque, min(each.forwards, each.backwards) < SELDOM))
@@ -222,6 +217,6 @@ def _excitation(samples: _Samples, rigid: RigidExcitation | str | None) -> Excit
                 samples.excitation, rigid.friction.tolist(), samples.speeds, samples.torques, strict=True
             )
         ]
-        out = Excitation(friction_beside="rigid bodies", joints=joints, whole=rigid.whole, text="")
+        out = schema.Excitation(friction_beside="rigid bodies", joints=joints, whole=rigid.whole, text="")
     out.text = in_words(out)
     return out

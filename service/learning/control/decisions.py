@@ -24,7 +24,7 @@ from service.learning.learners import Learners
 from service.learning.schema import LearningOptions
 from service.models import registry
 from service.storage.database import Database, EventRow, LearnerRow
-from service.web.pagination import Page
+from service.web.rows import Page
 
 WORDS = {"unlearnt": "has been unlearnt", "rolled_back": "was undone by a rollback"}
 

@@ -22,8 +22,8 @@ from service.learning.schema import MOST_SEQUENCE, LearningOptions, StreamId
 from service.training import jobs
 from service.training.queue import JobQueueDep
 from service.training.schema import Job
-from service.web.pagination import PageQuery
 from service.web.route import Route
+from service.web.rows import PageQuery
 
 Sequence = Annotated[int, Path(ge=0, le=MOST_SEQUENCE)]
 EXAMPLE = {"forgetting_s": 3600.0, "on_change": "hold", "contact_threshold": 8.0}

@@ -12,8 +12,9 @@ snapshot and in however many steps; so services that share a log answer alike. I
   Events that it undoes are passed over where that is known before they are learnt.
 
 It holds for as long as the log has what is needed. Where `snapshots.retain` has deleted it, the newest snapshot is
-gone on from, whoever stored it; without one, what is left of the log is learnt, and a batch that only the log could take out
-stays in what is learnt. It also takes the same arithmetic: the same release, kind of processor and number of threads.
+gone on from, whoever stored it; without one, what is left of the log is learnt, and a batch that only the log could
+take out stays in what is learnt. It also takes the same arithmetic: the same release, kind of processor and number
+of threads.
 
 Pages of the log are bounded, so that what comes of one can be published, and others have their turn, in between.
 """

@@ -19,8 +19,8 @@ from service.learning.control.schema import LiveAnswers, LiveNovelty, LiveStatus
 from service.learning.learners import Learners, LearnersDep
 from service.web.observability.meters import OTHER, Meters, MetersDep, StreamMeter
 from service.web.observability.readiness import StoppingDep
-from service.web.pagination import Page
 from service.web.route import Route
+from service.web.rows import Page
 
 MOST_ALARMS = 5
 COUNTS = (*CODES, "batches", "duplicates")

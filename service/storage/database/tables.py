@@ -30,7 +30,7 @@ class Base(DeclarativeBase):
 class DatasetRow(Base):
     """An uploaded data set; its samples lie in the file store under the same id.
 
-    idempotency_key, request_digest: see `service.web.idempotency`; None where the client has given none.
+    idempotency_key, request_digest: see `service.web.rows`; None where the client has given none.
     """
 
     __tablename__ = "datasets"
@@ -68,7 +68,7 @@ class JobRow(Base):
 
     history: what happened to it, oldest first, each {at, state, message}; retry_of: id of the job that it repeats;
     request_id: of the request that queued it; owner: id of the service that has it run, None where none does yet;
-    idempotency_key, request_digest: see `service.web.idempotency`.
+    idempotency_key, request_digest: see `service.web.rows`.
     """
 
     __tablename__ = "jobs"

@@ -16,7 +16,7 @@ from botocore.exceptions import BotoCoreError, NoCredentialsError, PartialCreden
 from fsspec.asyn import sync
 from fsspec.exceptions import FSTimeoutError
 
-from service.storage.files.objects import FilesUnreachableError, Found, unreachable
+from service.storage.files.objects import Entry, FilesUnreachableError, unreachable
 
 CONNECT_S, READ_S, ATTEMPTS = 5, 30, 2
 """Longest waits in s for a connection and for the next bytes, and how often a request is sent."""
@@ -64,14 +64,14 @@ class Bucket:
         with _of_store(missing=NO_BUCKET):
             self._system.rm_file(self._path(key))
 
-    def list(self, prefix: str) -> Iterator[Found]:
+    def list(self, prefix: str) -> Iterator[Entry]:
         """Objects whose keys begin so."""
         parent, _, beginning = prefix.rpartition("/")
         with _of_store(missing=NO_BUCKET):
             objects: dict[str, Any] = self._system.find(self._path(parent), detail=True, prefix=beginning)
         for path, about in objects.items():
             if about["type"] == "file":
-                yield Found(path.removeprefix(f"{self._root}/"), about["LastModified"].timestamp())
+                yield Entry(path.removeprefix(f"{self._root}/"), about["LastModified"].timestamp())
 
     def check(self) -> None:
         """See that the bucket is there and can be listed."""

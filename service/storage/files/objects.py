@@ -36,7 +36,7 @@ def unreachable(reason: str) -> FilesUnreachableError:
     return FilesUnreachableError(errno.EIO, f"the shared files: {reason}")
 
 
-class Found(NamedTuple):
+class Entry(NamedTuple):
     """An object of a listing. modified: s since 1970, by the clock of the store."""
 
     key: str
@@ -55,7 +55,7 @@ class Objects(Protocol):
     def delete(self, key: str) -> None:
         """Delete an object; nothing happens where there is none."""
 
-    def list(self, prefix: str) -> Iterator[Found]:
+    def list(self, prefix: str) -> Iterator[Entry]:
         """Objects whose keys begin so: the name of a folder, a slash, and maybe the beginning of a name in it."""
 
     def check(self) -> None:
@@ -80,7 +80,7 @@ class Patient:
         """Delete an object; nothing happens where there is none."""
         self._objects.delete(key)
 
-    def list(self, prefix: str) -> Iterator[Found]:
+    def list(self, prefix: str) -> Iterator[Entry]:
         """Objects whose keys begin so."""
         return iter(self._ask(lambda: builtins.list(self._objects.list(prefix))))
 
@@ -155,7 +155,7 @@ class Mounted:
                 except OSError:  # not empty, or gone
                     return
 
-    def list(self, prefix: str) -> Iterator[Found]:
+    def list(self, prefix: str) -> Iterator[Entry]:
         """Objects whose keys begin so; what an interrupted `put` left is among them."""
         parent, _, beginning = prefix.rpartition("/")
         with _of_folder():
@@ -165,10 +165,10 @@ class Mounted:
                 if path.name.startswith(beginning):
                     yield from self._below(path)
 
-    def _below(self, path: Path) -> Iterator[Found]:
+    def _below(self, path: Path) -> Iterator[Entry]:
         for each in path.iterdir() if path.is_dir() else [path]:
             with suppress(FileNotFoundError):  # deleted meanwhile
-                yield Found(each.relative_to(self.root).as_posix(), each.stat().st_mtime)
+                yield Entry(each.relative_to(self.root).as_posix(), each.stat().st_mtime)
 
     def check(self) -> None:
         """See that the folder is there."""

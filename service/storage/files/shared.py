@@ -18,7 +18,7 @@ from typing import IO, TypeVar
 
 from lipcore.files.manifest import MANIFEST
 from service.storage.files.local import remove
-from service.storage.files.objects import Found, Objects
+from service.storage.files.objects import Entry, Objects
 
 logger = logging.getLogger(__name__)
 
@@ -193,7 +193,7 @@ class Shared:
         except OSError as error:
             logger.warning("files of a version that was not made are left for a day: %s", error)
 
-    def _old(self, prefix: str) -> Iterator[Found]:
+    def _old(self, prefix: str) -> Iterator[Entry]:
         return (each for each in self.objects.list(prefix) if each.modified < time.time() - DAY_S)
 
     def _trim(self) -> None:
@@ -248,5 +248,5 @@ def _entries(folder: Path) -> Iterator[tuple[float, int, Path]]:
             yield about.st_mtime, size, path
 
 
-def _name(entry: Found) -> str:
+def _name(entry: Entry) -> str:
     return entry.key.rpartition("/")[2]

@@ -17,7 +17,7 @@ from service.foundation.settings import is_loopback
 from service.web.access.keys import CHALLENGE, Key, Keyring, refusal
 from service.web.access.scopes import ADMIN, WEBSOCKET, rule_of, scopes_of_stream
 from service.web.observability.logs import KEY_ID
-from service.web.server.stream_protocol import CONNECTION, StreamProtocol
+from service.web.server.connections import CONNECTION, StreamProtocol
 
 SUBPROTOCOL = "lipserve"
 KEY_SUBPROTOCOL = "lipserve.key."

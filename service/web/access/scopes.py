@@ -132,7 +132,7 @@ def rule_of(method: str, path: str) -> Rule | None:
 @lru_cache(1024)
 def _rule(method: str, path: str) -> Rule | None:
     method = "GET" if method == "HEAD" else method
-    return next((rule for rule, pattern in _patterns()[method] if pattern.match(path)), None)
+    return next((rule for rule, pattern in _patterns().get(method, ()) if pattern.match(path)), None)
 
 
 def scopes_of_stream(query: bytes) -> tuple[str, ...]:
@@ -141,15 +141,10 @@ def scopes_of_stream(query: bytes) -> tuple[str, ...]:
     return (PREDICT, UPDATE) if any(name == "stream_id" for name, _ in given) else (PREDICT,)
 
 
-class _Patterns(dict[str, list[tuple[Rule, re.Pattern[str]]]]):
-    def __missing__(self, method: str) -> list[tuple[Rule, re.Pattern[str]]]:
-        return []
-
-
 @lru_cache(1)
-def _patterns() -> _Patterns:
+def _patterns() -> dict[str, list[tuple[Rule, re.Pattern[str]]]]:
     """Rules by method, each with the pattern that Starlette matches paths with: what it routes is what is checked."""
-    patterns = _Patterns()
+    patterns: dict[str, list[tuple[Rule, re.Pattern[str]]]] = {}
     for route in (*TABLE, *OPEN):
         method, path = route
         rule = Rule((TABLE[route],) if route in TABLE else (), route in LASTING)

@@ -1,7 +1,1 @@
 """What clients may take of the machine: sizes, times, connections, rates, disk."""
-
-from __future__ import annotations
-
-from service.web.limits.body import BodyLimit
-
-__all__ = ["BodyLimit"]

@@ -49,7 +49,7 @@ def given_request_id(headers: Iterable[tuple[bytes, bytes]]) -> str | None:
 
 Event = MutableMapping[str, Any]
 
-SAID_BEFORE = ("Exception in ASGI application", '%s - "WebSocket %s"', "connection open", "connection closed")
+LOGGED_BEFORE = ("Exception in ASGI application", '%s - "WebSocket %s"', "connection open", "connection closed")
 """Begin what uvicorn logs of requests, which the outermost middleware has logged: with their ids, without queries."""
 _CONTROL = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160))} | {
     code: f"\\u{code:04x}" for code in (0x2028, 0x2029, *range(0x200E, 0x2010), *range(0x202A, 0x202F))
@@ -105,7 +105,7 @@ class _LoggedBefore(logging.Filter):
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Whether a record is news."""
-        return not str(record.msg).startswith(SAID_BEFORE)
+        return not str(record.msg).startswith(LOGGED_BEFORE)
 
 
 def _formatter(form: str) -> logging.Formatter:

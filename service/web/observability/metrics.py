@@ -15,8 +15,7 @@ from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector
 
 from service import __version__
-from service.storage.disk import measure
-from service.storage.storage import Storage
+from service.storage.storage import Storage, measure
 from service.web.observability.meters import Durations, Kind, Meters, MetricKind, merged
 from service.web.observability.readiness import Readiness
 from service.web.route import Route
@@ -36,7 +35,7 @@ CPU = MetricKind(
 )
 SYSTEM_KINDS = (BUILD, PARTS, USED, FREE, MEMORY, CPU)
 LEARNER = "lipserve-learner"
-_SHOWN = {"process_resident_memory_bytes": MEMORY, "process_cpu_seconds": CPU}
+_OF_PROCESSES = {"process_resident_memory_bytes": MEMORY, "process_cpu_seconds": CPU}
 
 
 class System(Collector):
@@ -53,7 +52,7 @@ class System(Collector):
     def collect(self) -> Iterator[Metric]:
         """Yield every metric."""
         yield BUILD.of([([__version__], 1)])
-        parts = self._readiness.report().checks
+        parts = self._readiness.report()
         yield PARTS.of(([part.name], float(part.state != "failed")) for part in parts)
         files, usage = self._storage.files, self._storage.disk.usage()
         used = {what: measure(folder) for what, folder in files.folders.items()}
@@ -70,10 +69,10 @@ def _processes() -> Iterator[Metric]:
     for process in multiprocessing.active_children():
         name, pid = "learner" if process.name == LEARNER else "training", process.pid
         for family in ProcessCollector(pid=lambda pid=pid: pid, registry=None).collect():  # type: ignore[misc]
-            if family.name in _SHOWN:
+            if family.name in _OF_PROCESSES:
                 figures[family.name][name] += family.samples[0].value
-    for shown, kind in _SHOWN.items():
-        yield kind.of(([name], value) for name, value in figures[shown].items())
+    for metric, kind in _OF_PROCESSES.items():
+        yield kind.of(([name], value) for name, value in figures[metric].items())
 
 
 DURATION = MetricKind(

@@ -1,4 +1,5 @@
-"""Whether the service can do what it is for: each part is looked at, and named; and whether it is about to stop."""
+"""Whether the service can do what it is for: each part is looked at, and named; whether it is about to stop; and what
+the API tells of it."""
 
 from __future__ import annotations
 
@@ -8,12 +9,16 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Literal
 
-from fastapi import Depends
+from fastapi import APIRouter, Depends
+from pydantic import BaseModel, Field
 
+from service import __version__
+from service.foundation.errors import NotReadyError, problem, responses
 from service.foundation.fields import of_app
 from service.foundation.states import PartState
+from service.web.route import Route
 
 
 class Stopping:
@@ -48,18 +53,6 @@ class Check:
     message: str
 
 
-@dataclass(frozen=True)
-class Report:
-    """All parts, as they were when they were looked at last."""
-
-    checks: tuple[Check, ...]
-
-    @property
-    def failed(self) -> list[Check]:
-        """Parts that keep the service from being ready."""
-        return [each for each in self.checks if each.state == "failed"]
-
-
 class Readiness:
     """Looks at the parts of a service, at most once every KEPT_S; safe from several threads, not for the event loop.
 
@@ -71,17 +64,17 @@ class Readiness:
     ) -> None:
         self.looks, self._stopping = looks, stopping
         self._clock, self._lock = clock, threading.Lock()
-        self._report, self._until = Report(()), -float("inf")
+        self._report, self._until = tuple[Check, ...](), -float("inf")
         self._wrong_since: dict[str, float] = {}
 
-    def report(self) -> Report:
-        """How the parts are, just now or within the last KEPT_S; never raises."""
+    def report(self) -> tuple[Check, ...]:
+        """How all parts are, just now or within the last KEPT_S; never raises."""
         with self._lock:
             if self._clock() >= self._until:
-                self._report = Report(tuple(self._check(name, look) for name, look in self.looks.items()))
+                self._report = tuple(self._check(name, look) for name, look in self.looks.items())
                 self._until = self._clock() + KEPT_S
             if self._stopping.begun:
-                return Report((Check("stopping", "failed", "the service is stopping"), *self._report.checks))
+                return Check("stopping", "failed", "the service is stopping"), *self._report
             return self._report
 
     def forget(self) -> None:
@@ -104,3 +97,48 @@ class Readiness:
 
 
 ReadinessDep = Annotated[Readiness, Depends(of_app("readiness"))]
+
+
+class Live(BaseModel):
+    """The process answers."""
+
+    status: Literal["alive"] = "alive"
+
+
+class Part(BaseModel):
+    """One part of the service."""
+
+    name: str = Field(examples=["database"])
+    state: Literal["ok", "warning"] = Field(description="warning: some clients may notice something")
+    message: str = Field(examples=["can be read and written"])
+
+
+class Ready(BaseModel):
+    """The service can do what it is for."""
+
+    status: Literal["ready"] = "ready"
+    version: str
+    checks: list[Part]
+
+
+router = APIRouter(prefix="/health", tags=["health"], route_class=Route)
+
+
+@router.get("/live", summary="Is the process alive?")
+async def live() -> Live:
+    """Answer while the event loop turns."""
+    return Live()
+
+
+@router.get("/ready", summary="Can the service answer?", responses=responses(NotReadyError))
+def ready(readiness: ReadinessDep) -> Ready:
+    """Answer once the models are loaded, and while each part works: the database and the home can be written and are
+    not full, the versions that serve can be read, the learner runs where something learns, training jobs are started,
+    and the service is not stopping. Otherwise `detail` names the parts that do not. Looked at once a second at most.
+    """
+    report = readiness.report()
+    if failed := [each for each in report if each.state == "failed"]:
+        message = "; ".join(f"{each.name}: {each.message}" for each in failed)
+        raise NotReadyError(message, [problem(each.name, each.message, "ok") for each in failed])
+    checks = [Part(name=each.name, state=each.state, message=each.message) for each in report]
+    return Ready(version=__version__, checks=checks)

@@ -4,7 +4,7 @@ reported to OpenTelemetry."""
 from __future__ import annotations
 
 import logging
-from collections.abc import Awaitable, Iterable, MutableMapping
+from collections.abc import Awaitable, Iterable
 from importlib.util import find_spec
 from time import monotonic, perf_counter
 from typing import Any
@@ -20,7 +20,7 @@ from service.web.observability.logs import KEY_ID, REQUEST_ID, given_request_id,
 from service.web.observability.meters import Kind, Meters
 
 EXPORTER = "opentelemetry.exporter.otlp.proto.http"
-MONITORING_PATHS = ("/health/", "/v2/health/", "/metrics")
+MONITORING = frozenset({"/health/live", "/health/ready", "/v2/health/live", "/v2/health/ready", "/metrics"})
 
 
 def telemetry(settings: Settings) -> TelemetryConfig:
@@ -40,7 +40,7 @@ def telemetry(settings: Settings) -> TelemetryConfig:
         "logs": False,
         "operation_spans": on,
         "auto_configure": on,
-        "exclude": _of_monitoring,
+        "exclude": lambda scope: scope["path"] in MONITORING,
     }
 
 
@@ -51,15 +51,9 @@ def _installed() -> bool:
         return False
 
 
-def _of_monitoring(scope: MutableMapping[str, Any]) -> bool:
-    path: str = scope["path"]
-    return path.startswith(MONITORING_PATHS)
-
-
 request_lines = logging.getLogger("service.requests")
 logger = logging.getLogger(__name__)
 
-MONITORING = frozenset({"/health/live", "/health/ready", "/v2/health/live", "/v2/health/ready", "/metrics"})
 SHOWN = 200
 """Characters of an address that are logged."""
 
@@ -74,7 +68,7 @@ class RequestLog:
 
     def __init__(self, quiet: Iterable[str], slow_s: float, most_refusals: int) -> None:
         self.quiet, self.slow_s, self.most_refusals = frozenset(quiet) | MONITORING, slow_s, most_refusals
-        self._refusals: dict[tuple[str, int, str], _Second] = {}
+        self._refusals: dict[tuple[str, int, str], tuple[int, int]] = {}  # the second, and how many there were in it
 
     def may_log(self, route: str, seconds: float) -> bool:
         """Whether a request that was not refused may be worth a line: a quick look, before more is made of it."""
@@ -106,16 +100,11 @@ class RequestLog:
 
     def _missed(self, kind: Kind) -> int:
         """How many equal refusals were not logged before this one; -1 where this one is not either."""
-        second = int(monotonic())
-        seen = self._refusals.get((kind.route, kind.status, kind.code))
-        if seen is None:
-            seen = self._refusals[kind.route, kind.status, kind.code] = _Second(second)
-        missed = 0
-        if seen.second != second:
-            missed = max(seen.count - self.most_refusals, 0)
-            seen.second, seen.count = second, 0
-        seen.count += 1
-        return missed if seen.count <= self.most_refusals else -1
+        now, sort = int(monotonic()), (kind.route, kind.status, kind.code)
+        second, count = self._refusals.get(sort, (now, 0))
+        missed, count = (0, count) if second == now else (max(count - self.most_refusals, 0), 0)
+        self._refusals[sort] = now, count + 1
+        return missed if count < self.most_refusals else -1
 
 
 def _of(scope: Scope, route: str) -> dict[str, Any]:
@@ -128,15 +117,6 @@ def _of(scope: Scope, route: str) -> dict[str, Any]:
     if KEY_ID in scope:
         fields["key"] = scope[KEY_ID]
     return fields
-
-
-class _Second:
-    """Refusals of one sort within one second."""
-
-    __slots__ = ("count", "second")
-
-    def __init__(self, second: int) -> None:
-        self.second, self.count = second, 0
 
 
 WEBSOCKET = "WEBSOCKET"

@@ -80,10 +80,7 @@ class Server(uvicorn.Server):
             return
         made: Any = self.config.http_protocol_class  # uvicorn's type of it says nothing of its arguments
         protocol = functools.partial(
-            made,
-            config=self.config,
-            server_state=self.server_state,
-            app_state=self.lifespan.state,
+            made, config=self.config, server_state=self.server_state, app_state=self.lifespan.state
         )
         loop = asyncio.get_running_loop()
         # among the servers that shutdown closes

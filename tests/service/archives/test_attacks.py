@@ -102,7 +102,7 @@ def test_size_that_lies(api, files, size):
     packed[124:136] = size.ljust(12, b"\0")
     packed[148:156] = b" " * 8
     packed[148:156] = f"{sum(packed[:512]):06o}\0 ".encode()
-    refused(api, bytes(packed), "archive" if size.startswith("0x") else TENSORS)
+    refused(api, bytes(packed), "archive" if size.startswith(b"0x") else TENSORS)
 
 
 SPOILT = {

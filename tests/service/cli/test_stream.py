@@ -86,7 +86,7 @@ def test_figures_are_those_of_all_rows():
             answer = StreamAnswer(row, mean[row], std[row], 1, 0, row % 10 == 0, 0, 0.0)
             part.add(answer, tau[row], seconds=row / 1e3, behind_s=row / 1e2)
         tally.merge(part)
-    figures, error = tally.shown(), tau - mean
+    figures, error = tally.figures(), tau - mean
     inside = np.abs(error) <= 1.959963984540054 * np.hypot(std, noise)
     assert (figures["rows"], figures["late"], figures["behind_s"]) == (40, 4, 0.39)
     assert figures["rmse"] == pytest.approx(np.sqrt((error**2).mean()))
@@ -95,7 +95,7 @@ def test_figures_are_those_of_all_rows():
     for at, joint in enumerate(tally.joints(("a", "b"))):
         assert joint["nmse"] == pytest.approx((error[:, at] ** 2).mean() / tau[:, at].var())
         assert joint["coverage"] == pytest.approx(inside[:, at].mean())
-    assert Tally(noise).shown()["rmse"] is None
+    assert Tally(noise).figures()["rmse"] is None
     assert Tally(noise).joints(("a", "b")) == []
 
 

@@ -90,7 +90,7 @@ def test_ctrl_c_in_train_cancels_the_job(lipserve, server, long, interrupted):
     assert code == 130
     job = json.loads(out)
     assert job["state"] == "cancelled"
-    assert f"job {job['id']} is cancelled" in err
+    assert f"{job['id']} is cancelled" in err
 
 
 def test_ctrl_c_while_the_job_is_queued_cancels_it(lipserve, server, long, monkeypatch):

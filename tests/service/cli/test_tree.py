@@ -13,17 +13,17 @@ from lipcore.vocabulary import AUTO, CHOICES
 from service import __version__
 from service.cli import consoles, options
 from service.cli.consoles import plain
-from service.cli.main import Commands, commands
+from service.cli.main import Commands
 from service.client import ApiError
 from tests.service.server import free_port
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
+PAGE = runpy.run_path(str(DOCS / "cli.py"))
 PRINTS_NO_RESULT = {"serve", "worker", "demo"}
 
 
 def test_reference_is_up_to_date():
-    written = runpy.run_path(str(DOCS / "cli.py"))["page"]()
-    assert (DOCS / "reference/cli.md").read_text() == written, "run: python docs/cli.py"
+    assert (DOCS / "reference/cli.md").read_text() == PAGE["page"](), "run: python docs/cli.py"
 
 
 def test_names_that_help_lists_are_those_that_there_are():
@@ -39,7 +39,7 @@ def test_version_and_help(lipserve):
 
 
 def test_every_command_prints_json_and_has_a_help():
-    for path, command, _ in commands():
+    for path, command, _ in PAGE["commands"]():
         assert command.help, path
         for parameter in command.params:
             assert parameter.help, (path, parameter.name)

@@ -10,8 +10,7 @@ import pytest
 
 from service.cli.simulate import write_recording
 from service.client import ApiError, AsyncClient, Client, ServiceUnreachableError
-from service.client.async_stream import AsyncStreamClient
-from service.client.stream import StreamError
+from service.client.stream import AsyncStreamClient, StreamError
 from tests.service.data import DEADLINE, QUICK, stream, upload
 from tests.service.server import free_port
 from tests.service.streams import MOTION, TAU

@@ -13,7 +13,7 @@ from service.client.call import Answer
 from service.client.results.arm import Arm, read_arm
 from service.client.results.evaluation import read_evaluation
 from service.client.results.series import LiveRows, read_live
-from service.learning.live.schema import LiveLost
+from service.learning.control.schema import LiveLost
 from service.models.schema import Version
 from tests.lipcore.arms import parameters_of
 from tests.service.client.conftest import over

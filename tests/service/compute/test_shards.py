@@ -14,12 +14,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lipcore.fitting.hyperparameters import FitCancelledError
-from service.compute.executors import Inline, shard_executor
-from service.compute.shards import AHEAD, ShardFailedError, summed
+from service.compute import executors
+from service.compute.executors import AHEAD, Inline, ShardFailedError, shard_executor, summed
 from service.foundation.settings import Settings
 from tests.service.compute.work import dying, numbers
 
 SHARDS = list(range(37))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _quick_looks():
+    """Executors here end nothing by themselves: each look at whether to stop does."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(executors, "POLL_S", 0.001)
+        yield
 
 
 def deadly(shard: int) -> np.ndarray:

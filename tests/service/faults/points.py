@@ -90,7 +90,7 @@ STORE = "service.journal.snapshots:save"
 LEARNING = [
     Point("observation: row made", actions.Observe, Fault("service.journal.log:append_batch", "after"), "nothing"),
     *_around_commit("observation", actions.Observe, APPEND),
-    *_around_commit("unlearning", actions.Unlearn, "service.learning.control.undoing:unlearn"),
+    *_around_commit("unlearning", actions.Unlearn, "service.learning.control.decisions:unlearn"),
     *_both("learner: page read", actions.Observe, Fault(f"{LEARNER}.restore:advance", "before")),
     *_both("learner: publication written", actions.Observe, Fault(f"{LEARNER}.publication:write", "after")),
     Point("publication: before it is read", actions.Observe, Fault(f"{LEARNER}.publication:read"), "all"),
@@ -113,7 +113,7 @@ MOVES = [
     Point(
         "other version serves: pointer moved", actions.Serve, Fault("service.models.registry:serve", "after"), "nothing"
     ),
-    *_around_commit("other version serves", actions.Serve, "service.learning.control.undoing:_to_version"),
+    *_around_commit("other version serves", actions.Serve, "service.learning.control.decisions:_to_version"),
     Point(
         "other version serves: before it answers",
         actions.Serve,

@@ -14,8 +14,8 @@ from fastapi.testclient import TestClient
 from lipcore.files.persistence import MANIFEST, TENSORS
 from service.app import create_app
 from service.foundation.settings import Settings
-from service.storage.database.sqlite import FILE
-from service.storage.home import HomeError, check_home
+from service.storage.database.engine import FILE
+from service.storage.storage import HomeError, check_home
 from tests.service.data import error, eventually, stream, upload
 from tests.service.faults.damage import HARM, cut, empty, flip, zero
 from tests.service.faults.house import furnish

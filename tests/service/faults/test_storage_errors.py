@@ -20,9 +20,9 @@ from service.app import create_app
 from service.foundation.errors import ServiceError, StorageFullError, StorageUnavailableError
 from service.foundation.settings import Settings
 from service.storage.database import Database
-from service.storage.database.sqlite import FILE
+from service.storage.database.engine import FILE
 from service.storage.files import Files
-from service.storage.home import HomeError, check_home
+from service.storage.storage import HomeError, check_home
 from service.web.storage_errors import translated
 from tests.service.data import arrays, error, npz, service_of, stream
 from tests.service.faults.storage import small_disk

@@ -13,7 +13,7 @@ import pytest
 from service.foundation.errors import StorageFullError, StorageUnavailableError
 from service.foundation.settings import Settings
 from service.storage.files import Files, FilesUnreachableError, objects
-from service.storage.home import HomeError, check_home
+from service.storage.storage import HomeError, check_home
 from service.web import storage_errors
 from tests.service.data import stream
 

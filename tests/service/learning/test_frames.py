@@ -11,8 +11,8 @@ import pytest
 from lipcore.data.independence import INDEPENDENT_HZ, stream_weights
 from lipcore.online.record import Record
 from service.foundation.errors import ConflictError
-from service.journal import log, retention
-from service.learning.ingest.frames import Frames, FramesResult
+from service.journal import log, snapshots
+from service.learning.ingest.batches import Frames, FramesResult
 from service.learning.schema import ExpiredError
 from tests.service.learning.lessons import apart
 from tests.service.learning.recordings import codes, learnt_from, logged, part, recording, send
@@ -131,7 +131,7 @@ def test_frames_that_are_no_longer_kept_are_not_taken_for_new(school, pupil, obs
         observe(range(first, first + 5))
     with school.service.database.transaction() as session:
         event = log.find_batch(session, pupil.model, "socket", 0)
-        retention._forget(session, event)
+        snapshots._forget(session, event)
         session.delete(event)
     with pytest.raises(ExpiredError, match="whether batch 3 of stream"):
         observe([3])

@@ -10,7 +10,7 @@ import pytest
 import lipcore
 from lipcore.robots.urdf import RigidBody
 from service.foundation.settings import Settings
-from service.journal import log, retention
+from service.journal import log, snapshots
 from service.learning.ingest.screening import limits
 from service.learning.schema import LearningOptions
 from tests.service.learning.lessons import apart
@@ -96,7 +96,7 @@ def test_batches_that_are_no_longer_kept_are_not_taken_for_new(school, body):
     with school.service.database.transaction() as session:
         for sequence in (0, 1, 3):
             event = log.find_batch(session, pupil.model, "arm", sequence)
-            retention._forget(session, event)
+            snapshots._forget(session, event)
             session.delete(event)
     for sequence in (0, 1, 3):
         said = refused(pupil, batch(sequence, parts[sequence]), 409, "expired")

@@ -12,13 +12,12 @@ from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES
 from service.foundation.errors import NotFoundError
 from service.foundation.settings import Settings
+from service.learning.control.schema import LiveRows, LiveStatus
 from service.learning.ingest.intake import Judged
 from service.learning.ingest.screening import Screened
-from service.learning.live import feed, thinning
-from service.learning.live.feed import MOST_UNREAD, Feed, FeedEvent
+from service.learning.live import feed
+from service.learning.live.feed import MOST_UNREAD, Feed, FeedEvent, pick, thinned
 from service.learning.live.routes import at_most
-from service.learning.live.schema import LiveRows, LiveStatus
-from service.learning.live.thinning import pick, thinned
 from tests.service.data import error, eventually, service_of
 from tests.service.learning.batches import rows
 from tests.service.learning.following import following
@@ -168,18 +167,18 @@ def test_only_doubtful_rows_are_looked_at_and_not_too_many(monkeypatch):
         looked.append(len(these))
         return np.arange(len(these)) % 2 == 0
 
-    monkeypatch.setattr(thinning, "uncovered", uncovered)
-    gathered = thinning.Novelty()
+    monkeypatch.setattr(feed, "uncovered", uncovered)
+    gathered = []
     for seed in range(4):
-        gathered.add(thinned([judged(20, seed=seed, bare=0.05)], 100)[0][1])
-    gathered.add(thinned([judged(4, stream_id="two", bare=0.15)], 100)[0][1])
-    gathered.add(thinned([judged(50, stream_id="three", bare=0.15)], 100)[0][1])
-    one, two, three = gathered.look()
+        gathered.append(thinned([judged(20, seed=seed, bare=0.05)], 100)[0][1])
+    gathered.append(thinned([judged(4, stream_id="two", bare=0.15)], 100)[0][1])
+    gathered.append(thinned([judged(50, stream_id="three", bare=0.15)], 100)[0][1])
+    one, two, three = feed.beyond(gathered)
     assert looked == [4, 17]
     assert (one.stream_id, one.times, one.unknown) == ("one", [], 0)
     assert (two.stream_id, len(two.times), two.unknown) == ("two", 2, 0)
     assert (len(three.times), three.unknown) == (9, 33)
-    assert gathered.look() == []
+    assert feed.beyond([]) == []
 
 
 def test_latency_is_told_by_the_bound_of_its_bucket():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.journal import log, snapshots
-from service.learning.control import undoing
+from service.learning.control import status
 from tests.service.data import error, eventually
 from tests.service.learning.batches import MODEL, batch, note, roll_back, write
 from tests.service.learning.lessons import LESSON, apart, lesson
@@ -91,11 +91,11 @@ def test_reach_follows_snapshots_and_what_is_left_of_the_log(database):
         for event in log.events(session, MODEL, 0, 5):
             session.delete(event)
     with database.session() as session:
-        assert undoing.reachable(session, MODEL, 1) == [(0, 0), (2, 2), (4, 6), (8, 10)]
-        assert undoing.current(session, MODEL, 1) == 10
+        assert status.reachable(session, MODEL, 1) == [(0, 0), (2, 2), (4, 6), (8, 10)]
+        assert status.current(session, MODEL, 1) == 10
     note(database, "settings", {"forgetting_s": 5.0})
     with database.session() as session:
-        assert undoing.reachable(session, MODEL, 1)[-1] == (8, 11)
+        assert status.reachable(session, MODEL, 1)[-1] == (8, 11)
 
 
 def test_another_version_serves_by_one_call(school):

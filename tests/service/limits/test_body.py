@@ -8,7 +8,7 @@ from unittest.mock import AsyncMock
 import pytest
 from starlette.exceptions import HTTPException
 
-from service.web.limits.body import BodyLimit
+from service.web.limits.requests import BodyLimit
 
 SOON = 0.05
 """Seconds that a body may take where it is meant to take too long."""

@@ -10,8 +10,7 @@ import pytest
 from service.app import create_app
 from service.foundation.settings import Settings
 from service.web.access.middleware import KEY_ID, KeyAccess
-from service.web.limits.body import BodyLimit
-from service.web.limits.requests import OTHERS, Gate, Rate, RateLimit, client_of
+from service.web.limits.requests import OTHERS, BodyLimit, Gate, Rate, RateLimit, client_of
 
 MODELS, STREAM = "/v1/models", "/v1/echo/stream"
 

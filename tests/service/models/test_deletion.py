@@ -112,9 +112,9 @@ def test_a_candidate_in_contest_stays(api, arm):
 
 def test_what_a_job_trains_anew_stays(api, arm):
     name = job(api, arm, RUNNING, refresh={"version": 1, "through": 0, "trigger": "asked"})
-    assert f"job '{name}' trains version 1" in refusal(api, f"{arm}/versions/1")
+    assert f"{name} trains version 1" in refusal(api, f"{arm}/versions/1")
     assert delete(api, f"{arm}/versions/2").status_code == 204
-    assert f"job '{name}' of model '{arm}' is running" in refusal(api, arm)
+    assert f"{name} of model '{arm}' is running" in refusal(api, arm)
     with service_of(api).database.transaction() as session:
         session.execute(update(JobRow).where(JobRow.id == name).values(state=CANCELLED))
     assert delete(api, f"{arm}/versions/1").status_code == 204
@@ -181,13 +181,13 @@ def test_a_batch_that_was_predicted_by_what_is_deleted_is_not_logged(api, arm):
     service = service_of(api)
     served = service.loaded.get(arm, None)
     intake = service.learners._intake
-    monitor, arrival = service.learners.monitor(arm), SimpleNamespace(rows=1)
+    monitor, screened = service.learners.monitor(arm), SimpleNamespace(own=slice(0, 1))
     assert delete(api, arm).status_code == 204
     with pytest.raises(NotFoundError, match="no model"):
-        intake.append(monitor, served, None, arrival, None, {})
+        intake.append(monitor, served, None, None, screened, {})
     publish(api, arm)
     with pytest.raises(ConflictError, match=r"version 3 .* was deleted meanwhile"):
-        intake.append(monitor, served, None, arrival, None, {})
+        intake.append(monitor, served, None, None, screened, {})
 
 
 def test_who_asks_for_a_pointer_is_answered_though_it_moves_and_the_version_before_goes(api, arm, monkeypatch):

@@ -41,7 +41,7 @@ def look(clock):
     def look(service):
         seen = kept.setdefault(id(service.readiness), Readiness(service.readiness.looks, service.stopping, clock))
         seen.forget()
-        return {check.name: (check.state, check.message) for check in seen.report().checks}
+        return {check.name: (check.state, check.message) for check in seen.report()}
 
     return look
 

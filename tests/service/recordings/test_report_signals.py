@@ -9,11 +9,20 @@ from hypothesis import strategies as st
 
 from lipcore.data.signals import noise_level
 from lipcore.preparation.recipe import Recipe
-from service.datasets.preview import extremes
-from service.datasets.report.lag import shifts
-from service.datasets.report.signals import against_limits, limits_of, noise_or_share, saturation, white_noise
-from service.datasets.report.timing import bounds, look_at_clock, number_parts, thin
+from service.datasets.report.fit import shifts
+from service.datasets.report.signals import (
+    against_limits,
+    bounds,
+    limits_of,
+    look_at_clock,
+    noise_or_share,
+    number_parts,
+    saturation,
+    thin,
+    white_noise,
+)
 from service.datasets.schema import DatasetReport
+from service.datasets.store import extremes
 from tests.service.recordings.report_data import FakeProfile, recording, report_on, staged
 
 PENDULUM = ("joint1", "joint2")

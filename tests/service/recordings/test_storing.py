@@ -22,7 +22,7 @@ from service.datasets.staging import QUANTITIES, Staged, column, prepare
 from service.foundation.settings import Settings
 from service.storage import sample_file
 from service.storage.database import JobRow
-from service.storage.disk import Disk
+from service.storage.storage import Disk
 from tests.service.data import arrays, npz, post, queue, service_of, stream
 
 SAMPLES = stream(samples=600, rate=100.0, seed=71)

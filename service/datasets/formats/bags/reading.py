@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
-from service.datasets.formats.bags import mcap, rosbag1, sqlite
+from service.datasets.formats.bags import files
 from service.datasets.formats.bags.container import Bag, Channel, JoinedBags
 from service.datasets.formats.bags.states import (
     ENCODINGS,
@@ -198,12 +198,12 @@ def open_bag(path: Path, kind: BagKind, options: ReadOptions, settings: Settings
 def _open(path: Path, kind: str, settings: Settings) -> Bag:
     with path.open("rb") as file:
         start = file.read(16)
-    if start.startswith(mcap.MAGIC):
-        return mcap.Mcap(path, settings)
-    if start.startswith(rosbag1.MAGIC):
-        return rosbag1.Rosbag1(path, settings)
-    if start.startswith(sqlite.MAGIC):
-        return sqlite.SqliteBag(path, settings)
+    if start.startswith(files.MCAP_MAGIC):
+        return files.Mcap(path, settings)
+    if start.startswith(files.ROSBAG1_MAGIC):
+        return files.Rosbag1(path, settings)
+    if start.startswith(files.SQLITE_MAGIC):
+        return files.SqliteBag(path, settings)
     if not start:
         raise invalid_data("file", "empty", KINDS[kind])
     raise invalid_data("file", f"no bag: it begins with {start!r}", KINDS[kind])

@@ -32,12 +32,7 @@ _DTYPES = {
 }
 """NumPy's types of numbers in messages."""
 _JOINT_STATE = {"position": "position", "velocity": "velocity", "effort": "effort"}
-_POINT = {
-    "position": "positions",
-    "velocity": "velocities",
-    "acceleration": "accelerations",
-    "effort": "effort",
-}
+_POINT = {"position": "positions", "velocity": "velocities", "acceleration": "accelerations", "effort": "effort"}
 
 
 @dataclass(frozen=True)

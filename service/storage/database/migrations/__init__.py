@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
-from sqlalchemy import Connection, Engine, inspect, text
+import sqlalchemy as sa
 
 HEAD = "0004"
 """The revision that this release needs."""
@@ -15,7 +16,7 @@ class DatabaseVersionError(RuntimeError):
     """The database is of a later release, which this one does not know how to read."""
 
 
-def migrate(engine: Engine, lock: Callable[[Connection, None], None]) -> None:
+def migrate(engine: sa.Engine, lock: Callable[[sa.Connection, None], None]) -> None:
     """Apply what is missing, all or nothing; a database that is up to date is only looked at.
 
     lock: begins a transaction as the only writer: other processes wait and then find it done. Raise
@@ -32,15 +33,15 @@ def migrate(engine: Engine, lock: Callable[[Connection, None], None]) -> None:
         connection.commit()
 
 
-def revision(connection: Connection) -> str | None:
+def revision(connection: sa.Connection) -> str | None:
     """The revision of a database; None of a new one and of those from before there were revisions."""
-    if not inspect(connection).has_table("alembic_version"):
+    if not sa.inspect(connection).has_table("alembic_version"):
         return None
-    number: str | None = connection.scalar(text("SELECT version_num FROM alembic_version"))
+    number: str | None = connection.scalar(sa.text("SELECT version_num FROM alembic_version"))
     return number
 
 
-def _upgrade(connection: Connection, found: str | None) -> None:
+def _upgrade(connection: sa.Connection, prior: str | None) -> None:
     from alembic import command  # noqa: PLC0415 - needed once a release, by none of the processes that train or learn
     from alembic.config import Config  # noqa: PLC0415
     from alembic.script import ScriptDirectory  # noqa: PLC0415
@@ -49,9 +50,36 @@ def _upgrade(connection: Connection, found: str | None) -> None:
     config.set_main_option("script_location", str(Path(__file__).parent).replace("%", "%%"))
     config.attributes["connection"] = connection
     known = {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}
-    if found is not None and found not in known:
+    if prior is not None and prior not in known:
         raise DatabaseVersionError(
-            f"the database has revision {found!r}, expected at most {HEAD!r}: a later release of LIPServe has used it; "
+            f"the database has revision {prior!r}, expected at most {HEAD!r}: a later release of LIPServe has used it; "
             "start that one, or set LIPSERVE_HOME, or LIPSERVE_DATABASE_URL, to another"
         )
     command.upgrade(config, HEAD)
+
+
+NUMBER = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
+
+
+def needed(kind: Any, *names: str) -> Iterator[sa.Column[Any]]:
+    """Columns of one type that no row goes without."""
+    return (sa.Column(name, kind, nullable=False) for name in names)
+
+
+def optional(kind: Any, *names: str) -> Iterator[sa.Column[Any]]:
+    """Columns of one type that may be null."""
+    return (sa.Column(name, kind, nullable=True) for name in names)
+
+
+def numbered() -> list[Any]:
+    """Column and primary key of a table whose rows are counted."""
+    return [sa.Column("seq", NUMBER, autoincrement=True, nullable=False), sa.PrimaryKeyConstraint("seq")]
+
+
+def of_model(*key: str) -> list[Any]:
+    """Column of the model that rows belong to; key: primary key, where it is one."""
+    columns: list[Any] = [
+        sa.Column("model", sa.String(64), nullable=False),
+        sa.ForeignKeyConstraint(["model"], ["models.name"]),
+    ]
+    return [*columns, sa.PrimaryKeyConstraint(*key)] if key else columns

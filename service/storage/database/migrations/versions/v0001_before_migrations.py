@@ -2,200 +2,101 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import sqlalchemy as sa
 from alembic import op
 
+from service.storage.database.migrations import NUMBER, needed, numbered, of_model, optional
+
 revision = "0001"
 down_revision = None
-NUMBER = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
+TEXT, ID, NAME, JSON = sa.String(), sa.String(40), sa.String(64), sa.JSON()
 
 
 def upgrade() -> None:
     """Create what is missing."""
-    op.create_table(
+    table = partial(op.create_table, if_not_exists=True)
+    table(
         "datasets",
-        sa.Column("seq", NUMBER, autoincrement=True, nullable=False),
-        sa.Column("id", sa.String(length=40), nullable=False),
-        sa.Column("name", sa.String(), nullable=False),
-        sa.Column("created_at", sa.String(), nullable=False),
-        sa.Column("sha256", sa.String(), nullable=False),
-        sa.Column("torque_convention", sa.String(), nullable=False),
-        sa.Column("joint_names", sa.JSON(), nullable=False),
-        sa.Column("rows", NUMBER, nullable=False),
-        sa.Column("report", sa.JSON(), nullable=False),
-        sa.PrimaryKeyConstraint("seq"),
+        *numbered(),
+        *needed(ID, "id"),
+        *needed(TEXT, "name", "created_at", "sha256", "torque_convention"),
+        *needed(JSON, "joint_names", "report"),
+        *needed(NUMBER, "rows"),
         sa.UniqueConstraint("id"),
-        if_not_exists=True,
     )
-    op.create_table(
+    table(
         "jobs",
-        sa.Column("seq", NUMBER, autoincrement=True, nullable=False),
-        sa.Column("id", sa.String(length=40), nullable=False),
-        sa.Column("model", sa.String(), nullable=False),
-        sa.Column("state", sa.String(), nullable=False),
-        sa.Column("request", sa.JSON(), nullable=False),
-        sa.Column("progress", sa.JSON(), nullable=False),
-        sa.Column("attempts", NUMBER, nullable=False),
-        sa.Column("cancel_requested", sa.Boolean(), nullable=False),
-        sa.Column("created_at", sa.String(), nullable=False),
-        sa.Column("started_at", sa.String(), nullable=True),
-        sa.Column("finished_at", sa.String(), nullable=True),
-        sa.Column("heartbeat_at", sa.String(), nullable=True),
-        sa.Column("version", NUMBER, nullable=True),
-        sa.Column("error", sa.JSON(), nullable=True),
-        sa.PrimaryKeyConstraint("seq"),
+        *numbered(),
+        *needed(ID, "id"),
+        *needed(TEXT, "model", "state", "created_at"),
+        *needed(JSON, "request", "progress"),
+        *needed(NUMBER, "attempts"),
+        *needed(sa.Boolean(), "cancel_requested"),
+        *optional(TEXT, "started_at", "finished_at", "heartbeat_at"),
+        *optional(NUMBER, "version"),
+        *optional(JSON, "error"),
         sa.UniqueConstraint("id"),
-        if_not_exists=True,
     )
     op.create_index(op.f("ix_jobs_state"), "jobs", ["state"], unique=False, if_not_exists=True)
-    op.create_table(
-        "models",
-        sa.Column("seq", NUMBER, autoincrement=True, nullable=False),
-        sa.Column("name", sa.String(length=64), nullable=False),
-        sa.Column("created_at", sa.String(), nullable=False),
-        sa.PrimaryKeyConstraint("seq"),
-        sa.UniqueConstraint("name"),
-        if_not_exists=True,
-    )
-    op.create_table(
+    table("models", *numbered(), *needed(NAME, "name"), *needed(TEXT, "created_at"), sa.UniqueConstraint("name"))
+    table(
         "robots",
-        sa.Column("seq", NUMBER, autoincrement=True, nullable=False),
-        sa.Column("id", sa.String(length=40), nullable=False),
-        sa.Column("name", sa.String(), nullable=False),
-        sa.Column("created_at", sa.String(), nullable=False),
-        sa.Column("sha256", sa.String(), nullable=False),
-        sa.Column("joints", sa.JSON(), nullable=False),
-        sa.Column("urdf", sa.String(), nullable=False),
-        sa.PrimaryKeyConstraint("seq"),
+        *numbered(),
+        *needed(ID, "id"),
+        *needed(TEXT, "name", "created_at", "sha256", "urdf"),
+        *needed(JSON, "joints"),
         sa.UniqueConstraint("id"),
-        if_not_exists=True,
     )
-    op.create_table(
+    table(
         "snapshots",
-        sa.Column("seq", NUMBER, autoincrement=True, nullable=False),
-        sa.Column("id", sa.String(length=40), nullable=False),
-        sa.Column("model", sa.String(), nullable=False),
-        sa.Column("version", NUMBER, nullable=False),
-        sa.Column("number", NUMBER, nullable=False),
-        sa.Column("created_at", sa.String(), nullable=False),
-        sa.PrimaryKeyConstraint("seq"),
+        *numbered(),
+        *needed(ID, "id"),
+        *needed(TEXT, "model", "created_at"),
+        *needed(NUMBER, "version", "number"),
         sa.UniqueConstraint("id"),
-        if_not_exists=True,
     )
-    op.create_table(
-        "alarms",
-        sa.Column("seq", NUMBER, autoincrement=True, nullable=False),
-        sa.Column("model", sa.String(length=64), nullable=False),
-        sa.Column("kind", sa.String(), nullable=False),
-        sa.Column("at", sa.String(), nullable=False),
-        sa.Column("message", sa.String(), nullable=False),
-        sa.Column("evidence", sa.JSON(), nullable=False),
-        sa.ForeignKeyConstraint(
-            ["model"],
-            ["models.name"],
-        ),
-        sa.PrimaryKeyConstraint("seq"),
-        if_not_exists=True,
-    )
-    op.create_table(
+    table("alarms", *numbered(), *of_model(), *needed(TEXT, "kind", "at", "message"), *needed(JSON, "evidence"))
+    table(
         "events",
-        sa.Column("seq", NUMBER, autoincrement=True, nullable=False),
-        sa.Column("model", sa.String(length=64), nullable=False),
-        sa.Column("number", NUMBER, nullable=False),
-        sa.Column("kind", sa.String(), nullable=False),
-        sa.Column("stream_id", sa.String(length=64), nullable=True),
-        sa.Column("sequence", sa.BigInteger(), nullable=True),
-        sa.Column("last_sequence", sa.BigInteger(), nullable=True),
-        sa.Column("digest", sa.String(), nullable=True),
-        sa.Column("received", sa.Double(), nullable=False),
-        sa.Column("version", NUMBER, nullable=True),
-        sa.Column("revision", NUMBER, nullable=True),
-        sa.Column("rows", NUMBER, nullable=False),
-        sa.Column("learnt", NUMBER, nullable=False),
-        sa.Column("first", sa.Double(), nullable=True),
-        sa.Column("last", sa.Double(), nullable=True),
-        sa.Column("void", sa.Boolean(), nullable=False),
-        sa.Column("report", sa.JSON(), nullable=True),
-        sa.Column("record", sa.JSON(), nullable=True),
-        sa.Column("detail", sa.JSON(), nullable=True),
-        sa.Column("payload", sa.LargeBinary(), nullable=True),
-        sa.ForeignKeyConstraint(
-            ["model"],
-            ["models.name"],
-        ),
-        sa.PrimaryKeyConstraint("seq"),
+        *numbered(),
+        *of_model(),
+        *needed(NUMBER, "number", "rows", "learnt"),
+        *needed(TEXT, "kind"),
+        *needed(sa.Double(), "received"),
+        *needed(sa.Boolean(), "void"),
+        *optional(NAME, "stream_id"),
+        *optional(sa.BigInteger(), "sequence", "last_sequence"),
+        *optional(TEXT, "digest"),
+        *optional(NUMBER, "version", "revision"),
+        *optional(sa.Double(), "first", "last"),
+        *optional(JSON, "report", "record", "detail"),
+        *optional(sa.LargeBinary(), "payload"),
         sa.UniqueConstraint("model", "number"),
         sa.UniqueConstraint("model", "stream_id", "sequence"),
-        if_not_exists=True,
     )
     op.create_index("events_received", "events", ["model", "received"], unique=False, if_not_exists=True)
-    op.create_table(
-        "learners",
-        sa.Column("model", sa.String(length=64), nullable=False),
-        sa.Column("version", NUMBER, autoincrement=False, nullable=False),
-        sa.Column("start", NUMBER, nullable=False),
-        sa.Column("role", sa.String(), nullable=False),
-        sa.ForeignKeyConstraint(
-            ["model"],
-            ["models.name"],
-        ),
-        sa.PrimaryKeyConstraint("model", "version"),
-        if_not_exists=True,
-    )
-    op.create_table(
-        "learning",
-        sa.Column("model", sa.String(length=64), nullable=False),
-        sa.Column("options", sa.JSON(), nullable=False),
-        sa.Column("held", sa.JSON(), nullable=True),
-        sa.ForeignKeyConstraint(
-            ["model"],
-            ["models.name"],
-        ),
-        sa.PrimaryKeyConstraint("model"),
-        if_not_exists=True,
-    )
-    op.create_table(
-        "serving",
-        sa.Column("model", sa.String(length=64), nullable=False),
-        sa.Column("version", NUMBER, nullable=False),
-        sa.Column("change", NUMBER, nullable=False),
-        sa.ForeignKeyConstraint(
-            ["model"],
-            ["models.name"],
-        ),
-        sa.PrimaryKeyConstraint("model"),
-        if_not_exists=True,
-    )
-    op.create_table(
+    table("learners", *of_model("model", "version"), *needed(NUMBER, "version", "start"), *needed(TEXT, "role"))
+    table("learning", *of_model("model"), *needed(JSON, "options"), *optional(JSON, "held"))
+    table("serving", *of_model("model"), *needed(NUMBER, "version", "change"))
+    table(
         "streams",
-        sa.Column("model", sa.String(length=64), nullable=False),
-        sa.Column("stream_id", sa.String(length=64), nullable=False),
-        sa.Column("kind", sa.String(), nullable=False),
-        sa.Column("offset", sa.Double(), nullable=False),
-        sa.Column("last", sa.BigInteger(), nullable=False),
-        sa.Column("missing", sa.JSON(), nullable=False),
-        sa.Column("forgotten", sa.BigInteger(), nullable=True),
-        sa.Column("created_at", sa.String(), nullable=False),
-        sa.ForeignKeyConstraint(
-            ["model"],
-            ["models.name"],
-        ),
-        sa.PrimaryKeyConstraint("model", "stream_id"),
-        if_not_exists=True,
+        *of_model("model", "stream_id"),
+        *needed(NAME, "stream_id"),
+        *needed(TEXT, "kind", "created_at"),
+        *needed(sa.Double(), "offset"),
+        *needed(sa.BigInteger(), "last"),
+        *needed(JSON, "missing"),
+        *optional(sa.BigInteger(), "forgotten"),
     )
-    op.create_table(
+    table(
         "versions",
-        sa.Column("model", sa.String(length=64), nullable=False),
-        sa.Column("version", NUMBER, autoincrement=False, nullable=False),
-        sa.Column("folder", sa.String(length=40), nullable=False),
-        sa.Column("created_at", sa.String(), nullable=False),
-        sa.Column("job", sa.String(), nullable=True),
-        sa.Column("manifest", sa.JSON(), nullable=False),
-        sa.ForeignKeyConstraint(
-            ["model"],
-            ["models.name"],
-        ),
-        sa.PrimaryKeyConstraint("model", "version"),
+        *of_model("model", "version"),
+        *needed(NUMBER, "version"),
+        *needed(ID, "folder"),
+        *needed(TEXT, "created_at"),
+        *optional(TEXT, "job"),
+        *needed(JSON, "manifest"),
         sa.UniqueConstraint("folder"),
-        if_not_exists=True,
     )

@@ -5,61 +5,47 @@ from __future__ import annotations
 import sqlalchemy as sa
 from alembic import op
 
+from service.storage.database.migrations import NUMBER, needed, numbered, of_model, optional
+
 revision = "0002"
 down_revision = "0001"
-NUMBER = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
+TEXT, NAME = sa.String(), sa.String(64)
 
 
 def upgrade() -> None:
     """Add them; the highest number of a version is that of those there are."""
     op.create_table(
         "api_keys",
-        sa.Column("seq", NUMBER, autoincrement=True, nullable=False),
-        sa.Column("id", sa.String(length=40), nullable=False),
-        sa.Column("name", sa.String(), nullable=False),
-        sa.Column("hash", sa.String(length=64), nullable=False),
-        sa.Column("scopes", sa.JSON(), nullable=False),
-        sa.Column("created_at", sa.String(), nullable=False),
-        sa.Column("expires_at", sa.String(), nullable=True),
-        sa.Column("revoked_at", sa.String(), nullable=True),
-        sa.Column("used_at", sa.String(), nullable=True),
-        sa.PrimaryKeyConstraint("seq"),
+        *numbered(),
+        *needed(sa.String(40), "id"),
+        *needed(TEXT, "name", "created_at"),
+        *needed(NAME, "hash"),
+        *needed(sa.JSON(), "scopes"),
+        *optional(TEXT, "expires_at", "revoked_at", "used_at"),
         sa.UniqueConstraint("hash"),
         sa.UniqueConstraint("id"),
     )
     op.create_table(
         "alias_moves",
-        sa.Column("seq", NUMBER, autoincrement=True, nullable=False),
-        sa.Column("model", sa.String(length=64), nullable=False),
-        sa.Column("alias", sa.String(length=64), nullable=False),
-        sa.Column("version", NUMBER, nullable=True),
-        sa.Column("before", NUMBER, nullable=True),
-        sa.Column("takes_back", NUMBER, nullable=True),
-        sa.Column("at", sa.String(), nullable=False),
-        sa.ForeignKeyConstraint(
-            ["model"],
-            ["models.name"],
-        ),
-        sa.PrimaryKeyConstraint("seq"),
+        *numbered(),
+        *of_model(),
+        *needed(NAME, "alias"),
+        *optional(NUMBER, "version", "before", "takes_back"),
+        *needed(TEXT, "at"),
     )
     op.create_index("alias_moves_alias", "alias_moves", ["model", "alias"], unique=False)
     op.create_table(
         "aliases",
-        sa.Column("model", sa.String(length=64), nullable=False),
-        sa.Column("alias", sa.String(length=64), nullable=False),
-        sa.Column("version", NUMBER, nullable=False),
-        sa.Column("changed_at", sa.String(), nullable=False),
-        sa.ForeignKeyConstraint(
-            ["model"],
-            ["models.name"],
-        ),
-        sa.PrimaryKeyConstraint("model", "alias"),
+        *of_model("model", "alias"),
+        *needed(NAME, "alias"),
+        *needed(NUMBER, "version"),
+        *needed(TEXT, "changed_at"),
     )
     op.create_table(
         "deleted_models",
-        sa.Column("name", sa.String(length=64), nullable=False),
-        sa.Column("last_version", NUMBER, nullable=False),
-        sa.Column("deleted_at", sa.String(), nullable=False),
+        *needed(NAME, "name"),
+        *needed(NUMBER, "last_version"),
+        *needed(TEXT, "deleted_at"),
         sa.PrimaryKeyConstraint("name"),
     )
     op.add_column("jobs", sa.Column("history", sa.JSON(), server_default="[]", nullable=False))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import sqlalchemy as sa
 from alembic import op
 
+from service.storage.database.migrations import needed
+
 revision = "0004"
 down_revision = "0003"
 
@@ -13,10 +15,9 @@ def upgrade() -> None:
     """Add them; jobs of earlier releases have no owner."""
     op.create_table(
         "replicas",
-        sa.Column("id", sa.String(length=40), nullable=False),
-        sa.Column("host", sa.String(), nullable=False),
-        sa.Column("started_at", sa.String(), nullable=False),
-        sa.Column("seen_at", sa.Double(), nullable=False),
+        *needed(sa.String(40), "id"),
+        *needed(sa.String(), "host", "started_at"),
+        *needed(sa.Double(), "seen_at"),
         sa.PrimaryKeyConstraint("id"),
     )
     op.add_column("jobs", sa.Column("owner", sa.String(length=40), nullable=True))

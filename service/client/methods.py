@@ -1,0 +1,165 @@
+"""What both clients have: a method for every call, what is known of the service, looks at a job."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar, overload
+
+from service.client import calls
+from service.client.call import Call, Page
+from service.client.sending import RETRIES, Address, Reach, headers_of
+from service.foundation.settings import DEFAULT_URL
+from service.foundation.states import ACTIVE
+from service.training.schema import Job
+
+if TYPE_CHECKING:
+    from service.client.asynchronous import AsyncClient
+    from service.client.sync import Client
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+POLL_SECONDS = 0.3
+
+
+class One(Generic[P, T]):
+    """A call as a method that returns its result; of `AsyncClient` it is awaited."""
+
+    def __init__(self, make: Callable[P, Call[T]]) -> None:
+        self.make = make
+
+    @overload
+    def __get__(self, client: Client, owner: Any = None) -> Callable[P, T]: ...
+    @overload
+    def __get__(self, client: AsyncClient, owner: Any = None) -> Callable[P, Coroutine[Any, Any, T]]: ...
+    def __get__(self, client: Any, owner: Any = None) -> Any:
+        """For types: `Calls` puts functions in the place of these."""
+        raise NotImplementedError
+
+
+class _Many(Generic[P, T]):
+    @overload
+    def __get__(self, client: Client, owner: Any = None) -> Callable[P, Iterator[T]]: ...
+    @overload
+    def __get__(self, client: AsyncClient, owner: Any = None) -> Callable[P, AsyncIterator[T]]: ...
+    def __get__(self, client: Any, owner: Any = None) -> Any:
+        raise NotImplementedError
+
+
+class Listed(_Many[P, T]):
+    """A call as a method that yields the items of all pages, each page when it is needed."""
+
+    def __init__(self, make: Callable[P, Call[Page[T]]]) -> None:
+        self.make = make
+
+
+class Followed(_Many[P, T]):
+    """A call as a method that yields its server-sent events."""
+
+    def __init__(self, make: Callable[P, Call[T]]) -> None:
+        self.make = make
+
+
+class Calls:
+    """The methods that clients have of calls.
+
+    url, timeout, key, retries: see `Client`. makers: of a client, what makes its methods, by kind.
+    """
+
+    def __init_subclass__(cls, makers: dict[type, Callable[[Any], Any]]) -> None:
+        for name, member in vars(Calls).items():
+            if type(member) in makers:
+                setattr(cls, name, makers[type(member)](member.make))
+
+    def __init__(
+        self, url: str = DEFAULT_URL, timeout: float = 120.0, key: str | None = None, retries: int = RETRIES
+    ) -> None:
+        self.url, self._key, self._address = url, key, Address.of(url)
+        self._reach = Reach(url, retries)
+        uds = None if self._address.unix is None else str(self._address.unix)
+        self._http = self._connected(uds, base_url=self._address.base, timeout=timeout, headers=headers_of(key))
+
+    def _connected(self, uds: str | None, **options: Any) -> Any:
+        """A client of httpx; uds: path of a Unix-domain socket, None where a host is named."""
+        raise NotImplementedError
+
+    upload = One(calls.datasets.upload)
+    datasets = Listed(calls.datasets.datasets)
+    dataset = One(calls.datasets.dataset)
+    preview = One(calls.datasets.preview)
+    delete_dataset = One(calls.datasets.delete_dataset)
+    upload_robot = One(calls.datasets.upload_robot)
+    robots = Listed(calls.datasets.robots)
+    robot = One(calls.datasets.robot)
+    delete_robot = One(calls.datasets.delete_robot)
+    profiles = One(calls.datasets.profiles)
+    profile = One(calls.datasets.profile)
+
+    train = One(calls.models.train)
+    jobs = Listed(calls.models.jobs)
+    job = One(calls.models.job)
+    job_events = Followed(calls.models.job_events)
+    cancel = One(calls.models.cancel)
+    retry = One(calls.models.retry)
+
+    models = Listed(calls.models.models)
+    model = One(calls.models.model)
+    delete_model = One(calls.models.delete_model)
+    version = One(calls.models.version)
+    delete_version = One(calls.models.delete_version)
+    aliases = One(calls.models.aliases)
+    set_alias = One(calls.models.set_alias)
+    remove_alias = One(calls.models.remove_alias)
+    rollback_alias = One(calls.models.rollback_alias)
+    export = One(calls.models.export)
+    urdf = One(calls.models.urdf)
+    import_model = One(calls.models.import_model)
+
+    predict = One(calls.inference.predict)
+    evaluate = One(calls.inference.evaluate)
+    compare = One(calls.inference.compare)
+    trace = One(calls.inference.trace)
+
+    observe = One(calls.learning.observe)
+    observations = Listed(calls.learning.observations)
+    observation = One(calls.learning.observation)
+    unlearn = One(calls.learning.unlearn)
+    replay = One(calls.learning.replay)
+    rollback = One(calls.learning.rollback)
+    refresh = One(calls.learning.refresh)
+    quality = One(calls.learning.quality)
+    learning = One(calls.learning.learning)
+    put_learning = One(calls.learning.put_learning)
+    decide = One(calls.learning.decide)
+    alarms = Listed(calls.learning.alarms)
+    live = Followed(calls.learning.live)
+
+    health = One(calls.inference.health)
+    live_health = One(calls.inference.live_health)
+    metrics = One(calls.inference.metrics)
+    echo = One(calls.inference.echo)
+    server_metadata = One(calls.inference.server_metadata)
+    server_live = One(calls.inference.server_live)
+    server_ready = One(calls.inference.server_ready)
+    model_metadata = One(calls.inference.model_metadata)
+    model_ready = One(calls.inference.model_ready)
+    infer = One(calls.inference.infer)
+
+
+@contextmanager
+def looking(on_progress: Callable[[Job], None] | None, progress: bool) -> Iterator[Callable[[Job], bool]]:
+    """What takes every look at a job, shows it to whoever asks for that, and tells whether the job has ended."""
+    with ExitStack() as stack:
+        looks = [] if on_progress is None else [on_progress]
+        if progress:
+            from service.client.progress import job_bar  # noqa: PLC0415 - rich, for those who look
+
+            looks.append(stack.enter_context(job_bar()))
+
+        def ended(seen: Job) -> bool:
+            for look in looks:
+                look(seen)
+            return seen.state not in ACTIVE
+
+        yield ended

@@ -1,0 +1,116 @@
+"""What routes make of rows: pages of lists, {items, next_cursor}; and requests that may be sent again, done once.
+
+A client names a request by the header `Idempotency-Key`. Key and digest of the request are columns of the row that it
+makes: they are as durable as what was done, and go with it when it is deleted.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from fastapi import Depends, Header, Query, Request
+from pydantic import BaseModel
+from sqlalchemy import ColumnElement, select
+from sqlalchemy.orm import Session
+
+from service.foundation.errors import ConflictError, invalid_request, problem
+from service.storage.database import AlarmRow, DatasetRow, EventRow, JobRow, ModelRow, RobotRow
+
+USUAL = 50
+Row = TypeVar("Row", AlarmRow, DatasetRow, EventRow, JobRow, ModelRow, RobotRow)
+
+
+class Page(BaseModel):
+    """Which part of a list: items after `after`, at most `limit`, newest first where `after` is None."""
+
+    after: int | None
+    limit: int
+
+
+def newest(
+    session: Session, table: type[Row], page: Page, *conditions: ColumnElement[bool]
+) -> tuple[list[Row], str | None]:
+    """Return the rows of a page that meet all conditions, newest first, and the cursor after it, None on the last."""
+    query = select(table).where(*conditions).order_by(table.seq.desc()).limit(page.limit + 1)
+    if page.after is not None:
+        query = query.where(table.seq < page.after)
+    rows = list(session.scalars(query))
+    following = str(rows[page.limit - 1].seq) if len(rows) > page.limit else None
+    return rows[: page.limit], following
+
+
+def _page(
+    request: Request,
+    limit: Annotated[int | None, Query(ge=1, description=f"Most items of this page; {USUAL} by default")] = None,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before")] = None,
+) -> Page:
+    most = request.app.state.storage.settings.max_page
+    if limit is None:
+        limit = min(USUAL, most)
+    if limit > most:
+        raise invalid_request("limit", limit, f"at most {most}")
+    if cursor is not None and not (cursor.isascii() and cursor.isdigit() and len(cursor) < 18):
+        raise invalid_request("cursor", cursor, "the next_cursor of a page")
+    return Page(after=None if cursor is None else int(cursor), limit=limit)
+
+
+PageQuery = Annotated[Page, Depends(_page)]
+
+
+HEADER = "Idempotency-Key"
+Made = TypeVar("Made", DatasetRow, JobRow)
+
+KeyHeader = Annotated[
+    str | None,
+    Header(
+        alias=HEADER,
+        max_length=100,
+        pattern=r"^[!-~]+$",
+        description="A name that the client gives to this request, of printable characters without spaces, so that it "
+        "can send it again when the answer is lost: it is done once, and what it made is answered each time. Another "
+        "request under the same key is a conflict",
+    ),
+]
+
+
+@dataclass(frozen=True)
+class Identity:
+    """A request as its client names it, and the digest of what it says."""
+
+    key: str
+    digest: str
+
+
+def identity(key: str | None, *content: Any, file: Path | None = None) -> Identity | None:
+    """The identity of a request; None where it has no key. content: JSON of what it asks; file: what it brings."""
+    if key is None:
+        return None
+    digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
+    if file is not None:
+        with file.open("rb") as opened:
+            digest.update(hashlib.file_digest(opened, "sha256").digest())
+    return Identity(key, digest.hexdigest())
+
+
+def done(session: Session, table: type[Made], named: Identity | None) -> Made | None:
+    """The row that a request has made before; None where it has not. Raise ConflictError where another request has the
+    key. Inside a transaction nobody else can make one meanwhile."""
+    if named is None:
+        return None
+    row = session.scalar(select(table).where(table.idempotency_key == named.key))
+    if row is not None and row.request_digest != named.digest:
+        raise ConflictError(
+            f"{HEADER} is {named.key}, the key of another request, which made {row.id}: give every request its own",
+            [problem(HEADER, named.key, "a key that no other request was sent with")],
+        )
+    return row
+
+
+def mark(row: DatasetRow | JobRow, named: Identity | None) -> None:
+    """Write the identity of the request into the row that it makes."""
+    if named is not None:
+        row.idempotency_key, row.request_digest = named.key, named.digest
