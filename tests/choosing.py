@@ -1,7 +1,5 @@
 """Which of many similar cases `make test` looks at; the others are slow. See also the marker `each_once`."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 from typing import Any

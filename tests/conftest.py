@@ -1,7 +1,5 @@
 """Settings of the whole suite, and which of its tests run in one process where several share the work."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """`python -m benchmarks latency`: its arithmetic on known numbers, and a tiny run from start to end."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

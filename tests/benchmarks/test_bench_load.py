@@ -1,7 +1,5 @@
 """`python -m benchmarks load`: what it counts, against services and writes that go wrong on purpose."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`python -m benchmarks online`: its parts against independent references, and a tiny run from start to end."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from itertools import chain

@@ -1,7 +1,5 @@
 """`python -m benchmarks scale`: what it makes and concludes. All that it starts takes minutes: a slow test."""
 
-from __future__ import annotations
-
 import pytest
 from rich.console import Console
 

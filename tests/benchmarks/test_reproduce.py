@@ -1,7 +1,5 @@
 """The paper's experiment in small: `python -m benchmarks.reproduce` from options to tables and figures."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil

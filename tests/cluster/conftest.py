@@ -1,7 +1,5 @@
 """Servers that the tests of several services share: starting both takes about two seconds."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The queues of several services, and what a test does with their jobs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any

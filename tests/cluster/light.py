@@ -4,8 +4,6 @@ What they do stands in the job's request, as {"do": …}: `finish` at once; `wai
 `deaf`, live and never look; `frozen`, as suspended by a debugger; `die`.
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import os

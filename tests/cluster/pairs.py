@@ -1,7 +1,5 @@
 """Services that share a model which learns, in this process or in processes of their own."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A real PostgreSQL server and a real S3 endpoint, started by whoever needs them, and what several services share."""
 
-from __future__ import annotations
-
 import os
 import warnings
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The database on a PostgreSQL server: its tables, its writers one after the other, what its failures are called."""
 
-from __future__ import annotations
-
 import sys
 
 import pytest

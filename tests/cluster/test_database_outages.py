@@ -1,7 +1,5 @@
 """The PostgreSQL server goes away and comes back: clients are told to come again, and everything goes on by itself."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Services that share their files in a bucket: what one stores the others read, and an outage loses nothing."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Jobs of several services, on a Dask cluster or each with its own processes: all come and go, each job ends once."""
 
-from __future__ import annotations
-
 import pytest
 
 from service.storage.database import ReplicaRow

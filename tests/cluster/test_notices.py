@@ -1,7 +1,5 @@
 """What a transaction tells other services: all that was committed, and nothing that was not."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing

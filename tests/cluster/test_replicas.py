@@ -1,7 +1,5 @@
 """Two services of one database: what one takes, moves or deletes, the other answers with; and one of them dies."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from functools import partial

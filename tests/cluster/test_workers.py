@@ -1,7 +1,5 @@
 """Shards and fits on processes of this host and on workers of a Dask cluster, which outlive the service that asked."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import pytest

@@ -1,7 +1,5 @@
 """A scheduler and workers of a Dask cluster, each a real process."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

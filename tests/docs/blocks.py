@@ -1,7 +1,5 @@
 """Fenced blocks of the documentation, and the marks before them that say why one is not run."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass

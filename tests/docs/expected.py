@@ -1,7 +1,5 @@
 """Is what was printed what the page shows?"""
 
-from __future__ import annotations
-
 import json
 from decimal import Decimal
 from typing import Any

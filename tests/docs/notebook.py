@@ -1,7 +1,5 @@
 """Runs Python blocks in one namespace: lines of JSON with code in, lines of JSON with what it printed out."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -1,7 +1,5 @@
 """A reader of the documentation: a service of their own, a folder, a shell, and a Python that keeps its variables."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """No block of the documentation is left out without one of the reasons that count."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.docs.blocks import REASONS, RUN, blocks, pages

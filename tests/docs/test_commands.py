@@ -1,7 +1,5 @@
 """Commands that the documentation only mentions are those that there are."""
 
-from __future__ import annotations
-
 import re
 import shlex
 

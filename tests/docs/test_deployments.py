@@ -1,7 +1,5 @@
 """compose.yaml and docs/examples/kubernetes.yaml: settings, commands, ports and names in them are those there are."""
 
-from __future__ import annotations
-
 import re
 import shlex
 

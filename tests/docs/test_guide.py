@@ -1,7 +1,5 @@
 """The guide shows every page of the documentation, its links lead on, and nothing else of the disk is served."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Links, pictures and generated pages of the documentation are there and up to date."""
 
-from __future__ import annotations
-
 import re
 import runpy
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Every block that a reader can type is typed. Quick ones share a service, all of a page have one of their own."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What an arm does, computed another way: by Pinocchio, and from its energies by automatic differentiation."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Arms made by hand, and what a manifest says of one."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Samples as rows that a model learns online, and whether two models answer alike."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lipcore.data.samples import Samples

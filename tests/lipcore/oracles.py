@@ -1,7 +1,5 @@
 """Slow, independent references: the definition, differentiated by machine; kernels to hold against them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Where joint axes lie, and the compiled dynamics: against Pinocchio and the derivatives of the arm's energies."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

@@ -1,7 +1,5 @@
 """A model that stands on an arm: stored, reported, taught further, and with arms to choose from."""
 
-from __future__ import annotations
-
 import copy
 import json
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The evidence of a geometry against dense Gaussian densities, its descent, and the scales that are fitted to it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """An arm found from nothing but its motion and torque, or a clear refusal where a recording tells too little."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a model says of what its recording leaves open, and how far an arm has moved from where its torque is linear."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

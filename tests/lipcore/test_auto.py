@@ -1,7 +1,5 @@
 """The estimator `auto`: what it holds out, what it chooses, and what it says of that."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The baselines: lse against automatic differentiation of its Lagrangian, se and gip against plain loops."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 

@@ -1,7 +1,5 @@
 """The calibration of a model: every standard deviation of the function times one factor, and nothing else."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

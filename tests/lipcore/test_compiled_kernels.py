@@ -1,7 +1,5 @@
 """Compiled Gram matrices, cross covariances and hand-written gradients against the PyTorch form and autograd."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

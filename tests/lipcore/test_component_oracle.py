@@ -3,8 +3,6 @@
 A compact posterior with every torque among its inducing outputs is the exact one, so both are held to the same.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import NamedTuple

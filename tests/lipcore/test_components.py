@@ -1,7 +1,5 @@
 """Components of the dynamics against Pinocchio at configurations never seen, and the laws that tie them together."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

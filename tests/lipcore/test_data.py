@@ -1,7 +1,5 @@
 """The table of samples, motion, and signals: filtered, differentiated, their noise."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The energy kernels against automatic differentiation of the energies they stand for, and what they know of arms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Every estimator that can be chosen: it fits and predicts, survives awkward data, and its gradient is right."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The compiled evaluator against the dense formulas in PyTorch."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Planned motions: limits that hold at every instant, variance against the posterior of a model that has seen them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

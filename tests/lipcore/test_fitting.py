@@ -1,7 +1,5 @@
 """Fitting: progress, cancellation, noise, options, devices, and the best of several starts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

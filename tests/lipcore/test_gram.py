@@ -1,7 +1,5 @@
 """From blocks to Gram matrices: order of rows, symmetry, chunks, sums; and the kernel of friction."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How much the rows of a fast stream count for, and those whose errors last."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

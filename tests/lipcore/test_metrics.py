@@ -1,7 +1,5 @@
 """Metrics against values worked out by hand, and paired differences with errors true for correlated samples."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The noise that all samples tell: draws of a prior whose noise is known, and a search by brute force."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

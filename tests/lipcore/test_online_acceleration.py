@@ -1,7 +1,5 @@
 """Accelerations derived from a live stream against true ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import example, given, settings

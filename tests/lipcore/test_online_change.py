@@ -1,7 +1,5 @@
 """Change detectors: quiet on what is no change, quick on what is, and evidence that tells why."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

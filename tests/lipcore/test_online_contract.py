@@ -1,7 +1,5 @@
 """What every model that learns online must keep to, whatever its estimator: in the spirit of river's `checks`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

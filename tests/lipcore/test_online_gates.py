@@ -1,7 +1,5 @@
 """Gates: each rejects what it names, costs no more rows than it must, and lets honest motion pass."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

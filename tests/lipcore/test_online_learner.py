@@ -1,7 +1,5 @@
 """A model that learns, against dense references: late rows, forgetting, changes, refusals, becoming a version."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Prequential records: figures of all rows however they were cut up, and the floor of uncertainty that they prove."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import fields
 from functools import reduce

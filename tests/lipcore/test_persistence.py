@@ -1,7 +1,5 @@
 """A model on disk: the same model back, anything else refused by name; JSON of one meaning only."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable

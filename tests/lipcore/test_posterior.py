@@ -1,7 +1,5 @@
 """Exact posterior and evidence against dense references, and the compact posterior against the exact one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """The causal form: row by row as in batches, late by what it says, all quantities of one moment."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

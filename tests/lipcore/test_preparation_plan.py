@@ -1,7 +1,5 @@
 """A plan of a recipe: the paper's choices by default, computed here anew; other choices; what is refused."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Robot profiles: limits against the URDFs they come from, joint names as drivers write them, and uploaded URDFs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

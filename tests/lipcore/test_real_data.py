@@ -1,7 +1,5 @@
 """Real recordings: a Franka Panda and a Schunk arm, from raw signals to predictions on what was held out."""
 
-from __future__ import annotations
-
 import sqlite3
 from pathlib import Path
 

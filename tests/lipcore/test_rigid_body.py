@@ -1,7 +1,5 @@
 """The rigid-body estimators: Pinocchio's dynamics as oracle, what they learn, and what they say of the bodies."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Simulated robots: joints, motion and torque against Pinocchio asked directly."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

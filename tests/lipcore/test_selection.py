@@ -1,7 +1,5 @@
 """Choosing samples that lie far from each other, pivoted Cholesky, and factors with jitter."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

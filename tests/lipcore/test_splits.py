@@ -1,7 +1,5 @@
 """Splits: the two sides never share an episode, a stretch or a moment, and are found again."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

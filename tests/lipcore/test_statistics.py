@@ -1,7 +1,5 @@
 """Sums over samples: their algebra, what is solved from them, and models that are given more samples than their fit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Friction that slow joints have besides: learnt where a recording shows it, and nowhere else."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

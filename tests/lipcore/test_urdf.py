@@ -1,7 +1,5 @@
 """Rigid bodies from a URDF, refused by name where they cannot be, and a learnt arm as one, read by Pinocchio."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from xml.etree import ElementTree
 

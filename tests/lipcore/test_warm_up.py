@@ -1,7 +1,5 @@
 """What is compiled ahead is all that a first training takes, also where the disk cannot be written."""
 
-from __future__ import annotations
-
 import gc
 import os
 import shutil

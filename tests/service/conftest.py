@@ -1,7 +1,5 @@
 """Services that tests share: starting one loads torch and a model, training in one starts a process."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass

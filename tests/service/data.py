@@ -1,7 +1,5 @@
 """Recordings to upload, and what tests do with them again and again."""
 
-from __future__ import annotations
-
 import io
 import time
 from collections.abc import Callable, Mapping

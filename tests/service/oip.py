@@ -1,7 +1,5 @@
 """Messages of the Open Inference Protocol, built and read by hand."""
 
-from __future__ import annotations
-
 import json
 import math
 import struct

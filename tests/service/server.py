@@ -1,7 +1,5 @@
 """A service in a process of its own, to be killed and started again."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

@@ -1,7 +1,5 @@
 """Frames of a torque stream, packed and read as the README documents them, without the service's own code."""
 
-from __future__ import annotations
-
 import json
 import socket
 import struct

@@ -1,7 +1,5 @@
 """Cancelling jobs: waiting ones at once, running ones soon, ended ones not at all."""
 
-from __future__ import annotations
-
 import pytest
 
 from service.training import worker

@@ -1,7 +1,5 @@
 """Components of a prediction over HTTP: what lipcore computes, shaped as the query, or a refusal that says why."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

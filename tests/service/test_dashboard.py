@@ -1,7 +1,5 @@
 """The dashboard's files as the service sends them; what they do is tested in a browser (tests/browser)."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

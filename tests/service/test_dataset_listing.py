@@ -1,7 +1,5 @@
 """Finding data sets again, page by page, and deleting them."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.service.data import QUICK, error, job, queue, service_of, stream, train, upload

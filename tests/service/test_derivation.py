@@ -1,7 +1,5 @@
 """What was not recorded is derived, close to the true, within episodes only, and said to be derived."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Evaluation: figures of lipcore's metrics on the samples of a data set."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`lipserve excite`: what it writes, prints and draws, and what it says where it cannot go on."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from typer.testing import CliRunner

@@ -1,7 +1,5 @@
 """Jobs that cannot be done say so and leave everything else as it was."""
 
-from __future__ import annotations
-
 from service.training import worker
 from tests.service.data import error, job, queue, service_of
 

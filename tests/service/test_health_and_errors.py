@@ -1,7 +1,5 @@
 """Health, and the one shape of every error, wherever it comes from."""
 
-from __future__ import annotations
-
 from fastapi.testclient import TestClient
 
 from service import __version__

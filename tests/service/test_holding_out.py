@@ -1,7 +1,5 @@
 """Holding data out of training: what is left out, how the version does on it, and that it stays left out."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from pydantic import ValidationError

@@ -1,7 +1,5 @@
 """What a service does with the home it finds: sweep what was interrupted, keep what was finished, lock it."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

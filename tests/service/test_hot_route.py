@@ -3,8 +3,6 @@
 The oracle is the endpoint that pydantic reads for: `application/x+json` is JSON which the hot route does not take up.
 """
 
-from __future__ import annotations
-
 import gc
 import json
 import os

@@ -1,7 +1,5 @@
 """Requests for training that cannot be granted: refused with the field that is wrong, and no job is made."""
 
-from __future__ import annotations
-
 import pytest
 
 from lipcore.vocabulary import CHOICES

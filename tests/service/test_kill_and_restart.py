@@ -1,7 +1,5 @@
 """A server process that is killed outright, while it trains: after a restart it is as if nothing had happened."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

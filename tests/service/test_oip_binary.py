@@ -1,7 +1,5 @@
 """The binary tensor data extension: byte by byte, and whatever is asked, answered with the numbers of JSON."""
 
-from __future__ import annotations
-
 import json
 import struct
 

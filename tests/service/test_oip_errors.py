@@ -1,7 +1,5 @@
 """The Open Inference Protocol: what is refused, in its own shape, naming field, value and what is expected."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Inference in JSON: the answers are lipcore's own, and only what is named is computed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

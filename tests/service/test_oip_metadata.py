@@ -1,7 +1,5 @@
 """The Open Inference Protocol: health, and metadata of server and models."""
 
-from __future__ import annotations
-
 import pytest
 
 import lipcore

@@ -1,7 +1,5 @@
 """The Open Inference Protocol over real sockets, as this test writes it and as NVIDIA's client does."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The OpenAPI document: complete, and true to what the service answers."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Torque queries: the service answers what lipcore's own model answers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Where training processes stand on the machine: few threads, all of them behind serving, on their own CPUs."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from pathlib import Path

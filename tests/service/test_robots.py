@@ -1,7 +1,5 @@
 """Robots: uploading URDFs, what is refused, and training with rigid bodies."""
 
-from __future__ import annotations
-
 import hashlib
 
 import numpy as np

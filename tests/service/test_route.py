@@ -1,7 +1,5 @@
 """What all routes refuse alike: that they are of the one class, and its reader of JSON."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

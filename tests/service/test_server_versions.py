@@ -1,7 +1,5 @@
 """What extends uvicorn holds for the versions that are installed and for all that may be: `HOLDS_FOR` names them."""
 
-from __future__ import annotations
-
 import tomllib
 from importlib.metadata import version
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Settings: environment variables, checked, with what is wrong named."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

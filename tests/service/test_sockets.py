@@ -1,7 +1,5 @@
 """The Unix-domain socket beside the port: who may ask, what is replaced, what is left alone."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

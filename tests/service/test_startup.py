@@ -1,7 +1,5 @@
 """What a start imports: a restart is quick, and nothing is loaded that serving does without."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Torque streams of a real server: the numbers, their order, the address, the floor, and a version that is new."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frames that cannot be answered: what is said, and that the stream goes on."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosedError

@@ -1,7 +1,5 @@
 """The controllers' client: of a real service, and of one on a Unix-domain socket that says what a test tells it to."""
 
-from __future__ import annotations
-
 import json
 import socket
 import struct

@@ -1,7 +1,5 @@
 """Frames with torque, without a server: what is gathered, when and how it is logged, and what is said of it."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import threading

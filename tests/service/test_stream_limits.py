@@ -1,7 +1,5 @@
 """Bounds of torque streams: connections, memory, idle and unread streams, and a server that stops."""
 
-from __future__ import annotations
-
 import json
 import socket
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """A stream without a server: what depends on time, on what is in memory, and on who else waits."""
 
-from __future__ import annotations
-
 import asyncio
 from time import perf_counter
 from types import SimpleNamespace

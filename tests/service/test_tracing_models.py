@@ -1,7 +1,5 @@
 """Traces: a model's torques along a data set, row by row, and what is said where not every row is shown."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A training job from the request to the version it makes."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.service.data import ENDLESS, QUICK, eventually, job, queue, running, stream, train, upload

@@ -1,7 +1,5 @@
 """Recordings in every accepted form become the same data set; what cannot be used is refused and leaves nothing."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

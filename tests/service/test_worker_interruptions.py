@@ -1,7 +1,5 @@
 """Training processes that are killed or interrupted: the service goes on and so do the jobs."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal

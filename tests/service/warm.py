@@ -3,8 +3,6 @@
 A service that tests share, and training and learning of all services in this process, start so; others as always.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """A service that asks for keys, in this process."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

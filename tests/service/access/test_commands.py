@@ -1,7 +1,5 @@
 """`lipserve keys`: on the home, whether a service runs on it or not; and the key that clients send."""
 
-from __future__ import annotations
-
 import json
 from datetime import UTC, datetime, timedelta
 

@@ -1,7 +1,5 @@
 """Keys: how they are stored, found and ended."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from datetime import UTC, datetime, timedelta

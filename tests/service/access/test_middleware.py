@@ -1,7 +1,5 @@
 """The middleware by itself and before a service: who may ask without keys, and events that last with one."""
 
-from __future__ import annotations
-
 import asyncio
 from unittest.mock import AsyncMock
 

@@ -1,7 +1,5 @@
 """Which key may do what: the table is complete, and it is what the service goes by."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

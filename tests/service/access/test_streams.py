@@ -1,7 +1,5 @@
 """Keys of streams: a real server, and clients that a controller, a browser and an intruder would be."""
 
-from __future__ import annotations
-
 import json
 import re
 

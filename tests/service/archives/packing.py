@@ -1,7 +1,5 @@
 """Archives taken apart, changed and put together again, rightly or with malice."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -1,7 +1,5 @@
 """Archives that no export has made: each is refused for what is wrong with it, and nothing of it is kept."""
 
-from __future__ import annotations
-
 import gzip
 import math
 import struct

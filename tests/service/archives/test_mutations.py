@@ -1,7 +1,5 @@
 """Archives changed at random: each is taken as it is or refused, and nothing else ever happens."""
 
-from __future__ import annotations
-
 import json
 import random
 

@@ -1,7 +1,5 @@
 """Archives of models with rigid bodies, whose URDF may come from a stranger too."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 

@@ -1,7 +1,5 @@
 """A version taken out and in again: the same answers, and it says where it comes from."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

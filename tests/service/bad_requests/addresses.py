@@ -1,7 +1,5 @@
 """Wrong paths, methods, query parameters and headers."""
 
-from __future__ import annotations
-
 from tests.service.bad_requests.bad import (
     ALIASES,
     DATASETS,

@@ -1,7 +1,5 @@
 """One wrong request and what it has to be answered with."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field
 from typing import Any

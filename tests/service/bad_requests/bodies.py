@@ -1,7 +1,5 @@
 """Bodies that are no JSON object, and JSON with one value that is of the wrong type, out of range, or no name."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from tests.service.bad_requests.bad import (

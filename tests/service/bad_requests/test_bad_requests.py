@@ -1,7 +1,5 @@
 """Wrong requests of every kind: each is refused as it should be, and leaves nothing behind."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,5 @@
 """Uploads that are refused before, or because of, what is in them."""
 
-from __future__ import annotations
-
 from tests.service.bad_requests.bad import DATASETS, ROBOTS, Bad
 
 CSV, NPZ, XML, FORM = "text/csv", "application/x-npz", "application/xml", "multipart/form-data; boundary=x"

@@ -1,7 +1,5 @@
 """`lipserve data` and `simulate`: recordings made, brought in, reported on, and deleted."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """`lipserve models`: versions, aliases, archives."""
 
-from __future__ import annotations
-
 import pytest
 
 from lipcore.robots.urdf import describe

@@ -1,7 +1,5 @@
 """`lipserve stream` and `bench`: a motion in real time, and what the model makes of it."""
 
-from __future__ import annotations
-
 import json
 import signal
 

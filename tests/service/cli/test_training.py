@@ -1,7 +1,5 @@
 """From a recording to a torque: `lipserve train`, `jobs`, `evaluate` and `predict`."""
 
-from __future__ import annotations
-
 import json
 from contextlib import contextmanager
 

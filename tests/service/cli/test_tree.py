@@ -1,7 +1,5 @@
 """The tree of commands: its reference, its lists, completion, exit codes, and what it says of mistakes."""
 
-from __future__ import annotations
-
 import runpy
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Clients that talk to a service in the same process, over connections that can be lost."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import httpx

@@ -1,7 +1,5 @@
 """Calls of the client: every route has one, in both clients; when one is made again, and when not."""
 
-from __future__ import annotations
-
 import inspect
 
 import httpx

@@ -1,7 +1,5 @@
 """Both Python clients against a real server: the synchronous one, then the asynchronous one and its streams."""
 
-from __future__ import annotations
-
 import asyncio
 
 import httpx

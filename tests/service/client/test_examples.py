@@ -1,7 +1,5 @@
 """The examples of the documentation run."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 from collections import Counter

@@ -1,7 +1,5 @@
 """Requests under a key of their client's: sent again, they are done once."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest

@@ -1,7 +1,5 @@
 """Progress of uploads and jobs in a terminal."""
 
-from __future__ import annotations
-
 import io
 
 import pytest

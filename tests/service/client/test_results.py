@@ -1,7 +1,5 @@
 """Results of the client: arrays, intervals of measurements, tables, and the arm that was learnt."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

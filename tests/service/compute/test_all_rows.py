@@ -1,7 +1,5 @@
 """A job's pass over all rows of its data sets: what is read, and what it comes to, whoever does it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

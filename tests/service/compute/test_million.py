@@ -1,7 +1,5 @@
 """A million samples of seven joints, in several data sets: trained in a process of bounded memory."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sums over shards: the same bits whoever computes what when, and nothing is lost with a worker."""
 
-from __future__ import annotations
-
 import random
 import threading
 from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """What the shards of tests are worked on by; nothing here takes long to import in a process of its own."""
 
-from __future__ import annotations
-
 import os
 import signal
 

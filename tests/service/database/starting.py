@@ -1,7 +1,5 @@
 """Several that start on one database at once."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 

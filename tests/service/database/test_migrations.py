@@ -1,7 +1,5 @@
 """Databases of earlier releases: brought up to date with all that is in them, whoever comes first."""
 
-from __future__ import annotations
-
 import sqlite3
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What is asked of a service while a fault strikes, and whether it has taken effect: both enter it in the ledger."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Ways in which a file comes to harm."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

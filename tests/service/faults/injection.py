@@ -1,7 +1,5 @@
 """Faults at named points of the service's code, without a line for them in it: see `injected/sitecustomize.py`."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Collection

@@ -1,7 +1,5 @@
 """What a service has acknowledged, and whether a service knows all of it: no less, nothing half, and nothing twice."""
 
-from __future__ import annotations
-
 import hashlib
 import sqlite3
 from contextlib import closing

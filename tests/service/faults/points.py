@@ -1,7 +1,5 @@
 """The points at which processes of the service are killed, and what has to be left of what was asked for."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal

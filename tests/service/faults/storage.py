@@ -1,7 +1,5 @@
 """Storage that fails for a while: full disks, locks of other processes. All of it undone at the end."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

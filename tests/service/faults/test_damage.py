@@ -1,7 +1,5 @@
 """Damaged files of every kind: who needs one is told, and everything else goes on."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 from contextlib import closing, contextmanager

@@ -1,7 +1,5 @@
 """Processes of the service killed at named points: what was acknowledged is there, nothing is half or twice."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from operator import attrgetter

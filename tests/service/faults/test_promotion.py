@@ -1,7 +1,5 @@
 """A process killed while a refreshed version takes over: it has done so as a whole, or not at all."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

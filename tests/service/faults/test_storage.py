@@ -1,7 +1,5 @@
 """Disks that are full, a database that another process writes to: nothing breaks for good."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 

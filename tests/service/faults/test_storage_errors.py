@@ -1,7 +1,5 @@
 """What failing storage is called: errors that databases and operating systems really make, and what a client hears."""
 
-from __future__ import annotations
-
 import errno
 import os
 import sqlite3

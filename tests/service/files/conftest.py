@@ -1,7 +1,5 @@
 """Shared stores: a folder, and a bucket of a real S3 endpoint."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator
 from itertools import count

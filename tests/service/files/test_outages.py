@@ -1,7 +1,5 @@
 """A shared store that is not there: who needs it is told so, in time, and what has a copy here goes on."""
 
-from __future__ import annotations
-
 import errno
 import os
 import pickle

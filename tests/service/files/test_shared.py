@@ -1,7 +1,5 @@
 """What one service stores, the others read; each from a copy of its own, which is never taken for the thing itself."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

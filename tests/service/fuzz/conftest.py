@@ -1,7 +1,5 @@
 """A service to send generated requests to, and what has come of them."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The OpenAPI document narrowed to what is there, so that generated requests get beyond "not found"."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from typing import Any
 

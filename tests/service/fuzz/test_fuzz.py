@@ -1,7 +1,5 @@
 """Generated requests to every operation of the OpenAPI document: answers are as documented, and never a failure."""
 
-from __future__ import annotations
-
 import pytest
 import requests
 from hypothesis import HealthCheck, Phase, given, settings

@@ -1,7 +1,5 @@
 """Files that have changed behind the service's back are found when they are read, and only what they hold is lost."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from functools import partial

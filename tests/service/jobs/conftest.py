@@ -1,7 +1,5 @@
 """A queue of jobs on its own, whose training processes do what a test wants."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """A job with the estimator `auto`: what it shows while it runs, and what its version keeps."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.service.data import QUICK, ended, stream, train, upload

@@ -1,7 +1,5 @@
 """A job's changes as server-sent events: from its present state to its end, for any number of readers."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """When a training process is ended, and what becomes of its job: judged from rows and a clock, without any process."""
 
-from __future__ import annotations
-
 import pytest
 from sqlalchemy import select
 

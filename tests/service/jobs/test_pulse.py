@@ -1,7 +1,5 @@
 """A training process's talk with the database, which goes on whatever the fit does; the remaining time of a fit."""
 
-from __future__ import annotations
-
 from contextlib import contextmanager
 
 import pytest

@@ -1,7 +1,5 @@
 """The queue of jobs, with processes that hang, die and do not listen: every job ends or goes on."""
 
-from __future__ import annotations
-
 from service.training import queue
 from tests.service.data import eventually
 from tests.service.jobs import workers

@@ -1,7 +1,5 @@
 """Repeating jobs, and what jobs tell of themselves."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.service.data import error, job, queue, stream, upload

@@ -3,8 +3,6 @@
 They speak to the database without SQLAlchemy, whose import would take longer than all that they do.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import sqlite3

@@ -1,7 +1,5 @@
 """A home with a model whose log tests write, and batches to write into it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

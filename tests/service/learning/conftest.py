@@ -1,7 +1,5 @@
 """A service that models learn in, shared by the tests: starting one starts a process."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path

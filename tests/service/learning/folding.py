@@ -1,7 +1,5 @@
 """What a log says, by the definition: one event after the other, from the beginning, on lists in memory."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A reader of server-sent events, inside the process of the service."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 from collections.abc import Iterator

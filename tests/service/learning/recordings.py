@@ -1,7 +1,5 @@
 """Recordings of a double pendulum as a robot would stream them, and what a model ought to learn from them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

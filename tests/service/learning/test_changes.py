@@ -1,7 +1,5 @@
 """A robot that changes: told from a collision, told to its owner, and followed as the owner has chosen."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from typing import Any

@@ -1,7 +1,5 @@
 """The contest between two versions: what it compares, what it concludes, and how often chance deceives it."""
 
-from __future__ import annotations
-
 import json
 import time
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The client's methods say what their routes say, and what a model has learnt goes with it to another service."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

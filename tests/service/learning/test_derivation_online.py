@@ -1,7 +1,5 @@
 """Accelerations that are derived within a stream: as if it had come in one piece, however it is cut and ordered."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

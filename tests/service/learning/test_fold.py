@@ -1,7 +1,5 @@
 """The state after an event is a function of the log up to it, to the last bit: whoever makes it, when and how."""
 
-from __future__ import annotations
-
 import hashlib
 import multiprocessing
 import tempfile

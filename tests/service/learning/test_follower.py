@@ -1,7 +1,5 @@
 """A version that follows its log: what it learns, publishes and stores, and how several take turns."""
 
-from __future__ import annotations
-
 from math import inf
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frames of a stream as the log takes them: in order, each once, with the answers that were given."""
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Batches that are refused with the place of what is wrong, and rows that are kept out as if they had not come."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The log as its owner sees it: lists, single batches, rows with their codes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

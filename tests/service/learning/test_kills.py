@@ -1,7 +1,5 @@
 """Kills while batches come: what was acknowledged is there, and nothing is there, or learnt, twice."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal

@@ -1,7 +1,5 @@
 """The learner as a process of its own: woken, heard, killed, started again, and out of serving's way."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

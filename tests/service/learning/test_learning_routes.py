@@ -1,7 +1,5 @@
 """How a model learns is set and seen, a hold ends by a decision, and its owner is told."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

@@ -1,7 +1,5 @@
 """A model that is followed live: its events over HTTP, and what is picked of many rows for slow readers."""
 
-from __future__ import annotations
-
 import asyncio
 from types import SimpleNamespace
 

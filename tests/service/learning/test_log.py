@@ -1,7 +1,5 @@
 """The event log: its numbers, its rows, how batches are found and taken back, and which of a stream have not come."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import threading

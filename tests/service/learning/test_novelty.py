@@ -1,7 +1,5 @@
 """Motion beyond what a version can learn: it is told, a better version is trained, and it takes over unnoticed."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Batches that are learnt: once each, in any order, whatever form they come in; and how they are acknowledged."""
 
-from __future__ import annotations
-
 import json
 import time
 

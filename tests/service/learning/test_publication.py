@@ -1,7 +1,5 @@
 """What has been learnt reaches answers: through files, by one assignment, whole, never backwards; and is waited for."""
 
-from __future__ import annotations
-
 import asyncio
 import gc
 import threading

@@ -1,7 +1,5 @@
 """Prequential quality: what was predicted of rows before they were learnt, as a route and for Prometheus."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

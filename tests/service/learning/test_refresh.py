@@ -1,7 +1,5 @@
 """Refreshing a version: when it is, what it learns from, what it becomes, and when its owner is told instead."""
 
-from __future__ import annotations
-
 import time
 from datetime import UTC, datetime
 

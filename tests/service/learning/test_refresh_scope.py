@@ -1,7 +1,5 @@
 """What of a model's log, and of its data sets, a refresh learns from."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime
 
 import numpy as np

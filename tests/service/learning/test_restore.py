@@ -1,7 +1,5 @@
 """What is learnt is a function of the log: from a snapshot or not, in pages or at once, whatever was taken back."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The log stays within its size and age, and nothing goes that a version has still to learn."""
 
-from __future__ import annotations
-
 from service.foundation.settings import Settings
 from service.journal import log, snapshots
 from service.journal.log import encode

@@ -1,7 +1,5 @@
 """Which version answers where none is named: the newest, a promoted one, an older one; and what a verdict leads to."""
 
-from __future__ import annotations
-
 import pytest
 from sqlalchemy import delete, select
 

@@ -1,7 +1,5 @@
 """Snapshots: stored durably, thinned evenly, refused where the log has gone another way since."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import pytest

@@ -1,7 +1,5 @@
 """Torque over WebSockets into the log of a real server: acknowledged when it is durable, learnt once, whatever dies."""
 
-from __future__ import annotations
-
 import json
 from contextlib import suppress
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """One call goes back to an earlier revision or version, takes a batch back, or learns what was kept out after all."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A small application behind the real server, in a thread: connections and signals without a service."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import socket

@@ -1,7 +1,5 @@
 """Bodies: too large or too slow, whatever they announce."""
 
-from __future__ import annotations
-
 import asyncio
 from unittest.mock import AsyncMock
 

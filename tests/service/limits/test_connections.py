@@ -1,7 +1,5 @@
 """Connections: too many, silent, slow, unread, endless."""
 
-from __future__ import annotations
-
 import time
 from contextlib import suppress
 

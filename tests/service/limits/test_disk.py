@@ -1,7 +1,5 @@
 """The quota of the home and the space that stays free on its disk."""
 
-from __future__ import annotations
-
 import os
 import time
 from contextlib import contextmanager

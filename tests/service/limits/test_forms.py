@@ -1,7 +1,5 @@
 """The file of a form: taken out in any pieces, and what is refused."""
 
-from __future__ import annotations
-
 import random
 
 import httpx

@@ -1,7 +1,5 @@
 """How many requests are answered at a time, and how often a client may ask."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 

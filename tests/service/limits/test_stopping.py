@@ -1,7 +1,5 @@
 """A service that is told to stop: it says so, finishes what it has begun, and keeps what it has learnt."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

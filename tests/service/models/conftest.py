@@ -1,7 +1,5 @@
 """A model to point to and to delete."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """Wherever a version can be named, an alias can: answers follow it in one step and always name the version."""
 
-from __future__ import annotations
-
 import threading
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Streams that follow an alias, and what they say once it is gone."""
 
-from __future__ import annotations
-
 import pytest
 from websockets.exceptions import InvalidStatus
 

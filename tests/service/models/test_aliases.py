@@ -1,7 +1,5 @@
 """Aliases: made, moved, taken back and removed, and what the service says of them."""
 
-from __future__ import annotations
-
 import pytest
 
 from service.foundation.errors import NotFoundError

@@ -1,7 +1,5 @@
 """Comparing two versions on a data set: figures, paired errors, and a verdict that does not go beyond them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

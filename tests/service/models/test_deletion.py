@@ -1,7 +1,5 @@
 """Deleting versions and models: what is needed stays, the rest goes whole, and no number comes back."""
 
-from __future__ import annotations
-
 import threading
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """The arm that a version has learnt, asked for as a URDF."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Versions put into a service without training them: pendulums, and the shipped arm."""
 
-from __future__ import annotations
-
 import json
 from functools import cache
 from typing import Any

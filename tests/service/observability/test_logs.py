@@ -1,7 +1,5 @@
 """The form of log lines: for people and as JSON, with ids, without what could forge a line or tell a key."""
 
-from __future__ import annotations
-
 import json
 import logging
 import multiprocessing

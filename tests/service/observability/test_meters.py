@@ -1,7 +1,5 @@
 """What is counted: in the right bucket, without labels that clients could make up, for the model that a stream asks."""
 
-from __future__ import annotations
-
 from time import perf_counter
 
 import pytest

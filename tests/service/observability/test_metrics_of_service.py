@@ -1,7 +1,5 @@
 """/metrics beyond learning: it says what was asked, and what is documented is what is there."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Readiness: each part that does not work is named, looked at anew, and no more often than need be."""
 
-from __future__ import annotations
-
 import sqlite3
 from contextlib import closing
 

@@ -1,7 +1,5 @@
 """Every request has an id, a line in the log where it needs one, and a span where traces are asked for."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import re

@@ -1,7 +1,5 @@
 """Bags written by others' programs: the `rosbags` package, and the `mcap` packages of Foxglove."""
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 import zipfile

@@ -1,7 +1,5 @@
 """Recordings in memory as tables, as every format yields them, and a robot that knows its joints by name."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Opening uploads in tests."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 

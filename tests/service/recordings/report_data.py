@@ -1,7 +1,5 @@
 """Recordings with known properties, staged as uploads are, and a robot to compare them with."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache

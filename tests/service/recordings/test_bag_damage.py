@@ -1,7 +1,5 @@
 """Damaged and hostile bags: read as far as they go, or refused in words; never an unexpected error, never unbounded."""
 
-from __future__ import annotations
-
 import bz2
 import sqlite3
 import struct

@@ -1,7 +1,5 @@
 """Joints are matched by name in every message, whatever order and company they come in."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Bags of every kind, written by two independent programs, come back number by number."""
 
-from __future__ import annotations
-
 import tracemalloc
 
 import numpy as np

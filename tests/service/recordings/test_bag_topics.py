@@ -1,7 +1,5 @@
 """Which topic is read, and the types that are: joint states, Franka's states, controllers' states."""
 
-from __future__ import annotations
-
 import sqlite3
 from typing import Any
 

@@ -1,7 +1,5 @@
 """CSV as programs and people write it: separators, headers, missing values, text, dates; and what is wrong in it."""
 
-from __future__ import annotations
-
 import csv as writer
 import io
 

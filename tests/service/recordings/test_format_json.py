@@ -1,7 +1,5 @@
 """JSON, one object a line or in one document, as Python, pandas and robots' loggers write it."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

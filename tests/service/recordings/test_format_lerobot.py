@@ -1,7 +1,5 @@
 """LeRobot data sets of versions 2 and 3, sent as zip."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile

@@ -1,7 +1,5 @@
 """NPZ archives: what becomes of their arrays, block after block, and archives that lie."""
 
-from __future__ import annotations
-
 import io
 import os
 import pickle

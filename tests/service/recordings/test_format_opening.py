@@ -1,7 +1,5 @@
 """A file is read as what it is, whatever it is called; damaged ones are read or refused, never an unexpected error."""
 
-from __future__ import annotations
-
 import io
 import pickle
 import tarfile

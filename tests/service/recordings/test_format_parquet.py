@@ -1,7 +1,5 @@
 """Parquet as pandas and pyarrow write it, flat and nested; damaged, and made to unpack to far more than it should."""
 
-from __future__ import annotations
-
 import io
 import struct
 from decimal import Decimal

@@ -1,7 +1,5 @@
 """Columns are recognised by the names that robots, drivers and other programs give them."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

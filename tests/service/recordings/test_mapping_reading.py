@@ -1,7 +1,5 @@
 """Tables become columns on disk in SI units; what is wrong is refused with its row, what is missing is counted."""
 
-from __future__ import annotations
-
 import tracemalloc
 
 import numpy as np

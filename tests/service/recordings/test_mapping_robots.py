@@ -1,7 +1,5 @@
 """Robots as they name their joints, and the two real recordings, from the file to columns in SI units."""
 
-from __future__ import annotations
-
 import sqlite3
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What of an upload is stored and shown: its samples, prepared step by step, its report, its preview."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -4,8 +4,6 @@ LIPSERVE_FAULT_TARGETS: functions to watch, `module:Class.function`, separated b
 which of them to strike; without that file nothing happens. Spawned processes inherit both.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib.abc
 import importlib.machinery
