@@ -21,10 +21,9 @@ from lipcore.kernels.arm_prior import Arm
 from lipcore.kernels.base import SumKernel, TorqueKernel
 from lipcore.kernels.chain import ChainKernel
 from lipcore.kernels.friction import FrictionKernel
-from lipcore.kernels.gip import GeometricallyInspiredKernel
+from lipcore.kernels.independent import GeometricallyInspiredKernel, SquaredExponentialKernel
 from lipcore.kernels.lip import LipKernel
 from lipcore.kernels.lse import LagrangianSEKernel
-from lipcore.kernels.se import SquaredExponentialKernel
 from lipcore.robots.urdf import JointMismatchError, RigidBody
 from lipcore.vocabulary import AUTO, CHOICES, ROBOT_ESTIMATORS, JointType
 

@@ -22,10 +22,9 @@ from lipcore.data.motion import Motion, check_joint_types
 from lipcore.kernels.base import Params, State
 from lipcore.kernels.compiled.chain import chain_cross, chain_gradient, chain_gram, chain_size
 from lipcore.kernels.compiled.kernel import CompiledKernel, Driver
-from lipcore.kernels.energy import potential_blocks, potential_energy_torque
+from lipcore.kernels.energy import PRIOR_STD as WEIGHTS_PRIOR_STD
+from lipcore.kernels.energy import initial_weights, potential_blocks, potential_energy_torque, velocity_weights
 from lipcore.kernels.polynomial import BaseKernels, Derivatives, base_kernels, chain_sum
-from lipcore.kernels.weights import PRIOR_STD as WEIGHTS_PRIOR_STD
-from lipcore.kernels.weights import initial_weights, velocity_weights
 from lipcore.vocabulary import JointType
 
 SHARE = 2 / 3
@@ -40,7 +39,7 @@ class ChainKernel(CompiledKernel):
     share the p_b; the first joint turns gravity alone.
 
     Hyperparameters: `chain.logits` (n,), logits of each joint's share α, with σ = 1 − α; `potential.log_scales` (n,),
-    log s_l; and those of `weights.velocity_weights`.
+    log s_l; and those of `energy.velocity_weights`.
     """
 
     driver = Driver(chain_size, chain_gram, chain_gradient, chain_cross)

@@ -12,13 +12,15 @@ from lipcore.kernels.base import Params, State
 from lipcore.kernels.compiled.kernel import CompiledKernel, Driver
 from lipcore.kernels.compiled.lip import lip_cross, lip_gradient, lip_gram, lip_size
 from lipcore.kernels.energy import (
+    PRIOR_STD,
+    initial_weights,
     kinetic_blocks,
     kinetic_energy_torque,
     potential_blocks,
     potential_energy_torque,
+    velocity_weights,
 )
 from lipcore.kernels.polynomial import Derivatives, base_kernels, product
-from lipcore.kernels.weights import PRIOR_STD, initial_weights, velocity_weights
 from lipcore.vocabulary import JointType
 
 
@@ -26,7 +28,7 @@ class LipKernel(CompiledKernel):
     """Potential energy over all joints plus one kinetic energy a link, each over the joints that move it.
 
     Hyperparameters: `potential.log_scale` (); `potential.logits` (n, 2); `kinetic.<i>.logits` (i, 2) of link i in 1..n;
-    and those of `weights.velocity_weights`. Logits give each joint's shares (σ, α, β), which sum to one: the energies'
+    and those of `energy.velocity_weights`. Logits give each joint's shares (σ, α, β), which sum to one: the energies'
     scale lives in the scale and the weights alone. With `tied` all links share one `kinetic.logits` (n, 2): fewer
     parameters to overfit with; without, every link has its own as in the paper.
     """

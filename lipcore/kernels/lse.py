@@ -25,7 +25,7 @@ from torch import Tensor
 
 from lipcore.data.motion import Motion, check_joint_types
 from lipcore.kernels.base import PairKernel, Params, State
-from lipcore.kernels.se import independent_blocks, per_joint, power, spread
+from lipcore.kernels.independent import independent_blocks, per_joint, power, spread
 from lipcore.vocabulary import JointType
 
 

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from lipcore.data.motion import Motion
 from lipcore.kernels.base import LinearKernel, PairKernel, Params
-from lipcore.kernels.compiled.answer import COVARIANCE, MEAN, STD, answer
-from lipcore.kernels.compiled.panels import ROWS, WIDTH, pack
+from lipcore.kernels.compiled.answer import COVARIANCE, MEAN, ROWS, STD, WIDTH, answer, pack
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

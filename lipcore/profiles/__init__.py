@@ -1,8 +1,7 @@
 """Robot profiles: joints, limits, torque limits, and what the effort field of a recording means."""
 
 from lipcore.profiles.catalogue import names, profile, profiles, recognise
-from lipcore.profiles.profile import Profile
-from lipcore.profiles.reading import from_urdf
+from lipcore.profiles.profile import Profile, from_urdf
 from lipcore.vocabulary import EffortMeaning
 
 __all__ = ["EffortMeaning", "Profile", "from_urdf", "names", "profile", "profiles", "recognise"]

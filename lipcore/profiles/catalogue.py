@@ -10,8 +10,7 @@ import numpy as np
 
 from lipcore.profiles.arms import ARMS
 from lipcore.profiles.names import is_number, makes
-from lipcore.profiles.profile import Profile, Sheet, array
-from lipcore.profiles.reading import Limits, read_limits
+from lipcore.profiles.profile import Limits, Profile, Sheet, array, read_limits
 from lipcore.robots.library import ROBOTS, UnknownRobotError, installed_profiles, profile_urdf
 from lipcore.vocabulary import JointType
 

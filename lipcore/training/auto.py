@@ -14,9 +14,8 @@ import numpy as np
 
 from lipcore.arm.learning import Learnt, learn
 from lipcore.arm.posing import mode_of
-from lipcore.arm.starts import known_geometries
-from lipcore.data.metrics import evaluate
-from lipcore.data.paired import Answer, compare
+from lipcore.arm.search import known_geometries
+from lipcore.data.metrics import Answer, compare, evaluate
 from lipcore.data.samples import Samples
 from lipcore.data.splits import SplitError, taken
 from lipcore.fitting.hyperparameters import FitCancelledError, FitProgress, Progress

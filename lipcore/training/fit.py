@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 import torch
 
 from lipcore.arm.learning import Learnt, learn
-from lipcore.arm.starts import known_geometries
+from lipcore.arm.search import known_geometries
 from lipcore.data.independence import motion_dimensions
 from lipcore.fitting.estimators import calibrate, check_estimator, make_estimator
 from lipcore.fitting.hyperparameters import fit

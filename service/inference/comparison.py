@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection
 from math import isfinite
 
-from lipcore.data import paired
-from lipcore.data.metrics import evaluate
-from lipcore.data.paired import Answer, Comparison, Difference
+from lipcore.data import metrics
+from lipcore.data.metrics import Answer, Comparison, Difference, evaluate
 from lipcore.data.samples import Samples
 from service.foundation.errors import invalid_request
 from service.foundation.fields import finite
@@ -22,7 +21,7 @@ def compare(loaded: LoadedModels, model: str, request: schema.CompareRequest) ->
     first, second = versions = _versions(loaded, model, request)
     recorded = measured(loaded, request.dataset, *versions)
     answers = [_answer(each, recorded.used) for each in versions]
-    compared = paired.compare(recorded.used, *answers)
+    compared = metrics.compare(recorded.used, *answers)
     outcome, verdict = _verdict(first.version, second.version, compared)
     in_training = [each.has_learnt_from(recorded.id, recorded.sha256) for each in versions]
     return schema.CompareResponse(
@@ -73,10 +72,10 @@ def _answer(served: Served, samples: Samples) -> Answer:
 
 def _verdict(first: int, second: int, compared: Comparison) -> tuple[schema.Outcome, str]:
     """What the difference says, for programs and in words."""
-    if compared.blocks < paired.MIN_BLOCKS:
+    if compared.blocks < metrics.MIN_BLOCKS:
         return "cannot_tell", (
-            f"These data cannot tell: they make {compared.blocks} stretches of {paired.BLOCK_S:g} s, or episodes, and "
-            f"a verdict needs {paired.MIN_BLOCKS}. Record longer, or more episodes."
+            f"These data cannot tell: they make {compared.blocks} stretches of {metrics.BLOCK_S:g} s, or episodes, and "
+            f"a verdict needs {metrics.MIN_BLOCKS}. Record longer, or more episodes."
         )
     total = compared.total
     (density, nmse), (clear, larger_or_smaller) = total.mean.tolist(), total.significant.tolist()

@@ -14,7 +14,7 @@ from lipcore import profiles
 from lipcore.data.motion import Array
 from lipcore.profiles import Profile
 from lipcore.profiles.names import is_number
-from lipcore.profiles.reading import read_limits
+from lipcore.profiles.profile import read_limits
 from lipcore.robots.library import ROBOTS, UnknownRobotError, profile_urdf
 from lipcore.robots.urdf import MOVABLE, RigidBody, UrdfError, describe
 from service.foundation.errors import (

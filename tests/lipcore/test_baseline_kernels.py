@@ -10,9 +10,8 @@ from torch import Tensor
 
 from lipcore.data.motion import Motion
 from lipcore.kernels.base import PairKernel, State
-from lipcore.kernels.gip import GeometricallyInspiredKernel
+from lipcore.kernels.independent import GeometricallyInspiredKernel, SquaredExponentialKernel
 from lipcore.kernels.lse import LagrangianSEKernel
-from lipcore.kernels.se import SquaredExponentialKernel
 from lipcore.posterior.exact import negative_log_evidence
 from tests.lipcore.oracles import Energy, instant, scale_of, torque_terms
 

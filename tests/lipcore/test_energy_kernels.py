@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from lipcore import FitOptions, train
 from lipcore.data.metrics import evaluate
 from lipcore.data.motion import Motion
-from lipcore.kernels import weights
+from lipcore.kernels import energy
+from lipcore.kernels.energy import initial_weights, velocity_weights
 from lipcore.kernels.lip import shares
-from lipcore.kernels.weights import initial_weights, velocity_weights
 from lipcore.robots.simulation import Stream, simulate
 from tests.choosing import slow
 from tests.lipcore.arm_oracles import arm
@@ -157,7 +157,7 @@ def test_every_energy_kernel_uses_them(kernel: str) -> None:
     problem = random_problem(MIXED, 1, seed=1, kernel=kernel)
     assert torch.equal(problem.kernel.weights(problem.params), velocity_weights(problem.params, 3))
     for name in weight_shapes(3):
-        assert problem.kernel.prior_std()[name] == weights.PRIOR_STD[name]
+        assert problem.kernel.prior_std()[name] == energy.PRIOR_STD[name]
 
 
 @pytest.mark.parametrize("n", [1, 3, 7])

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from lipcore.data.metrics import LEVELS, RELIABILITY_LEVELS, evaluate
-from lipcore.data.paired import MIN_BLOCKS, Answer, blocks, compare, difference
+from lipcore.data.metrics import LEVELS, MIN_BLOCKS, RELIABILITY_LEVELS, Answer, blocks, compare, difference, evaluate
 from lipcore.data.samples import Samples
 
 Z95 = 1.959963984540054

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lipcore.data.motion import Motion
-from lipcore.kernels.se import SquaredExponentialKernel
+from lipcore.kernels.independent import SquaredExponentialKernel
 from lipcore.model import dynamics
 from service.foundation.settings import Settings
 from service.inference import predicting

@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.special import stdtrit
 
-from lipcore.data.paired import BLOCK_S, MAX_BLOCKS, Answer, Difference, of_blocks, surprise
+from lipcore.data.metrics import BLOCK_S, MAX_BLOCKS, Answer, Difference, of_blocks, surprise
 from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
 from lipcore.online.record import Record

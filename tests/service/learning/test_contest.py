@@ -11,8 +11,7 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import norm
 
-from lipcore.data.metrics import evaluate
-from lipcore.data.paired import Answer, surprise
+from lipcore.data.metrics import Answer, evaluate, surprise
 from lipcore.model.torque_model import TorquePrediction
 from lipcore.online.batch import Rows
 from service.foundation.settings import Settings

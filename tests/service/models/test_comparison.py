@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lipcore.data.paired import Answer, Comparison, Difference, compare
+from lipcore.data.metrics import Answer, Comparison, Difference, compare
 from service.inference.comparison import _verdict
 from tests.service.data import arrays, error, npz, post, stream, upload
 from tests.service.models.test_aliases import CODES
