@@ -14,12 +14,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.data.samples import Array, Samples
+if TYPE_CHECKING:
+    from lipcore.data.samples import Array, Samples
 
 LEVELS = (0.5, 0.8, 0.95, 0.99)
 """Probabilities of the intervals whose coverage and width are always given."""
