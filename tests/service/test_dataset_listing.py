@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.service.data import QUICK, error, job, queue, service_of, stream, train, upload
+from tests.service.data import QUICK, error, job, queue, service_of, stream, upload
 
 
 @pytest.fixture
@@ -49,12 +49,3 @@ def test_data_set_of_a_queued_job_is_not_deleted(no_worker, datasets):
     no_worker.post(f"/v1/jobs/{waiting['id']}/cancel")
     assert job(no_worker, waiting["id"])["state"] == "cancelled"
     assert no_worker.delete(f"/v1/datasets/{datasets[0]}").status_code == 204
-
-
-def test_a_model_outlives_its_data_set(api):
-    dataset = upload(api, stream(seed=8))["id"]
-    train(api, "survivor", dataset)
-    assert api.delete(f"/v1/datasets/{dataset}").status_code == 204
-    query = {"q": [0.1, 0.2], "dq": [0, 0], "ddq": [0, 0]}
-    assert api.post("/v1/models/survivor/predict", json=query).status_code == 200
-    assert api.get("/v1/models/survivor/versions/1").json()["lineage"]["datasets"][0]["id"] == dataset
