@@ -60,8 +60,6 @@ def test_components_are_those_of_lipcore_shaped_as_the_query(api, trained, motio
 @pytest.mark.parametrize(
     ("request_", "field", "value"),
     [
-        ({"components": ["mass"]}, "components[0]", "mass"),
-        ({"components": ["gravity", "gravity"]}, "components[1]", "gravity"),
         ({"components": ["forward_dynamics"]}, "tau", "missing"),
         ({"components": ["gravity"], "tau": [[0, 0]] * 5}, "tau", "given"),
         ({"components": ["forward_dynamics"], "tau": [[0, 0]] * 4}, "tau", "of shape (4, 2)"),

@@ -99,12 +99,6 @@ def test_data_of_other_joints_or_torques_are_refused(api, trained, robot, conven
     assert all(word in problem["message"] for word in words)
 
 
-def test_unknown_names_are_not_found(api, trained, unseen):
-    error(ask(api, "nobody", unseen), 404, "not_found")
-    error(ask(api, trained.name, "ds_nowhere"), 404, "not_found")
-    error(ask(api, trained.name, unseen, version=99), 404, "not_found")
-
-
 def cut(counts):
     """Samples in episodes of so many rows, and a mean that is wrong by another amount in each."""
     samples = stream(samples=sum(counts), seed=3)

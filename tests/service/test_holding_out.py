@@ -40,13 +40,6 @@ def recording(seed=1):
     return stream(samples=ROWS, rate=10.0, seed=seed)
 
 
-def upload_episodes(api, samples, episode):
-    body = npz(**arrays(samples), episode=np.asarray(episode), joint_names=np.array(samples.joint_names))
-    answer = post(api, body)
-    assert answer.status_code == 201, answer.text
-    return answer.json()["id"]
-
-
 def ask(api, model, dataset, **request):
     return api.post(f"/v1/models/{model}/evaluate", json={"dataset": dataset, **request})
 
@@ -129,23 +122,6 @@ def test_what_was_not_held_out_cannot_be_asked_for(api, held, trained):
         assert reply["detail"][0]["field"] == "part"
         assert f"version 1 has held nothing out of data set {other}" in reply["message"]
     assert error(ask(api, held[0], other, part="most"), 422, "invalid_request")["detail"][0]["field"] == "part"
-
-
-@pytest.mark.parametrize("kind", ["episodes", "last", "blocks"])
-def test_sides_are_apart_in_every_kind(api, kind):
-    """Twelve episodes of one recording without pauses, as gaps leave them: rows within 0.25 s are on no two sides."""
-    samples, episode = recording(), np.arange(ROWS) // 10
-    result = material(api, upload_episodes(api, samples, episode), kind=kind, share=0.4, blocks=6)
-    learnt, held = rows_of(samples, result.samples), rows_of(samples, result.held_out[0])
-    assert not set(learnt) & set(held)
-    assert min(abs(first - second) for first in learnt for second in held) == 5
-    assert 24 <= len(held) <= 48
-    if kind == "episodes":
-        assert not set(episode[learnt]) & set(episode[held])
-    # where rows are missing between, a new episode begins: differences across it would be no noise
-    for part in (result.samples, result.held_out[0]):
-        steps = np.diff(rows_of(samples, part))
-        np.testing.assert_array_equal(steps[np.diff(part.episode) == 0], 1)
 
 
 def test_whole_data_sets_stand_for_episodes(api):

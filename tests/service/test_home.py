@@ -10,9 +10,8 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import select
 
-import lipcore
 from service.app import create_app
-from service.foundation.settings import Settings, shipped_models
+from service.foundation.settings import Settings
 from service.models import registry
 from service.storage.database import Database, JobRow, VersionRow, now
 from service.storage.files import Files
@@ -104,24 +103,6 @@ def test_a_job_that_was_interrupted_too_often_fails_and_an_unwanted_one_is_cance
     assert (seen["state"], seen["attempts"], seen["error"]["code"]) == ("failed", 3, "interrupted")
     assert seen["finished_at"]
     assert job(api, "job_unwanted")["state"] == "cancelled"
-
-
-def test_a_damaged_version_does_not_keep_the_others_from_answering(home):
-    database, files = Database.of(Settings(home=home)), Files(home)
-    registry.install_shipped(database, files)
-    manifest = lipcore.copy_model(shipped_models() / registry.SHIPPED, files.versions / "mv_damaged")
-    with database.transaction() as session:
-        registry.publish(session, "damaged", "mv_damaged", manifest, None)
-    database.close()
-    (files.versions / "mv_damaged/model.safetensors").write_bytes(b"")
-
-    zero = {"q": [0.0] * 7, "dq": [0.0] * 7, "ddq": [0.0] * 7}
-    with TestClient(create_app(Settings(home=home)), ADDRESS, raise_server_exceptions=False) as api:
-        assert api.get("/health/ready").status_code == 200
-        assert api.post("/v1/models/panda-sim/predict", json=zero).status_code == 200
-        reply = error(api.post("/v1/models/damaged/predict", json=zero), 500, "unreadable_version")
-        assert reply["message"].startswith("version 1 of model 'damaged' cannot be loaded: ")
-        assert "does not have the sha256 that was kept of it" in reply["message"]
 
 
 def earlier_release(home, job):

@@ -49,7 +49,6 @@ WRONG = {
     "too few": (changed(1, data=[1.0]), "dq.data is 1 numbers, expected 2 numbers or rows of them, as the"),
     "row": (changed(1, data=[[0.0, 0.0]]), "dq.data is rows of shape [1, 2], expected 2 numbers"),
     "mixed": (changed(1, data=[0.0, [0.0]]), "dq.data is numbers and lists, or lists of"),
-    "ragged": (changed(1, data=[[0.0], []]), "dq.data is numbers and lists, or lists of"),
     "no data": (changed(1, data=None), "dq.data is missing, expected numbers in data, or binary_data_"),
     "data twice": (changed(1, parameters={"binary_data_size": 0}), "dq.data is given, and binary_data_size too, expe"),
     "shared memory": (
@@ -97,7 +96,6 @@ def test_requests_that_are_refused(api, trained, kind):
     ("place", "value", "message"),
     [
         ("q", "NaN", "inputs[0].data[1] is nan, expected a finite number"),
-        ("q", "1e400", "inputs[0].data[1] is inf, expected a finite number"),
         ("q", "1" + "0" * 400, "inputs[0].data[1] is 1" + "0" * 199 + "…, expected a finite number"),
         ("q", "9" * 5000, "inputs[0].data[1] is out of range, expected a finite number"),
         ("q", '"1.0"', "inputs[0].data[1] is 1.0, expected a number, or a list of numbers"),
@@ -124,9 +122,7 @@ def test_values_of_wrong_types_are_named(api, trained, place, value, message):
         (b'{"inputs": []} {}', "the body is not JSON: trailing characters (byte "),
         (b"\xef\xbb\xbf{}", "the body is not JSON: invalid character (byte 0), expected"),
         (b'{"id": "\xff"}', "the body is not JSON: 'utf-8' codec can't decode byte 0xff"),
-        (b'{"id": "\\ud800"}', "the body is not JSON: "),
         (b'{"parameters": {"x": ' + b"[" * 15_000, "the body is not JSON: maximum recursion depth exceeded"),
-        (b'{"parameters": {"x": ' + b"[" * 900 + b"NaN", "the body is not JSON: "),
         (b"[" * 15_000, "the body is array, expected an object"),
         (b"{}", "inputs is missing, expected a value"),
         (b'{"inputs": [{"name": "q", "shape": [2]}]}', "inputs[0].datatype is missing, expected a value"),
@@ -177,15 +173,6 @@ def test_answers_that_are_not_finite_are_refused(api, trained, monkeypatch, rows
     batch = {name: np.tile(values, (rows, 1)) for name, values in MOTION.items()}
     reply = refusal(api, message(batch, "tau"))
     assert reply == "tau[0][0] is inf, expected a finite number: are dq in rad/s and ddq in rad/s²?"
-
-
-def test_unknown_models_and_versions(api, trained):
-    assert refused(api.post(path_of("nobody"), json=message(MOTION)), 404) == (
-        "no model 'nobody': GET /v1/models lists all"
-    )
-    for version in ("2", "x"):
-        reply = refused(api.post(path_of("pendulum", version), json=message(MOTION)), 404)
-        assert reply == f"version is {version}, expected one of 1, of model 'pendulum'"
 
 
 @pytest.mark.parametrize("body", [lambda: b" " * 20_001, lambda: (b" " * 1000 for _ in range(21))])

@@ -75,5 +75,3 @@ def test_the_client_reads_errors(client):
         client.infer("nobody", inputs(MOTION))
     with pytest.raises(InferenceServerException, match=r"\[400\] q\.shape is \[3\], expected \[7\]"):
         client.infer("panda-sim", inputs({name: [0.0] * 3 for name in MOTION}))
-    with pytest.raises(InferenceServerException, match=r"\[415\] Content-Encoding is gzip"):
-        client.infer("panda-sim", inputs(MOTION), request_compression_algorithm="gzip")

@@ -45,13 +45,6 @@ def resolve(document, reference):
     return document
 
 
-def test_every_reference_leads_somewhere(document):
-    result = set(references(document))
-    assert len(result) > 10
-    for reference in result:
-        assert resolve(document, reference)
-
-
 def test_every_schema_is_used(document):
     used = {reference.rpartition("/")[2] for reference in references(document)}
     assert set(document["components"]["schemas"]) == used

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.service.data import error, service_of, train
+from tests.service.data import error
 
 EXACT = {"rtol": 1e-12, "atol": 1e-12}
 
@@ -38,15 +38,6 @@ def test_a_single_query_is_answered_as_its_row_of_a_batch(api, trained, motion):
             np.testing.assert_allclose(single[name], batch[name][row], rtol=1e-9, atol=1e-12)
 
 
-def test_the_answer_says_what_it_is(api, trained, motion):
-    answer = ask(api, trained.name, motion)
-    assert (answer["model"], answer["version"], answer["revision"]) == (trained.name, 1, 0)
-    assert answer["joint_names"] == ["joint1", "joint2"]
-    assert answer["torque_convention"] == "gravity_included"
-    view = api.get(f"/v1/models/{trained.name}/versions/1").json()
-    assert answer["noise_std"] == view["noise_std"]
-
-
 def refused(api, width=7, rows=None, **changes):
     """A query of zeros but for what is changed; the first of what is wrong with it."""
     zeros = np.zeros(width if rows is None else (rows, width)).tolist()
@@ -79,19 +70,8 @@ def test_large_velocities_are_answered_unclipped(strict):
     assert np.abs(fast).max() > 1.5 * np.abs(slow).max()
 
 
-@pytest.mark.parametrize("path", ["/v1/models/panda-sim/predict", "/v1/models/panda-sim/evaluate", "/v1/jobs"])
+@pytest.mark.parametrize("path", ["/v1/models/panda-sim/predict", "/v1/echo", "/v1/jobs"])
 def test_bodies_beyond_the_limit_are_refused_however_they_come(strict, path):
     for body in (b"[" + b" " * 20_000, (b" " * 1000 for _ in range(21))):
         answer = strict.post(path, content=body, headers={"content-type": "application/json"})
         assert "20000 bytes" in error(answer, 413, "too_large")["message"]
-
-
-def test_more_models_than_fit_in_memory_all_answer(api, trained, motion):
-    """The least recently used one is dropped and loaded again."""
-    before = ask(api, trained.name, motion)
-    loaded = service_of(api).loaded
-    for number in range(loaded.capacity):
-        train(api, f"another{number}", trained.dataset)
-        ask(api, f"another{number}", motion)
-        assert len(loaded._snapshot.served) <= loaded.capacity
-    assert ask(api, trained.name, motion) == before

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from service.foundation.errors import InvalidRequestError, problem, readable
 from service.web.route import Route, each_once, read_json
-from tests.service.data import service_of
+from tests.service.data import error, service_of
 
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
@@ -74,6 +74,13 @@ def test_values_that_are_large_or_deep_are_shown_in_short():
         deep = [deep]
     for value in (deep, [deep] * 3, ["x" * 10**6] * 1000, {"a": deep}, list(range(10**6))):
         assert len(problem("q", value, "a number").value) <= 201
+
+
+def test_many_wrong_fields_and_long_names_give_a_short_answer(api):
+    body = {"model": "a", "datasets": list(range(5000)), "x" * 9000: 1}
+    problems = error(api.post("/v1/jobs", json=body), 422, "invalid_request")["detail"]
+    assert len(problems) == 20
+    assert max(len(each["field"]) for each in problems) < 500
 
 
 def test_the_page_of_error_codes_is_what_the_document_says(api):

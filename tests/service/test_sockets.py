@@ -8,14 +8,13 @@ import stat
 import subprocess
 import sys
 
-import httpx
 import numpy as np
 import pytest
 from websockets.sync.client import unix_connect
 
-from service.client import Client, ServiceUnreachableError
+from service.client import Client
 from service.web.server.sockets import SocketError, UnixSocket
-from tests.service.data import DEADLINE, eventually
+from tests.service.data import DEADLINE
 from tests.service.server import Server
 
 QUERY = {"q": [0, -0.5, 0, -2, 0, 1.5, 0.7], "dq": [0.1] * 7, "ddq": [0.2] * 7}
@@ -107,7 +106,7 @@ def test_where_there_can_be_no_socket_is_said(tmp_path, folder):
 
 def test_a_service_listens_on_both(home, path):
     """Then it is killed, started again on what it left, and asked to end."""
-    with Server(home, LIPSERVE_UDS=str(path)) as server, Client(f"unix://{path}") as client:
+    with Server(home, warm=True, LIPSERVE_UDS=str(path)) as server, Client(f"unix://{path}") as client:
         reply = server.client.post("/v1/models/panda-sim/predict", json=QUERY).json()
         assert client.predict("panda-sim", **QUERY).as_dict() == reply
         assert stat.S_IMODE(path.lstat().st_mode) == 0o660
@@ -117,7 +116,10 @@ def test_a_service_listens_on_both(home, path):
         server.kill()
     assert path.is_socket()
 
-    with Server(home, LIPSERVE_UDS=str(path), LIPSERVE_UDS_MODE="600") as server, Client(f"unix://{path}") as client:
+    with (
+        Server(home, warm=True, LIPSERVE_UDS=str(path), LIPSERVE_UDS_MODE="600") as server,
+        Client(f"unix://{path}") as client,
+    ):
         assert stat.S_IMODE(path.lstat().st_mode) == 0o600
         zero = np.zeros(7)
         assert client.predict("panda-sim", zero, zero, zero).model == "panda-sim"
@@ -127,29 +129,6 @@ def test_a_service_listens_on_both(home, path):
         assert client.ready()
         assert server.terminate() == -signal.SIGTERM
         assert not path.exists()
-
-
-@pytest.mark.slow
-def test_a_free_port_is_printed_beside_the_socket(home, path, tmp_path):
-    log = tmp_path / "log"
-    process = start(home, "--port", "0", "--uds", path, stdout=log.open("w"))
-    try:
-        url = eventually(lambda: re.search(r"running on (http://127\.0\.0\.1:[1-9]\d*)", log.read_text()))[1]
-        eventually(lambda: f"listening on the Unix-domain socket {path}" in log.read_text())
-        assert httpx.get(f"{url}/health/ready").status_code == 200
-        process.send_signal(signal.SIGINT)
-        process.wait(DEADLINE)
-        assert not path.exists()
-    finally:
-        process.kill()
-        process.wait(DEADLINE)
-
-
-def test_a_client_says_that_nobody_listens(path):
-    with Client(f"unix://{path}") as client:
-        assert client.ready() is False
-        with pytest.raises(ServiceUnreachableError, match=f"no service answers at unix://{path}"):
-            client.model("panda-sim")
 
 
 def test_the_socket_of_a_successor_is_not_removed(path):
@@ -167,12 +146,12 @@ def test_a_client_needs_an_absolute_path(url):
         Client(url)
 
 
-def start(home, *arguments, stdout=subprocess.PIPE):
+def start(home, *arguments):
     """`lipserve serve` with arguments."""
     return subprocess.Popen(
         [sys.executable, "-m", "service", "serve", *map(str, arguments)],
         env={**os.environ, "LIPSERVE_HOME": str(home)},
-        stdout=stdout,
+        stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
     )

@@ -88,14 +88,6 @@ def test_a_wrong_address_is_refused_in_http(streaming, path, status, message):
     assert body["error"]["detail"]
 
 
-def test_refusals_are_no_errors_of_the_server(streaming):
-    with pytest.raises(InvalidStatus), dial(streaming.server, "/v1/models/nobody/stream"):
-        pass
-    with dial(streaming.server) as connection:  # by then, what there is to log of the refusal is logged
-        hello(connection)
-    assert "ERROR" not in streaming.server.log.read_text()
-
-
 def test_web_pages_of_other_sites_are_refused(streaming):
     own = f"http://127.0.0.1:{streaming.server.port}"
     with dial(streaming.server, origin=own) as connection:

@@ -13,7 +13,6 @@ from service.client.stream import StreamClient, StreamError, StreamRefusal
 from tests.service.data import DEADLINE
 from tests.service.server import free_port
 from tests.service.streams import MOTION as PAIR
-from tests.service.streams import motions
 
 HELLO = {
     "layout": 1,
@@ -90,20 +89,6 @@ class Scripted:
 def scripted(tmp_path):
     """Makes a server that follows a script."""
     return lambda *script, **hello: Scripted(tmp_path / "lipserve.sock", *script, **hello)
-
-
-def test_it_says_what_the_service_says(streaming):
-    with client_of(streaming, version=1) as client:
-        assert client.hello.joint_names == streaming.model.joint_names
-        np.testing.assert_allclose(client.hello.noise_std, streaming.model.noise_std, rtol=1e-12)
-        for motion in motions(5, seed=6):
-            tau, std = streaming.model.answer(motion)
-            both, mean = client.ask(*motion), client.ask(*motion.tolist(), std=False)
-            np.testing.assert_allclose(both.tau, tau, rtol=1e-12, atol=1e-12)
-            np.testing.assert_allclose(both.tau_std, std, rtol=1e-12, atol=1e-12)
-            np.testing.assert_allclose(mean.tau, tau, rtol=1e-12, atol=1e-12)
-            assert mean.tau_std is None
-            assert (both.version, both.revision, both.late) == (1, 0, False)
 
 
 def test_deadlines_are_reported(streaming):

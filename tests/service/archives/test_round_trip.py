@@ -8,7 +8,6 @@ import subprocess
 import numpy as np
 import pytest
 
-from service.client import ApiError, Client
 from service.models import lineage
 from tests.service.archives.packing import exported, pack, send, unpack, vouched
 from tests.service.data import service_of, stream
@@ -98,17 +97,3 @@ def test_commit_is_known_in_a_checkout_only(tmp_path):
     assert lineage.git_commit(tmp_path) is None
     (tmp_path / ".git").mkdir()  # no repository for git
     assert lineage.git_commit(tmp_path / ".") is None
-
-
-def test_client_writes_a_whole_file_or_none(streaming, tmp_path):
-    with Client(streaming.server.url) as client:
-        path = client.export("pendulum", tmp_path / "arm.tar")
-        version = client.import_model(path, name="by-client")
-        assert (version.model, version.version) == ("by-client", 1)
-        with pytest.raises(ApiError, match="nobody") as refused:
-            client.export("nobody", tmp_path / "nobody.tar")
-        assert refused.value.status == 404
-        path.write_bytes(path.read_bytes()[:-5000])
-        with pytest.raises(ApiError, match=r"model\.safetensors"):
-            client.import_model(path)
-    assert [each.name for each in tmp_path.iterdir()] == ["arm.tar"]

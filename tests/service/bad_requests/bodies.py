@@ -140,7 +140,11 @@ SETTING = [
     *wrong("/v1/models/panda-sim/refresh", {}, "estimator", "lip"),
     *wrong(f"{ALIASES}/best", {}, "version", 0, "x", 1.5, method="PUT"),
     *wrong(f"{ALIASES}/best", {}, "version", 99, status=404, code="not_found", method="PUT"),
-    *(body(f"{ALIASES}/{alias}", {"version": 1}, "alias", method="PUT") for alias in ("A", "1", "a%20b")),
+    *(body(f"{ALIASES}/{alias}", {"version": 1}, "alias", method="PUT") for alias in ("A", "1", "a%20b", "a" * 65)),
+    *wrong(f"{ALIASES}/best", {}, "alias", "No", method="PUT"),
+    *wrong(f"{ALIASES}/best", {}, "alias", "nowhere", status=404, code="not_found", method="PUT"),
+    *wrong(f"{ALIASES}/best", {"version": 1}, "to", 2, method="PUT"),
+    *(body(f"{ALIASES}/best", each, "version or alias", method="PUT") for each in ({}, {"version": 1, "alias": "a"})),
 ]
 OF_DATA = {"dataset": "ds_0"}
 ASSESSING = [

@@ -195,15 +195,6 @@ def test_a_lost_upload_makes_one_data_set(losing, api, tmp_path):
     assert client.upload(path).id != made.id  # asked for again, not repeated
 
 
-def test_a_lost_job_is_queued_once(losing, pendulum):
-    client, transport = losing()
-    job = client.train("lost-job", [pendulum["id"]], "lip-chain", options=QUICK)
-    assert len(transport.requests) == 2
-    assert [each.id for each in client.jobs() if each.model == "lost-job"] == [job.id]
-    client.cancel(job.id)
-    client.wait(job.id)
-
-
 def test_events_are_followed_though_their_start_is_lost(losing, pendulum):
     client, transport = losing()
     job = client.train("lost-events", [pendulum["id"]], "lip-chain", options=QUICK)

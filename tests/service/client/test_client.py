@@ -47,6 +47,9 @@ def test_refusals_carry_code_message_and_detail(client, tmp_path):
     assert str(caught.value) == caught.value.message
     assert "q is 6 numbers long, expected 7 numbers: panda_joint1" in caught.value.message
     assert caught.value.detail[0]["field"] == "q"
+    with pytest.raises(ApiError, match="no model 'nobody'"):
+        client.export("nobody", tmp_path / "nobody.tar")
+    assert list(tmp_path.iterdir()) == []
     large = tmp_path / "large.csv"
     large.write_bytes(b"x" * 3_000_000)
     with pytest.raises(ApiError) as caught:
@@ -95,15 +98,6 @@ def test_from_files_to_torques(streaming, tmp_path):
         np.testing.assert_allclose(client.predict("awaited", *MOTION).tau, answer.tau, rtol=1e-9)
         assert client.evaluate("awaited", evaluated.dataset).as_dict() == evaluated.as_dict()
     assert not (tmp_path / "awaited.tar.part").exists()
-
-
-def test_many_at_once(streaming):
-    async def work(client):
-        return await asyncio.gather(*(client.predict("pendulum", *(MOTION * scale)) for scale in (0.5, 1.0, 0.5)))
-
-    first, other, again = ask(streaming.server, work)
-    np.testing.assert_array_equal(first.tau, again.tau)
-    assert (first.tau != other.tau).all()
 
 
 def test_refusals_and_silence_of_the_asynchronous_client(streaming, tmp_path):

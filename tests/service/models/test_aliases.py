@@ -94,33 +94,6 @@ def test_serving_is_moved_by_training_and_by_its_owner_and_taken_back(api, arm):
     assert "built in" in error(api.delete(f"/v1/models/{arm}/aliases/serving"), 409, "conflict")["message"]
 
 
-@pytest.mark.parametrize(
-    ("alias", "body", "status", "field"),
-    [
-        ("production", {}, 422, "version or alias"),
-        ("production", {"version": 1, "alias": "serving"}, 422, "version or alias"),
-        ("production", {"version": 0}, 422, "version"),
-        ("production", {"version": 7}, 404, "version"),
-        ("production", {"alias": "nowhere"}, 404, "alias"),
-        ("production", {"alias": "No"}, 422, "alias"),
-        ("production", {"version": 1, "to": 2}, 422, "to"),
-        ("Production", {"version": 1}, 422, "alias"),
-        ("a" * 65, {"version": 1}, 422, "alias"),
-    ],
-)
-def test_bad_requests_name_what_is_wrong(api, trained, alias, body, status, field):
-    answer = put(api, trained.name, alias, **body)
-    assert error(answer, status, CODES[status])["detail"][0]["field"] == field
-    assert pointers(api, trained.name) == {"serving": 1}
-
-
-def test_models_that_are_not_there_have_no_aliases(api):
-    error(api.get("/v1/models/nobody/aliases"), 404, "not_found")
-    error(put(api, "nobody", "production", version=1), 404, "not_found")
-    error(rollback(api, "nobody", "production"), 404, "not_found")
-    error(api.delete("/v1/models/nobody/aliases/production"), 404, "not_found")
-
-
 def test_a_model_has_so_many_aliases_and_no_more(api, arm, monkeypatch):
     monkeypatch.setitem(vars(service_of(api).settings), "max_aliases", 2)
     put(api, arm, "one", version=1)

@@ -227,10 +227,3 @@ def test_the_shipped_model_stays_deleted(home):
     with database.session() as session:
         assert session.scalars(select(VersionRow.version)).all() == []
     database.close()
-
-
-@pytest.mark.parametrize(
-    ("path", "field"), [("nobody", "model"), ("nobody/versions/1", "model"), ("panda-sim/versions/9", "version")]
-)
-def test_what_is_not_there_cannot_be_deleted(api, path, field):
-    assert error(delete(api, path), 404, "not_found")["detail"][0]["field"] == field

@@ -5,10 +5,8 @@ import pytest
 
 from lipcore.kernels.geometry import Geometry
 from lipcore.robots.urdf import RigidBody
-from service.client import ApiError
-from tests.service.client.conftest import over
 from tests.service.data import error, service_of
-from tests.service.models.versions import JOINTS, NO_BODIES, WARNING, panda, publish_arm
+from tests.service.models.versions import JOINTS, NO_BODIES, panda, publish_arm
 
 
 @pytest.fixture(scope="module")
@@ -49,18 +47,3 @@ def test_a_version_without_an_arm_is_refused(api, arm, model, version, reason):
     assert f"version {version} of model {model!r}" in refusal["message"]
     assert reason in refusal["message"]
     assert refusal["detail"][0]["field"] == "version"
-
-
-def test_the_client_has_its_text_and_shows_the_arm(api, arm):
-    with over(api._transport) as client:
-        assert client.urdf(arm) == client.urdf(arm, 2) == client.urdf(arm, alias="serving")
-        assert client.urdf(arm) == api.get(f"/v1/models/{arm}/urdf").text
-        with pytest.raises(ApiError, match="no rigid bodies"):
-            client.urdf("urdf-none")
-        shown = client.version(arm, 2)
-        assert shown.arm.joint_names == JOINTS
-        assert str(shown).splitlines()[1] == f"careful: {WARNING}"
-        assert "mirror image" in str(shown)
-        bare = client.version("urdf-none", 1)
-        assert bare.arm is None
-        assert str(bare) == f"urdf-none version 1: {bare.estimator}, 7 joints: {', '.join(JOINTS)}"

@@ -5,6 +5,7 @@ from contextlib import closing
 
 import pytest
 
+from service import __version__
 from service.learning.learner.process import LearnerProcess
 from service.learning.learners import RESTART_S
 from service.storage import storage
@@ -47,12 +48,14 @@ def look(clock):
 def test_all_parts_are_named_and_what_does_not_work(api, fresh_looks, monkeypatch):
     answer = api.get("/health/ready")
     assert answer.status_code == 200, answer.text
+    assert (answer.json()["status"], answer.json()["version"]) == ("ready", __version__)
     assert [part["name"] for part in answer.json()["checks"]] == PARTS
     service_of(api).readiness.forget()
     monkeypatch.setattr(service_of(api).disk, "floor", 2**62)
     refusal = error(api.get("/health/ready"), 503, "not_ready")
     assert [item["field"] for item in refusal["detail"]] == ["home"]
     assert "LIPSERVE_MIN_FREE_BYTES" in refusal["message"]
+    assert api.get("/health/live").json() == {"status": "alive"}
 
 
 def test_a_locked_database_is_found(api, look, monkeypatch):

@@ -14,6 +14,7 @@ import pytest
 from service.datasets.formats.bags.reading import BagKind, open_bag
 from service.datasets.options import ReadOptions
 from service.foundation.settings import Settings
+from tests.service.recordings.reading import Read, taken
 
 typesys = pytest.importorskip("rosbags.typesys", reason="bags are written by `rosbags`, of the extra `dev`")
 rosbag1 = pytest.importorskip("rosbags.rosbag1", reason="bags are written by `rosbags`, of the extra `dev`")
@@ -140,27 +141,10 @@ def bare(folder: Path, file: Path) -> Path:
     return file
 
 
-@dataclass
-class Read:
-    """A table with its blocks put together."""
-
-    names: tuple[str, ...]
-    rows: np.ndarray
-    joint_names: tuple[str, ...] | None
-    units: dict[str, str]
-    facts: list[str]
-
-    def column(self, name: str) -> np.ndarray:
-        """One column, (rows,)."""
-        return self.rows[:, self.names.index(name)]
-
-
 def read(path: Path, kind: BagKind, options: ReadOptions | None = None, settings: Settings = SETTINGS) -> Read:
     """The whole table of a bag."""
     with open_bag(path, kind, options or ReadOptions(), settings) as table:
-        blocks = list(table.blocks)
-        assert all(block.dtype == np.float64 and 0 < len(block) <= 16_384 for block in blocks)
-        return Read(table.names, np.concatenate(blocks), table.joint_names, table.units, table.facts)
+        return taken(table)
 
 
 @contextlib.contextmanager

@@ -29,6 +29,22 @@ class Read:
     def names(self):
         return tuple(self.columns)
 
+    @property
+    def rows(self):
+        return np.column_stack(list(self.columns.values()))
+
+
+def taken(table):
+    """Read the blocks of a table, and check what holds of every table."""
+    blocks = list(table.blocks)
+    for block in blocks:
+        assert block.dtype == np.float64
+        assert 1 <= len(block) <= BLOCK_ROWS
+        assert block.shape == (len(block), len(table.names))
+    assert len(set(table.names)) == len(table.names)
+    entire = np.concatenate(blocks) if blocks else np.empty((0, len(table.names)))
+    return Read(dict(zip(table.names, entire.T, strict=True)), table.units, table.facts, table.joint_names)
+
 
 @cache
 def settings_of(folder, **changed):
@@ -36,20 +52,14 @@ def settings_of(folder, **changed):
 
 
 def read(folder, body, kind, options=None, **settings):
-    """Read the bytes of an upload, and check what holds of every table."""
+    """Read the bytes of an upload, and check that no file is left."""
     path = folder / "upload"
     path.write_bytes(body)
     before = set(folder.iterdir())
     with open_table(path, kind, options or ReadOptions(), settings_of(folder, **settings)) as table:
-        blocks = list(table.blocks)
-        for block in blocks:
-            assert block.dtype == np.float64
-            assert 1 <= len(block) <= BLOCK_ROWS
-            assert block.shape == (len(block), len(table.names))
+        result = taken(table)
     assert set(folder.iterdir()) == before, "leftovers"
-    assert len(set(table.names)) == len(table.names)
-    entire = np.concatenate(blocks) if blocks else np.empty((0, len(table.names)))
-    return Read(dict(zip(table.names, entire.T, strict=True)), table.units, table.facts, table.joint_names)
+    return result
 
 
 def refused(folder, body, kind, options=None, error=ServiceError, **settings):

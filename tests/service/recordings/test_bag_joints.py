@@ -49,7 +49,7 @@ def test_joints_that_are_asked_for_come_in_that_order(tmp_path):
     recorded = states(50)
     result = read(write_mcap(tmp_path / "a.mcap", recorded), "mcap", ReadOptions(joint_names=("c", "a")))
     assert result.joint_names == ("c", "a")
-    np.testing.assert_array_equal(result.column("c/effort"), [each.effort[2] for each in recorded])
+    np.testing.assert_array_equal(result["c/effort"], [each.effort[2] for each in recorded])
     assert "joints b were left out" in result.facts
     with pytest.raises(InvalidDataError, match=r"joint_names is a, x, expected joints out of a, b, c"):
         read(tmp_path / "a.mcap", "mcap", ReadOptions(joint_names=("a", "x")))

@@ -130,7 +130,7 @@ def check_forty(tmp_path, name, text, base, fields, with_definition=True, option
         forget_definitions(path)
     result = read(path, "rosbag1" if base is ROS1 else "rosbag2", options)
     np.testing.assert_array_equal(result.rows[:, 1:], numbers.reshape(40, -1))
-    np.testing.assert_array_equal(result.column("t"), np.arange(40) / 1000)
+    np.testing.assert_array_equal(result["t"], np.arange(40) / 1000)
     return result
 
 

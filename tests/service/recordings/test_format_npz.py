@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from service.foundation.errors import InvalidDataError
 from tests.service.recordings.reading import read, refused
+from tests.service.recordings.test_format_lerobot import zipped
 
 RNG = np.random.default_rng(2)
 Q, TAU = RNG.normal(size=(100, 2)), RNG.normal(size=(100, 2))
@@ -21,14 +22,6 @@ Q, TAU = RNG.normal(size=(100, 2)), RNG.normal(size=(100, 2))
 def npz(*, compressed=False, **arrays):
     out = io.BytesIO()
     (np.savez_compressed if compressed else np.savez)(out, **arrays)
-    return out.getvalue()
-
-
-def zipped(files, compression=zipfile.ZIP_STORED):
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", compression) as file:
-        for name, content in files.items():
-            file.writestr(name, content)
     return out.getvalue()
 
 

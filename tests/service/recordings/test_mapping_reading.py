@@ -247,11 +247,3 @@ def test_memory_does_not_grow_with_the_recording(tmp_path, limits):
         tracemalloc.stop()
     assert result.staged.rows == rows
     assert peak < 10e6
-
-
-def test_velocities_that_begin_late_lack_rows_before(reading):
-    columns = canonical(motion())
-    columns["dq1"][:90] = columns["dq2"][:90] = np.nan
-    result = reading(columns)
-    assert result.staged.missing().tolist() == [True] * 90 + [False] * 110
-    np.testing.assert_array_equal(result.staged.read("dq2"), columns["dq2"])

@@ -1,12 +1,10 @@
 """What of an upload is stored and shown: its samples, prepared step by step, its report, its preview."""
 
 import hashlib
-import io
 import json
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from safetensors.numpy import load_file
 from scipy.interpolate import Akima1DInterpolator
@@ -22,19 +20,10 @@ from service.storage import sample_file
 from service.storage.database import JobRow
 from service.storage.storage import Disk
 from tests.service.data import arrays, npz, post, queue, service_of, stream
+from tests.service.recordings.test_format_parquet import parquet
+from tests.service.test_uploads import created
 
 SAMPLES = stream(samples=600, rate=100.0, seed=71)
-
-
-def created(answer):
-    assert answer.status_code == 201, answer.text
-    return answer.json()
-
-
-def parquet(**columns):
-    file = io.BytesIO()
-    pq.write_table(pa.table(columns), file)
-    return file.getvalue()
 
 
 def test_the_library_reads_what_was_written_array_by_array(tmp_path):
@@ -61,7 +50,7 @@ def test_recipe_and_source_of_an_upload_are_kept(api):
     }
     answer = post(
         api,
-        parquet(**columns),
+        parquet(columns),
         "application/vnd.apache.parquet",
         columns='{"t": "stamp", "q": "arm_{joint}/pos", "tau": "arm_{joint}/torque"}',
         units='{"t": "ms", "q": "deg"}',
@@ -93,22 +82,6 @@ def test_the_types_of_joints_are_those_of_the_robot_unless_the_job_says_otherwis
     api.post(f"/v1/jobs/{job['id']}/cancel")
     unknown = created(post(api, npz(**arrays(SAMPLES))))
     assert unknown["report"]["joint_types"] is None
-
-
-def test_preview_keeps_the_extremes(api):
-    dataset = created(post(api, npz(**arrays(SAMPLES), joint_names=np.array(["a", "b"]))))
-    answer = api.get(f"/v1/datasets/{dataset['id']}/preview", params={"quantities": "tau,q", "points": 50})
-    assert answer.status_code == 200
-    result = answer.json()
-    assert result["samples"] == len(SAMPLES)
-    names = [(each["quantity"], each["joint"]) for each in result["columns"]]
-    assert names == [("tau", "a"), ("tau", "b"), ("q", "a"), ("q", "b")]
-    for each in result["columns"]:
-        values = getattr(SAMPLES, each["quantity"])[:, "ab".index(each["joint"])]
-        assert len(each["values"]) <= 50
-        assert (max(each["values"]), min(each["values"])) == (values.max(), values.min())
-        np.testing.assert_array_equal(values[each["rows"]], each["values"])
-        np.testing.assert_array_equal(SAMPLES.t[each["rows"]], each["t"])
 
 
 @pytest.mark.parametrize("kind", recording.FORMATS)
