@@ -153,12 +153,3 @@ def test_friction(case: Case, row: int) -> None:
     prior, cross = friction_covariance(params, [x], [x]), friction_covariance(params, [x], samples(case.motion))
     friction = dynamics.components(case.model, case.query, ["friction"])["friction"]
     assert_estimate(friction, row, *conditioned(case, prior, cross))
-
-
-def test_order_and_choice_of_names_do_not_matter(case: Case) -> None:
-    names = [name for name in dynamics.COMPONENTS if name != "forward_dynamics"]
-    together = dynamics.components(case.model, case.query, names[::-1])
-    for name in names:
-        alone = dynamics.components(case.model, case.query, [name])[name]
-        torch.testing.assert_close(alone.mean, together[name].mean, rtol=1e-9, atol=1e-12)
-        torch.testing.assert_close(alone.std, together[name].std, rtol=1e-7, atol=1e-9)

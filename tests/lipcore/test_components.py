@@ -196,17 +196,13 @@ def test_torque_is_affine_in_acceleration_and_its_velocity_terms_are_quadratic(c
     assert (torque(-2 * motion.dq, zero) - rest - 4 * (torque(motion.dq, zero) - rest)).abs().max() < 1e-6 * size
 
 
-def test_names_that_are_not_on_offer(case: Case) -> None:
-    motion = case.unseen.motion()[:1]
+def test_what_cannot_be_asked_for(case: Case) -> None:
+    motion, tau = case.unseen.motion()[:2], torch.from_numpy(case.unseen.tau[:2])
     with pytest.raises(dynamics.UnavailableComponentError, match="component is 'mass', expected one that estimator"):
         dynamics.components(case.model, motion, ["gravity", "mass"])
     q = torch.zeros((1, 5), dtype=torch.float64)
     with pytest.raises(ValueError, match="motion has 5 joints, expected"):
         dynamics.components(case.model, Motion(q, q, q), ["gravity"])
-
-
-def test_torque_and_forward_dynamics_come_together(case: Case) -> None:
-    motion, tau = case.unseen.motion()[:2], torch.from_numpy(case.unseen.tau[:2])
     with pytest.raises(ValueError, match="tau is None, expected a torque for forward_dynamics"):
         dynamics.components(case.model, motion, ["forward_dynamics"])
     with pytest.raises(ValueError, match="tau is given, expected None without forward_dynamics"):

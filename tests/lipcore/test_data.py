@@ -40,16 +40,6 @@ def test_array_of_another_shape_is_named(name: str) -> None:
         replace(table(), episode=np.zeros(5, dtype=np.int64))
 
 
-def test_rows_are_chosen_from_every_column() -> None:
-    samples = table()
-    for index in (slice(1, 5, 2), np.array([1, 3]), np.isin(np.arange(6), [1, 3])):
-        part = samples.rows(index)
-        assert part.joint_names == samples.joint_names
-        assert part.t.tolist() == [0.1, 0.3]
-        assert part.tau.tolist() == samples.tau[[1, 3]].tolist()
-        assert len(part.episode) == 2
-
-
 def test_episodes_are_contiguous_runs() -> None:
     assert table(6, (4, 4, 1, 1, 1, 4)).episodes() == [slice(0, 2), slice(2, 5), slice(5, 6)]
     assert table(0).episodes() == []
@@ -74,13 +64,6 @@ def test_what_is_no_motion_and_no_robot_is_refused() -> None:
         Motion.from_arrays(*np.zeros((3, 4, 2, 2)))
     with pytest.raises(ValueError, match="joint_types is empty"):
         check_joint_types([])
-
-
-def test_one_instant_and_many_are_accepted() -> None:
-    assert Motion.from_arrays([1, 2], [3, 4], [5, 6]).q.shape == (1, 2)
-    motion = Motion.from_arrays(*np.arange(24.0).reshape(3, 4, 2))
-    assert (len(motion), motion.n_joints) == (4, 2)
-    assert motion[1:3].dq.tolist() == [[10.0, 11.0], [12.0, 13.0]]
 
 
 @pytest.mark.parametrize("name", ["q", "dq", "ddq"])

@@ -153,19 +153,10 @@ def test_answer_for_many_is_the_answers_for_each(model: TorqueModel, samples: Sa
         assert np.allclose(one.tau[0], many.tau[k], rtol=1e-8, atol=1e-10)
         assert np.allclose(one.covariance[0], many.covariance[k], rtol=1e-6, atol=1e-12)
     assert np.allclose(many.tau_std**2, np.diagonal(many.covariance, axis1=1, axis2=2), rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("shapes", "message"),
-    [
-        (((4, 3),) * 3, "q has 3 joints, expected 2: joint1, joint2"),
-        (((4, 2), (4, 2), (3, 2)), r"ddq has shape \(3, 2\), expected \(4, 2\)"),
-    ],
-    ids=str,
-)
-def test_query_of_wrong_shape_is_refused(model: TorqueModel, shapes: tuple, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        model.predict(*(np.zeros(shape) for shape in shapes))
+    with pytest.raises(ValueError, match="q has 3 joints, expected 2: joint1, joint2"):
+        model.predict(*np.zeros((3, 4, 3)))
+    with pytest.raises(ValueError, match=r"ddq has shape \(3, 2\), expected \(4, 2\)"):
+        model.predict(np.zeros((4, 2)), np.zeros((4, 2)), np.zeros((3, 2)))
 
 
 def test_bad_argument_of_training_is_named(samples: Samples) -> None:

@@ -26,14 +26,6 @@ def test_all_figures_equal_hand_computed_values() -> None:
     assert answer.level == 0.95
 
 
-def test_joints_are_judged_apart_and_noise_may_differ_by_sample() -> None:
-    tau = np.array([[0.0, 0.0], [2.0, 2.0]])
-    mean = tau + np.array([[1.0, 0.0], [1.0, 0.0]])
-    answer = evaluate(tau, mean, np.zeros((2, 2)), np.array([[0.6, 1.0], [0.4, 1.0]]))
-    assert answer.nmse.tolist() == [1.0, 0.0]
-    assert answer.coverage.tolist() == [0.5, 1.0]
-
-
 def gaussian(confidence: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Torques, means, and stds that are too small by the factor `confidence`."""
     rng = np.random.default_rng(1)
