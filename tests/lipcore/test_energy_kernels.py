@@ -9,7 +9,6 @@ from lipcore import FitOptions, train
 from lipcore.data.metrics import evaluate
 from lipcore.data.motion import Motion
 from lipcore.kernels.lip import shares
-from lipcore.kernels.weights import initial_weights, velocity_weights
 from lipcore.robots.simulation import Stream, simulate
 from tests.choosing import slow
 from tests.lipcore.arm_oracles import arm
@@ -113,14 +112,3 @@ def test_dynamics_of_a_true_chain_lie_in_the_space_of_the_kernel(kinds: str) -> 
     answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
     nmse = evaluate(unseen.tau, answer.tau, answer.tau_std, answer.noise_std).nmse
     assert (nmse < 1e-6).all(), nmse
-
-
-@pytest.mark.parametrize("n", [1, 3, 7])
-def test_start_is_the_inertia_that_the_torques_hint_at(n: int) -> None:
-    tau = torch.zeros((50, n), dtype=torch.float64)
-    tau[:, 0] = 40.0
-    found = velocity_weights(initial_weights(tau), n)
-    # a torque of 40 N·m: an arm of about a metre with about 4 kg·m², to which every link contributes alike
-    assert float(found.sum(0)[0]) == pytest.approx(4.0)
-    assert len(set(found[torch.tril_indices(n, n).unbind()].tolist())) == 1
-    torch.testing.assert_close(velocity_weights(initial_weights(100 * tau), n), 100 * found)
