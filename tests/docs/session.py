@@ -58,7 +58,7 @@ class Session:
             self._python.communicate()
 
     def run(self, block: Block) -> None:
-        """Do what a block says; raise AssertionError where it fails, or prints something else than is shown."""
+        """Do what a block says; raise AssertionError where it fails, or prints something else than is written."""
         text = block.text.replace(WRITTEN, self._reader.address)
         if block.language == "json":
             compare(json.loads(self._printed), block.text, block.place)
@@ -99,26 +99,26 @@ class Session:
         return str(answer["printed"])
 
 
-def compare(printed: Any, shown: str, place: str) -> None:
-    """Raise AssertionError where a value that a page shows is not the one printed, to the digits that are shown."""
-    _same(printed, json.loads(shown, parse_float=Decimal), place)
+def compare(printed: Any, written: str, place: str) -> None:
+    """Raise AssertionError where a value that a page shows is not the one printed, to the digits that are written."""
+    _same(printed, json.loads(written, parse_float=Decimal), place)
 
 
-def _same(printed: Any, shown: Any, place: str) -> None:
-    if isinstance(shown, dict):
+def _same(printed: Any, written: Any, place: str) -> None:
+    if isinstance(written, dict):
         assert isinstance(printed, dict), place
-        for name, value in shown.items():
+        for name, value in written.items():
             assert name in printed, f"{place}: {name} is not printed, but {list(printed)}"
             _same(printed[name], value, f"{place}, {name}")
-    elif isinstance(shown, list):
+    elif isinstance(written, list):
         assert isinstance(printed, list), place
-        assert len(printed) == len(shown), f"{place}: {len(printed)} printed, {len(shown)} shown"
-        for index, (left, right) in enumerate(zip(printed, shown, strict=True)):
+        assert len(printed) == len(written), f"{place}: {len(printed)} printed, {len(written)} written"
+        for index, (left, right) in enumerate(zip(printed, written, strict=True)):
             _same(left, right, f"{place}[{index}]")
-    elif isinstance(shown, Decimal):
-        last_digit = Decimal(1).scaleb(int(shown.as_tuple().exponent))
-        assert abs(Decimal(repr(printed)) - shown) <= last_digit, f"{place}: {printed} is shown as {shown}"
-    elif isinstance(shown, str) and shown.endswith("…"):
-        assert str(printed).startswith(shown.removesuffix("…")), f"{place}: {printed!r} is shown as {shown!r}"
+    elif isinstance(written, Decimal):
+        last_digit = Decimal(1).scaleb(int(written.as_tuple().exponent))
+        assert abs(Decimal(repr(printed)) - written) <= last_digit, f"{place}: {printed} is written as {written}"
+    elif isinstance(written, str) and written.endswith("…"):
+        assert str(printed).startswith(written.removesuffix("…")), f"{place}: {printed!r} is written as {written!r}"
     else:
-        assert printed == shown, f"{place}: {printed!r} is shown as {shown!r}"
+        assert printed == written, f"{place}: {printed!r} is written as {written!r}"

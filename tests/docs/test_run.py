@@ -22,7 +22,7 @@ def test_every_block_is_run_or_says_why_not(page):
 
 
 @pytest.mark.parametrize(
-    ("printed", "shown"),
+    ("printed", "written"),
     [
         ({"a": 1.2375}, '{"a": 1.235}'),
         ([1.0, 2.0], "[1.0]"),
@@ -31,10 +31,10 @@ def test_every_block_is_run_or_says_why_not(page):
         ({"n": 3}, '{"n": 4}'),
     ],
 )
-def test_output_is_compared_to_the_digits_that_are_shown(printed, shown):
+def test_output_is_compared_to_the_digits_that_are_shown(printed, written):
     compare({"a": 1.23456, "id": "ds_12345", "b": 2}, '{"a": 1.235, "id": "ds_…"}', "here")
     with pytest.raises(AssertionError, match="here"):
-        compare(printed, shown, "here")
+        compare(printed, written, "here")
 
 
 def chosen(page: Path, slow: bool) -> list[Block]:
