@@ -95,9 +95,6 @@ def _features(model: FourierModel, joint: int, q: np.ndarray, dq: np.ndarray, dd
     return np.hstack([*waves, friction])
 
 
-# fleet and cost
-
-
 # flow
 
 

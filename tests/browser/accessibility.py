@@ -5,9 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import pytest
+
+from tests.browser.visitor import PATIENCE_MS
+
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
+expect = pytest.importorskip("playwright.sync_api", reason="Playwright is missing: pip install playwright").expect
+"""Playwright's, as patient as machines are slow. Without Playwright the module that imports it is skipped."""
+expect.set_options(timeout=PATIENCE_MS)
 AUDIT = (Path(__file__).parent / "audit.js").read_text()
 
 

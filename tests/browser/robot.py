@@ -1,7 +1,5 @@
 """A robot that streams to a service in real time, for pages to follow."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence

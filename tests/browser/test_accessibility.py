@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.browser.accessibility import audit, focused, tab_to
+from tests.browser.accessibility import audit, expect, focused, tab_to
 from tests.browser.conftest import Dashboard, Visit
-from tests.browser.looking import expect
 from tests.browser.visitor import PHONE, Visitor
 from tests.service.data import arrays, npz, stream
 

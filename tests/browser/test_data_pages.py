@@ -1,7 +1,5 @@
 """Data sets and jobs in the browser: a refusal that is mended, episodes, deleting, a job stopped and repeated."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
@@ -9,9 +7,8 @@ import pytest
 
 from lipcore.fitting.estimators import ESTIMATORS
 from lipcore.vocabulary import ROBOT_ESTIMATORS
-from tests.browser.accessibility import audit
+from tests.browser.accessibility import audit, expect
 from tests.browser.conftest import Dashboard
-from tests.browser.looking import expect
 from tests.browser.visitor import Visitor
 from tests.service.data import ENDLESS, arrays, columns, csv, ended, job, npz, queue, stream, upload
 

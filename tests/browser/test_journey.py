@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lipcore.data.samples import Samples
-from tests.browser.accessibility import audit
+from tests.browser.accessibility import audit, expect
 from tests.browser.conftest import Dashboard
-from tests.browser.looking import expect
 from tests.browser.robot import playing
 from tests.browser.visitor import DESKTOP, PHONE, Visitor
 from tests.service.data import arrays, npz, stream, train

@@ -1,14 +1,11 @@
 """A model's page: what is drawn of a long recording, where there is nothing to draw, aliases, lineage and a query."""
 
-from __future__ import annotations
-
 import re
 
 import pytest
 
-from tests.browser.accessibility import audit
+from tests.browser.accessibility import audit, expect
 from tests.browser.conftest import Dashboard
-from tests.browser.looking import expect
 from tests.browser.visitor import Visitor
 from tests.service.data import QUICK, stream, train, upload
 

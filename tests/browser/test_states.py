@@ -12,9 +12,8 @@ import pytest
 
 from service.storage.database import Database
 from service.web.access import keys
-from tests.browser.accessibility import audit
+from tests.browser.accessibility import audit, expect
 from tests.browser.conftest import Dashboard, Visit
-from tests.browser.looking import expect
 from tests.browser.visitor import PHONE, Visitor
 from tests.service.server import Server
 

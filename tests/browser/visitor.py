@@ -69,7 +69,7 @@ class Visitor:
 
     def settled(self) -> Page:
         """Wait until the page of the address shows what it has to show, and loads nothing more."""
-        from tests.browser.looking import expect
+        from tests.browser.accessibility import expect
 
         self.page.evaluate("new Promise((done) => setTimeout(done))")  # a changed hash is told a moment later
         self.page.locator("main").locator("h1, .error, .empty").first.wait_for()

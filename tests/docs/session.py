@@ -1,64 +1,37 @@
-"""A reader of the documentation: a service of their own, a folder, a shell, and a Python that keeps its variables."""
+"""A reader of the documentation: a folder, a shell, a Python that keeps its variables, and eyes for what is printed."""
 
 import json
 import os
 import subprocess
 import sys
-from contextlib import ExitStack
+from decimal import Decimal
 from pathlib import Path
-from typing import Self
-
-import httpx
+from typing import Any, Self
 
 from tests.docs.blocks import ROOT, Block
-from tests.docs.expected import compare
-from tests.service.data import DEADLINE, eventually
-from tests.service.server import free_port
+from tests.service import backend
+from tests.service.server import Server
 
 WRITTEN = "127.0.0.1:8000"
 """Address of the service as the documentation has it."""
-PATIENCE, STARTING = 600, 180
-"""Seconds that a block may take, and the start of the service."""
+PATIENCE = 600
+"""Seconds that a block may take."""
 NOTEBOOK = Path(__file__).with_name("notebook.py")
 
 
 class Reader:
-    """A service on an empty home, started as the documentation says, and environment and folders of who uses it."""
+    """Environment and folders of who uses a service on an empty home."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.address = folder, f"127.0.0.1:{free_port()}"
+    def __init__(self, folder: Path, server: Server) -> None:
+        self.folder, self.address = folder, f"127.0.0.1:{server.port}"
         self.environment = {
             **os.environ,
+            **backend.environment(server.home),
             "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]),
-            "LIPSERVE_HOME": str(folder / "home"),
-            "LIPSERVE_PORT": self.address.rpartition(":")[2],
-            "LIPSERVE_URL": f"http://{self.address}",
+            "LIPSERVE_HOME": str(server.home),
+            "LIPSERVE_PORT": str(server.port),
+            "LIPSERVE_URL": server.url,
         }
-        self._stack = ExitStack()
-
-    def __enter__(self) -> Self:
-        path = self.folder / "service.log"
-        log = self._stack.enter_context(path.open("wb"))
-        command = ["bash", "-c", "exec .venv/bin/lipserve serve"]
-        service = subprocess.Popen(command, cwd=self.place("service"), env=self.environment, stdout=log, stderr=log)
-        self._stack.callback(_end, service)
-
-        def ready() -> bool:
-            assert service.poll() is None, path.read_text()
-            try:
-                return httpx.get(f"http://{self.address}/health/ready").status_code == httpx.codes.OK
-            except httpx.TransportError:
-                return False
-
-        try:
-            eventually(ready, STARTING)
-        except BaseException:
-            self._stack.close()
-            raise
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
 
     def place(self, name: str) -> Path:
         """A new folder with what a checkout has that pages name."""
@@ -74,24 +47,25 @@ class Session:
 
     def __init__(self, reader: Reader, name: str) -> None:
         self._reader, self._work = reader, reader.place(name)
-        self._said, self._python = "", None
+        self._printed, self._python = "", None
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._python is not None:
-            _end(self._python)
+            self._python.kill()
+            self._python.communicate()
 
     def run(self, block: Block) -> None:
-        """Do what a block says; raise AssertionError where it fails, or prints something else than is shown."""
+        """Do what a block says; raise AssertionError where it fails, or prints something else than is written."""
         text = block.text.replace(WRITTEN, self._reader.address)
         if block.language == "json":
-            compare(json.loads(self._said), block.text, block.place)
+            compare(json.loads(self._printed), block.text, block.place)
         elif block.language == "python":
-            self._said = self._in_python(text, block.place)
+            self._printed = self._in_python(text, block.place)
         elif not block.serves:  # it does already
-            self._said = self._in_shell(text, block.place)
+            self._printed = self._in_shell(text, block.place)
 
     def _in_shell(self, text: str, place: str) -> str:
         done = subprocess.run(
@@ -120,18 +94,31 @@ class Session:
         assert self._python.stdout is not None
         self._python.stdin.write(json.dumps(text) + "\n")
         self._python.stdin.flush()
-        said = json.loads(self._python.stdout.readline())
-        assert said["error"] is None, f"{place}\n{text}\n{said['error']}"
-        return str(said["printed"])
+        answer = json.loads(self._python.stdout.readline())
+        assert answer["error"] is None, f"{place}\n{text}\n{answer['error']}"
+        return str(answer["printed"])
 
 
-def _end(process: subprocess.Popen[bytes] | subprocess.Popen[str]) -> None:
-    for stream in (process.stdin, process.stdout):
-        if stream is not None:
-            stream.close()
-    process.terminate()
-    try:
-        process.wait(DEADLINE)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+def compare(printed: Any, written: str, place: str) -> None:
+    """Raise AssertionError where a value that a page shows is not the one printed, to the digits that are written."""
+    _same(printed, json.loads(written, parse_float=Decimal), place)
+
+
+def _same(printed: Any, written: Any, place: str) -> None:
+    if isinstance(written, dict):
+        assert isinstance(printed, dict), place
+        for name, value in written.items():
+            assert name in printed, f"{place}: {name} is not printed, but {list(printed)}"
+            _same(printed[name], value, f"{place}, {name}")
+    elif isinstance(written, list):
+        assert isinstance(printed, list), place
+        assert len(printed) == len(written), f"{place}: {len(printed)} printed, {len(written)} written"
+        for index, (left, right) in enumerate(zip(printed, written, strict=True)):
+            _same(left, right, f"{place}[{index}]")
+    elif isinstance(written, Decimal):
+        last_digit = Decimal(1).scaleb(int(written.as_tuple().exponent))
+        assert abs(Decimal(repr(printed)) - written) <= last_digit, f"{place}: {printed} is written as {written}"
+    elif isinstance(written, str) and written.endswith("…"):
+        assert str(printed).startswith(written.removesuffix("…")), f"{place}: {printed!r} is written as {written!r}"
+    else:
+        assert printed == written, f"{place}: {printed!r} is written as {written!r}"

@@ -11,7 +11,7 @@ from distributed.cli.dask_scheduler import main as dask_scheduler
 from service.app import create_app
 from service.foundation.settings import Settings
 from tests.docs.blocks import ROOT
-from tests.docs.test_commands import parse
+from tests.docs.test_pages import parse
 
 COMPOSE = yaml.safe_load((ROOT / "compose.yaml").read_text("utf-8"))
 SERVICES = COMPOSE["services"]

@@ -69,18 +69,6 @@ def test_html_in_markdown_is_text(monkeypatch, tmp_path):
     assert [part for part in ("<script", 'href="javascript', 'src="data:text/html') if part in html] == []
 
 
-@pytest.mark.parametrize(
-    ("href", "leads"),
-    [
-        ("own-robot.md#2-upload", "/guide/own-robot#2-upload"),
-        ("reference/api.md", "/guide/api"),
-        ("README.md", "/guide"),
-        ("demo.png", "/guide/files/demo.png"),
-        ("#here", "#here"),
-        ("https://example.org", "https://example.org"),
-        ("../service/settings.py", None),
-        ("../../etc/passwd", None),
-    ],
-)
-def test_links_are_those_of_the_guide(href, leads):
-    assert routes.target(href, "numbers.md") == leads
+@pytest.mark.parametrize("href", ["../service/settings.py", "../../etc/passwd"])
+def test_links_to_what_is_no_page_lead_nowhere(href):
+    assert routes.target(href, "numbers.md") is None

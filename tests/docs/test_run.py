@@ -1,12 +1,40 @@
-"""Every block that a reader can type is typed. Quick ones share a service, all of a page have one of their own."""
+"""Every block that a reader can type is typed, or says why not; what it prints is compared."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
 
-from tests.docs.blocks import ROOT, RUN, Block, blocks, pages
-from tests.docs.session import Reader, Session
+from tests.docs.blocks import REASONS, ROOT, RUN, Block, blocks, pages
+from tests.docs.session import Reader, Session, compare
+from tests.service.server import Server
+
+
+@pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)
+def test_every_block_is_run_or_says_why_not(page):
+    for block in blocks(page):
+        known = block.language in RUN if block.reason is None else block.reason in REASONS
+        assert known, f"{block.place} is {block.language or 'of no language'}: run it or say why not, {REASONS}"
+    for before, block in zip([None, *blocks(page)], blocks(page), strict=False):
+        if block.language == "json" and block.reason is None:  # output follows the command that prints it
+            assert before is not None, block.place
+            assert (before.reason, before.language == "json") == (None, False), block.place
+
+
+@pytest.mark.parametrize(
+    ("printed", "written"),
+    [
+        ({"a": 1.2375}, '{"a": 1.235}'),
+        ([1.0, 2.0], "[1.0]"),
+        ({"id": "job_1"}, '{"id": "ds_…"}'),
+        ({}, '{"a": null}'),
+        ({"n": 3}, '{"n": 4}'),
+    ],
+)
+def test_output_is_compared_to_the_digits_that_are_shown(printed, written):
+    compare({"a": 1.23456, "id": "ds_12345", "b": 2}, '{"a": 1.235, "id": "ds_…"}', "here")
+    with pytest.raises(AssertionError, match="here"):
+        compare(printed, written, "here")
 
 
 def chosen(page: Path, slow: bool) -> list[Block]:
@@ -34,8 +62,9 @@ def run(reader: Reader, page: Path, found: Sequence[Block]) -> None:
 @pytest.fixture(scope="module")
 def reader(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Reader]:
     """A service for the quick blocks of all pages."""
-    with Reader(tmp_path_factory.mktemp("docs")) as started:
-        yield started
+    folder = tmp_path_factory.mktemp("docs")
+    with Server(folder / "home", warm=True) as server:
+        yield Reader(folder, server)
 
 
 @pytest.mark.parametrize("page", QUICK, ids=name)
@@ -46,5 +75,5 @@ def test_what_a_page_says_works(reader, page):
 @pytest.mark.slow
 @pytest.mark.parametrize("page", SLOW, ids=name)
 def test_all_that_a_page_says_works(tmp_path, page):
-    with Reader(tmp_path) as fresh:
-        run(fresh, page, chosen(page, slow=True))
+    with Server(tmp_path / "home", warm=True) as server:
+        run(Reader(tmp_path, server), page, chosen(page, slow=True))

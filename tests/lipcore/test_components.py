@@ -1,19 +1,37 @@
-"""Components of the dynamics against Pinocchio at configurations never seen, and the laws that tie them together."""
+"""Components of the dynamics: against Pinocchio, a dense Gaussian posterior of energies, and the laws that tie them."""
 
+from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 import pytest
 import torch
+from torch import Tensor
 from torch.func import jacrev
 
 from lipcore import FitOptions, Samples, TorqueModel, train
 from lipcore.data.motion import Motion
+from lipcore.fitting.estimators import make_estimator
+from lipcore.kernels.friction import SIGN_WIDTH
 from lipcore.model import dynamics
+from lipcore.model.torque_model import training_range
+from lipcore.posterior.basis import Basis
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.statistics import collect
 from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import Stream, simulate
 from lipcore.robots.urdf import RigidBody
+from tests.lipcore.oracles import (
+    Energy,
+    Instant,
+    chain_energies,
+    energy_torque,
+    instant,
+    lip_energies,
+    torque_terms,
+)
 
 
 class Setting(NamedTuple):
@@ -196,20 +214,140 @@ def test_torque_is_affine_in_acceleration_and_its_velocity_terms_are_quadratic(c
     assert (torque(-2 * motion.dq, zero) - rest - 4 * (torque(motion.dq, zero) - rest)).abs().max() < 1e-6 * size
 
 
-def test_names_that_are_not_on_offer(case: Case) -> None:
-    motion = case.unseen.motion()[:1]
+def test_what_cannot_be_asked_for(case: Case) -> None:
+    motion, tau = case.unseen.motion()[:2], torch.from_numpy(case.unseen.tau[:2])
     with pytest.raises(dynamics.UnavailableComponentError, match="component is 'mass', expected one that estimator"):
         dynamics.components(case.model, motion, ["gravity", "mass"])
     q = torch.zeros((1, 5), dtype=torch.float64)
     with pytest.raises(ValueError, match="motion has 5 joints, expected"):
         dynamics.components(case.model, Motion(q, q, q), ["gravity"])
-
-
-def test_torque_and_forward_dynamics_come_together(case: Case) -> None:
-    motion, tau = case.unseen.motion()[:2], torch.from_numpy(case.unseen.tau[:2])
     with pytest.raises(ValueError, match="tau is None, expected a torque for forward_dynamics"):
         dynamics.components(case.model, motion, ["forward_dynamics"])
     with pytest.raises(ValueError, match="tau is given, expected None without forward_dynamics"):
         dynamics.components(case.model, motion, ["gravity"], tau)
     with pytest.raises(ValueError, match=r"tau has shape \(1, ., expected|tau has shape \(1, .\), expected \(2, .\)"):
         dynamics.components(case.model, motion, ["forward_dynamics"], tau[:1])
+
+
+TYPES = ("revolute", "prismatic")
+N, SAMPLES, QUERIES = 2, 3, 2
+JOINT_NAMES = ("a", "b")
+
+
+ENERGIES = {"lip": lip_energies, "lip-chain": chain_energies}
+
+
+class Small(NamedTuple):
+    """A random model, the energies of its prior, the covariance of the measured torques, and queries."""
+
+    model: TorqueModel
+    motion: Motion
+    tau: Tensor
+    energies: list[Energy]
+    gram: np.ndarray
+    query: Motion
+
+
+@pytest.fixture(scope="module", params=ENERGIES)
+def small(request: pytest.FixtureRequest) -> Small:
+    rng = np.random.default_rng(3)
+    motion = Motion.from_arrays(*rng.uniform(-1.5, 1.5, (3, SAMPLES, N)))
+    query = Motion.from_arrays(*rng.uniform(-1.5, 1.5, (3, QUERIES, N)))
+    tau = torch.from_numpy(rng.normal(size=(SAMPLES, N)))
+    like = make_estimator(request.param, TYPES).kernel.initial(motion, tau)
+    params = {name: torch.from_numpy(np.asarray(rng.uniform(-1, 0.5, value.shape))) for name, value in like.items()}
+    params["noise.log_std"] = torch.tensor([-1.5, -2.0], dtype=torch.float64)
+    kernel, outputs = make_estimator(request.param, TYPES).kernel, torch.arange(SAMPLES * N)
+    basis = Basis.build(kernel, params, motion, outputs)
+    statistics = collect(basis, torch.exp(2 * params["noise.log_std"]), motion, tau)
+    estimator = make_estimator(request.param, TYPES)
+    posterior = CompactPosterior.restore(estimator.kernel, params, motion, outputs, statistics)
+    span = training_range(motion)
+    model = TorqueModel(estimator, JOINT_NAMES, TYPES, "gravity_included", {}, {}, posterior, span, {})
+    energies = ENERGIES[request.param](TYPES, params)
+    data = samples(motion)
+    noise = np.tile(np.exp(2 * params["noise.log_std"].numpy()), SAMPLES)
+    gram = torque_covariance(energies, data, data) + friction_covariance(params, data, data) + np.diag(noise)
+    return Small(model, motion, tau, energies, gram, query)
+
+
+def torque_covariance(energies: list[Energy], xs: Sequence[Instant], ys: Sequence[Instant]) -> np.ndarray:
+    """Covariance of the torques of the energies alone: (len(xs) n, len(ys) n)."""
+    blocks = [[torque_terms(energies, x, y).sum(0).numpy() for y in ys] for x in xs]
+    return np.block(blocks)
+
+
+def friction_covariance(params: Mapping[str, Tensor], xs: Sequence[Instant], ys: Sequence[Instant]) -> np.ndarray:
+    variances = torch.exp(2 * params["friction.log_std"]).numpy()
+
+    def features(v: Tensor) -> np.ndarray:
+        return np.stack([v.numpy(), np.tanh(v.numpy() / SIGN_WIDTH), np.ones(N)], axis=1)
+
+    return np.block([[np.diag((features(x[1]) * variances * features(y[1])).sum(1)) for y in ys] for x in xs])
+
+
+def samples(motion: Motion) -> list[Instant]:
+    return [instant(motion, row) for row in range(SAMPLES)]
+
+
+def conditioned(small: Small, prior: np.ndarray, cross: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of quantities with prior covariance (k, k) and covariance (k, m) with the torques."""
+    solved = np.linalg.solve(small.gram, cross.T)
+    return solved.T @ small.tau.numpy().ravel(), np.sqrt(np.diag(prior - cross @ solved))
+
+
+def assert_estimate(found: dynamics.Estimate, row: int, mean: np.ndarray, std: np.ndarray) -> None:
+    np.testing.assert_allclose(found.mean[row].numpy().ravel(), mean, rtol=1e-7, atol=1e-10)
+    np.testing.assert_allclose(found.std[row].numpy().ravel(), std, rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize("row", range(QUERIES))
+def test_energies(small: Small, row: int) -> None:
+    names = ["kinetic_energy", "potential_energy"]
+    found = dynamics.components(small.model, small.query, names)
+    x = instant(small.query, row)
+    origin = dynamics.reference_posture(small.model)
+    reference = (origin, torch.zeros(N, dtype=torch.float64), torch.zeros(N, dtype=torch.float64))
+    data = samples(small.motion)
+    torques = np.array([[energy_torque(small.energies, at, y).numpy() for y in data] for at in (x, reference)])
+    torques = torques.transpose(0, 2, 1, 3).reshape(2, len(small.energies), -1)  # (at, energy, m)
+
+    def value(which: int, at: Instant, other: Instant) -> float:
+        return float(small.energies[which].kernel(*at[:2], *other[:2]))
+
+    kinetic = sum(value(which, x, x) for which in range(1, N + 1))
+    expected = conditioned(small, np.array([[kinetic]]), torques[0, 1:].sum(0)[None])
+    assert_estimate(found["kinetic_energy"], row, *expected)
+
+    potential = value(0, x, x) - 2 * value(0, x, reference) + value(0, reference, reference)
+    expected = conditioned(small, np.array([[potential]]), (torques[0, 0] - torques[1, 0])[None])
+    assert_estimate(found["potential_energy"], row, *expected)
+
+
+@pytest.mark.parametrize("row", range(QUERIES))
+def test_torques_and_inertia(small: Small, row: int) -> None:
+    q, v, a = instant(small.query, row)
+    zero, eye = torch.zeros(N, dtype=torch.float64), torch.eye(N, dtype=torch.float64)
+    stack = [(q, zero, zero), (q, v, zero), (q, zero, a), *((q, zero, eye[j]) for j in range(N))]
+    prior = torque_covariance(small.energies, stack, stack)
+    cross = torque_covariance(small.energies, stack, samples(small.motion))
+    rest, moving, accelerating, *pushes = np.split(np.eye(len(stack) * N), len(stack))
+    column = [push - rest for push in pushes]
+    differences = {
+        "gravity": rest,
+        "coriolis": moving - rest,
+        "inertial": accelerating - rest,
+        "inertia_matrix": np.stack([column[j][i] for i, j in product(range(N), range(N))]),
+    }
+    found = dynamics.components(small.model, small.query, list(differences))
+    for name, rows in differences.items():
+        assert_estimate(found[name], row, *conditioned(small, rows @ prior @ rows.T, rows @ cross))
+
+
+@pytest.mark.parametrize("row", range(QUERIES))
+def test_friction(small: Small, row: int) -> None:
+    x = instant(small.query, row)
+    params = small.model.posterior.params
+    prior, cross = friction_covariance(params, [x], [x]), friction_covariance(params, [x], samples(small.motion))
+    friction = dynamics.components(small.model, small.query, ["friction"])["friction"]
+    assert_estimate(friction, row, *conditioned(small, prior, cross))

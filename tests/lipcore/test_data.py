@@ -1,11 +1,20 @@
-"""The table of samples, motion, and signals: filtered, differentiated, their noise."""
+"""The table of samples, motion and signals, and how much the rows of a fast stream count for."""
 
 import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from lipcore.data.independence import (
+    INDEPENDENT_HZ,
+    even_weights,
+    recording_weights,
+    residual_correlation,
+    stream_weights,
+)
 from lipcore.data.motion import Motion, check_joint_types
 from lipcore.data.samples import Samples
 from lipcore.data.signals import differentiate, low_pass, noise_level
@@ -40,16 +49,6 @@ def test_array_of_another_shape_is_named(name: str) -> None:
         replace(table(), episode=np.zeros(5, dtype=np.int64))
 
 
-def test_rows_are_chosen_from_every_column() -> None:
-    samples = table()
-    for index in (slice(1, 5, 2), np.array([1, 3]), np.isin(np.arange(6), [1, 3])):
-        part = samples.rows(index)
-        assert part.joint_names == samples.joint_names
-        assert part.t.tolist() == [0.1, 0.3]
-        assert part.tau.tolist() == samples.tau[[1, 3]].tolist()
-        assert len(part.episode) == 2
-
-
 def test_episodes_are_contiguous_runs() -> None:
     assert table(6, (4, 4, 1, 1, 1, 4)).episodes() == [slice(0, 2), slice(2, 5), slice(5, 6)]
     assert table(0).episodes() == []
@@ -74,13 +73,6 @@ def test_what_is_no_motion_and_no_robot_is_refused() -> None:
         Motion.from_arrays(*np.zeros((3, 4, 2, 2)))
     with pytest.raises(ValueError, match="joint_types is empty"):
         check_joint_types([])
-
-
-def test_one_instant_and_many_are_accepted() -> None:
-    assert Motion.from_arrays([1, 2], [3, 4], [5, 6]).q.shape == (1, 2)
-    motion = Motion.from_arrays(*np.arange(24.0).reshape(3, 4, 2))
-    assert (len(motion), motion.n_joints) == (4, 2)
-    assert motion[1:3].dq.tolist() == [[10.0, 11.0], [12.0, 13.0]]
 
 
 @pytest.mark.parametrize("name", ["q", "dq", "ddq"])
@@ -135,3 +127,84 @@ def test_noise_level_of_a_noisy_sinusoid(std: float) -> None:
 def test_noise_level_of_recordings_too_short_to_tell_is_a_tenth_of_the_spread() -> None:
     episodes = [np.array([[0.0], [1.0]]), np.array([[2.0]])]
     assert noise_level(episodes)[0] == pytest.approx(0.1 * np.std([0.0, 1.0, 2.0]))
+
+
+@pytest.mark.parametrize("rate", [100.0, 250.0, 1000.0])
+def test_a_second_of_a_fast_stream_counts_the_same_at_every_rate(rate: float) -> None:
+    time = 1e9 + np.arange(int(4 * rate)) / rate
+    assert stream_weights(time).sum() == pytest.approx(4 * INDEPENDENT_HZ, rel=1e-3)
+    assert stream_weights(time[1:], time[0]).sum() == pytest.approx((4 - 1 / rate) * INDEPENDENT_HZ, rel=1e-3)
+
+
+def test_rows_of_a_slow_stream_count_in_full() -> None:
+    assert (stream_weights(np.arange(5) / INDEPENDENT_HZ) > 1 - 1e-12).all()
+    assert (stream_weights(np.arange(5) / 2.0) == 1).all()
+    assert (stream_weights(np.array([3.0])) == 1).all()
+    assert (stream_weights(np.array([3.0]), 2.0) == 1).all()
+
+
+def test_a_wrong_time_does_not_change_what_evenly_spaced_rows_count_for() -> None:
+    time = 5.0 + np.arange(20) / 500
+    expected = np.full(20, INDEPENDENT_HZ / 500)
+    np.testing.assert_allclose(even_weights(time), expected)
+    for wrong in (np.nan, 4.0, 1e9, time[6]):
+        np.testing.assert_allclose(even_weights(np.where(np.arange(20) == 7, wrong, time)), expected, rtol=1e-9)
+    assert (even_weights(np.array([3.0])) == 1).all()
+    assert (even_weights(np.arange(5.0)) == 1).all()
+
+
+def test_rows_that_were_bunched_count_for_the_time_they_took() -> None:
+    """Ten frames that wait for each other and arrive together stand for the ten milliseconds since the last ones."""
+    even = np.arange(1, 201) / 1000
+    bunched = np.repeat(even[9::10], 10) + np.tile(np.arange(10), 20) * 1e-6
+    assert stream_weights(bunched, 0.0).sum() == pytest.approx(stream_weights(even, 0.0).sum(), rel=1e-2)
+
+
+def test_rows_without_times_share_those_since_the_batch_before() -> None:
+    together = stream_weights(np.full(100, 7.0), 6.9)
+    assert (together == together[0]).all()
+    assert together.sum() == pytest.approx(0.1 * INDEPENDENT_HZ)
+    assert (stream_weights(np.full(100, 7.0)) == 1).all()
+
+
+def test_time_that_goes_backwards_counts_nothing() -> None:
+    assert stream_weights(np.array([3.0]), 4.0)[0] == 0
+    assert len(stream_weights(np.empty(0))) == 0
+
+
+@given(st.permutations(range(8)))
+def test_weights_belong_to_rows_and_not_to_places(order: list[int]) -> None:
+    time = np.cumsum([0.001, 0.002, 0.001, 0.05, 0.003, 0.001, 0.001, 0.01])
+    np.testing.assert_allclose(stream_weights(time[order], 0.0), stream_weights(time, 0.0)[order])
+
+
+@pytest.mark.parametrize("rate", [1000.0, 100.0, 8.0])
+def test_rows_of_a_recording_count_for_their_time(rate: float) -> None:
+    time = np.r_[np.arange(50) / rate, 5 + np.arange(50) / rate, 9.0]
+    episode = np.r_[np.zeros(50), np.ones(50), 2].astype(np.int64)
+    found = recording_weights(time, episode)
+    np.testing.assert_allclose(found, np.r_[np.full(100, min(1.0, 10 / rate)), 1.0], rtol=1e-9)
+    # a piece with one more row at both ends knows what the whole knows
+    np.testing.assert_array_equal(recording_weights(time[29:72], episode[29:72])[1:-1], found[30:71])
+    assert len(recording_weights(np.empty(0), np.empty(0, np.int64))) == 0
+
+
+def noisy(size: int, memory: float, seed: int, episodes: int = 1) -> tuple[np.ndarray, Samples]:
+    """An autoregression e_k = φ e_{k−1} + white, in each of several recordings."""
+    rng = np.random.default_rng(seed)
+    white = rng.standard_normal((size, 2))
+    episode = np.arange(size) * episodes // size
+    for k in range(1, size):
+        if episode[k] == episode[k - 1]:
+            white[k] += memory * white[k - 1]
+    nothing = np.zeros((size, 2))
+    return white, Samples(("a", "b"), np.arange(size) * 0.01, episode, nothing, nothing, nothing, white)
+
+
+@pytest.mark.parametrize("episodes", [1, 5])
+def test_rows_that_an_independent_one_stands_for(episodes: int) -> None:
+    assert residual_correlation(*noisy(5000, 0.0, 1, episodes)) == pytest.approx(1.0, abs=0.1)
+    for memory in (0.5, 0.8):  # 1 + 2 Σ φ^k
+        expected = (1 + memory) / (1 - memory)
+        assert residual_correlation(*noisy(20_000, memory, 2, episodes)) == pytest.approx(expected, rel=0.2)
+    assert residual_correlation(np.zeros((3, 2)), noisy(3, 0.0, 3)[1]) == 1.0

@@ -4,13 +4,10 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given
-from hypothesis import strategies as st
 
 from lipcore import FitOptions, train
 from lipcore.data.metrics import evaluate
 from lipcore.data.motion import Motion
-from lipcore.kernels import energy
-from lipcore.kernels.energy import initial_weights, velocity_weights
 from lipcore.kernels.lip import shares
 from lipcore.robots.simulation import Stream, simulate
 from tests.choosing import slow
@@ -21,14 +18,10 @@ from tests.lipcore.oracles import (
     Problem,
     base_kernel,
     chain_base_kernel,
-    chain_shapes,
-    lip_shapes,
     opposite,
-    pooled_weight,
     problems,
     random_problem,
     shares_of,
-    weight_shapes,
     worst_block_error,
     worst_energy_error,
 )
@@ -102,22 +95,6 @@ def test_zero_of_a_revolute_joint_of_a_chain_is_of_no_account(joint: int) -> Non
     assert (after - before).abs().max() < 1e-12 * before.abs().max()
 
 
-@kernels
-def test_initial_hyperparameters_have_the_documented_names_and_shapes(kernel: str) -> None:
-    problem = random_problem(MIXED, samples=20, seed=0, kernel=kernel)
-    shapes = chain_shapes(3) if kernel == "chain" else lip_shapes(3, kernel == "tied")
-    for tau in (problem.motion.q, 0 * problem.motion.q):
-        initial = problem.kernel.initial(problem.motion, tau)
-        assert {name: tuple(value.shape) for name, value in initial.items()} == shapes
-        assert all(value.isfinite().all() for value in initial.values())
-
-
-@kernels
-def test_unknown_joint_type_is_named(kernel: str) -> None:
-    with pytest.raises(ValueError, match=r"joint_types\[1\] is 'planar'"):
-        KERNELS[kernel][0](("revolute", "planar"))
-
-
 def test_shares_sum_to_one_and_equal_their_definition() -> None:
     logits = torch.tensor([[0.0, 0.0], [3.0, -50.0], [700.0, 1.0]]).double()
     assert torch.allclose(shares(logits).sum(1), torch.ones(3).double(), rtol=0, atol=1e-15)
@@ -135,37 +112,3 @@ def test_dynamics_of_a_true_chain_lie_in_the_space_of_the_kernel(kinds: str) -> 
     answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
     nmse = evaluate(unseen.tau, answer.tau, answer.tau_std, answer.noise_std).nmse
     assert (nmse < 1e-6).all(), nmse
-
-
-# the velocity weights of both
-
-
-@given(st.integers(1, 8), st.integers(0, 99))
-def test_weights_are_five_logarithms_added_up(n: int, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    params = {name: torch.tensor(rng.uniform(-2, 2, shape)) for name, shape in weight_shapes(n).items()}
-    found = velocity_weights(params, n)
-    assert found.shape == (n, n)
-    assert torch.count_nonzero(found.triu(1)) == 0
-    for link in range(n):
-        for joint in range(link + 1):
-            assert float(found[link, joint]) == pytest.approx(float(pooled_weight(params, link, joint)), rel=1e-13)
-
-
-@kernels
-def test_every_energy_kernel_uses_them(kernel: str) -> None:
-    problem = random_problem(MIXED, 1, seed=1, kernel=kernel)
-    assert torch.equal(problem.kernel.weights(problem.params), velocity_weights(problem.params, 3))
-    for name in weight_shapes(3):
-        assert problem.kernel.prior_std()[name] == energy.PRIOR_STD[name]
-
-
-@pytest.mark.parametrize("n", [1, 3, 7])
-def test_start_is_the_inertia_that_the_torques_hint_at(n: int) -> None:
-    tau = torch.zeros((50, n), dtype=torch.float64)
-    tau[:, 0] = 40.0
-    found = velocity_weights(initial_weights(tau), n)
-    # a torque of 40 N·m: an arm of about a metre with about 4 kg·m², to which every link contributes alike
-    assert float(found.sum(0)[0]) == pytest.approx(4.0)
-    assert len(set(found[torch.tril_indices(n, n).unbind()].tolist())) == 1
-    torch.testing.assert_close(velocity_weights(initial_weights(100 * tau), n), 100 * found)

@@ -1,20 +1,32 @@
-"""Every estimator that can be chosen: it fits and predicts, survives awkward data, and its gradient is right."""
+"""Every estimator that can be chosen: it fits and predicts, survives awkward data, and is calibrated by one factor."""
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import ArrayLike
 
-from lipcore import FitOptions, Samples, TorqueModel, train
+from lipcore import FitOptions, Samples, TorqueModel, load, save, train
 from lipcore.data.metrics import evaluate
-from lipcore.fitting.estimators import ESTIMATORS, make_estimator
+from lipcore.fitting.estimators import (
+    ESTIMATORS,
+    FUNCTION_STD_FACTOR,
+    NO_CALIBRATION,
+    Calibration,
+    calibrate,
+    make_estimator,
+)
 from lipcore.kernels.arm_prior import Arm, arm_of_robot
+from lipcore.model import dynamics
+from lipcore.model.parameters import friction_coefficients, inertial_parameters, weight_posterior
 from lipcore.posterior.exact import negative_log_evidence
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate
 from lipcore.robots.urdf import RigidBody
+from lipcore.training import fit
 from lipcore.vocabulary import ROBOT_ESTIMATORS
 
 ROBOT = "double-pendulum"
@@ -127,7 +139,6 @@ def test_gradient_of_the_evidence_equals_finite_differences(name: str, prior: st
             assert float(gradient[key][index]) == pytest.approx(expected, rel=1e-6, abs=1e-7), (key, index)
 
 
-JOINT_TYPES = ("revolute", "revolute")
 SMALL = FitOptions(
     hyperparameter_samples=20, posterior_samples=50, max_iterations=10, starts=1, device="cpu", statistics="chosen"
 )
@@ -135,12 +146,12 @@ SMALL = FitOptions(
 
 @pytest.fixture(scope="module")
 def samples() -> Samples:
-    return simulate(load_robot("double-pendulum"), Stream(n_samples=60, speed=10, noise=0.01), seed=1)
+    return recorded(noise=1e-4)
 
 
 @pytest.fixture(scope="module")
 def model(samples: Samples) -> TorqueModel:
-    return train(samples, JOINT_TYPES, "lip-chain", SMALL)
+    return train(samples, TYPES, "lip-chain", SMALL)
 
 
 def test_answer_for_many_is_the_answers_for_each(model: TorqueModel, samples: Samples) -> None:
@@ -153,23 +164,14 @@ def test_answer_for_many_is_the_answers_for_each(model: TorqueModel, samples: Sa
         assert np.allclose(one.tau[0], many.tau[k], rtol=1e-8, atol=1e-10)
         assert np.allclose(one.covariance[0], many.covariance[k], rtol=1e-6, atol=1e-12)
     assert np.allclose(many.tau_std**2, np.diagonal(many.covariance, axis1=1, axis2=2), rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("shapes", "message"),
-    [
-        (((4, 3),) * 3, "q has 3 joints, expected 2: joint1, joint2"),
-        (((4, 2), (4, 2), (3, 2)), r"ddq has shape \(3, 2\), expected \(4, 2\)"),
-    ],
-    ids=str,
-)
-def test_query_of_wrong_shape_is_refused(model: TorqueModel, shapes: tuple, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        model.predict(*(np.zeros(shape) for shape in shapes))
+    with pytest.raises(ValueError, match="q has 3 joints, expected 2: joint1, joint2"):
+        model.predict(*np.zeros((3, 4, 3)))
+    with pytest.raises(ValueError, match=r"ddq has shape \(3, 2\), expected \(4, 2\)"):
+        model.predict(np.zeros((4, 2)), np.zeros((4, 2)), np.zeros((3, 2)))
 
 
 def test_bad_argument_of_training_is_named(samples: Samples) -> None:
-    good = {"joint_types": JOINT_TYPES, "estimator": "lip-chain", "options": SMALL}
+    good = {"joint_types": TYPES, "estimator": "lip-chain", "options": SMALL}
     for arguments, message in (
         ({"joint_types": ("revolute",)}, "joint_types has 1 entries, expected 2"),
         ({"joint_types": ("revolute", "spherical")}, r"joint_types\[1\] is 'spherical'"),
@@ -182,4 +184,81 @@ def test_bad_argument_of_training_is_named(samples: Samples) -> None:
         values = getattr(samples, name).copy()
         values[3, 1] = np.nan
         with pytest.raises(ValueError, match=rf"{name}\[3, 1\]"):
-            train(replace(samples, **{name: values}), JOINT_TYPES, "lip-chain", SMALL)
+            train(replace(samples, **{name: values}), TYPES, "lip-chain", SMALL)
+
+
+FACTOR = 1.75
+SAME = 1e-6
+"""Share of the largest number by which two fits to the same samples may differ."""
+ZERO = FitOptions(hyperparameter_samples=30, max_iterations=20, starts=1, device="cpu", prior="zero")
+
+
+@pytest.fixture(scope="module", params=["lip-chain", "lip", "rigid-body"])
+def plain(request: pytest.FixtureRequest, samples: Samples) -> TorqueModel:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit, "calibrate", lambda name: NO_CALIBRATION)
+        return trained(request.param, samples, ZERO)
+
+
+@pytest.fixture(scope="module")
+def corrected(plain: TorqueModel, samples: Samples) -> TorqueModel:
+    """The same training, with a factor for its estimator."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(FUNCTION_STD_FACTOR, plain.estimator.name, FACTOR)
+        return trained(plain.estimator.name, samples, ZERO)
+
+
+def alike(found: ArrayLike, expected: ArrayLike) -> None:
+    """Assert that what two fits say is the same but for rounding, which the steps of a search magnify."""
+    np.testing.assert_allclose(found, expected, rtol=0, atol=SAME * np.abs(np.asarray(expected)).max())
+
+
+def test_predictions(plain: TorqueModel, corrected: TorqueModel, samples: Samples) -> None:
+    assert corrected.calibration == Calibration(FACTOR)
+    query = samples.q + 0.3, samples.dq, 2 * samples.ddq
+    one, other = (model.predict(*query, covariance=True) for model in (plain, corrected))
+    alike(other.tau, one.tau)
+    alike(other.noise_std, one.noise_std)
+    alike(other.tau_std, FACTOR * one.tau_std)
+    alike(other.covariance, FACTOR**2 * one.covariance)
+    assert (one.tau_std > 0).all()
+
+
+def test_components(plain: TorqueModel, corrected: TorqueModel, samples: Samples) -> None:
+    motion, tau = samples.motion()[10:15], samples.torque()[10:15]
+    one, other = (dynamics.components(m, motion, dynamics.COMPONENTS, tau) for m in (plain, corrected))
+    for name in dynamics.COMPONENTS:
+        alike(other[name].mean, one[name].mean)
+        alike(other[name].std, FACTOR * one[name].std)
+        assert (one[name].std > 0).any(), name
+
+
+def test_parameters(plain: TorqueModel, corrected: TorqueModel) -> None:
+    one, other = (friction_coefficients(m.posterior, m.estimator) for m in (plain, corrected))
+    for name in ("viscous", "coulomb", "offset"):
+        alike(getattr(other, name), getattr(one, name))
+        alike(getattr(other, f"{name}_std"), FACTOR * getattr(one, f"{name}_std"))
+    if plain.robot is not None:
+        bodies, scaled = (inertial_parameters(m.posterior, m.estimator) for m in (plain, corrected))
+        alike(scaled.mean, bodies.mean)
+        alike(scaled.std, FACTOR * bodies.std)
+        weights, more = (weight_posterior(m.posterior, m.estimator.terms["rigid_body"]) for m in (plain, corrected))
+        assert np.array_equal(weights.scale, more.scale)  # the prior's own
+
+
+def test_it_is_saved_and_loaded(corrected: TorqueModel, samples: Samples, tmp_path: Path) -> None:
+    manifest = save(corrected, tmp_path / "model")
+    assert manifest["calibration"] == {"function_std_factor": FACTOR}
+    again = load(tmp_path / "model")
+    assert again.calibration == corrected.calibration
+    query = samples.q, samples.dq, samples.ddq
+    for name in ("tau", "tau_std", "covariance", "noise_std"):
+        assert np.array_equal(getattr(again.predict(*query), name), getattr(corrected.predict(*query), name)), name
+    # what a model was saved with counts, not what its estimator has by now
+    assert calibrate(corrected.estimator.name).function_std_factor != FACTOR
+
+
+@pytest.mark.parametrize("factor", [0.999, 0.0, -2.0, float("nan"), float("inf"), 100.0])
+def test_factor_out_of_range_is_refused(factor: float) -> None:
+    with pytest.raises(ValueError, match=f"function_std_factor is {factor!r}, expected a number from 1 to 100"):
+        Calibration(factor)

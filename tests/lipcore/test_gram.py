@@ -1,4 +1,4 @@
-"""From blocks to Gram matrices: order of rows, symmetry, chunks, sums; and the kernel of friction."""
+"""Gram matrices: blocks, rows, sums and friction; the compiled ones against the PyTorch form and autograd."""
 
 import math
 
@@ -8,10 +8,11 @@ import torch
 from hypothesis import given
 
 from lipcore.data.motion import Motion
-from lipcore.kernels.base import PAIRS_PER_CHUNK, SumKernel, row_chunks
-from lipcore.kernels.friction import SIGN_WIDTH, STRIBECK_SPEED, FrictionKernel, friction_features
+from lipcore.kernels.base import SumKernel
+from lipcore.kernels.compiled.lanes import LANES
+from lipcore.kernels.friction import SIGN_WIDTH, STRIBECK_SPEED, FrictionKernel
 from lipcore.kernels.lip import LipKernel
-from tests.lipcore.oracles import KERNELS, Problem, problems, random_problem
+from tests.lipcore.oracles import KERNELS, Problem, TorchForm, opposite, problems, random_problem, shares_of
 
 JOINTS = ("revolute", "prismatic", "revolute")
 
@@ -24,13 +25,6 @@ def test_gram_is_symmetric_and_positive_semidefinite(problem: Problem) -> None:
     assert (symmetric - gram).abs().max() <= 1e-13 * gram.abs().max()
     values = torch.linalg.eigvalsh(0.5 * (gram + gram.T))
     assert values[0] >= -1e-10 * values[-1]
-
-
-def test_chunks_cover_all_rows_once_and_stay_small() -> None:
-    for rows, columns in ((1, 1), (1000, 10), (10, 100_000), (129, 64)):
-        chunks = list(row_chunks(rows, columns))
-        assert [row for chunk in chunks for row in range(chunk.start, chunk.stop)] == list(range(rows))
-        assert all((c.stop - c.start) * columns <= max(PAIRS_PER_CHUNK, columns) for c in chunks)
 
 
 @pytest.mark.parametrize("name", KERNELS)
@@ -75,17 +69,103 @@ def test_block_is_the_covariance_of_independent_weights_on_the_features(terms: i
                     assert math.isclose(float(gram[x, i, y, j]), expected, rel_tol=1e-12, abs_tol=1e-14)
 
 
-def test_sign_is_smooth_at_standstill_and_full_beyond() -> None:
-    sign = friction_features(torch.tensor([-1.0, -5 * SIGN_WIDTH, 0.0, 5 * SIGN_WIDTH, 1.0]).double())[1]
-    assert sign[2] == 0
-    assert torch.allclose(sign[[0, 1, 3, 4]], torch.tensor([-1.0, -1.0, 1.0, 1.0]).double(), rtol=0, atol=1e-4)
+RELATIVE = 1e-11
+ROBOTS = [
+    ("revolute",),
+    ("prismatic",),
+    ("revolute",) * 2,
+    ("prismatic",) * 3,
+    ("prismatic", "revolute", "revolute", "prismatic", "revolute"),
+    ("revolute",) * 7,
+]
+
+kernels = pytest.mark.parametrize("kernel", KERNELS)
+robots = pytest.mark.parametrize("joint_types", ROBOTS, ids=lambda kinds: "".join(kind[0] for kind in kinds))
 
 
-def test_initial_hyperparameters_split_a_tenth_of_the_torque_over_features() -> None:
-    motion = random_problem(("revolute",) * 2, samples=200, seed=2).motion
-    tau = torch.stack([5 * motion.q[:, 0], 0.1 * motion.q[:, 1]], dim=1)
-    std = torch.exp(FrictionKernel(2, stribeck=True).initial(motion, tau)["friction.log_std"])
-    usual_speed = motion.dq.square().mean(0).sqrt()
-    assert std.shape == (2, 4)
-    assert torch.allclose(std[:, 0] * usual_speed, 0.1 * tau.square().mean(0).sqrt(), rtol=1e-12)
-    assert torch.allclose(std[:, 1:], 0.1 * tau.square().mean(0).sqrt()[:, None].expand(2, 3), rtol=1e-12)
+def agree(actual: torch.Tensor, expected: torch.Tensor, name: str = "") -> None:
+    assert actual.shape == expected.shape
+    if expected.numel():
+        assert float((actual - expected).abs().max()) <= RELATIVE * float(expected.abs().max()), name
+
+
+def check(problem: Problem) -> None:
+    """All samples with each other and the gradient, and the first third of them with the rest."""
+    kernel, params, motion, third = problem.kernel, problem.params, problem.motion, len(problem.motion) // 3
+    form, places = TorchForm(kernel), len(motion) * kernel.n_joints
+    agree(kernel.gram(params, motion[:third], motion[third:]), form.gram(params, motion[:third], motion[third:]))
+    gram = kernel.symmetric_gram(params, motion)
+    assert torch.equal(gram, gram.T)
+    agree(gram, form.symmetric_gram(params, motion))
+
+    weight = torch.from_numpy(np.random.default_rng(1).standard_normal((places, places)))
+    compiled, reference = (each.gradient(params, motion, weight + weight.T) for each in (kernel, form))
+    assert compiled.keys() == reference.keys()
+    for name, derivative in reference.items():
+        agree(compiled[name], derivative, name)
+
+
+@robots
+@kernels
+# part of a block of columns, exactly one, and several
+@pytest.mark.parametrize("samples", [1, 3, LANES - 1, LANES, LANES + 1, 3 * LANES + 2])
+def test_equal_the_formula_in_pytorch(kernel: str, joint_types: tuple[str, ...], samples: int) -> None:
+    check(random_problem(joint_types, samples, seed=samples, kernel=kernel))
+
+
+@kernels
+def test_many_joints(kernel: str) -> None:
+    problem = random_problem(("revolute", "prismatic", "revolute") * 5, 3, seed=0, kernel=kernel)
+    if kernel == "chain":
+        problem.params["chain.logits"] -= 3.0
+    check(problem)
+
+
+@kernels
+@pytest.mark.parametrize("joint_types", [("revolute",) * 3, ("prismatic", "revolute", "prismatic")])
+@pytest.mark.parametrize("zeros", [(0,), (2,), (0, 2), (0, 1, 2)])
+def test_base_kernels_of_zero(kernel: str, joint_types: tuple[str, ...], zeros: tuple[int, ...]) -> None:
+    """p_b = 0 of one, two or all joints: the derivatives stay exact, as nothing divides by it."""
+    problem = random_problem(joint_types, 2, seed=3, kernel=kernel)
+    logits = torch.full((3, 2), 0.7, dtype=torch.float64)  # σ < α, β: p changes sign
+    for name, value in problem.params.items():
+        if name.endswith("logits"):
+            value[:] = 0.7 if kernel == "chain" else logits[: len(value)]
+    shares = shares_of(logits)
+    if kernel == "chain":
+        alpha = torch.sigmoid(torch.tensor(0.7, dtype=torch.float64))
+        straight = torch.tensor([kind == "prismatic" for kind in joint_types])
+        shares = torch.stack([1 - alpha.expand(3), alpha.expand(3), torch.where(straight, 0.0, alpha)], dim=1)
+    q = problem.motion.q.clone()
+    q[0] = torch.tensor([0.4, 0.9, 1.1])
+    for joint in zeros:
+        q[1, joint] = opposite(joint_types[joint], shares[joint].tolist(), float(q[0, joint]))
+    check(Problem(problem.kernel, problem.params, Motion(q, problem.motion.dq, problem.motion.ddq)))
+
+
+@kernels
+def test_no_samples(kernel: str) -> None:
+    problem = random_problem(("revolute",) * 2, 3, seed=0, kernel=kernel)
+    assert problem.kernel.gram(problem.params, problem.motion, problem.motion[:0]).shape == (6, 0)
+    nothing = torch.zeros((0, 0), dtype=torch.float64)
+    assert not any(
+        bool(each.any()) for each in problem.kernel.gradient(problem.params, problem.motion[:0], nothing).values()
+    )
+
+
+@robots
+@kernels
+# part of a block of columns, with and without room for the query, exactly one, and several
+@pytest.mark.parametrize("size", [1, LANES - 1, LANES, 2 * LANES - 1, 8 * LANES + 5])
+def test_cross_equals_the_gram_matrix(kernel: str, joint_types: tuple[str, ...], size: int) -> None:
+    problem, n = random_problem(joint_types, size + 3, seed=size, kernel=kernel), len(joint_types)
+    asked = problem.motion[size:]
+    queries = np.ascontiguousarray(torch.stack([asked.q, asked.dq, asked.ddq], dim=1).numpy())
+    found = np.full((len(asked), size + 1, n, n), np.nan)  # where anything left out would show
+    problem.kernel.cross(problem.params, problem.motion[:size]).fill_many(queries, found)
+    gram = problem.kernel.gram(problem.params, problem.motion[:size], asked).numpy()
+    expected = gram.reshape(size, n, 3, n).transpose(2, 0, 1, 3)
+    np.testing.assert_allclose(found[:, :size], expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    prior = problem.kernel.variance(problem.params, asked).numpy()
+    np.testing.assert_allclose(found[:, size], prior, rtol=0, atol=1e-12 * np.abs(prior).max())
+    assert np.array_equal(found[:, size], found[:, size].transpose(0, 2, 1))

@@ -151,12 +151,3 @@ def test_start_is_the_white_noise_or_a_hundredth_of_the_spread() -> None:
     std = noise.start(table(np.stack([wave, wave + 0.5 * rng.standard_normal(500)], axis=1)))
     assert std[0] == pytest.approx(0.01 * wave.std(), rel=1e-6)
     assert std[1] == pytest.approx(0.5, rel=0.15)
-
-
-def test_floor_is_a_share_of_the_spread_and_of_the_strongest_joint() -> None:
-    t = np.arange(100)[:, None] / 10
-    strong, weak, still = 100 * np.sin(t), 1e-3 * np.sin(t), 0 * t
-    floor = noise.floor(table(np.hstack([strong, weak, still])))
-    largest = np.sqrt(np.mean(strong**2))
-    assert floor.tolist() == pytest.approx([1e-4 * strong.std(), 1e-5 * largest, 1e-5 * largest])
-    assert (noise.floor(table(np.zeros((20, 2)))) > 0).all()

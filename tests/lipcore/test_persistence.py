@@ -200,7 +200,7 @@ def test_what_json_can_say_is_read(value: object) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (b"NaN", "holds NaN"),
         (b"-1e400", "'-1e400' is too large"),
@@ -221,8 +221,8 @@ def test_what_json_can_say_is_read(value: object) -> None:
     ],
     ids=lambda each: repr(each)[:24],
 )
-def test_what_is_ambiguous_or_runs_away_is_refused(text: bytes, said: str) -> None:
-    with pytest.raises(StrictJsonError, match=said):
+def test_what_is_ambiguous_or_runs_away_is_refused(text: bytes, message: str) -> None:
+    with pytest.raises(StrictJsonError, match=message):
         read(text, 1000 if b"1,1" in text else 10**6)
 
 

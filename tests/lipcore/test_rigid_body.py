@@ -138,11 +138,6 @@ def test_saved_model_comes_back_with_its_robot(model: TorqueModel, unseen: Sampl
     urdf.write_text(urdf.read_text().replace("panda", "bandit", 1))
     with pytest.raises(ModelFormatError, match=r"robot\.urdf does not match the sha256"):
         load(tmp_path / "copy")
-    with pytest.raises(ModelFormatError, match="sha256"):
-        copy_model(tmp_path / "copy", tmp_path / "again")
-    urdf.unlink()
-    with pytest.raises(ModelFormatError, match=r"robot\.urdf cannot be read"):
-        load(tmp_path / "copy")
     robot = manifest["robot"]
     assert (robot["joints"], robot["matched"]) == (list(model.robot.urdf_joints), "name")
     assert (robot["sha256"], robot["prior"]) == (model.robot.sha256, model.options["prior"])

@@ -92,16 +92,11 @@ def test_smallest_jitter_that_works_is_taken_and_reported(jitter: float) -> None
     assert torch.allclose(factor.lower @ factor.lower.T, shifted, rtol=1e-12, atol=1e-25)
 
 
-def test_singular_matrix_takes_little_jitter_and_an_indefinite_one_is_refused() -> None:
+def test_singular_matrix_takes_little_jitter_and_any_other_that_has_no_factor_is_refused() -> None:
     assert 0 < cholesky(torch.ones(4, 4, dtype=torch.float64)).jitter <= 1e-11
     matrix = torch.diag(torch.tensor([1.0, 1.0, -1e-6]).double())
     with pytest.raises(NotPositiveDefiniteError, match="size 3 is not positive definite"):
         cholesky(matrix)
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_matrix_that_is_not_finite_is_refused(value: float) -> None:
-    matrix = torch.eye(3, dtype=torch.float64)
-    matrix[2, 1] = value
+    matrix[2, 1] = float("nan")
     with pytest.raises(NotPositiveDefiniteError, match="not finite"):
         cholesky(matrix)

@@ -18,7 +18,7 @@ from lipcore.posterior.basis import Basis
 from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.posterior.statistics import Statistics, collect, decay, empty, merge, solve, subtract, update
 from lipcore.posterior.summing import Summing, Total
-from lipcore.training.conditioning import condition, should_condition
+from lipcore.training.conditioning import condition
 from tests.lipcore.oracles import random_problem
 from tests.service.data import QUICK, stream
 
@@ -115,14 +115,14 @@ def test_large_products_are_symmetric_and_those_of_small_ones() -> None:
     assert torch.equal(whole.a, whole.a.T)
 
 
-@pytest.mark.parametrize(("told", "largest"), [(3, 1e2), (20, 1e2), (60, 1e2), (60, 1e5)])
-def test_what_is_learnt_is_exact_and_triangular(told: int, largest: float) -> None:
+@pytest.mark.parametrize(("count", "largest"), [(3, 1e2), (20, 1e2), (60, 1e2), (60, 1e5)])
+def test_what_is_learnt_is_exact_and_triangular(count: int, largest: float) -> None:
     """From samples that tell of all 20 variables or only of some, as much of one as 1e10 times another's prior."""
-    generator = np.random.default_rng(told)
-    columns = generator.standard_normal((20, told)) * np.geomspace(1, largest, 20)[:, None]
+    generator = np.random.default_rng(count)
+    columns = generator.standard_normal((20, count)) * np.geomspace(1, largest, 20)[:, None]
     b, centre = generator.standard_normal(20), generator.standard_normal(20)
     found = solve(
-        Statistics(torch.from_numpy(columns @ columns.T), torch.from_numpy(b), told), torch.from_numpy(centre)
+        Statistics(torch.from_numpy(columns @ columns.T), torch.from_numpy(b), count), torch.from_numpy(centre)
     )
     # from the columns and not from their products, whose condition number is the square
     vectors, values, _ = np.linalg.svd(columns)
@@ -207,21 +207,6 @@ def test_the_form_of_other_devices_sums_alike(few, samples):
     found = summing._elsewhere(slow, samples, np.ones(len(samples)))
     np.testing.assert_allclose(np.tril(found.T @ found), fast.a, rtol=1e-8, atol=1e-8 * np.abs(fast.a).max())
     np.testing.assert_allclose(slow.b, fast.b, rtol=1e-8, atol=1e-8 * np.abs(fast.b).max())
-
-
-@pytest.mark.parametrize(
-    ("statistics", "count", "worth", "expected"),
-    [
-        ("auto", 500, 500.0, False),
-        ("auto", 501, 500.0, False),
-        ("auto", 501, 501.0, True),
-        ("all", 501, 3.0, True),
-        ("all", 500, 500.0, False),
-        ("chosen", 10**6, 1e6, False),
-    ],
-)
-def test_when_all_samples_are_wanted(statistics, count, worth, expected):
-    assert should_condition(FitOptions(statistics=statistics), count, worth) is expected
 
 
 def test_what_is_worth_more_than_the_chosen_ones_is_learnt(samples):
