@@ -4,6 +4,7 @@ import gc
 import os
 import shutil
 import stat
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from numba.core.dispatcher import Dispatcher
 from lipcore import FitOptions, train
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Samples
+from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.arm_prior import Alternative
 from lipcore.kernels.compiled import compile as compiling
 from lipcore.kernels.compiled.compile import source_stamp, use_cache
 from lipcore.model.functionals import kinetic_energy
@@ -45,6 +48,10 @@ def test_a_first_training_compiles_nothing_more(name: str) -> None:
     model.evaluator.one(np.ascontiguousarray(np.stack([q[0], dq[0], ddq[0]])))
     energies = [term for term in model.estimator.terms.values() if not hasattr(term, "stribeck")]
     kinetic_energy(model.posterior, energies, Motion.from_arrays(q[:2], dq[:2], ddq[:2]))
+    if model.arm is not None:
+        friction = np.zeros((3, 4 if model.arm.stribeck else 3))
+        other = Alternative(model.arm.geometry, model.arm.parameters, np.zeros(3), friction, 0.5)
+        ArmKernel(replace(model.arm, alternatives=(other, other))).features(Motion.from_arrays(q, dq, ddq))
     assert signatures() <= compiled
 
 
