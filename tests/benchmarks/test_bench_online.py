@@ -1,9 +1,5 @@
 """`python -m benchmarks online`: its parts against independent references, and a tiny run from start to end."""
 
-import json
-from dataclasses import replace
-from itertools import chain
-
 import numpy as np
 import pytest
 from rich.console import Console
@@ -11,16 +7,10 @@ from rich.console import Console
 import lipcore
 from benchmarks.latency import table as bench_table
 from benchmarks.online import flow, promises, table
-from benchmarks.online.asking import Asked
-from benchmarks.online.cost import Cost
-from benchmarks.online.flow import Flow
 from benchmarks.online.fourier import FourierModel
-from benchmarks.online.quality import Method, Quality
-from benchmarks.online.results import Results
 from benchmarks.online.running import Options, run
 from benchmarks.online.scene import Scene, rows_of
-from benchmarks.online.sending import Ack, batch_requests, stream
-from benchmarks.timing import Timing
+from benchmarks.online.sending import Ack
 from lipcore import TorqueModel
 from lipcore.robots.simulation import Payload, inverse_dynamics
 from tests.service.data import QUICK
@@ -98,36 +88,6 @@ def _features(model: FourierModel, joint: int, q: np.ndarray, dq: np.ndarray, dd
 # flow
 
 
-class Service:
-    """Acknowledges batches, as the service does."""
-
-    def __init__(self) -> None:
-        self.asked: list[dict] = []
-
-    def ask(self, request: bytes) -> bytes:
-        head, body = request.split(b"\r\n\r\n", 1)
-        assert head.startswith(b"POST /v1/models/m/observations HTTP/1.1")
-        said = json.loads(body)
-        self.asked.append(said)
-        answer = {"model": "m", "sequence": said["sequence"], "rows": len(said["t"]), "accepted": len(said["t"]) - 1}
-        answer |= {"revision": 7 + said["sequence"], "duplicate": False, "rejected": {"contact": 1}, "state": "learnt"}
-        return json.dumps(answer).encode()
-
-
-def test_batches_hold_all_rows_in_order_and_are_sent_in_turn():
-    samples, service, seen = PENDULUM.live().rows(slice(0, 250)), Service(), []
-    requests = batch_requests("m", "bench", samples, 0.1)
-    acks = stream(service, requests, 0.001, {2: lambda: seen.append(len(service.asked))})
-    assert [ack.sequence for ack in acks] == [0, 1, 2]
-    assert [(ack.rows, ack.accepted, ack.revision) for ack in acks] == [(100, 99, 7), (100, 99, 8), (50, 49, 9)]
-    assert all(ack.acked >= ack.sent for ack in acks)
-    assert seen == [2]
-    assert {said["stream_id"] for said in service.asked} == {"bench"}
-    for name in ("t", "q", "dq", "ddq", "tau"):
-        sent = list(chain.from_iterable(said[name] for said in service.asked))
-        np.testing.assert_allclose(sent, getattr(samples, name) * (0.1 if name == "t" else 1), rtol=1e-12)
-
-
 def _ack(acked: int, revision: int, accepted: int = 100) -> Ack:
     return Ack(0, acked - 5_000_000, acked, 100, accepted, revision, False, {"contact": 100 - accepted})
 
@@ -139,52 +99,6 @@ def test_lag_reaches_to_the_first_answer_with_the_batch():
     # 9 was never seen; 5 teaches nothing; 4 came with revision 7
     assert flow.lags(acks, revisions) == pytest.approx([0.5, 2.0])
     assert flow.lags([_ack(2 * second, 3)], revisions) == [0.0]
-
-
-# figures
-
-
-def _timing(p50: float, p99: float) -> Timing:
-    return Timing(1000, p50, p50, p99, 2 * p99, 3 * p99, 1e6 / p50)
-
-
-def known() -> Results:
-    names = ("before the change", "0.5 s after", "30 s after")
-
-    def method(key: str, *nmse: float) -> Method:
-        found = {n: Quality((v, 3 * v), (0.9, 0.8)) for n, v in zip(names, nmse, strict=True)}
-        return Method(key, f"way {key}", found, [61.0] if key == "refit" else [])
-
-    results = Results({"processor": "p"}, {"model": "m"}, joints=("j1", "j2"), moments=list(names))
-    results.idle = Asked(_timing(100, 200), _timing(110, 220), _timing(50, 60), ((0, 0),))
-    results.learning = Asked(_timing(150, 500), _timing(160, 550), _timing(55, 120), ((0, 0), (9, 4)))
-    results.live = Flow(60_000, 58_000, {"contact": 2000}, 1000.4, 961.0, (20.0, 44.0, 60.0), (0.6, 1.2, 1.5), 0.7)
-    results.burst = Flow(60_000, 60_000, {}, 4000.0, 1500.0, (20.0, 44.0, 60.0), None, 0.9)
-    results.costs = [Cost(1000, 400.0, 90.0), Cost(10_000, 500.0, 91.0), Cost(100_000, 450.0, 92.0)]
-    ways = (method("none", 1e-3, 0.1, 0.2), method("learn", 1e-3, 0.1, 0.04))
-    ways += (method("adapt", 1e-3, 0.1, 0.0023), method("refit", 1e-3, 0.1, 0.002))
-    results.methods = {each.key: each for each in ways}
-    results.robots, results.merged = 10, 3e-12
-    results.notes = ["a note"]
-    return results
-
-
-def test_promises_are_judged_by_their_figures():
-    found = {each.name: each for each in promises.targets(known())}
-    assert [each.value for each in found.values()] == pytest.approx([1500.0, 2.5, 25.0, 1.15, 20.0, 3e-12])
-    assert [each.met for each in found.values()] == [True, True, False, True, None, True]
-    results = known()
-    results.methods["adapt"].found["30 s after"] = Quality((0.0025, 0.0075), (0.9, 0.8))
-    results.learning = replace(known().learning, answers=_timing(150, 601))
-    written = bench_table.grids_markdown(table.grids(known()), known().notes)
-    for text in ("NOT met", "2.50", "4.60e-03 (85 %)", "2.3e-03", "1,500", "0.60", "3.0e-12", "way refit", "a note"):
-        assert text in written
-    missed = {each.name for each in promises.targets(results) if each.met is False}
-    assert missed == {
-        "prediction p99 while learning / idle",
-        "cost of a sample: the largest above the smallest",
-        "nMSE 30 s after, adapting / full refit",
-    }
 
 
 def tiny(websocket: bool) -> Options:
