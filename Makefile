@@ -32,7 +32,7 @@ bytecode: install
 # the API as all tests know it with SQLite and local files, once more on PostgreSQL and S3
 SHARED := models/test_aliases.py models/test_deletion.py access/test_keys.py test_job_requests.py test_predicting.py \
 	observability/test_readiness.py models/test_alias_answers.py access/test_scopes.py access/test_commands.py \
-	test_dataset_deletion.py test_training.py test_cancelling.py test_evaluating.py test_robots.py \
+	test_training.py test_cancelling.py test_evaluating.py test_robots.py \
 	test_uploads.py bad_requests client/test_idempotency.py archives/test_round_trip.py \
 	observability/test_metrics_of_service.py learning/test_observations.py learning/test_learning_routes.py \
 	learning/test_undoing.py learning/test_inspection.py learning/test_log.py

@@ -1,7 +1,14 @@
-"""Jobs that cannot be done say so and leave everything else as it was."""
+"""Jobs whose processes are superseded, killed or interrupted: each is done once, and the service goes on."""
+
+import multiprocessing
+import os
+import signal
+
+import pytest
 
 from service.training import worker
-from tests.service.data import error, job, queue, service_of
+from tests.service.data import ENDLESS, ended, error, job, queue, running, service_of, stream, upload
+from tests.service.server import command
 
 
 def test_an_attempt_that_was_superseded_publishes_nothing(api, pendulum, monkeypatch):
@@ -34,3 +41,19 @@ def test_a_job_is_run_once_even_if_it_is_handed_out_twice(api, pendulum, monkeyp
         worker.run(service.settings, name)
     assert job(api, name)["attempts"] == 1
     assert api.get("/v1/models/once").json()["latest_version"] == 1
+
+
+@pytest.mark.parametrize(
+    ("number", "attempts"), [(signal.SIGKILL, 2), pytest.param(signal.SIGINT, 1, marks=pytest.mark.slow)]
+)
+def test_a_killed_process_costs_an_attempt_and_an_interrupted_one_nothing(api, number, attempts):
+    """Ctrl-C goes to the whole process group: the service decides what becomes of its processes."""
+    model, seconds_long = f"ended-by-{number}", {**ENDLESS, "hyperparameter_samples": 60, "max_iterations": 25}
+    name = queue(api, model, upload(api, stream("panda", 100))["id"], options=seconds_long)["id"]
+    running(api, name)
+    for child in multiprocessing.active_children():
+        if command(child.pid):  # the training processes among them
+            os.kill(child.pid, number)
+    seen = ended(api, name)
+    assert (seen["state"], seen["attempts"], seen["version"]) == ("succeeded", attempts, 1)
+    assert api.get(f"/v1/models/{model}").json()["latest_version"] == 1
