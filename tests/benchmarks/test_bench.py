@@ -84,13 +84,6 @@ def test_promises_are_medians_of_figures_of_the_same_run():
     assert found["largest deviation from the exact posterior"].met is False
 
 
-def test_the_echo_of_a_transport_comes_with_it():
-    options = Options(only=("http", LOOP))
-    assert {name for name in KEYS if options.wanted(name)} == {"http", "echo-http", LOOP, "ws", "echo-ws"}
-    with pytest.raises(ValueError, match="'carrier-pigeon'"):
-        Options(only=("carrier-pigeon",))
-
-
 def test_frames_are_as_the_service_documents_them():
     motion = np.arange(6.0).reshape(3, 2)
     data = request_frame(motion, std=True, deadline=0.25, sequence=7)

@@ -30,9 +30,8 @@ from lipcore.posterior.compression import linear
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate
 from lipcore.robots.urdf import RigidBody
-from tests.lipcore.arm_oracles import arm, as_robot, followed, motions, recorded
+from tests.lipcore.arm_oracles import arm, as_robot, as_rows, followed, motions, recorded
 from tests.lipcore.arms import parameters, random_bodies, random_geometry
-from tests.lipcore.online_checks import as_rows
 
 OPTIONS = FitOptions(device="cpu", statistics="chosen")
 GEOMETRY, _, ROBOT = arm("RPR", 51)

@@ -23,8 +23,7 @@ from lipcore.model.warnings import linearisation_error, warnings
 from lipcore.online.learner import OnlineModel
 from lipcore.robots.library import Robot, random_arm
 from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
-from tests.lipcore.arm_oracles import arm, followed
-from tests.lipcore.online_checks import as_rows
+from tests.lipcore.arm_oracles import arm, as_rows, followed
 from tests.lipcore.test_arm_model import errors
 
 GEOMETRY, BODIES, ROBOT = arm("RRR", 31)

@@ -23,7 +23,7 @@ from lipcore.robots.simulation import Payload, Stream, simulate
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import CODES, ROBOT_ESTIMATORS
 from tests.choosing import few
-from tests.lipcore.online_checks import as_rows, same_answers
+from tests.lipcore.arm_oracles import as_rows, same_answers
 
 ROBOT = "double-pendulum"
 OPTIONS = FitOptions(hyperparameter_samples=40, max_iterations=25, starts=1, device="cpu", compact_tolerance=0.1)
