@@ -27,7 +27,7 @@ warm-chain: install
 
 # of ours: where Python is told to write none, each of the many processes that tests start would else compile it again
 bytecode: install
-	$(BIN)/python -m compileall -q lipcore service
+	$(BIN)/python -m compileall -q lipcore service benchmarks tests
 
 # the API as all tests know it with SQLite and local files, once more on PostgreSQL and S3
 SHARED := models/test_aliases.py models/test_deletion.py access/test_keys.py test_job_requests.py test_predicting.py \

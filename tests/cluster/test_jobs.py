@@ -46,6 +46,7 @@ def test_a_cancel_ends_a_process_that_does_not_obey_and_another_service_may_ask(
     assert messages_of(one.ended(waiting))[-1] == "obeyed"
 
 
+@pytest.mark.slow
 def test_the_job_of_a_killed_worker_is_finished_by_another_one(services, workers):
     queue = services("a")
     job = queue.add("orphan", "wait")
