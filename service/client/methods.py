@@ -44,6 +44,7 @@ class _Many(Generic[P, T]):
     @overload
     def __get__(self, client: AsyncClient, owner: Any = None) -> Callable[P, AsyncIterator[T]]: ...
     def __get__(self, client: Any, owner: Any = None) -> Any:
+        """For types, as that of `One`."""
         raise NotImplementedError
 
 

@@ -1,9 +1,7 @@
 """Jobs whose processes are superseded, killed or interrupted: each is done once, and the service goes on."""
 
-import gc
 import os
 import signal
-from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
@@ -51,9 +49,10 @@ def test_a_killed_process_costs_an_attempt_and_an_interrupted_one_nothing(api, n
     model, seconds_long = f"ended-by-{number}", {**ENDLESS, "hyperparameter_samples": 60, "max_iterations": 25}
     name = queue(api, model, upload(api, stream("panda", 100))["id"], options=seconds_long)["id"]
     running(api, name)
-    # of training, not of services that other tests have started
-    pools = [each for each in gc.get_objects() if type(each) is ProcessPoolExecutor]
-    assert [os.kill(pid, number) for pid in {pid for pool in pools for pid in pool._processes or ()}]
+    workers = [pid for slot in service_of(api).jobs._slots for pid in slot._pool._processes or ()]
+    assert workers
+    for pid in workers:
+        os.kill(pid, number)
     seen = ended(api, name)
     assert (seen["state"], seen["attempts"], seen["version"]) == ("succeeded", attempts, 1)
     assert api.get(f"/v1/models/{model}").json()["latest_version"] == 1

@@ -72,6 +72,7 @@ def template(function: _F) -> _F:
     return _compile(function, keep=False, forceinline=True, no_cpython_wrapper=True)
 
 
+@cache
 def source_stamp(path: Path) -> str:
     """Hash of a source file and of all files of FOLDER that it imports, directly or not.
 
