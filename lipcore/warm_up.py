@@ -55,8 +55,7 @@ def _of_arm(arm: Arm) -> None:
     """What a training on another recording might take besides: other arms or none, and the energies."""
     friction = np.zeros((arm.n_joints, 4 if arm.stribeck else 3))
     one = Alternative(arm.geometry, arm.parameters, np.zeros(arm.n_joints), friction, 0.5)
-    # (of a single row, every slice is contiguous, which counts as another type)
-    zeros = torch.zeros((2, arm.n_joints), dtype=torch.float64)
+    zeros = torch.zeros((1, arm.n_joints), dtype=torch.float64)
     motion = Motion(zeros, zeros, zeros)
     for kernel in (ArmKernel(replace(arm, alternatives=others)) for others in ((), (one, one))):
         kernel.features(motion)

@@ -74,14 +74,15 @@ class ArmKernel(LinearKernel):
         for seen, features in self._recent:
             if seen.q is x.q and seen.dq is x.dq and seen.ddq is x.ddq:
                 return features
-        out = np.zeros((len(x), self.size, self.n_joints))
-        motions, first = x.arrays(), self.steps.stop
-        arm = self.arm
-        arm_features(arm.geometry.constants, arm.geometry.gravity, arm.parameters, arm.order, motions, out[:, :first])
+        # contiguous each: machine code is compiled for the layout of an array
+        rows = np.empty((len(x), self.steps.stop, self.n_joints))
+        others = np.empty((len(x), self.size - self.steps.stop, self.n_joints))
+        motions, arm = x.arrays(), self.arm
+        arm_features(arm.geometry.constants, arm.geometry.gravity, arm.parameters, arm.order, motions, rows)
         if arm.alternatives:
-            linear = _linear_features(motions, arm.stribeck)
-            arm_differences(*_stacked(arm), arm.order, motions, linear, out[:, first:])
-        features = torch.from_numpy(np.ascontiguousarray(out.transpose(0, 2, 1))).to(x.device)
+            arm_differences(*_stacked(arm), arm.order, motions, _linear_features(motions, arm.stribeck), others)
+        transposed = np.concatenate([rows, others], axis=1).transpose(0, 2, 1)
+        features = torch.from_numpy(np.ascontiguousarray(transposed)).to(x.device)
         self._recent = ((x, features), *self._recent[: REMEMBERED - 1])
         return features
 
@@ -106,17 +107,10 @@ class ArmKernel(LinearKernel):
 
     def energy_features(self, x: Motion) -> Tensor:
         """Kinetic and potential energy per unit of each weight: (N, 2, p) J; of alternative arms none is counted."""
-        out = np.zeros((len(x), 2, self.size))
-        arm = self.arm
-        arm_energies(
-            arm.geometry.constants,
-            arm.geometry.gravity,
-            arm.parameters,
-            arm.order,
-            x.arrays(),
-            out[:, :, : self.steps.stop],
-        )
-        return torch.from_numpy(out).to(x.device)
+        out, arm = np.empty((len(x), 2, self.steps.stop)), self.arm
+        arm_energies(arm.geometry.constants, arm.geometry.gravity, arm.parameters, arm.order, x.arrays(), out)
+        none = np.zeros((len(x), 2, self.size - self.steps.stop))
+        return torch.from_numpy(np.concatenate([out, none], axis=2)).to(x.device)
 
 
 class ArmRegressor(Regressor):

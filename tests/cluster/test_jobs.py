@@ -30,7 +30,6 @@ def services(shared, workers):
         yield new
 
 
-@pytest.mark.slow
 def test_a_cancel_ends_a_process_that_does_not_obey_and_another_service_may_ask(services):
     one, other = services("a"), services("b")
     deaf = one.add("deaf", "deaf")

@@ -257,7 +257,8 @@ def sent(servers: list[Server], number: int, rng: np.random.Generator) -> int:
         assert answer.status_code == httpx.codes.SERVICE_UNAVAILABLE, answer.text
 
 
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_service_that_is_killed_in_the_middle_of_batches_loses_nothing(shared, servers, seed):
     rng = np.random.default_rng(seed)
     victim, other = servers

@@ -19,6 +19,7 @@ def summed_by(executor, work=numbers):
     return summed(executor, work, SHARDS, lambda: False)
 
 
+@pytest.mark.slow
 def test_workers_of_a_cluster_come_to_the_same_sum_and_a_lost_one_costs_nothing(shared, tmp_path):
     with shard_executor(Settings(home=tmp_path)) as inline:
         once = summed_by(inline)

@@ -101,7 +101,7 @@ def test_shares_sum_to_one_and_equal_their_definition() -> None:
     assert torch.allclose(shares(logits), shares_of(logits), rtol=1e-14, atol=0)
 
 
-@pytest.mark.parametrize("kinds", ["RR", "RPR", *map(slow, ("RRR", "PRR"))])
+@pytest.mark.parametrize("kinds", ["RPR", *map(slow, ("RR", "RRR", "PRR"))])
 def test_dynamics_of_a_true_chain_lie_in_the_space_of_the_kernel(kinds: str) -> None:
     """Enough noise-free torques of an arm pin down all that it ever does, whatever the hyperparameters."""
     _, _, robot = arm(kinds, seed=len(kinds))

@@ -51,7 +51,7 @@ def read_panda() -> tuple[tuple[str, ...], np.ndarray]:
 @pytest.mark.parametrize(
     ("options", "lowest_coverage"),
     [
-        pytest.param(QUICK, 0.4, id="quick"),
+        pytest.param(QUICK, 0.4, id="quick", marks=pytest.mark.slow),
         pytest.param(DEFAULT, 0.3, id="default", marks=pytest.mark.slow),
     ],
 )

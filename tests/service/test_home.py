@@ -3,8 +3,6 @@
 import json
 import os
 import shutil
-import subprocess
-import sys
 
 import pytest
 from fastapi.testclient import TestClient
@@ -17,7 +15,7 @@ from service.storage.database import Database, JobRow, VersionRow, now
 from service.storage.files import Files
 from service.storage.storage import HomeInUseError
 from tests.service.data import ADDRESS, DEADLINE, QUICK, ended, error, job, stream, train, upload
-from tests.service.server import free_port
+from tests.service.warm import Served
 
 QUERY = {"q": [0.3, -0.2], "dq": [0.1, 0.4], "ddq": [1.0, -0.5], "covariance": True}
 
@@ -141,15 +139,9 @@ def test_a_second_service_on_the_same_home_is_refused(second_start):
         pass
 
 
-def test_a_second_server_on_the_same_home_says_why_it_ends(server):
-    ended = subprocess.run(
-        [sys.executable, "-m", "service", "serve", "--port", str(free_port())],
-        env={**os.environ, "LIPSERVE_HOME": str(server.home)},
-        capture_output=True,
-        text=True,
-        timeout=DEADLINE,
-        check=False,
-    )
-    assert ended.returncode != 0
-    assert f"another service uses {server.home}: stop it, or set LIPSERVE_HOME" in ended.stdout + ended.stderr
-    assert "Traceback" not in ended.stdout + ended.stderr
+def test_a_second_server_on_the_same_home_says_why_it_ends(server, tmp_path):
+    log = tmp_path / "second.log"
+    second = Served(["serve", "--port", "0"], {**os.environ, "LIPSERVE_HOME": str(server.home)}, log)
+    assert second.wait(DEADLINE) != 0
+    assert f"another service uses {server.home}: stop it, or set LIPSERVE_HOME" in log.read_text()
+    assert "Traceback" not in log.read_text()

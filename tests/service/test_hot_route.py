@@ -117,11 +117,11 @@ def test_wrong_queries(api, trained, body):
 
 
 def test_bodies_with_a_fault_anywhere(api, trained):
-    """A byte of a right query is replaced, left out or doubled: half a thousand times."""
+    """A byte of a right query is replaced, left out or doubled: two hundred times."""
     rng = random.Random(3)
     right = json.dumps(QUERY | {"version": 1, "covariance": False, "components": ["friction"], "tau": None})
     statuses = set()
-    for _ in range(500):
+    for _ in range(200):
         body = bytearray(right.encode())
         at = rng.randrange(len(body))
         match rng.randrange(3):

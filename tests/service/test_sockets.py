@@ -5,8 +5,6 @@ import re
 import signal
 import socket
 import stat
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -16,6 +14,7 @@ from service.client import Client
 from service.web.server.sockets import SocketError, UnixSocket
 from tests.service.data import DEADLINE
 from tests.service.server import Server
+from tests.service.warm import Served
 
 QUERY = {"q": [0, -0.5, 0, -2, 0, 1.5, 0.7], "dq": [0.1] * 7, "ddq": [0.2] * 7}
 
@@ -123,9 +122,10 @@ def test_a_service_listens_on_both(home, path):
         assert stat.S_IMODE(path.lstat().st_mode) == 0o600
         zero = np.zeros(7)
         assert client.predict("panda-sim", zero, zero, zero).model == "panda-sim"
-        second = start(home.with_name("other"), "--port", "0", "--uds", path)
-        reply, _ = second.communicate(timeout=DEADLINE)
-        assert (second.returncode, "another service listens" in reply, "Traceback" in reply) == (1, True, False)
+        log, other = home.with_name("second.log"), {**os.environ, "LIPSERVE_HOME": str(home.with_name("other"))}
+        second = Served(["serve", "--port", "0", "--uds", str(path)], other, log)
+        assert second.wait(DEADLINE) == 1
+        assert ("another service listens" in log.read_text(), "Traceback" in log.read_text()) == (True, False)
         assert client.ready()
         assert server.terminate() == -signal.SIGTERM
         assert not path.exists()
@@ -144,14 +144,3 @@ def test_the_socket_of_a_successor_is_not_removed(path):
 def test_a_client_needs_an_absolute_path(url):
     with pytest.raises(ValueError, match="expected unix:// and an absolute path"):
         Client(url)
-
-
-def start(home, *arguments):
-    """`lipserve serve` with arguments."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "service", "serve", *map(str, arguments)],
-        env={**os.environ, "LIPSERVE_HOME": str(home)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )

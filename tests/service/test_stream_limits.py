@@ -86,7 +86,10 @@ def test_more_streams_than_allowed_are_refused_until_one_ends(bounded):
     assert eventually(another)["version"] == 1
 
 
-@pytest.mark.parametrize(("path", "size"), [(PANDA, 0), (ECHO, 60_000)], ids=["tiny frames", "large frames"])
+@pytest.mark.parametrize(
+    ("path", "size"),
+    [pytest.param(PANDA, 0, id="tiny frames"), pytest.param(ECHO, 60_000, id="large frames", marks=pytest.mark.slow)],
+)
 def test_a_client_that_never_reads_is_slowed_down_and_then_cut_off(bounded, path, size):
     with dial(bounded, ECHO) as other:
         before = memory(bounded.process.pid)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.kernels.compiled.compile import compiled
+from lipcore.kernels.compiled.compile import compiled, inlined
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -28,7 +28,7 @@ WORK = 128
 PSI, PSI2, FORCE, SCREW, SPARE = 76, 82, 88, 94, 100
 
 
-@compiled
+@inlined
 def add_cross(a: Array, i: int, b: Array, j: int, out: Array, k: int) -> None:
     """Add a × b to `out`; each a 3-vector from the element given on."""
     out[k] += a[i + 1] * b[j + 2] - a[i + 2] * b[j + 1]
@@ -36,7 +36,7 @@ def add_cross(a: Array, i: int, b: Array, j: int, out: Array, k: int) -> None:
     out[k + 2] += a[i] * b[j + 1] - a[i + 1] * b[j]
 
 
-@compiled
+@inlined
 def moving_cross(a: Array, i: int, b: Array, j: int, out: Array, k: int) -> None:
     """Write a × b of two motions (ω, v)."""
     x, y, z, u, v, w = b[j], b[j + 1], b[j + 2], b[j + 3], b[j + 4], b[j + 5]
@@ -48,7 +48,7 @@ def moving_cross(a: Array, i: int, b: Array, j: int, out: Array, k: int) -> None
     out[k + 5] = a[i] * v - a[i + 1] * u + a[i + 3] * y - a[i + 4] * x
 
 
-@compiled
+@inlined
 def add_force_cross(a: Array, i: int, b: Array, j: int, out: Array, k: int) -> None:
     """Add a ×* b of a motion (ω, v) and a force (n, f)."""
     add_cross(a, i, b, j, out, k)
@@ -56,7 +56,7 @@ def add_force_cross(a: Array, i: int, b: Array, j: int, out: Array, k: int) -> N
     add_cross(a, i, b, j + 3, out, k + 3)
 
 
-@compiled
+@inlined
 def dot(a: Array, i: int, b: Array, j: int, size: int) -> float:
     """a · b of `size` numbers, each from the element given on."""
     total = 0.0
@@ -65,7 +65,7 @@ def dot(a: Array, i: int, b: Array, j: int, size: int) -> float:
     return total
 
 
-@compiled
+@inlined
 def momentum(row: Array, motion: Array, i: int, out: Array, k: int) -> None:
     """Write I x of the bodies whose mass, first moment and inertia are in `row`, for a motion x: a force."""
     for c in range(3):

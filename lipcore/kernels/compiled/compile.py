@@ -14,7 +14,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from numba import config, njit
+from numba import config, njit, types
 
 _F = TypeVar("_F", bound=Callable[..., object])
 
@@ -100,6 +100,9 @@ def _compile(function: _F, keep: bool = True, **options: Any) -> _F:
         if "no locator available" not in str(error):
             raise
         dispatcher = njit(cache=False, **options)(function)
+    # one machine code for all integers, not another one for each constant that a caller names
+    resolve = dispatcher.get_call_template
+    dispatcher.get_call_template = lambda given, named: resolve([types.unliteral(each) for each in given], named)
     with suppress(AttributeError):
         dispatcher._cache._cache_file._source_stamp = source_stamp(Path(function.__code__.co_filename))
     return cast(_F, dispatcher)

@@ -4,7 +4,6 @@ import errno
 import os
 import sqlite3
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -22,9 +21,10 @@ from service.storage.database.engine import FILE
 from service.storage.files import Files
 from service.storage.storage import HomeError, check_home
 from service.web.storage_errors import translated
-from tests.service.data import arrays, error, npz, service_of, stream
+from tests.service.data import DEADLINE, arrays, error, npz, service_of, stream
 from tests.service.faults.storage import small_disk
 from tests.service.test_robots import urdf
+from tests.service.warm import Served
 
 ZERO = {name: [0.0] * 7 for name in ("q", "dq", "ddq")}
 
@@ -225,9 +225,8 @@ def test_no_service_starts_while_another_process_writes_all_the_time(tmp_path):
 
 def test_a_service_says_why_it_cannot_start(tmp_path):
     (tmp_path / FILE).write_bytes(b"no database" * 1000)
-    command = [sys.executable, "-m", "service", "serve", "--port", "0"]
-    environment = {**os.environ, "LIPSERVE_HOME": str(tmp_path)}
-    ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert ended.returncode == 1
-    assert ended.stderr.startswith(f"error: the database {tmp_path / FILE} cannot be used: file is not a database.")
-    assert "Traceback" not in ended.stderr
+    log = tmp_path / "log"
+    ended = Served(["serve", "--port", "0"], {**os.environ, "LIPSERVE_HOME": str(tmp_path)}, log)
+    assert ended.wait(DEADLINE) == 1
+    assert f"error: the database {tmp_path / FILE} cannot be used: file is not a database." in log.read_text()
+    assert "Traceback" not in log.read_text()
