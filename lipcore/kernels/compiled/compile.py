@@ -102,7 +102,7 @@ def _compile(function: _F, keep: bool = True, **options: Any) -> _F:
         dispatcher = njit(cache=False, **options)(function)
     # one machine code for all integers, not another one for each constant that a caller names
     resolve = dispatcher.get_call_template
-    dispatcher.get_call_template = lambda given, named: resolve([types.unliteral(each) for each in given], named)
+    dispatcher.get_call_template = lambda given, named: resolve([types.unliteral(each) for each in given], named)  # type: ignore[no-untyped-call]
     with suppress(AttributeError):
         dispatcher._cache._cache_file._source_stamp = source_stamp(Path(function.__code__.co_filename))
     return cast(_F, dispatcher)
