@@ -14,6 +14,7 @@ from tests.service.data import arrays, npz, stream
 TABS = ("accuracy", "parts", "versions", "lineage", "ask", "learning")
 
 
+@pytest.mark.slow
 def test_every_page_can_be_read_on_a_phone_in_both_themes(windows: Visit, dashboard: Dashboard) -> None:
     visitor = windows(dashboard.server.url, size=PHONE, scheme="dark", touch=True)
     model = f"#/models/{dashboard.model}"

@@ -49,6 +49,7 @@ def test_frames_are_where_pinocchio_has_them(visitor: Visitor, kinds: str) -> No
         np.testing.assert_allclose(origin, frame.translation, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_gravity_is_drawn_downwards(visitor: Visitor) -> None:
     page = visitor.open("#/train")
     for gravity in ([0, 0, -9.81], [0, 0, 9.81], [9.81, 0, 0], [3.0, -4.0, 5.0], [1e-9, 0, -9.81]):

@@ -67,6 +67,7 @@ REFRESHED = """async () => {
 }"""
 
 
+@pytest.mark.slow
 def test_what_is_refreshed_is_changed_in_place(visitor: Visitor) -> None:
     found = visitor.open("#/train").evaluate(REFRESHED)
     assert found.pop("added") == ["C", "more of A", "B"]
@@ -74,6 +75,7 @@ def test_what_is_refreshed_is_changed_in_place(visitor: Visitor) -> None:
     assert all(found.values()), found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("route", [slow("#/"), "#/jobs"])
 def test_a_job_that_comes_takes_no_link_away(visitor: Visitor, dashboard: Dashboard, route: str) -> None:
     page = visitor.open(route)
@@ -155,6 +157,7 @@ def test_a_change_is_decided_and_old_rows_are_said_to_be_old(
     expect(page.get_by_text("no new rows: what is shown is old")).to_be_visible()
 
 
+@pytest.mark.slow
 def test_who_chooses_no_model_is_asked_which(visitor: Visitor, dashboard: Dashboard) -> None:
     page = visitor.open("#/live")
     page.get_by_role("main").get_by_role("link", name=dashboard.model, exact=True).click()

@@ -41,6 +41,7 @@ def locked(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterat
         yield Locked(server.url, key)
 
 
+@pytest.mark.slow
 def test_a_key_is_asked_for_and_a_wrong_one_asked_for_again(windows: Visit, locked: Locked) -> None:
     visitor = windows(locked.url)
     visitor.expect_refusals(401)
@@ -96,6 +97,7 @@ def test_an_empty_service_says_what_to_do_next(windows: Visit, locked: Locked) -
         assert audit(page) == [], route
 
 
+@pytest.mark.slow
 def test_what_is_not_there_is_said_to_be_not_there(visitor: Visitor) -> None:
     visitor.expect_refusals(404)
     for route in ("#/data/ds_0000000000000000", "#/jobs/job_0000000000000000", "#/models/nobody", "#/live/nobody"):

@@ -88,6 +88,7 @@ def test_what_one_service_stores_another_reads_and_deletes(shared):
         error(one.get(f"/v1/datasets/{dataset['id']}/preview"), 404, "not_found")
 
 
+@pytest.mark.slow
 def test_services_that_start_together_bring_one_shipped_model(shared):
     opened = [(Database.of(settings), Files.of(settings)) for settings in map(shared.settings, ("a", "b", "c"))]
     barrier = threading.Barrier(len(opened))

@@ -151,6 +151,7 @@ def test_a_job_is_anybodys_until_one_hands_it_out(neighbours):
     assert [messages_of(one.ended(job))[-1] for job in (first, second)] == ["obeyed", "obeyed"]
 
 
+@pytest.mark.slow
 def test_a_job_of_a_service_that_is_gone_is_started_again_by_one_other(neighbours):
     one, other, third = neighbours("a"), neighbours("b", training_workers=2), neighbours("c", training_workers=2)
     job = one.add("orphan", "wait")

@@ -210,6 +210,7 @@ def _taken(pupil, number):
     return answer.is_success and answer.json()["revision"]
 
 
+@pytest.mark.slow
 def test_without_any_notice_a_service_looks_for_itself(pair, arm, monkeypatch):
     first, second = arm
     monkeypatch.setattr(replication, "LOOK_S", 0.2)

@@ -108,6 +108,7 @@ def test_the_choice_is_saved_and_loaded_and_a_malformed_one_refused(chosen, tmp_
         read_manifest_bytes(manifest_bytes(manifest))
 
 
+@pytest.mark.slow
 def test_of_an_arm_with_springs_the_chain_is_chosen():
     samples = recorded(300, speed=8.0)
     # of the energy 0.1 sin²q₂ sin q₃: gravity has no second harmonic

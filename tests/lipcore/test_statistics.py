@@ -19,6 +19,7 @@ from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.posterior.statistics import Statistics, collect, decay, empty, merge, solve, subtract, update
 from lipcore.posterior.summing import Summing, Total
 from lipcore.training.conditioning import condition
+from tests.choosing import slow
 from tests.lipcore.oracles import random_problem
 from tests.service.data import QUICK, stream
 
@@ -179,7 +180,7 @@ def test_a_conditioned_model_knows_all_samples(samples):
     assert again.fit["samples_posterior"] == 200
 
 
-@pytest.mark.parametrize("estimator", ["lip-chain", "lip", "se", "gip", "lse"])
+@pytest.mark.parametrize("estimator", ["lip-chain", "lip", *map(slow, ("se", "gip", "lse"))])
 def test_the_fast_sum_is_that_of_the_statistics(estimator, samples):
     """Against the plain sum, sample by sample, with weights, over pieces that do not divide the whole."""
     options = FitOptions(**{**QUICK, "posterior_samples": 40}, statistics="chosen", device="cpu")

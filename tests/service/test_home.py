@@ -78,6 +78,7 @@ def test_what_was_finished_is_kept(second_start):
     assert api.post("/v1/models/kept/predict", json=QUERY).json() == before["predict"]
 
 
+@pytest.mark.slow
 def test_leftovers_of_interrupted_writes_are_swept(second_start):
     api, before, home = second_start
     assert list((home / "uploads").iterdir()) == []

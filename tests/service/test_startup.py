@@ -41,6 +41,7 @@ def test_help_and_completion_of_what_asks_a_service_import_neither_numerics_nor_
     assert result.isdisjoint((*NUMERICS, *CLIENTS, "fastapi"))
 
 
+@pytest.mark.slow
 def test_the_client_loads_no_numerics_but_arrays_and_no_service():
     result = imported("import service.client")
     assert "numpy" in result
@@ -49,6 +50,7 @@ def test_the_client_loads_no_numerics_but_arrays_and_no_service():
     )
 
 
+@pytest.mark.slow
 def test_a_controller_that_loads_a_model_imports_neither_fitting_nor_service():
     folder, zeros = str(shipped_models() / "panda-sim"), [0.0] * 7
     result = imported(

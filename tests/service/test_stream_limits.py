@@ -22,7 +22,7 @@ MiB = 1024 * 1024
 def bounded(tmp_path_factory):
     """A server with room for two streams, which soon gives up those that do not read."""
     home = tmp_path_factory.mktemp("bounded")
-    with Server(home, LIPSERVE_MAX_STREAMS="2", LIPSERVE_STREAM_WRITE_S="1.0") as started:
+    with Server(home, warm=True, LIPSERVE_MAX_STREAMS="2", LIPSERVE_STREAM_WRITE_S="1.0") as started:
         yield started
 
 
@@ -86,6 +86,7 @@ def test_more_streams_than_allowed_are_refused_until_one_ends(bounded):
     assert eventually(another)["version"] == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("path", "size"),
     [pytest.param(PANDA, 0, id="tiny frames"), pytest.param(ECHO, 60_000, id="large frames", marks=pytest.mark.slow)],

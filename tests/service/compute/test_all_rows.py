@@ -113,6 +113,7 @@ def test_shards_without_rows_are_left_out(parts):
     assert (shard.first, shard.last) == (SHARD, ROWS)
 
 
+@pytest.mark.slow
 def test_the_pass_is_the_same_in_processes_and_here(settings, parts, model):
     """To the last bit; and what the plain way finds, to rounding."""
     table = Table([masked(parts[0]), parts[0]])

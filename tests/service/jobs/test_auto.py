@@ -28,6 +28,7 @@ def test_the_version_keeps_how_its_estimator_was_chosen(api, made):
     assert api.get("/v1/models/panda-sim/versions/1").json()["selection"] is None
 
 
+@pytest.mark.slow
 def test_a_refresh_keeps_the_chosen_estimator(api, made):
     asked = api.post("/v1/models/chosen/refresh", json={})
     assert asked.status_code == 202, asked.text

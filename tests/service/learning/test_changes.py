@@ -98,6 +98,7 @@ def test_the_owner_is_told_with_the_evidence(loaded):
     assert held["at"] == evidence["at"]
 
 
+@pytest.mark.slow
 def test_after_a_decision_the_changed_robot_is_learnt(school):
     pupil = school.enrol("decided", **WATCHFUL, on_change="hold")
     drive(pupil, range(10))
@@ -136,6 +137,7 @@ def test_adapting_begins_a_new_regime_before_the_batch_that_told(school):
     assert np.sqrt((error**2).mean()) < 0.1
 
 
+@pytest.mark.slow
 def test_errors_below_a_contact_are_a_change_too(school):
     """What is off by a few standard deviations passes as no contact; together it is told.
 

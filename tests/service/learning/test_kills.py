@@ -55,6 +55,7 @@ def sent_until_killed(home, sequence, count, later):
     return acknowledged
 
 
+@pytest.mark.slow
 def test_a_kill_at_any_moment_loses_no_acknowledged_batch_and_leaves_none_twice(home):
     opened(home).close()
     chance = np.random.default_rng(3)

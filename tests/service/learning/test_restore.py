@@ -36,6 +36,7 @@ def test_a_page_takes_no_more_rows_than_it_may_and_at_least_a_batch(arm, monkeyp
     assert advance(arm.database, known) is known
 
 
+@pytest.mark.each_once
 @pytest.mark.parametrize("at", [0, 7, 12])
 def test_a_snapshot_changes_nothing_but_the_time_it_takes(arm, pages, at, monkeypatch):
     """Twelve batches are learnt as one would be."""
@@ -134,6 +135,7 @@ def test_slow_streams_are_judged_by_enough_rows(arm):
     assert learnt.floor(arm.database, ARM, 1, 3, 2)[0] > 0.1
 
 
+@pytest.mark.each_once
 @pytest.mark.parametrize("at", [None, 3, 5], ids="snapshot at {}".format)
 def test_a_batch_that_was_unlearnt_leaves_nothing_behind(arm, pages, at):
     arm.batches(*range(6))
@@ -224,6 +226,7 @@ def test_where_the_log_reaches_back_no_more_such_a_batch_stays_and_that_is_said(
     assert "events 2 of model 'arm' stay in what is learnt" in caplog.text
 
 
+@pytest.mark.each_once
 @pytest.mark.parametrize("at", [None, 2, 5])
 def test_forgetting_is_that_of_the_log(arm, pages, at):
     arm.event("settings", forgetting_s=2.0)

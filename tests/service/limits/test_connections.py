@@ -62,6 +62,7 @@ def test_clients_that_do_not_ask_are_let_go(soon):
         assert silent.rest() == second.rest() == idle.rest() == b""
 
 
+@pytest.mark.slow
 def test_streams_outlast_what_requests_may_take(soon):
     end = time.monotonic() + 2 * SOON["header_s"]
     with connect(f"ws://127.0.0.1:{soon.port}/") as stream:

@@ -98,6 +98,7 @@ def test_columns_that_are_empty(tmp_path):
     assert "1 of 20 messages have no effort" in result.facts
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_recording(tmp_path, monkeypatch):
     monkeypatch.setattr(reading, "BATCH_BYTES", 100_000)
     path = write_mcap(tmp_path / "a.mcap", states(6000), "NONE", chunk_size=100_000)
