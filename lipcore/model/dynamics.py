@@ -7,7 +7,6 @@ So every part is a sum or difference of torques at a few motions, with an exact 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -21,8 +20,6 @@ from lipcore.model.functionals import (
     combine_torques,
     kinetic_energy,
     potential_energy,
-    prior_mean,
-    with_anchors,
 )
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.exact import Posterior
@@ -50,14 +47,6 @@ class IndefiniteInertiaError(ValueError):
             "training data tell the inertia of"
         )
         self.index = index
-
-
-@dataclass(frozen=True)
-class Energies:
-    """Posterior means of kinetic and potential energy in J, each (N,). The potential is known up to a constant."""
-
-    kinetic: Tensor
-    potential: Tensor
 
 
 def available(estimator: Estimator) -> tuple[ComponentName, ...]:
@@ -138,24 +127,6 @@ def inertia_matrix(posterior: Posterior, dynamics: TorqueKernel, q: Tensor) -> T
     rest = posterior.mean(Motion(q, zero, zero), dynamics)
     pushes = [_push(q, joint) for joint in range(n)]
     return torch.stack([posterior.mean(push, dynamics) - rest for push in pushes], dim=2)
-
-
-def gravity(posterior: Posterior, dynamics: TorqueKernel, q: Tensor) -> Tensor:
-    """Posterior mean of the gravity torque g(q) = f(q, 0, 0), (N, n) N·m: the torque at standstill, friction excluded.
-
-    dynamics: the kernel's terms but friction; q: (N, n) rad or m.
-    """
-    zero = torch.zeros_like(q)
-    return posterior.mean(Motion(q, zero, zero), dynamics)
-
-
-def energies(posterior: Posterior, dynamics: EnergyKernel, query: Motion) -> Energies:
-    """Posterior means of kinetic and potential energy at N queries, learnt without a label on either.
-
-    dynamics: the term that the energies are of.
-    """
-    kinetic, potential = prior_mean([dynamics], query) + posterior.weights @ with_anchors(posterior, [dynamics], query)
-    return Energies(kinetic, potential)
 
 
 def _torque_parts(

@@ -1,5 +1,7 @@
 """`lipserve excite`: what it writes, prints and draws, and what it says where it cannot go on."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -12,6 +14,7 @@ from service.cli import excite as command
 from service.cli.excite import fetch, find
 from tests.service.data import QUICK, stream, train, upload
 from tests.service.server import free_port
+from tests.service.test_robots import urdf
 
 SHORT = ("--seconds", "6", "--rate", "20", "--iterations", "2", "--budget", "1000")
 
@@ -86,6 +89,18 @@ def test_the_robot_is_told_by_the_joints_of_the_model():
     assert result.name == "panda"
     np.testing.assert_array_equal(result.limits.acceleration, profile("panda").acceleration)
     assert result.limits.joint_names == samples.joint_names
+
+
+def test_a_robot_of_a_urdf_moves_the_joints_of_the_model(folder, tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_bytes(urdf(kind="revolute", joints=("joint1", "joint2")))
+    model = lipcore.load(folder)
+    for given in (None, model):
+        result = find(str(path), given)
+        assert (result.name, result.limits.joint_names) == ("arm", ("joint1", "joint2"))
+        assert result.robot.joint_names == result.bodies.joint_names == ("joint1", "joint2")
+    with pytest.raises(ValueError, match="the joints"):
+        find(str(path), replace(model, joint_names=("a", "b", "c")))
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,8 @@
 import pytest
 
 from lipcore.robots.urdf import describe
+from service.cli.models import print_selection
+from service.models.schema import Selection, SelectionCandidate, SelectionHeldOut
 from tests.service.models.versions import JOINTS, WARNING
 
 
@@ -78,3 +80,31 @@ def test_what_a_version_has_learnt_of_its_arm_is_shown(asked, refused, robot_arm
 )
 def test_refusals_say_what_to_do(refused, arm, arguments, hint):
     assert f"hint: {hint}" in refused(*arguments)
+
+
+def judged(estimator, nmse, **given):
+    figures = {"log_density": 1.5, "difference": -0.25, "standard_error": 0.1, "coverage": [0.9, None], "seconds": 2.0}
+    return SelectionCandidate(estimator=estimator, nmse=nmse, error=None, **{**figures, **given})
+
+
+def test_how_an_estimator_was_chosen_is_printed(capsys):
+    failed = SelectionCandidate.model_construct(estimator="lip-chain", error="no [factor]")
+    best = judged("rigid-body", [0.01, 0.03], difference=0.0, standard_error=None)
+    held = SelectionHeldOut(rows=90, blocks=6, repeats=True)
+    made = {"asked": "auto", "chosen": "rigid-body", "reason": "it errs least", "held_out": held}
+    print_selection(Selection(**made, table=[best, judged("rigid-body+lip-chain", None)]))
+    out = capsys.readouterr().out
+    parts = (
+        "6 stretches",
+        "rigid-body (chosen)",
+        "2.00e-02",
+        "90.0%",
+        "0.25 ± 0.10",
+        "it errs least",
+        "these figures flatter",
+    )
+    assert not [each for each in parts if each not in out]
+    nothing = SelectionHeldOut(rows=0, blocks=0, repeats=False)
+    print_selection(Selection.model_construct(**{**made, "held_out": nothing}, table=[failed]))
+    out = capsys.readouterr().out
+    assert ("not judged" in out, "failed: no [factor]" in out, "flatter" in out) == (True, True, False)

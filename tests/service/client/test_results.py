@@ -8,6 +8,7 @@ import pytest
 
 from lipcore.robots.urdf import RigidBody
 from service.client.call import Answer
+from service.client.results import arm as arm_results
 from service.client.results.arm import Arm, read_arm
 from service.client.results.evaluation import read_evaluation
 from service.client.results.series import LiveRows, read_live
@@ -204,3 +205,16 @@ def test_friction_of_slow_joints_is_shown_where_it_was_learnt(robot, arm):
     assert list(shown.tables()["friction"])[-1] == "at low speed N·m"
     assert "stribeck" not in arm.friction
     assert "low speed" not in str(arm)
+
+
+def test_a_version_is_printed_with_its_warnings_and_its_arm(robot):
+    known = client_version(robot, estimator="rigid-body", warnings=["joint 3 hardly moved"])
+    lines = str(known).splitlines()
+    assert lines[:2] == [f"m version 1: rigid-body, 7 joints: {', '.join(REVERSED)}", "careful: joint 3 hardly moved"]
+    assert str(known.arm) in str(known)
+    assert str(client_version(None, estimator="lip", warnings=[])).endswith(REVERSED[-1])
+
+
+def client_version(robot, **given):
+    made = version(None if robot is None else parameters_of(robot))
+    return arm_results.Version.model_construct(**{**made.__dict__, **given})
