@@ -1,4 +1,4 @@
-"""Pinocchio-simulated robot streams: the paper's random sinusoids, with noise, friction and a payload to choose."""
+"""Pinocchio-simulated robot streams: motion, noise, friction and a payload to choose, and the dirt of real arms."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from typing import Literal
 import numpy as np
 
 from lipcore.data.samples import Array, Samples
+from lipcore.robots.dirt import FINE_HZ, Dirt
 from lipcore.robots.library import Robot, pinocchio
 
 MotionRange = Literal["middle", "full"]
+Course = Literal["sinusoids", "periodic", "rests"]
 
 FUNDAMENTAL = 0.02
 """ω_f of eq. 16 of TR2023-063, rad/s."""
@@ -19,6 +21,11 @@ MIDDLE_AMPLITUDE = 0.5
 """Half range of a joint under `middle` motion, rad (m)."""
 FULL_SHARE = 0.95
 """Share of the joint's range that `full` motion uses."""
+PERIOD, HARMONICS = 10.0, 5
+"""Of periodic motion: s at speed 1, and sinusoids."""
+MOVE, REST = (1.0, 2.5), (0.5, 2.0)
+"""Of motion with rests: s that a move takes at speed 1, and that a rest takes, drawn evenly from least to most."""
+SMALLEST_SHARE = 0.1
 FAST = 10.0
 """`speed` of the faster-moving variant: the same sums of sinusoids at ten times the frequency."""
 
@@ -37,7 +44,10 @@ class Stream:
     """What to simulate. Defaults are the paper's training set; its test sets have n_sinusoids = 100.
 
     rate in Hz; noise is the standard deviation of the measured torque in N·m; viscous (N·m·s/rad) and coulomb (N·m)
-    friction are one number for all joints or one a joint; `speed` multiplies the fundamental frequency.
+    friction are one number for all joints or one a joint; `speed` multiplies the fundamental frequency, or divides the
+    period, or the time that moves take. course: the paper's `sinusoids`; `periodic`, few sinusoids again and again;
+    `rests`, from point to point with rests between, all joints at once. dirt: of real arms, see `Dirt`, none where
+    None: q, dq and ddq are then as measured, too.
     """
 
     n_samples: int = 500
@@ -49,23 +59,40 @@ class Stream:
     viscous: float | Sequence[float] = 0.0
     coulomb: float | Sequence[float] = 0.0
     payload: Payload | None = None
+    course: Course = "sinusoids"
+    dirt: Dirt | None = None
 
 
 def simulate(robot: Robot, stream: Stream, seed: int) -> Samples:
-    """Move the robot along random sinusoids and measure its torque (eq. 16 of TR2023-063).
+    """Move the robot along its course and measure its torque.
 
     Equal arguments give equal samples. Raise ValueError for a stream that cannot be simulated.
     """
     _check(stream)
     rng = np.random.default_rng(seed)
-    t = np.arange(stream.n_samples) / stream.rate
-    q, dq, ddq = sinusoids(robot, stream, t, rng)
+    fine = 1 if stream.dirt is None else int(np.ceil(FINE_HZ / stream.rate))
+    t = np.arange(stream.n_samples * fine) / (stream.rate * fine)
+    q, dq, ddq = COURSES[stream.course](robot, stream, t, rng)
     tau = inverse_dynamics(robot, q, dq, ddq, _payload_mask(stream, t), stream.payload)
     tau += _per_joint("viscous", stream.viscous, robot) * dq + _per_joint("coulomb", stream.coulomb, robot) * np.sign(
         dq
     )
-    tau += stream.noise * rng.standard_normal(tau.shape)
+    if stream.dirt is not None:
+        tau = stream.dirt.torque(t, q, dq, tau, usual_torque(robot), rng)
+        q, dq, ddq = stream.dirt.motion(t, q)
+    t, q, dq, ddq, tau = (np.ascontiguousarray(values[::fine]) for values in (t, q, dq, ddq, tau))
+    tau = tau + stream.noise * rng.standard_normal(tau.shape)
     return Samples(robot.joint_names, t, np.zeros(len(t), dtype=np.int64), q, dq, ddq, tau)
+
+
+def usual_torque(robot: Robot) -> Array:
+    """How large each joint's torque usually is, (n,) N·m: its standard deviation over one fast stream.
+
+    At least SMALLEST_SHARE of the largest: a joint about a vertical axis has friction, too.
+    """
+    motion = COURSES["sinusoids"](robot, Stream(speed=FAST), np.arange(100) / 10.0, np.random.default_rng(0))
+    spread = inverse_dynamics(robot, *motion).std(0)
+    return np.asarray(np.maximum(spread, SMALLEST_SHARE * spread.max()))
 
 
 def inverse_dynamics(
@@ -100,11 +127,47 @@ def sinusoids(robot: Robot, stream: Stream, t: Array, rng: np.random.Generator) 
     q = sin @ (a / omega[:, None]) - cos @ (b / omega[:, None])
     dq = cos @ a + sin @ b
     ddq = -sin @ (a * omega[:, None]) + cos @ (b * omega[:, None])
+    return _within(robot, stream, q, dq, ddq)
 
+
+def periodic(robot: Robot, stream: Stream, t: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Sums of HARMONICS sinusoids that repeat every PERIOD / speed seconds: q, dq, ddq, each (N, n)."""
+    omega = 2 * np.pi * stream.speed / PERIOD * np.arange(1, HARMONICS + 1)
+    a, b = rng.uniform(-1, 1, (2, HARMONICS, robot.n_joints))
+    sin, cos = np.sin(np.outer(t, omega)), np.cos(np.outer(t, omega))
+    q = sin @ (a / omega[:, None]) - cos @ (b / omega[:, None])
+    return _within(robot, stream, q, cos @ a + sin @ b, -sin @ (a * omega[:, None]) + cos @ (b * omega[:, None]))
+
+
+def rests(robot: Robot, stream: Stream, t: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Moves of least jerk between random points, with rests between them: q, dq, ddq, each (N, n).
+
+    A move's share of its way after the share s of its time is 10 s³ − 15 s⁴ + 6 s⁵ (Flash & Hogan 1985).
+    """
+    q, dq, ddq = np.zeros((3, len(t), robot.n_joints))
+    begin, here = 0.0, rng.uniform(-1, 1, robot.n_joints)
+    while begin <= t[-1]:
+        there = rng.uniform(-1, 1, robot.n_joints)
+        move, rest = rng.uniform(*MOVE) / stream.speed, rng.uniform(*REST)
+        rows = (t >= begin) & (t < begin + move + rest)
+        s = np.minimum((t[rows] - begin) / move, 1.0)[:, None]
+        way = there - here
+        q[rows] = here + way * s**3 * (10 - 15 * s + 6 * s**2)
+        dq[rows] = way * 30 * s**2 * (1 - s) ** 2 / move
+        ddq[rows] = way * 60 * s * (1 - s) * (1 - 2 * s) / move**2
+        begin, here = begin + move + rest, there
+    return _within(robot, stream, q, dq, ddq)
+
+
+COURSES = {"sinusoids": sinusoids, "periodic": periodic, "rests": rests}
+
+
+def _within(robot: Robot, stream: Stream, q: Array, dq: Array, ddq: Array) -> tuple[Array, Array, Array]:
+    """The same motion within the joints' range and speed."""
     half = (robot.upper - robot.lower) / 2
     reach = np.minimum(MIDDLE_AMPLITUDE, half) if stream.motion == "middle" else FULL_SHARE * half
     top, bottom = q.max(0), q.min(0)
-    scale = np.minimum(2 * reach / (top - bottom), robot.speed / np.abs(dq).max(0))
+    scale = np.minimum(2 * reach / np.maximum(top - bottom, 1e-9), robot.speed / np.maximum(np.abs(dq).max(0), 1e-9))
     middle = (robot.upper + robot.lower) / 2
     return middle + scale * (q - (top + bottom) / 2), scale * dq, scale * ddq
 
@@ -131,6 +194,8 @@ def _check(stream: Stream) -> None:
             raise ValueError(f"{name} is {getattr(stream, name)}, expected a positive number")
     if not 0 <= stream.noise < np.inf:
         raise ValueError(f"noise is {stream.noise}, expected a number of at least 0")
+    if stream.course not in COURSES:
+        raise ValueError(f"course is {stream.course!r}, expected one of {', '.join(COURSES)}")
     if stream.motion not in ("middle", "full"):
         raise ValueError(f"motion is {stream.motion!r}, expected 'middle' or 'full'")
     if stream.payload is not None:

@@ -9,6 +9,7 @@ import numpy as np
 import typer
 
 from lipcore.data.samples import Samples
+from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import ROBOTS, SimulationUnavailableError, load_robot
 from lipcore.robots.simulation import FAST, Payload, Stream, simulate
 from service.cli.consoles import print_result
@@ -45,12 +46,17 @@ def simulate_(
     rate: Annotated[float, typer.Option(help="Hz.")] = 10.0,
     sinusoids: Annotated[int, typer.Option(min=1, help="50 for training, 100 for testing in the paper.")] = 50,
     motion: Annotated[str, typer.Option(help="middle (±0.5 rad) or full.")] = "middle",
+    course: Annotated[str, typer.Option(help="sinusoids, periodic, or rests: from point to point.")] = "sinusoids",
     fast: Annotated[bool, typer.Option("--fast", help="The faster-moving variant.")] = False,
     noise: Annotated[float, typer.Option(help="Std of the torque noise, N·m.")] = 0.01,
     viscous: Annotated[float, typer.Option(help="Viscous friction, N·m·s/rad.")] = 0.0,
     coulomb: Annotated[float, typer.Option(help="Coulomb friction, N·m.")] = 0.0,
     payload: Annotated[float, typer.Option(help="Payload, kg.")] = 0.0,
     payload_at: Annotated[float, typer.Option(help="When the payload is attached, s.")] = 0.0,
+    dirt: Annotated[
+        float,
+        typer.Option(min=0.0, help="Friction with memory, ripple, coloured noise, encoders: 1 is an industrial arm's."),
+    ] = 0.0,
     as_json: Json = False,
 ) -> None:
     """Simulate a robot's stream with Pinocchio and write it as a recording."""
@@ -64,6 +70,8 @@ def simulate_(
         viscous=viscous,
         coulomb=coulomb,
         payload=Payload(payload, payload_at) if payload else None,
+        course=course,  # type: ignore[arg-type]  # as above
+        dirt=Dirt().times(dirt) if dirt else None,
     )
     data = simulate(load_robot(robot), stream, seed)
     write_recording(output, data)

@@ -57,6 +57,7 @@ def test_gravity_is_drawn_downwards(visitor: Visitor) -> None:
         np.testing.assert_allclose(down, [0, 0, -np.linalg.norm(gravity)], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_an_arm_is_drawn_and_moved(visitor: Visitor, arm: str) -> None:
     page = visitor.open(f"#/models/{arm}?tab=arm")
     figure = page.get_by_role("img", name=re.compile("The arm in 3-D, 7 joints from base to tip"))

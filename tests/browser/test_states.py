@@ -106,6 +106,7 @@ def test_what_is_not_there_is_said_to_be_not_there(visitor: Visitor) -> None:
     expect(visitor.open("#/nowhere").get_by_text("There is no page")).to_be_visible()
 
 
+@pytest.mark.slow
 def test_a_service_that_stops_answering_is_said_to_be_gone(windows: Visit, dashboard: Dashboard) -> None:
     visitor = windows(dashboard.server.url)
     page = visitor.open("#/")

@@ -123,6 +123,7 @@ def test_searching_leaves_less_than_where_it_began_and_equal_seeds_give_equal_mo
     assert not np.array_equal(made.series.sine, other.series.sine)
 
 
+@pytest.mark.slow
 def test_a_plan_tells_more_than_random_sinusoids_about_what_a_model_does_not_know(robot, model, limits):
     made = plan(Belief.of_model(model), limits, replace(SHORT, iterations=25, references=60))
     own = replace(robot, lower=limits.lower, upper=limits.upper, speed=limits.speed)

@@ -24,6 +24,7 @@ def imported(statement):
     return set(json.loads(done.stdout.splitlines()[-1]))
 
 
+@pytest.mark.slow
 def test_the_command_that_serves_imports_no_client_and_no_experiment():
     result = imported("import service.cli.serve")
     assert {"service.app", "torch", "fastapi"} <= result

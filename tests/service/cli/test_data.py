@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from lipcore.robots.dirt import Dirt
 from lipcore.robots.simulation import Payload
 from service.datasets.formats.opening import open_table
 from service.datasets.options import ReadOptions
@@ -37,6 +38,11 @@ def test_options_of_the_simulator_matter(lipserve, tmp_path):
     physics = {"noise": 0.0, "viscous": 2.0, "coulomb": 1.0, "payload": Payload(3.0)}
     expected = stream("ur5", 40, 0, speed=10.0, motion="full", **physics)
     np.testing.assert_array_equal(np.column_stack([columns[f"tau{joint}"] for joint in range(1, 7)]), expected.tau)
+    dirty = ("--samples", 20, "--rate", 20, "--course", "rests", "--dirt", 0.5)
+    assert lipserve("simulate", "double-pendulum", tmp_path / "dirty.npz", *dirty)[0] == 0
+    columns = read(tmp_path / "dirty.npz")[1]
+    expected = stream(samples=20, seed=0, rate=20.0, speed=1.0, course="rests", dirt=Dirt().times(0.5))
+    np.testing.assert_array_equal(np.column_stack([columns["tau1"], columns["tau2"]]), expected.tau)
 
 
 def test_an_upload_prints_its_report(asked, recording):
