@@ -9,13 +9,12 @@ from torch import Tensor
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import KINDS, Arm
-from lipcore.kernels.base import LinearKernel, Params
+from lipcore.kernels.base import LinearKernel, Params, Regressor
 from lipcore.kernels.compiled.arm import arm_differences, arm_energies, arm_features, arm_query, arm_size, arm_torques
 from lipcore.kernels.compiled.arm_recursion import PARAMETERS
 from lipcore.kernels.compiled.views import Memory
 from lipcore.kernels.friction import friction_features
 from lipcore.kernels.geometry import Geometry
-from lipcore.kernels.query import Regressor
 
 REMEMBERED = 4
 """Motions whose features are kept: the training samples and the query in work, asked for over and over."""

@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from lipcore.data.motion import Motion
-from lipcore.kernels.base import LinearKernel, Params
+from lipcore.kernels.base import Array, LinearKernel, Params, Regressor
 from lipcore.kernels.compiled.compile import compiled
-from lipcore.kernels.query import Array, Regressor
 
 SIGN_WIDTH = 0.02
 """Velocity over which the Coulomb sign turns over, rad/s (m/s): tanh(dq / width) avoids a jump at standstill."""

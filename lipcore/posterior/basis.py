@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from lipcore.data.motion import Motion
-from lipcore.kernels.base import LinearKernel, PairKernel, Params, SumKernel, TorqueKernel
-from lipcore.kernels.query import Cross
+from lipcore.kernels.base import Cross, LinearKernel, PairKernel, Params, SumKernel, TorqueKernel
 from lipcore.posterior.linalg import cholesky
 
 

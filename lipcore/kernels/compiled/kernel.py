@@ -11,11 +11,10 @@ import torch
 from torch import Tensor
 
 from lipcore.data.motion import Motion
-from lipcore.kernels.base import PairKernel, Params
+from lipcore.kernels.base import Array, Cross, PairKernel, Params
 from lipcore.kernels.compiled.joints import Flags, columns, read_rows
 from lipcore.kernels.compiled.lanes import LANES
 from lipcore.kernels.compiled.views import Memory
-from lipcore.kernels.query import Array, Cross
 from lipcore.vocabulary import JointType
 
 
