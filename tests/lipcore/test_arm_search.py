@@ -10,6 +10,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from lipcore import FitOptions, Samples, load, save, train
+from lipcore.arm import learning
 from lipcore.arm import search as searching
 from lipcore.arm.learning import learn
 from lipcore.arm.posing import make_problem
@@ -372,3 +373,18 @@ def test_a_matrix_that_rounding_has_spoilt_is_factored() -> None:
     np.testing.assert_allclose(root_of(good), np.linalg.cholesky(good))
     with pytest.raises(np.linalg.LinAlgError, match="not finite"):
         root_of(np.full((2, 2), np.nan))
+
+
+def test_optima_that_answer_otherwise_stand_side_by_side(learnt: tuple[Problem, Point]) -> None:
+    problem, best = learnt
+    place = np.arange(problem.n_joints)
+    turned = best.geometry.moved(np.where(best.geometry.turns, 0.3, 0.1))
+    other = problem.at(turned, best.sigma)
+    one, _ = learning._arm(problem, best, [best], place, "learn")
+    assert one.alternatives == ()
+    both, params = learning._arm(problem, best, [other], place, "learn")
+    assert [each.geometry for each in both.alternatives] == [best.geometry, turned]
+    odds = problem.laplace(best) - problem.laplace(other)
+    assert both.alternatives[1].probability == pytest.approx(np.exp(odds) / (1 + np.exp(odds)), rel=1e-6, abs=1e-6)
+    assert sum(each.probability for each in both.alternatives) == pytest.approx(1.0)
+    assert {name: len(values) for name, values in params.items()}["noise.log_std"] == problem.n_joints

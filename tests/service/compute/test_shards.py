@@ -76,7 +76,6 @@ def test_the_sum_does_not_depend_on_the_order(count, seed):
     assert found.tobytes() == tree([numbers(each) for each in shards]).tobytes()
 
 
-@pytest.mark.slow
 def test_a_lost_process_costs_its_shard_another_attempt(tmp_path):
     expected = summed(Inline(), numbers, SHARDS, never)
     with shard_executor(Settings(home=tmp_path, statistics_workers=2, training_cpus=2)) as executor:
