@@ -1,5 +1,6 @@
 """Settings of the whole suite, and which of its tests run in one process where several share the work."""
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -25,6 +26,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         default="own",
         help="own: SQLite and files of each service (the default); shared: PostgreSQL and S3, started by the tests",
     )
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out what takes seconds to import where none of its tests is asked for."""
+    unasked = config.getoption("markexpr") == "not slow"
+    return True if unasked and collection_path == Path(__file__).parent / "service/fuzz" else None
 
 
 def room(test: str) -> str:
