@@ -13,7 +13,7 @@ SHARE := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 demo: install
 	$(BIN)/lipserve demo
 
-# under five minutes on two cores; some tests of each kind, the others are slow
+# five to six minutes on two cores; some tests of each kind, the others are slow
 test: install
 	$(MAKE) -j2 warm-lip warm-chain bytecode
 	$(TEST) $(SHARE) -m "not slow" $(TESTS)
