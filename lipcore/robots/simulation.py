@@ -90,7 +90,7 @@ def usual_torque(robot: Robot) -> Array:
 
     At least SMALLEST_SHARE of the largest: a joint about a vertical axis has friction, too.
     """
-    motion = COURSES["sinusoids"](robot, Stream(speed=FAST), np.arange(100) / 10.0, np.random.default_rng(0))
+    motion = sinusoids(robot, Stream(speed=FAST), np.arange(100) / 10.0, np.random.default_rng(0))
     spread = inverse_dynamics(robot, *motion).std(0)
     return np.asarray(np.maximum(spread, SMALLEST_SHARE * spread.max()))
 
@@ -121,22 +121,25 @@ def sinusoids(robot: Robot, stream: Stream, t: Array, rng: np.random.Generator) 
 
     t: (N,) s; rng: where amplitudes are drawn from.
     """
-    omega = FUNDAMENTAL * stream.speed * np.arange(1, stream.n_sinusoids + 1)
-    a, b = rng.uniform(-1, 1, (2, stream.n_sinusoids, robot.n_joints))
+    return _summed(robot, stream, t, rng, FUNDAMENTAL * stream.speed, stream.n_sinusoids)
+
+
+def periodic(robot: Robot, stream: Stream, t: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Sums of HARMONICS sinusoids that repeat every PERIOD / speed seconds: q, dq, ddq, each (N, n)."""
+    return _summed(robot, stream, t, rng, 2 * np.pi * stream.speed / PERIOD, HARMONICS)
+
+
+def _summed(
+    robot: Robot, stream: Stream, t: Array, rng: np.random.Generator, fundamental: float, count: int
+) -> tuple[Array, Array, Array]:
+    """Random sums of sinusoids: `count` multiples of the fundamental, rad/s."""
+    omega = fundamental * np.arange(1, count + 1)
+    a, b = rng.uniform(-1, 1, (2, count, robot.n_joints))
     sin, cos = np.sin(np.outer(t, omega)), np.cos(np.outer(t, omega))
     q = sin @ (a / omega[:, None]) - cos @ (b / omega[:, None])
     dq = cos @ a + sin @ b
     ddq = -sin @ (a * omega[:, None]) + cos @ (b * omega[:, None])
     return _within(robot, stream, q, dq, ddq)
-
-
-def periodic(robot: Robot, stream: Stream, t: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    """Sums of HARMONICS sinusoids that repeat every PERIOD / speed seconds: q, dq, ddq, each (N, n)."""
-    omega = 2 * np.pi * stream.speed / PERIOD * np.arange(1, HARMONICS + 1)
-    a, b = rng.uniform(-1, 1, (2, HARMONICS, robot.n_joints))
-    sin, cos = np.sin(np.outer(t, omega)), np.cos(np.outer(t, omega))
-    q = sin @ (a / omega[:, None]) - cos @ (b / omega[:, None])
-    return _within(robot, stream, q, cos @ a + sin @ b, -sin @ (a * omega[:, None]) + cos @ (b * omega[:, None]))
 
 
 def rests(robot: Robot, stream: Stream, t: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
