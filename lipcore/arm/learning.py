@@ -16,8 +16,7 @@ from lipcore.arm.posing import make_problem, mode_of, with_samples, with_stribec
 from lipcore.arm.problem import Point, Problem, root_of
 from lipcore.arm.scales import rescale
 from lipcore.arm.search import Pool, SearchResult, search
-from lipcore.data.independence import residual_correlation
-from lipcore.data.samples import Samples
+from lipcore.data.samples import Array, Samples
 from lipcore.data.signals import noise_level
 from lipcore.fitting import noise
 from lipcore.fitting.hyperparameters import FitCancelledError, FitProgress
@@ -26,6 +25,7 @@ from lipcore.kernels.arm_prior import Alternative, Arm
 from lipcore.kernels.compiled.arm import PARAMETERS
 from lipcore.kernels.friction import FRICTION_TERMS
 from lipcore.kernels.geometry import Geometry
+from lipcore.posterior.misfit import Misfit, estimate, shared_rows
 from lipcore.posterior.selection import spread_out
 from lipcore.vocabulary import GeometryMode
 
@@ -43,20 +43,22 @@ CHECKS = 200
 STRIBECK_NATS = 10.0
 """What a fourth term of friction has to gain to be kept. On simulated arms without such friction it lost two to seven,
 a sign that turns over at once instead of smoothly gained seven, 0.5 N·m of such friction gained forty."""
-STRIBECK_ROUNDS = 2
+STRIBECK_ROUNDS, REST_ROUNDS = 2, 2
 CORRELATED = 20_000
-"""Contiguous rows at most that tell how correlated errors are."""
+"""Contiguous rows at most that tell what lasts of the errors."""
 
 
 @dataclass(frozen=True)
 class Learnt:
     """What was learnt. arm: its linearisation; params: hyperparameters of arm, friction and noise; rows: samples that
-    it was learnt from; weight: independent samples that each of them stands for; report: for the manifest."""
+    it was learnt from; counts: (rows, n), independent measurements that each torque of them stands for; misfit: what is
+    not expressed; report: for the manifest."""
 
     arm: Arm
     params: dict[str, Tensor]
     rows: NDArray[np.int64]
-    weight: float
+    counts: Array
+    misfit: Misfit
     report: dict[str, float | int | bool | str]
 
 
@@ -95,13 +97,11 @@ def learn(
             polished.add(problem.descend(geometry, sigma, POLISHING, watch.stop))
         ends = polished.points
         watch.step("hyperparameters", ends[0].value, 0.85)
-        contiguous = task.signals.rows(slice(0, CORRELATED))
-        recorded = with_samples(problem, contiguous, order)
-        correlation = residual_correlation(recorded.tau - recorded.mean(ends[0]), contiguous)
-        weight = min(1.0, len(samples) / correlation / len(rows))
-        problem = replace(problem, counts=np.full(len(rows), weight))
+        counting = _Counting(task.signals, order, shared_rows(samples, len(rows)))
+        problem = counting.applied(problem, ends[0], at_rest=False)
         ends = sorted((problem.at(each.geometry, each.sigma) for each in ends), key=lambda each: each.value)
-        best, others, problem, stribeck_nats = _refined(problem, ends, watch)
+        best, others, problem, stribeck_nats = _refined(problem, ends, counting, watch)
+        misfit, _ = counting.misfit(problem, best, best.sigma**2)
         watch.step("posterior", best.value, 0.95)
         report: dict[str, float | int | bool | str] = {"geometry": mode, "search_objective": ends[0].value}
         if result is not None:
@@ -115,12 +115,39 @@ def learn(
             "samples_given": len(samples),
             "samples_hyperparameters": len(rows),
             "samples_posterior": len(rows),
-            "row_correlation": correlation,
+            "independent_samples": float(problem.counts.mean(axis=1).sum()),
             "seconds": time.monotonic() - watch.began,
             "device": "cpu",
         }
         arm, params = _arm(problem, best, others, order, mode)
-        return Learnt(arm, params, rows, weight, report)
+        place, n = np.argsort(order), problem.n_joints
+        friction = problem.weights(best)[(PARAMETERS + 1) * n :].reshape(n, -1)
+        misfit = misfit.with_friction(friction[:, FRICTION_TERMS.index("coulomb")]).of_joints(place)
+        return Learnt(arm, params, rows, problem.counts[:, place], misfit, report)
+
+
+@dataclass(frozen=True)
+class _Counting:
+    """What each torque counts. signals: contiguous samples; order: (n,), the data's joint at each place of the chain;
+    shared: rows of a problem that have an error in common where it lasts."""
+
+    signals: Samples
+    order: NDArray[np.int64]
+    shared: float
+
+    def applied(self, problem: Problem, point: Point, at_rest: bool) -> Problem:
+        """The problem whose torques count as a point's residuals say. at_rest: less where friction is unknown, too."""
+        misfit, noise = self.misfit(problem, point)
+        misfit = misfit if at_rest else replace(misfit, rest=torch.zeros_like(misfit.rest))
+        variance = misfit.of_row(torch.from_numpy(noise), torch.from_numpy(problem.motions[:, 1]), self.shared)
+        return replace(problem, counts=noise / variance.numpy())
+
+    def misfit(self, problem: Problem, point: Point, least: Array | float = 0.0) -> tuple[Misfit, Array]:
+        """What `estimate` says of what a point leaves of contiguous samples, base to tip."""
+        contiguous = self.signals.rows(slice(0, CORRELATED))
+        recorded = with_samples(problem, contiguous, self.order)
+        residual, dq = recorded.tau - recorded.mean(point), recorded.motions[:, 1]
+        return estimate(residual, recorded.tau, dq, contiguous.episodes(), least)
 
 
 def _search(
@@ -140,15 +167,23 @@ def _search(
     return search(problem.rows(few.numpy()), types, task.gravity, sensor, seconds, seed, known, watch.searching)
 
 
-def _refined(problem: Problem, ends: Sequence[Point], watch: _Watch) -> tuple[Point, list[Point], Problem, float]:
-    """Scales, noise and geometry of the best end, with friction's fourth term where the evidence wants it; then what
-    becomes of the other ends with the same scales; last how many nats that term gains."""
+def _refined(
+    problem: Problem, ends: Sequence[Point], counting: _Counting, watch: _Watch
+) -> tuple[Point, list[Point], Problem, float]:
+    """Scales, noise and geometry of the best end, with friction's fourth term where the evidence wants it, and what
+    torques count at rest; then what becomes of the other ends with the same scales; last how many nats that term gains.
+    """
     best, problem = _in_turn(problem, ends[0], ROUNDS, 0.85, watch)
     wider = with_stribeck(problem)
     start = wider.at(best.geometry, best.sigma)
     gain = rescale(problem, best).value - rescale(wider, start).value
     if gain > STRIBECK_NATS:
-        best, problem = _in_turn(wider, start, STRIBECK_ROUNDS, 0.91, watch)
+        best, problem = _in_turn(wider, start, STRIBECK_ROUNDS, 0.88, watch)
+    for number in range(REST_ROUNDS):
+        problem = counting.applied(problem, best, at_rest=True)
+        best, problem = _in_turn(
+            problem, problem.at(best.geometry, best.sigma), STRIBECK_ROUNDS, 0.9 + 0.02 * number, watch
+        )
     others = []
     for end in ends[1:]:
         if end.value < ends[0].value + 2 * NEAR:
@@ -165,7 +200,7 @@ def _in_turn(problem: Problem, point: Point, rounds: int, fraction: float, watch
         scaled = rescale(problem, point)
         problem = scaled.problem
         point = problem.descend(point.geometry, scaled.sigma, ROUND_STEPS, watch.stop, noise=False)
-        watch.step("hyperparameters", point.value, fraction + 0.02 * number)
+        watch.step("hyperparameters", point.value, fraction + 0.01 * number)
     return point, problem
 
 

@@ -66,7 +66,7 @@ def make_problem(
         Problem(
             motions,
             tau,
-            np.ones(len(samples)),
+            np.ones(tau.shape),
             joint_friction(motions[:, 1]),
             np.concatenate([centre.reshape(-1), np.zeros(n + len(friction))]),
             np.concatenate([body, friction]),
@@ -82,7 +82,7 @@ def with_samples(problem: Problem, samples: Samples, order: NDArray[np.int64]) -
     """The same expectations with N other samples, each counted in full. order: (n,), as of `make_problem`."""
     motions, tau = _in_chain(samples, order)
     friction = joint_friction(motions[:, 1], problem.friction_terms > len(FRICTION_TERMS))
-    return replace(problem, motions=motions, tau=tau, counts=np.ones(len(samples)), friction=friction)
+    return replace(problem, motions=motions, tau=tau, counts=np.ones(tau.shape), friction=friction)
 
 
 def _in_chain(samples: Samples, order: NDArray[np.int64]) -> tuple[Array, Array]:

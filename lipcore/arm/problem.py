@@ -73,10 +73,9 @@ class Point:
 class Problem:
     """Samples that a geometry is to explain.
 
-    motions: (N, 3, n), q, dq and ddq from base to tip; tau: (N, n); counts: (N,), independent samples that a row stands
-    for; friction: (N, n, f n), its features; centre, scale: (k,), μ and s of w; noise: (n,), where its prior lies;
-    floor: (n,), the smallest admitted; expected: prior of the geometry,
-    None where it is fixed.
+    motions: (N, 3, n), q, dq and ddq from base to tip; tau: (N, n); counts: (N, n), independent measurements that a
+    torque stands for; friction: (N, n, f n), its features; centre, scale: (k,), μ and s of w; noise: (n,), where its
+    prior lies; floor: (n,), the smallest admitted; expected: prior of the geometry, None where it is fixed.
     """
 
     motions: Array
@@ -111,7 +110,9 @@ class Problem:
         rows = rng.integers(len(self.tau), size=(3, size))
         motions = np.stack([self.motions[rows[part], part] for part in range(3)], axis=1)
         nothing = np.zeros((size, self.n_joints))
-        return replace(self, motions=motions, tau=nothing, counts=np.ones(size), friction=self.friction[rows[1]])
+        return replace(
+            self, motions=motions, tau=nothing, counts=np.ones_like(nothing), friction=self.friction[rows[1]]
+        )
 
     def mean(self, point: Point) -> Array:
         """The most likely torque of a point at these samples, (N, n) N·m."""
@@ -164,7 +165,7 @@ class Problem:
         weights = cho_solve((lower, True), scaled.T @ target, check_finite=False)
         left = target - scaled @ weights  # (not target² − …: where the noise is small, that leaves no digit)
         value = 0.5 * (left @ left + weights @ weights) + np.log(lower.diagonal()).sum()
-        value += self.counts.sum() * np.log(sigma).sum()
+        value += self.counts.sum(0) @ np.log(sigma)
         value += 0.0 if self.expected is None else self.expected.value(geometry)
         value += 0.5 * np.sum((np.log(sigma / self.noise) / NOISE_WIDTH) ** 2)
         return Point(geometry, sigma, float(value), weights, features, lower)
@@ -186,9 +187,9 @@ class Problem:
         scaled, _ = self._scaled(point.features, point.sigma)
         white = solve_triangular(point.factor, scaled.T, lower=True, check_finite=False)
         leverage = np.square(white).sum(0).reshape(size, n).sum(0)
-        total = self.counts.sum()
+        total = self.counts.sum(0)
         left = np.maximum(total - np.minimum(leverage, MOST_LEVERAGE * total), 1.0)
-        squares = (self.counts[:, None] * self.residual(point) ** 2).sum(0)
+        squares = (self.counts * self.residual(point) ** 2).sum(0)
         sigma = np.maximum(np.sqrt(squares / left), self.floor)
         return self.at(point.geometry, sigma, point.features)
 
@@ -241,7 +242,7 @@ class Problem:
         k = len(self.scale)
         both = np.concatenate([point.features, self.shapes(point)], axis=2)
         scaled, _ = self._scaled(both, point.sigma)
-        weight = np.sqrt(self.counts)[:, None] / point.sigma
+        weight = np.sqrt(self.counts) / point.sigma
         left = (self.residual(point) * weight).reshape(-1)
         hessian, gradient = scaled.T @ scaled, scaled.T @ left
         gradient[:k] -= point.weights
@@ -254,7 +255,7 @@ class Problem:
 
     def _scaled(self, features: Array, sigma: Array) -> tuple[Array, Array]:
         """Features (N n, …) and the torque that μ leaves, (N n,), in units of the noise."""
-        weight = np.sqrt(self.counts)[:, None] / sigma
+        weight = np.sqrt(self.counts) / sigma
         target = self.tau
         if np.any(self.centre):
             k = len(self.centre)

@@ -67,12 +67,12 @@ def rescale(problem: Problem, point: Point) -> Scaled:
 @dataclass(frozen=True)
 class _Evidence:
     """Sums over samples: of each joint the Gram matrix (k + g, k + g) and right-hand side of all features, Σ τ²; the
-    prior's mean and deviations; how many of them are scaled."""
+    prior's mean and deviations; how many of them are scaled; counts: (n,)."""
 
     grams: Array
     rights: Array
     squares: Array
-    count: float
+    counts: Array
     mean: Array
     std: Array
     scaled: int
@@ -83,12 +83,12 @@ class _Evidence:
         both = np.concatenate([plain, problem.shapes(point)], axis=2)
         steps = np.zeros(0) if problem.expected is None else problem.expected.step(point.geometry)
         widths = np.zeros(0) if problem.expected is None else problem.expected.widths
-        weighed = both * problem.counts[:, None, None]
+        weighed = both * problem.counts[:, :, None]
         return cls(
             np.stack([weighed[:, j].T @ both[:, j] for j in range(problem.n_joints)]),
             np.stack([weighed[:, j].T @ problem.tau[:, j] for j in range(problem.n_joints)]),
-            (problem.counts[:, None] * problem.tau**2).sum(0),
-            float(problem.counts.sum()),
+            (problem.counts * problem.tau**2).sum(0),
+            problem.counts.sum(0),
             np.concatenate([problem.centre, steps]),
             np.concatenate([problem.scale, widths]),
             len(problem.scale),
@@ -112,9 +112,9 @@ class _Evidence:
         value = 0.5 * (precision @ squares + deviation @ deviation) + np.log(lower.diagonal()).sum()
         spread = covariance * np.outer(std, std)
         used = np.einsum("kl,jkl->j", spread, self.grams)
-        by_noise = self.count - precision * (squares + used)
+        by_noise = self.counts - precision * (squares + used)
         by_scale = 1.0 - deviation**2 - covariance.diagonal()
-        return float(value + self.count * log_noise.sum()), by_noise, by_scale[: self.scaled]
+        return float(value + self.counts @ log_noise), by_noise, by_scale[: self.scaled]
 
 
 def _parts(n: int, k: int) -> Array:

@@ -32,7 +32,7 @@ from lipcore.files.manifest import (
     ModelFormatError,
     read_manifest_bytes,
 )
-from lipcore.files.tensors import FLOOR, INDUCING, OUTPUTS, PARAMS, A, B, read_tensors
+from lipcore.files.tensors import FLOOR, INDUCING, MISFIT, OUTPUTS, PARAMS, A, B, read_tensors
 from lipcore.fitting.estimators import Calibration, make_estimator
 from lipcore.kernels.arm_prior import Arm
 from lipcore.model.parameters import report
@@ -40,6 +40,7 @@ from lipcore.model.torque_model import TorqueModel
 from lipcore.model.warnings import warnings
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.linalg import pack_symmetric, unpack_symmetric
+from lipcore.posterior.misfit import Misfit
 from lipcore.posterior.statistics import Statistics
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import ROBOT_ESTIMATORS
@@ -72,6 +73,8 @@ def encode(model: TorqueModel, lineage: Mapping[str, Any] | None = None) -> tupl
     tensors |= {OUTPUTS: basis.outputs, A: pack_symmetric(statistics.a), B: statistics.b}
     if bool((model.posterior.floor > 0).any()):
         tensors[FLOOR] = model.posterior.floor
+    if model.posterior.misfit.exists:
+        tensors[MISFIT] = model.posterior.misfit.packed()
     if model.arm is not None:
         tensors |= arm_tensors(model.arm)
     parameters = report(model.posterior, model.estimator, model.joint_names)
@@ -269,6 +272,7 @@ def _restore(manifest: Mapping[str, Any], tensors: dict[str, Tensor], robot: Rig
         statistics,
         float(manifest["fit"].get("jitter", 0.0)),
         calibration.function_std_factor,
+        Misfit.unpacked(tensors[MISFIT]) if MISFIT in tensors else None,
     )
     if FLOOR in tensors:
         posterior = replace(posterior, floor=tensors[FLOOR])

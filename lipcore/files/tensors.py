@@ -24,7 +24,7 @@ WIDTH = 8
 """Bytes of a number: all are float64 but the places of outputs, which are int64."""
 OUTPUTS = "inducing/outputs"
 INDUCING = ("inducing/q", "inducing/dq", "inducing/ddq")
-A, B, FLOOR = "statistics/a", "statistics/b", "floor"
+A, B, FLOOR, MISFIT = "statistics/a", "statistics/b", "floor", "misfit"
 PARAMS = "params/"
 TYPES = {"F64": "float64", "I64": "int64"}
 
@@ -54,6 +54,8 @@ def read_tensors(payload: bytes, n: int, limits: Limits) -> dict[str, Tensor]:
             raise _bad(f"tensor {name!r} is not made of finite float64 numbers")
     if FLOOR in tensors and bool((tensors[FLOOR] < 0).any()):
         raise _bad(f"tensor {FLOOR!r} has a number below zero, expected variances")
+    if MISFIT in tensors and bool((tensors[MISFIT][0::2] < 0).any() or (tensors[MISFIT][1::2] <= 0).any()):
+        raise _bad(f"tensor {MISFIT!r} has a number below zero, expected variances and speeds")
     return tensors
 
 
@@ -108,7 +110,7 @@ def _are_counts(value: object) -> bool:
 
 def _check_sizes(entries: dict[str, Entry], n: int, limits: Limits) -> None:
     for name in entries:
-        if not (name.startswith(PARAMS) or is_of_arm(name)) and name not in (OUTPUTS, *INDUCING, A, B, FLOOR):
+        if not (name.startswith(PARAMS) or is_of_arm(name)) and name not in (OUTPUTS, *INDUCING, A, B, FLOOR, MISFIT):
             raise _bad(f"{TENSORS} has the tensor {quote(name)}, which this release does not know")
     for name in (OUTPUTS, *INDUCING, A, B):
         if name not in entries:
@@ -131,5 +133,6 @@ def _check_sizes(entries: dict[str, Entry], n: int, limits: Limits) -> None:
     if entries[A].shape != (b[0] * (b[0] + 1) // 2,):
         length = b[0] * (b[0] + 1) // 2
         raise _bad(f"{A} has shape {entries[A].shape}, expected M (M + 1) / 2 numbers, {length}, as {B} has {b[0]}")
-    if FLOOR in entries and entries[FLOOR].shape != (n,):
-        raise _bad(f"tensor {FLOOR!r} has shape {entries[FLOOR].shape}, expected ({n},)")
+    for name, shape in ((FLOOR, (n,)), (MISFIT, (4, n))):
+        if name in entries and entries[name].shape != shape:
+            raise _bad(f"tensor {name!r} has shape {entries[name].shape}, expected {shape}")

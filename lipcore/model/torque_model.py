@@ -125,4 +125,5 @@ class TorqueModel:
             posterior.root.numpy(),
             posterior.std_factor,
             posterior.floor.numpy(),
+            posterior.misfit.packed().numpy(),
         )

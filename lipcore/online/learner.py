@@ -146,6 +146,7 @@ class OnlineModel:
             posterior.noise_variance,
             posterior.std_factor,
             None if floor is None else torch.from_numpy(np.array(floor, np.float64)),
+            posterior.misfit,
         )
         return replace(self.base, posterior=updated)
 
@@ -186,7 +187,7 @@ class OnlineModel:
         features, open_ = posterior.basis.features_and_uncovered(motion)
         if novel is not None:
             novel((open_ > posterior.noise_variance).any(1).numpy())
-        return add_to(statistics, features, posterior.noise_variance + open_, residual, weights, sign)
+        return add_to(statistics, features, posterior.row_variance(motion) + open_, residual, weights, sign)
 
     def _aged(self, reference: float, since: float) -> OnlineModel:
         """The same knowledge as it weighs at a later reference time; its sums are overwritten."""

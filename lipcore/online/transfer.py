@@ -40,6 +40,7 @@ def consolidate(online: OnlineModel, floor: Array | None = None) -> TorqueModel:
         Statistics(now.statistics.a, now.centre + now.statistics.b, max(samples, 0.0)),
         base.noise_variance,
         base.std_factor,
+        base.misfit,
     )
     if floor is not None:
         posterior = replace(posterior, floor=torch.from_numpy(floor.copy()))

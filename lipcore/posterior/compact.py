@@ -12,6 +12,7 @@ from lipcore.data.motion import Motion
 from lipcore.kernels.base import LinearKernel, Params, TorqueKernel
 from lipcore.posterior.basis import Basis
 from lipcore.posterior.exact import Posterior, Prediction
+from lipcore.posterior.misfit import Misfit
 from lipcore.posterior.statistics import Solution, Statistics, solve
 
 
@@ -27,14 +28,15 @@ class CompactPosterior(Posterior):
 
     where φ does not reach, the variance is the prior's. root: Q, (M, M) lower triangular; noise_variance: (n,) R;
     floor: (n,) (N·m)², which the variance of a torque is never below, whatever the samples say; zero but for models
-    that learn online (see `online.record.error_floor`). statistics: what it was made from; None where that is more than
-    one sum.
+    that learn online (see `online.record.error_floor`). misfit: variance of the torque besides.
+    statistics: what it was made from; None where that is more than one sum.
     """
 
     basis: Basis
     noise_variance: Tensor
     root: Tensor
     floor: Tensor
+    misfit: Misfit
     statistics: Statistics | None = None
 
     @classmethod
@@ -45,13 +47,14 @@ class CompactPosterior(Posterior):
         statistics: Statistics,
         noise_variance: Tensor,
         std_factor: float = 1.0,
+        misfit: Misfit | None = None,
     ) -> CompactPosterior:
         """Posterior of statistics (eq. 24 of docs/method.md).
 
-        noise_variance: (n,) (N·m)²; std_factor: calibration. Raise NotPositiveDefiniteError for statistics that no
-        samples have.
+        noise_variance: (n,) (N·m)²; std_factor: calibration; misfit: none where None. Raise NotPositiveDefiniteError
+        for statistics that no samples have.
         """
-        posterior = cls.solved(kernel, basis, solve(statistics), noise_variance, std_factor)
+        posterior = cls.solved(kernel, basis, solve(statistics), noise_variance, std_factor, None, misfit)
         return replace(posterior, statistics=statistics)
 
     @classmethod
@@ -64,6 +67,7 @@ class CompactPosterior(Posterior):
         statistics: Statistics,
         jitter: float = 0.0,
         std_factor: float = 1.0,
+        misfit: Misfit | None = None,
     ) -> CompactPosterior:
         """Rebuild a posterior from what a file holds: hyperparameters, inducing outputs (see `Basis`) and statistics.
 
@@ -84,7 +88,7 @@ class CompactPosterior(Posterior):
                 f"expected {(size, size)} and {(size,)}"
             )
         noise_variance = torch.exp(2 * params["noise.log_std"]) + jitter
-        return cls.build(kernel, basis, statistics, noise_variance, std_factor)
+        return cls.build(kernel, basis, statistics, noise_variance, std_factor, misfit)
 
     @classmethod
     def solved(
@@ -95,27 +99,34 @@ class CompactPosterior(Posterior):
         noise_variance: Tensor,
         std_factor: float = 1.0,
         floor: Tensor | None = None,
+        misfit: Misfit | None = None,
     ) -> CompactPosterior:
         """Posterior of the torques, given that of the whitened variables.
 
-        noise_variance: (n,) (N·m)²; floor: (n,) (N·m)², none where None.
+        noise_variance: (n,) (N·m)²; floor: (n,) (N·m)²; misfit; none where None.
         """
         weights = torch.linalg.solve_triangular(basis.root.T, solution.mean[:, None], upper=True)[:, 0]
         # and not from QᵀQ itself: B⁻¹ is badly conditioned
         root = torch.linalg.solve_triangular(basis.root, solution.learnt, upper=False, left=False)
         floor = torch.zeros_like(noise_variance) if floor is None else floor
-        return cls(kernel, basis.params, std_factor, weights, basis, noise_variance, root, floor)
+        misfit = Misfit.none(len(noise_variance)) if misfit is None else misfit
+        return cls(kernel, basis.params, std_factor, weights, basis, noise_variance, root, floor, misfit)
+
+    def row_variance(self, motion: Motion) -> Tensor:
+        """Variance R with which each of N rows teaches, as far as the basis reaches: (N, n) (N·m)²."""
+        return self.misfit.of_row(self.noise_variance, motion.dq)
 
     def predict(self, query: Motion, component: TorqueKernel | None = None) -> Prediction:
         """Posterior mean and n×n covariance of the torques at each of N queries, or of one term of the kernel.
 
-        The floor is one of the whole torque: no term's share of it is known.
+        Floor and misfit are those of the whole torque: no term's share of them is known.
         """
         prediction = super().predict(query, component)
         if component is not None:
             return prediction
-        short = (self.floor - prediction.covariance.diagonal(dim1=1, dim2=2)).clamp_min(0.0)
-        return Prediction(prediction.mean, prediction.covariance + torch.diag_embed(short))
+        variance = prediction.covariance.diagonal(dim1=1, dim2=2)
+        more = torch.maximum(self.misfit.variance(query.dq), self.floor - variance)
+        return Prediction(prediction.mean, prediction.covariance + torch.diag_embed(more))
 
     def whiten(self, cross: Tensor) -> Tensor:
         """Q c, (M, K). cross: covariance of the variables with K quantities, (M, K)."""

@@ -14,6 +14,7 @@ from lipcore.posterior.basis import Basis, split
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.exact import ExactPosterior, Prediction
 from lipcore.posterior.linalg import cholesky
+from lipcore.posterior.misfit import Misfit
 from lipcore.posterior.selection import Pivots, pivots, spread_out
 from lipcore.posterior.statistics import collect
 
@@ -113,18 +114,24 @@ def compress(exact: ExactPosterior, tau: Tensor, tolerance: float, most: int, se
 
 
 def linear(
-    kernel: TorqueKernel, params: Params, motion: Motion, tau: Tensor, weights: Tensor, tolerance: float
+    kernel: TorqueKernel,
+    params: Params,
+    motion: Motion,
+    tau: Tensor,
+    counts: Tensor,
+    tolerance: float,
+    misfit: Misfit,
 ) -> Compression:
     """The posterior of a kernel whose terms are all linear, which is compact as it is: nothing is left out.
 
-    motion, tau: N samples; weights: (N,), independent samples that each stands for. Of the motion, STORED spread-out
-    instants are kept: to ask the model where it should know.
+    motion, tau: N samples; counts: (N, n), independent measurements that each torque stands for. Of the motion, STORED
+    spread-out instants are kept: to ask the model where it should know.
     """
     kept = motion[spread_out(motion, STORED)]
     basis = Basis.build(kernel, params, kept, torch.empty(0, dtype=torch.int64))
     noise = torch.exp(2 * params["noise.log_std"])
-    statistics = collect(basis, noise, motion, tau - kernel.mean(motion), weights)
-    posterior = CompactPosterior.build(kernel, basis, statistics, noise)
+    statistics = collect(basis, noise / counts, motion, tau - kernel.mean(motion))
+    posterior = CompactPosterior.build(kernel, basis, statistics, noise, misfit=misfit)
     return Compression(posterior, Deviation(0.0, 0.0, 0.0, 0), tolerance, True)
 
 

@@ -38,12 +38,13 @@ class Evaluator:
     """Posterior torques of a robot with n joints from M = m + P anchors: m inducing outputs, then all linear weights.
 
     With g(x) the covariance of the anchors with the torques at x, (M, n), the mean is E f(x) + gᵀ weights and the
-    covariance std_factor² (k(x, x) − (Q g)ᵀ (Q g)), whose diagonal is raised to `floor` where it is below.
+    covariance std_factor² (k(x, x) − (Q g)ᵀ (Q g)), to whose diagonal the misfit is added, and which is
+    raised to `floor` where it is below.
 
     term: the kernel's nonlinear term, None if it has none. params: hyperparameters of all terms. inducing: S samples,
     None without `term`. outputs: (m,), which of their torques, as sample · n + joint. linear: the linear terms in the
     order of the anchors. weights: (M,). root: Q, (M, M) lower triangular. std_factor: calibration. floor: (n,)
-    (N·m)², none where None.
+    (N·m)²; misfit: (4, n), see `Misfit.packed`; none where None.
 
     Safe from several threads, which answer at the same time: compiled code runs without the GIL and every thread has
     memory of its own. Raises ValueError naming the argument that does not fit.
@@ -60,6 +61,7 @@ class Evaluator:
         root: Array,
         std_factor: float = 1.0,
         floor: Array | None = None,
+        misfit: Array | None = None,
     ) -> None:
         if (term is None) != (inducing is None):
             raise ValueError("term and inducing: expected both of them or neither")
@@ -82,6 +84,10 @@ class Evaluator:
         self._floor = np.zeros(n) if floor is None else np.array(floor, np.float64)
         if self._floor.shape != (n,):
             raise ValueError(f"floor has shape {self._floor.shape}, expected ({n},)")
+        nothing = np.array([[0.0], [1.0], [0.0], [1.0]]).repeat(n, axis=1)
+        self._misfit = nothing if misfit is None else np.array(misfit, np.float64)
+        if self._misfit.shape != nothing.shape:
+            raise ValueError(f"misfit has shape {self._misfit.shape}, expected {nothing.shape}")
         sizes = samples, len(self._outputs) + len(means), len(means), n
         self._one, self._many = _Scratch(1, *sizes), _Scratch(QUERIES, *sizes)
 
@@ -122,6 +128,8 @@ class Evaluator:
             features,
             self._std_factor,
             self._floor,
+            self._misfit,
+            query,
             STD if std else MEAN,
             memory,
             tau,
@@ -166,6 +174,8 @@ class Evaluator:
             features,
             self._std_factor,
             self._floor,
+            self._misfit,
+            motions,
             what,
             scratch.memory,
             tau,

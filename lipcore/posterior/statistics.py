@@ -53,8 +53,8 @@ def collect(
 ) -> Statistics:
     """Sums over N samples, A = Σ φ R⁻¹ φᵀ and b = Σ φ R⁻¹ residual (eq. 24 of docs/method.md).
 
-    noise_variance: (n,) (N·m)²; residual: torque less its prior mean, (N, n) N·m; weights: (N,), what each sample
-    counts, one where None.
+    noise_variance: (n,) or (N, n) (N·m)²; residual: torque less its prior mean, (N, n) N·m; weights: (N,),
+    what each sample counts, one where None.
     """
     features = basis.features(motion)
     variance = noise_variance + basis.uncovered(motion, features)

@@ -20,6 +20,7 @@ from lipcore.kernels.base import PairKernel, Params, TorqueKernel
 from lipcore.kernels.compiled.compile import compiled
 from lipcore.posterior.basis import Basis
 from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.misfit import Misfit
 
 CHUNK = 1024
 """Samples whose product is computed together: the more, the less often the sum is read and written."""
@@ -48,7 +49,7 @@ class Total:
 
 @dataclass(frozen=True)
 class Summing:
-    """How samples are summed up for a posterior: its kernel, basis and noise.
+    """How samples are summed up for a posterior: its kernel, basis, noise and misfit.
 
     On a device other than the CPU, torch does all but the sum.
     """
@@ -56,6 +57,7 @@ class Summing:
     kernel: TorqueKernel
     basis: Basis
     noise_variance: Tensor
+    misfit: Misfit
     device: torch.device
     prior: Callable[[Motion], Array] = field(repr=False)
 
@@ -66,7 +68,8 @@ class Summing:
         prior = _nothing if basis.term is None else _prior(basis.term, basis.params, basis.inducing)
         if place.type != "cpu":
             basis = _moved(basis, place)
-        return cls(posterior.kernel, basis, posterior.noise_variance.to(place), place, prior)
+        misfit = Misfit.unpacked(posterior.misfit.packed().to(place))
+        return cls(posterior.kernel, basis, posterior.noise_variance.to(place), misfit, place, prior)
 
     def add(self, total: Total, samples: Samples, weights: Array | None = None) -> None:
         """Add samples to a total. weights: (N,), one for each, all equal where None."""
@@ -84,11 +87,11 @@ class Summing:
         n, first = samples.n_joints, len(self.basis.outputs)
         # memory of torch: BLAS rounds in another order where memory is aligned otherwise, as that of NumPy may be
         out = torch.empty((len(samples) * n, len(self.basis)), dtype=torch.float64).numpy()
-        noise = self.noise_variance.numpy()
         for start in range(0, len(samples), PIECE):
             part = slice(start, start + PIECE)
             motion = Motion(*(torch.from_numpy(each[part]) for each in (samples.q, samples.dq, samples.ddq)))
             residual = np.ascontiguousarray(samples.tau[part] - self.kernel.mean(motion).numpy())
+            noise = self.misfit.of_row(self.noise_variance, motion.dq).numpy()
             piece = out[start * n : (start + len(motion)) * n]
             self._features(motion, piece)
             weigh(piece, first, self.prior(motion), noise, weights[part], residual, total.b)
@@ -112,7 +115,7 @@ class Summing:
         motion, scale = samples.motion(self.device), torch.from_numpy(weights.copy()).to(self.device)
         residual = samples.torque(self.device) - self.kernel.mean(motion)
         features = self.basis.features(motion)
-        variance = self.noise_variance + self.basis.uncovered(motion, features)
+        variance = self.misfit.of_row(self.noise_variance, motion.dq) + self.basis.uncovered(motion, features)
         root = (scale[:, None] / variance).sqrt()
         features *= root.reshape(-1)
         total.b += (features @ (residual * root).reshape(-1)).cpu().numpy()
@@ -150,7 +153,7 @@ def weigh(
     """Scale the features φ of N samples' torques by the square root of their precision, and add Σ φ R⁻¹ residual to b.
 
     R is the noise and what of the prior variance the first `inducing` features leave open, see `statistics.Statistics`.
-    features: (N n, M), in place; prior: (N, n) variances of the nonlinear term; noise: (n,); weights: (N,);
+    features: (N n, M), in place; prior: (N, n) variances of the nonlinear term; noise: (N, n); weights: (N,);
     residual: (N, n); b: (M,).
     """
     count, n = prior.shape
@@ -161,7 +164,7 @@ def weigh(
             explained = 0.0
             for k in range(inducing):
                 explained += row[k] * row[k]
-            precision = weights[sample] / (noise[joint] + max(prior[sample, joint] - explained, 0.0))
+            precision = weights[sample] / (noise[sample, joint] + max(prior[sample, joint] - explained, 0.0))
             root = np.sqrt(precision)
             weighed = precision * residual[sample, joint]
             for k in range(size):

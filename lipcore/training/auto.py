@@ -22,9 +22,8 @@ from lipcore.fitting.hyperparameters import FitCancelledError, FitProgress, Prog
 from lipcore.fitting.task import Task
 from lipcore.model.selection import Candidate, plain, selection, unjudged
 from lipcore.model.torque_model import TorqueModel, training_range
-from lipcore.posterior.compression import compressed
 from lipcore.posterior.selection import spread_out
-from lipcore.training.fit import fit_estimator, independent_samples
+from lipcore.training.fit import compact, fit_estimator
 from lipcore.training.held_out import hold_out
 from lipcore.vocabulary import ROBOT_ESTIMATORS
 
@@ -75,17 +74,8 @@ def _of_all(work: Work, contest: Contest, chosen: str) -> TorqueModel:
         return work.fit(task.samples, chosen, ALL, replace(learnt, report={**learnt.report, **searched}))
     objective = float(model.fit["objective"])
     work.overall.of(chosen, ALL)(FitProgress("posterior", 0, 0, objective, 0.0, 0.0))
-    arm = contest.learnt if chosen in ROBOT_ESTIMATORS else None
-    options = task.options if arm is None else independent_samples(task.options, arm)
-    used = task.samples.rows(spread_out(task.samples.motion(), options.posterior_samples).numpy())
-    compression, jitter = compressed(
-        model.estimator.kernel,
-        model.posterior.params,
-        used,
-        options.compact_tolerance,
-        options.max_inducing_outputs,
-        model.calibration.function_std_factor,
-    )
+    used = task.samples.rows(spread_out(task.samples.motion(), task.options.posterior_samples).numpy())
+    compression, jitter = compact(task, model.estimator, model.posterior.params, used)
     counts = {"samples_given": len(task.samples), "samples_posterior": len(used), "jitter": jitter}
     return replace(
         model,

@@ -87,7 +87,12 @@ def with_statistics(model: TorqueModel, sums: ShardStatistics, count: int) -> To
     a = unpack_symmetric("a", torch.from_numpy(sums.a))
     statistics = Statistics(a, torch.from_numpy(sums.b), sums.weight)
     updated = CompactPosterior.build(
-        posterior.kernel, posterior.basis, statistics, posterior.noise_variance, posterior.std_factor
+        posterior.kernel,
+        posterior.basis,
+        statistics,
+        posterior.noise_variance,
+        posterior.std_factor,
+        posterior.misfit,
     )
     spans = {
         name: {"min": sums.low[at].tolist(), "max": sums.high[at].tolist()}

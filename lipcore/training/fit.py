@@ -10,14 +10,25 @@ import torch
 from lipcore.arm.learning import Learnt, learn
 from lipcore.arm.search import known_geometries
 from lipcore.data.independence import motion_dimensions
-from lipcore.fitting.estimators import calibrate, check_estimator, make_estimator
+from lipcore.data.samples import Samples
+from lipcore.fitting.estimators import Estimator, calibrate, check_estimator, make_estimator
 from lipcore.fitting.hyperparameters import fit
 from lipcore.fitting.options import FitOptions
-from lipcore.fitting.task import MIN_SAMPLES, Task
+from lipcore.fitting.task import Task
+from lipcore.kernels.base import Params
 from lipcore.kernels.geometry import Geometry
+from lipcore.model.parameters import friction_coefficients
 from lipcore.model.torque_model import TorqueModel, training_range
-from lipcore.posterior.compression import compressed, linear
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.compression import Compression, compressed, linear
+from lipcore.posterior.misfit import estimate, shared_rows
+from lipcore.posterior.statistics import collect
 from lipcore.vocabulary import ROBOT_ESTIMATORS
+
+LEAST_SAMPLES = 50
+"""That hyperparameters are fitted to."""
+CONTIGUOUS = 4000
+"""Rows that tell the misfit."""
 
 
 def fit_estimator(
@@ -39,9 +50,14 @@ def fit_estimator(
     if learnt is not None and name == "rigid-body":
         report = {**learnt.report, "jitter": 0.0}
         used = samples.rows(learnt.rows)
-        weights = torch.full((len(used),), learnt.weight, dtype=torch.float64)
         compression = linear(
-            estimator.kernel, learnt.params, used.motion(), used.torque(), weights, options.compact_tolerance
+            estimator.kernel,
+            learnt.params,
+            used.motion(),
+            used.torque(),
+            torch.from_numpy(learnt.counts),
+            options.compact_tolerance,
+            learnt.misfit,
         )
     else:
         # not the noise: what rigid bodies leave of the torque is what the other term is there for
@@ -50,14 +66,7 @@ def fit_estimator(
         fewer = options if learnt is None else independent_samples(options, learnt)
         fitted = fit(estimator.kernel, samples, fewer, task.on_progress, task.cancelled, task.stretches, start)
         used = samples.rows(fitted.rows)
-        compression, jitter = compressed(
-            estimator.kernel,
-            fitted.params,
-            used,
-            options.compact_tolerance,
-            options.max_inducing_outputs,
-            calibration.function_std_factor,
-        )
+        compression, jitter = compact(task, estimator, fitted.params, used)
         report = {**asdict(fitted.report), "jitter": jitter}
         if learnt is not None:
             seconds = float(learnt.report["seconds"]) + fitted.report.seconds
@@ -77,11 +86,33 @@ def fit_estimator(
     )
 
 
+def compact(task: Task, estimator: Estimator, params: Params, used: Samples) -> tuple[Compression, float]:
+    """The compact posterior of an estimator with a nonlinear term, and the jitter, (N·m)², that the exact one took.
+
+    used: samples of the task's recordings. A torque counts as `Misfit.of_row` says; what that is, contiguous samples
+    tell. Raise NotPositiveDefiniteError where the exact posterior cannot be computed.
+    """
+    options, factor = task.options, calibrate(estimator.name).function_std_factor
+    compression, jitter = compressed(
+        estimator.kernel, params, used, options.compact_tolerance, options.max_inducing_outputs, factor
+    )
+    posterior = compression.posterior
+    contiguous = task.signals.rows(slice(0, CONTIGUOUS))
+    residual = contiguous.tau - posterior.mean(contiguous.motion()).numpy()
+    noise = posterior.noise_variance
+    misfit, _ = estimate(residual, contiguous.tau, contiguous.dq, contiguous.episodes(), noise.numpy())
+    misfit = misfit.with_friction(friction_coefficients(posterior, estimator).coulomb)
+    motion = used.motion()
+    variance = misfit.of_row(noise, motion.dq, shared_rows(task.samples, len(used)))
+    statistics = collect(posterior.basis, variance, motion, used.torque() - estimator.kernel.mean(motion))
+    counted = CompactPosterior.build(estimator.kernel, posterior.basis, statistics, noise, factor, misfit)
+    return replace(compression, posterior=counted), jitter
+
+
 def independent_samples(options: FitOptions, learnt: Learnt) -> FitOptions:
-    """Options for no more samples than the recording holds independent ones, as the arm's residuals say."""
-    most = max(MIN_SAMPLES, round(learnt.weight * len(learnt.rows)))
+    """Options for hyperparameters from no more samples than the recording holds independent ones."""
+    most = max(LEAST_SAMPLES, round(float(learnt.counts.mean(axis=1).sum())))
     return replace(
         options,
         hyperparameter_samples=min(options.hyperparameter_samples, most),
-        posterior_samples=min(options.posterior_samples, most),
     )

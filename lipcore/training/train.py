@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from lipcore.data.independence import recording_weights
 from lipcore.data.motion import check_joint_types
 from lipcore.data.samples import Samples
@@ -50,7 +48,6 @@ def train(
     )
     model = fit_model(task, estimator)
     weights = recording_weights(samples.t, samples.episode)
-    weights = np.minimum(weights, 1.0 / float(model.fit.get("row_correlation", 1.0)))  # errors that last count once
     if not conditioning.should_condition(task.options, len(samples), float(weights.sum())):
         return model
     return conditioning.condition(model, samples, weights, cancelled)

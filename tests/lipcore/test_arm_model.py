@@ -78,8 +78,8 @@ def with_alternatives(model: TorqueModel, samples: Samples, count: int = 1) -> T
         for place, share in enumerate(shares)
     ]
     chosen = make_estimator("rigid-body", model.joint_types, arm=replace(found, alternatives=tuple(others)))
-    weights = torch.ones(len(samples), dtype=torch.float64)
-    made = linear(chosen.kernel, model.posterior.params, samples.motion(), samples.torque(), weights, 0.01)
+    posterior, once = model.posterior, torch.ones_like(samples.torque())
+    made = linear(chosen.kernel, posterior.params, samples.motion(), samples.torque(), once, 0.01, posterior.misfit)
     return replace(model, estimator=chosen, posterior=made.posterior)
 
 

@@ -242,13 +242,13 @@ def posed(request: pytest.FixtureRequest) -> tuple[Problem, Point]:
 
 
 def dense(problem: Problem, features: np.ndarray, mean: np.ndarray, std: np.ndarray, sigma: np.ndarray) -> float:
-    """−log N(τ; Φ μ, Φ diag s² Φᵀ + R) without its constant; R: σ² over the samples that a row stands for."""
+    """−log N(τ; Φ μ, Φ diag s² Φᵀ + R) without its constant; R: σ² over the measurements that a torque stands for."""
     flat = features.reshape(-1, features.shape[2])
-    noise = (sigma**2 / problem.counts[:, None]).reshape(-1)
+    noise = (sigma**2 / problem.counts).reshape(-1)
     covariance = (flat * std**2) @ flat.T + np.diag(noise)
     log_density = multivariate_normal.logpdf(problem.tau.reshape(-1), flat @ mean, covariance)
-    # a row counted c times has the density's power c: c log σ instead of log σ / √c
-    counted = ((problem.counts - 1) * np.log(sigma).sum() + 0.5 * len(sigma) * np.log(problem.counts)).sum()
+    # a torque counted c times has the density's power c: c log σ instead of log σ / √c
+    counted = ((problem.counts - 1) * np.log(sigma) + 0.5 * np.log(problem.counts)).sum()
     return float(-log_density - 0.5 * flat.shape[0] * np.log(2 * np.pi) + counted)
 
 
@@ -269,7 +269,7 @@ def off_geometry(problem: Problem, geometry: Geometry) -> float:
 @pytest.mark.parametrize("count", [1.0, 0.3])
 def test_evidence_is_the_density_of_the_torque(posed: tuple[Problem, Point], count: float) -> None:
     problem, point = posed
-    problem = replace(problem, counts=np.linspace(count, 1.0, len(problem.tau)))
+    problem = replace(problem, counts=np.linspace(count, 1.0, problem.tau.size).reshape(problem.tau.shape))
     features = plain_features(problem, point.geometry)
     expected = dense(problem, features, problem.centre, problem.scale, point.sigma)
     expected += off_noise(problem, point.sigma) + off_geometry(problem, point.geometry)
@@ -329,7 +329,7 @@ def linearised(problem: Problem, point: Point, scale: np.ndarray, sigma: np.ndar
 
 def test_scales_are_never_worse_than_before(posed: tuple[Problem, Point]) -> None:
     problem, point = posed
-    problem = replace(problem, counts=np.full(len(problem.tau), 0.7))
+    problem = replace(problem, counts=np.full(problem.tau.shape, 0.7))
     scaled = rescale(problem, point)
     before = linearised(problem, point, problem.scale, point.sigma)
     after = linearised(problem, point, scaled.problem.scale, scaled.sigma)

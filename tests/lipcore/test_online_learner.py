@@ -149,6 +149,14 @@ def base() -> TorqueModel:
     return train(recorded(1), ("revolute",) * 2, "lip-chain", CLOSER)
 
 
+def row_noise(posterior: CompactPosterior, motion: Motion) -> np.ndarray:
+    """Variance of each torque in turn: what lasts for a second is that of ten rows."""
+    misfit, dq = posterior.misfit, motion.dq.numpy()
+    resting = misfit.rest.numpy() * np.exp(-((dq / misfit.slow.numpy()) ** 2))
+    noise: np.ndarray = posterior.noise_variance.numpy() + 9 * misfit.lasting.numpy() + 10 * resting
+    return noise.reshape(-1)
+
+
 def regression(
     posterior: CompactPosterior, motion: Motion, tau: np.ndarray, weights: np.ndarray, centre: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -157,7 +165,7 @@ def regression(
     prior = posterior.kernel.variance(posterior.params, motion).diagonal(dim1=1, dim2=2).numpy()
     open_ = np.maximum(prior.reshape(-1) - np.square(features).sum(0), 0.0)
     # the linear terms' features explain their share of the prior exactly
-    noise = np.tile(posterior.noise_variance.numpy(), len(motion)) + open_
+    noise = row_noise(posterior, motion) + open_
     gram = features.T @ features + np.diag(noise / np.repeat(weights, motion.n_joints))
     gain = features @ np.linalg.inv(gram)
     mean = centre + gain @ (tau.reshape(-1) - features.T @ centre)
@@ -195,7 +203,7 @@ def test_forgetting_weighs_rows_by_their_age_and_keeps_the_mean_of_the_version(b
     features = posterior.basis.features(rows.motion()).numpy()
     prior = posterior.kernel.variance(posterior.params, rows.motion()).diagonal(dim1=1, dim2=2).numpy()
     open_ = np.maximum(prior.reshape(-1) - np.square(features).sum(0), 0.0)
-    precision = np.repeat(np.exp(-age / forgetting), 2) / (np.tile(posterior.noise_variance.numpy(), len(rows)) + open_)
+    precision = np.repeat(np.exp(-age / forgetting), 2) / (row_noise(posterior, rows.motion()) + open_)
     design = np.concatenate([(vectors * scale).T, features.T * np.sqrt(precision)[:, None]])
     target = np.concatenate([(vectors * scale).T @ centre, rows.tau.reshape(-1) * np.sqrt(precision)])
     covariance = np.linalg.inv(np.eye(len(centre)) + design.T @ design)

@@ -193,7 +193,9 @@ def test_the_fast_sum_is_that_of_the_statistics(estimator, samples):
     residual = samples.torque() - posterior.kernel.mean(motion)
     for row in range(len(samples)):
         one, weight = slice(row, row + 1), torch.tensor(weights[row : row + 1])
-        slow = merge(slow, collect(posterior.basis, posterior.noise_variance, motion[one], residual[one], weight))
+        slow = merge(
+            slow, collect(posterior.basis, posterior.row_variance(motion[one]), motion[one], residual[one], weight)
+        )
     a = total.a + np.tril(total.a, -1).T
     assert np.abs(a - slow.a.numpy()).max() <= 1e-8 * slow.a.abs().max()
     assert np.abs(total.b - slow.b.numpy()).max() <= 1e-8 * slow.b.abs().max()

@@ -65,6 +65,8 @@ def answer(
     features: Array,
     std_factor: float,
     floor: Array,
+    misfit: Array,
+    motions: Array,
     what: int,
     memory: Array,
     tau: Array,
@@ -75,6 +77,8 @@ def answer(
 
     fixed: variances of the P linear weights, the panel of the mean, then those of the root; blocks: (N, S + 1, n, n)
     from `Cross`; features: (N, P, n), Φᵀ; floor: (n,), smallest variance, at least 0;
+    misfit: (4, n), variance at rest, the speed where it has faded to exp(−1), variance that grows with speed beyond the
+    usual one, and that, see `posterior.misfit`; motions: (N, 3, n), of which dq is read;
     tau, std: (N, n); covariance: (N, n, n), work unless asked for.
     """
     queries, n = tau.shape
@@ -104,8 +108,13 @@ def answer(
         panel += ROWS * reach
     for query in range(queries):
         _subtract(blocks[query, -1], fixed, features[query], std_factor * std_factor, full, covariance[query])
+        faster = 0.0
         for j in range(n):
-            covariance[query, j, j] = max(covariance[query, j, j], floor[j])
+            faster += (motions[query, 1, j] / misfit[3, j]) ** 2
+        faster = max(faster / n - 1.0, 0.0)
+        for j in range(n):
+            more = misfit[0, j] * np.exp(-((motions[query, 1, j] / misfit[1, j]) ** 2)) + misfit[2, j] * faster
+            covariance[query, j, j] = max(covariance[query, j, j] + more, floor[j])
             std[query, j] = np.sqrt(covariance[query, j, j])
 
 

@@ -1,0 +1,152 @@
+"""What no estimator expresses, as variance: friction of joints at rest, errors that last, motion faster than seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lipcore.data.independence import INDEPENDENT_HZ, recording_weights
+from lipcore.data.samples import Array, Samples
+from lipcore.data.signals import noise_level
+from lipcore.kernels.friction import SIGN_WIDTH
+
+LASTS_S = 1.0
+"""Seconds over which an error that is no white noise is the same: as long as the motion is. Chosen on simulated arms
+with `Dirt` (seeds 50 and 51 of `benchmarks/studies/dirty_arms.py`) among 0.5, 0.67 and 1."""
+ROWS = INDEPENDENT_HZ * LASTS_S
+"""Rows that share such an error, of those that count as independent otherwise."""
+AT_REST = 0.5
+"""Variance of the torque that holds a joint at rest, in units of its Coulomb torque squared: that of a joint which
+stopped anywhere on a slow oscillation; 1/3 if all torques that hold it were equally likely, 1 if only the largest."""
+SPEEDS = (0.01, 0.02, 0.05, 0.1, 0.2)
+"""Speeds below which friction may be unknown, rad/s (m/s)."""
+NATS = 10.0
+"""What more variance at low speed has to gain to be kept."""
+CHANCE = 1.5
+"""Variance over that of white noise, as estimated, that chance explains."""
+LEAST_SHARE = 0.01
+"""Of the mean square: variance that is left to faster motion at least."""
+STEPS = 30
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Variance besides noise and posterior, of joints at N velocities dq (eq. 25 of docs/method.md).
+
+        at rest      rest_j exp(−(dq_j / slow_j)²)
+        faster       lasting_j max(0, mean_i (dq_i / usual_i)² − 1)
+
+    rest: (n,) (N·m)², of friction that has not broken away or has just turned round; slow: (n,) rad/s (m/s); lasting:
+    (n,) (N·m)², share of the noise's variance that lasts: the error of neighbouring rows is the same, and grows with
+    speed beyond what was seen, as what causes it does; usual: (n,) root mean square of dq in training.
+    """
+
+    rest: Tensor
+    slow: Tensor
+    lasting: Tensor
+    usual: Tensor
+
+    @classmethod
+    def none(cls, n: int) -> Misfit:
+        """No such variance, for n joints."""
+        zero, one = torch.zeros(n, dtype=torch.float64), torch.ones(n, dtype=torch.float64)
+        return cls(zero, one, zero, one)
+
+    @classmethod
+    def unpacked(cls, values: Tensor) -> Misfit:
+        """From what `packed` returns, (4, n)."""
+        return cls(*values)
+
+    def packed(self) -> Tensor:
+        """Its fields one below the other, (4, n)."""
+        return torch.stack([self.rest, self.slow, self.lasting, self.usual])
+
+    def of_joints(self, joints: NDArray[np.int64]) -> Misfit:
+        """The same with the joints in another order. joints: (n,), their places in this one."""
+        return Misfit.unpacked(self.packed()[:, torch.from_numpy(joints)])
+
+    def with_friction(self, coulomb: Array) -> Misfit:
+        """The same with at least AT_REST of the squares of Coulomb torques, (n,) N·m, at rest, moved or not so far."""
+        return replace(self, rest=torch.maximum(self.rest, torch.from_numpy(AT_REST * coulomb**2)))
+
+    @property
+    def exists(self) -> bool:
+        """Whether there is any."""
+        return bool((self.rest > 0).any() or (self.lasting > 0).any())
+
+    def at_rest(self, dq: Tensor) -> Tensor:
+        """Variance of friction at low speed, (N, n) (N·m)². dq: (N, n)."""
+        return self.rest * torch.exp(-((dq / self.slow) ** 2))
+
+    def variance(self, dq: Tensor) -> Tensor:
+        """Variance of a torque, (N, n) (N·m)². dq: (N, n)."""
+        faster = ((dq / self.usual) ** 2).mean(dim=-1, keepdim=True) - 1
+        return self.at_rest(dq) + self.lasting * faster.clamp_min(0.0)
+
+    def of_row(self, noise: Tensor, dq: Tensor, rows: float = ROWS) -> Tensor:
+        """Variance R with which each of N rows teaches, (N, n) (N·m)²: white noise is new in every row, an error that
+        lasts is that of `rows` rows, which count together as one.
+
+        noise: (n,) (N·m)², white or lasting.
+        """
+        return noise + (rows - 1) * self.lasting + rows * self.at_rest(dq)
+
+
+def shared_rows(samples: Samples, count: int) -> float:
+    """Of `count` rows chosen from all over a recording, how many have an error in common where it lasts: at least 1."""
+    seconds = float(recording_weights(samples.t, samples.episode, 1 / LASTS_S).sum())
+    return max(1.0, count / seconds) if seconds > 0 else 1.0
+
+
+def estimate(
+    residual: Array, tau: Array, dq: Array, episodes: Sequence[slice], least: Array | float = 0.0
+) -> tuple[Misfit, Array]:
+    """The misfit that residuals prove, and the variance of the noise in motion, (n,) (N·m)².
+
+    residual: (N, n) N·m, what a model leaves of contiguous samples; tau, dq: (N, n), their torques and velocities;
+    episodes: their rows; least: (n,) (N·m)², that the noise has at least. What differences of neighbours say, of
+    torques or of residuals, is white noise, and CHANCE times that; the rest of the noise lasts.
+    """
+    noise, rest, slow = low_speed_variance(residual, dq)
+    noise = np.maximum(noise, least)
+    # residuals may be rougher than torques, where the model's friction turns round at once
+    white = np.minimum(*(noise_level([each[part] for part in episodes]) for each in (residual, tau)))
+    lasting = np.maximum(noise - CHANCE * white**2, 0.0)
+    usual = np.maximum(np.sqrt(np.mean(dq**2, axis=0)), SIGN_WIDTH)
+    return Misfit(*(torch.from_numpy(each) for each in (rest, slow, lasting, usual))), noise
+
+
+def low_speed_variance(residual: Array, dq: Array) -> tuple[Array, Array, Array]:
+    """Most likely s², r and w of residuals of variance s² + r exp(−(dq / w)²): (n,) each, w one of SPEEDS.
+
+    residual, dq: (N, n). Fisher scoring of both variances at once; r is zero where it gains less than NATS.
+    """
+    unit = np.maximum(np.mean(residual**2, axis=0), np.finfo(float).tiny)
+    squares, mean = residual**2 / unit, np.ones_like(unit)
+    least = np.full_like(unit, 0.5 * len(residual) - NATS)
+    best = mean, np.zeros_like(unit), np.full_like(unit, SIGN_WIDTH)
+    for speed in SPEEDS:
+        low = np.exp(-((dq / speed) ** 2))
+        noise, rest = mean, np.zeros_like(mean)
+        for _ in range(STEPS):
+            weight = (noise + rest * low) ** -2.0
+            total, cross, square = weight.sum(0), (weight * low).sum(0), (weight * low**2).sum(0)
+            right, lowly = (weight * squares).sum(0), (weight * low * squares).sum(0)
+            determinant = total * square - cross**2
+            known = determinant > 1e-12 * total * square
+            rest = np.where(known, (total * lowly - cross * right) / np.where(known, determinant, 1.0), 0.0)
+            rest = np.maximum(rest, 0.0)
+            noise = np.maximum((right - cross * rest) / total, LEAST_SHARE)
+        variance = noise + rest * low
+        value = 0.5 * (np.log(variance) + squares / variance).sum(axis=0)
+        better = value < least
+        least = np.where(better, value, least)
+        found = noise, rest, np.full_like(unit, speed)
+        best = tuple(np.where(better, new, old) for new, old in zip(found, best, strict=True))
+    noise, rest, slow = best
+    return noise * unit, rest * unit, slow

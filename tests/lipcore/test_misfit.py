@@ -1,0 +1,125 @@
+"""Variance of what no estimator expresses: found in residuals, added to answers, and counted in learning."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lipcore import FitOptions, Samples, load, save, train
+from lipcore.data.metrics import evaluate
+from lipcore.model.torque_model import TorqueModel
+from lipcore.posterior.misfit import AT_REST, ROWS, Misfit, estimate, low_speed_variance, shared_rows
+from lipcore.robots.dirt import Dirt
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.urdf import RigidBody
+
+TYPES = ("revolute",) * 2
+ROBOT = load_robot("double-pendulum")
+STREAM = Stream(n_samples=1000, rate=50.0, speed=5.0, noise=0.0)
+QUICK = FitOptions(hyperparameter_samples=40, posterior_samples=200, max_iterations=20, starts=1, device="cpu")
+
+
+def dirty(seed: int, **changes: object) -> Samples:
+    return simulate(ROBOT, replace(STREAM, dirt=Dirt(seed=5), **changes), seed)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module", params=["rigid-body", "lip-chain"])
+def model(request: pytest.FixtureRequest) -> TorqueModel:
+    samples = dirty(1)
+    robot = RigidBody.from_profile("double-pendulum", samples.joint_names, TYPES)
+    return train(samples, TYPES, request.param, QUICK, robot=robot if request.param == "rigid-body" else None)
+
+
+def test_variance_at_low_speed_is_found_where_it_is() -> None:
+    rng = np.random.default_rng(0)
+    dq = rng.uniform(-1, 1, (20_000, 2))
+    variance = 0.04 + np.array([2.0, 0.0]) * np.exp(-((dq / 0.1) ** 2))
+    noise, rest, slow = low_speed_variance(np.sqrt(variance) * rng.standard_normal(dq.shape), dq)
+    np.testing.assert_allclose(noise, 0.04, rtol=0.05)
+    assert rest[0] == pytest.approx(2.0, rel=0.1)
+    assert slow[0] == 0.1
+    assert rest[1] == 0.0
+
+
+def test_residuals_of_any_size_are_taken() -> None:
+    dq = np.random.default_rng(0).uniform(-1, 1, (100, 1))
+    for size in (0.0, 1e-150, 1e150):
+        noise, rest, _ = low_speed_variance(np.full((100, 1), size), dq)
+        assert np.isfinite([noise, rest]).all()
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.5])
+def test_what_lasts_is_no_white_noise(seconds: float) -> None:
+    """White noise, or noise behind a low-pass, at 50 Hz: with the first every row is new."""
+    rng = np.random.default_rng(1)
+    residual = rng.standard_normal((5000, 1))
+    if seconds:
+        width = round(50 * seconds)
+        residual = np.apply_along_axis(lambda x: np.convolve(x, np.hanning(width), "same"), 0, residual)
+    dq = 1.0 + rng.uniform(0, 1, residual.shape)
+    misfit, noise = estimate(residual, residual, dq, [slice(0, 2500), slice(2500, 5000)])
+    share = misfit.lasting.numpy() / noise
+    assert share == pytest.approx(1.0 if seconds else 0.0, abs=0.05)
+    torch.testing.assert_close(misfit.usual, torch.from_numpy(np.sqrt(np.mean(dq**2, axis=0))))
+
+
+def test_rows_of_one_second_share_what_lasts() -> None:
+    samples = dirty(1)
+    assert shared_rows(samples, 200) == pytest.approx(10.0)  # of twenty seconds
+    assert shared_rows(samples, 5) == 1.0
+    noise, dq = torch.tensor([1.0, 1.0]), torch.tensor([[0.0, 3.0]])
+    misfit = Misfit(torch.tensor([0.5, 0.5]), torch.ones(2), torch.tensor([0.25, 1.0]), torch.ones(2))
+    counted = misfit.of_row(noise.double(), dq.double())
+    expected = [0.75 + ROWS * (0.25 + 0.5), ROWS * (1.0 + 0.5 * np.exp(-9.0))]
+    torch.testing.assert_close(counted, torch.tensor([expected]).double(), check_dtype=False)
+
+
+def test_answers_hold_it(model: TorqueModel) -> None:
+    """Standing still, and faster than ever, against the formula; the compiled answer and the plain one agree."""
+    posterior, n = model.posterior, 2
+    misfit = posterior.misfit
+    assert misfit.exists
+    q = np.full((3, n), 0.3)
+    dq = np.array([[0.0, 0.0], [0.01, -0.02], [9.0, -7.0]])
+    bare = replace(model, posterior=replace(posterior, misfit=Misfit.none(n)))
+    found, without = (each.predict(q, dq, np.zeros((3, n)), covariance=True) for each in (model, bare))
+    rest, slow, lasting, usual = misfit.packed().numpy()
+    faster = np.maximum(np.mean((dq / usual) ** 2, axis=1) - 1, 0.0)
+    expected = rest * np.exp(-((dq / slow) ** 2)) + lasting * faster[:, None]
+    np.testing.assert_allclose(found.tau_std**2 - without.tau_std**2, expected, rtol=1e-6, atol=1e-9 * expected.max())
+    plain = posterior.predict(samples_of(q, dq).motion())
+    assert found.covariance is not None
+    np.testing.assert_allclose(found.covariance, plain.covariance.numpy(), rtol=1e-6, atol=1e-8)
+    one = model.answer(np.stack([q[2], dq[2], np.zeros(n)]))[1]
+    np.testing.assert_allclose(one, found.tau_std[2], rtol=1e-9)
+
+
+def samples_of(q: np.ndarray, dq: np.ndarray) -> Samples:
+    zeros = np.zeros_like(q)
+    return Samples(("a", "b"), np.arange(len(q), dtype=float), np.zeros(len(q), np.int64), q, dq, zeros, zeros)
+
+
+def test_at_rest_friction_may_hold_any_torque(model: TorqueModel) -> None:
+    from lipcore.model.parameters import friction_coefficients
+
+    coulomb = friction_coefficients(model.posterior, model.estimator).coulomb
+    assert (model.posterior.misfit.rest.numpy() >= 0.9 * AT_REST * coulomb**2).all()
+    held = dirty(7, course="rests", speed=0.5)
+    answer = model.predict(held.q, held.dq, held.ddq)
+    still = (np.abs(held.dq) < 0.01).all(axis=1)
+    assert 100 < still.sum() < len(held)
+    at_rest = evaluate(held.tau[still], answer.tau[still], answer.tau_std[still], answer.noise_std)
+    assert (at_rest.coverage > 0.85).all(), at_rest.coverage
+
+
+def test_it_is_saved_and_loaded(model: TorqueModel, tmp_path: Path) -> None:
+    save(model, tmp_path / "model")
+    again = load(tmp_path / "model")
+    assert torch.equal(again.posterior.misfit.packed(), model.posterior.misfit.packed())
+    query = dirty(2).rows(slice(0, 50))
+    for name in ("tau", "tau_std"):
+        found, expected = (getattr(each.predict(query.q, query.dq, query.ddq), name) for each in (again, model))
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
