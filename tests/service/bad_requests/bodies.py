@@ -127,11 +127,11 @@ TEACHING = [
 ]
 SETTING = [
     *wrong(LEARNING, {}, "enabled", "on", None, 1, method="PUT"),
-    *wrong(LEARNING, {}, "forgetting_s", 0, -1, NAN, INF, "1 h", method="PUT"),
+    *wrong(LEARNING, {}, "forgetting_s", 0, -1, 1e308, NAN, INF, "1 h", method="PUT"),
     *wrong(LEARNING, {}, "on_change", "wait", None, method="PUT"),
     *wrong(LEARNING, {}, "torque_limits", [1.0] * 6, "87", method="PUT"),
-    *wrong(LEARNING, {}, "torque_limits", first(-1), first(NAN), first(INF), named="torque_limits[0]", method="PUT"),
-    *wrong(LEARNING, {}, "contact_threshold", 0, NAN, None, method="PUT"),
+    *wrong(LEARNING, {}, "torque_limits", first(-1), first(5e-324), first(1e7), first(NAN), first(INF), named="torque_limits[0]", method="PUT"),
+    *wrong(LEARNING, {}, "contact_threshold", 0, 5e-324, 2.9, 100.1, 1e308, NAN, None, method="PUT"),
     *wrong(LEARNING, {}, "rate", 1, method="PUT"),
     *wrong(ROLLBACK, {}, "revision", "0", False, -1, 2**53, 1.5, NAN),
     *wrong(ROLLBACK, {}, "version", 0, "x"),
