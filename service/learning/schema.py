@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema
 
-from lipcore.online.gates import LARGEST_TORQUE
+from lipcore.data.outliers import LARGEST_TORQUE
 from service.foundation.errors import ServiceError
 from service.foundation.fields import numbers, rows_of_numbers
 
