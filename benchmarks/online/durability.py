@@ -18,7 +18,7 @@ from service.learning.schema import LearningOptions
 
 ROBOT, RATE, SPEED = "double-pendulum", 100.0, 5.0
 FIT = {"hyperparameter_samples": 40, "posterior_samples": 100, "max_iterations": 30, "starts": 1}
-LEARNING = LearningOptions(on_change="learn", contact_threshold=1e9, auto_refresh=False, auto_promote=False)
+LEARNING = LearningOptions(on_change="learn", contact_threshold=100.0, auto_refresh=False, auto_promote=False)
 """Every row is learnt, so that the client knows what the service must know."""
 VICTIMS: tuple[Victim, ...] = ("service", "learner")
 TOLERANCE = 1e-8

@@ -29,7 +29,7 @@ BATCHES, ROWS, QUERIES = 10, 20, 100
 LEARNING = {
     "enabled": True,
     "on_change": "learn",
-    "contact_threshold": 1e9,
+    "contact_threshold": 100.0,
     "auto_refresh": False,
     "auto_promote": False,
 }

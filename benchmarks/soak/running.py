@@ -33,7 +33,7 @@ QUERIES, UPLOADED = 200, 300
 """Motions that are asked; samples of an uploaded recording."""
 OBSERVED_RATE = 50.0
 """Hz, of the streams that are taught: half a second a batch."""
-LEARNING = LearningOptions(on_change="learn", contact_threshold=1e9, auto_refresh=False, auto_promote=False)
+LEARNING = LearningOptions(on_change="learn", contact_threshold=100.0, auto_refresh=False, auto_promote=False)
 """Every row is learnt, so that the clients know what the service must know."""
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from lipcore.data.samples import Array
 from lipcore.online.record import Record, number
 
-Kind = Literal["sudden", "drift"]
+Kind = Literal["sudden", "drift", "departure"]
 
 BUCKET_S, BUCKET_ROWS = 0.5, 50
 """A bucket holds at least both. The mean of 50 squared standard normals deviates by 0.2 from 1."""
@@ -57,7 +57,8 @@ class Bucket:
 class Change:
     """Errors have grown. at: event time from which on, s; joints: whose; before, after: records of then and now.
 
-    kind: `sudden` within seconds (a payload, a tool), `drift` over longer (friction, wear, temperature).
+    kind: `sudden` within seconds (a payload, a tool), `drift` over longer (friction, wear, temperature), `departure`
+    where errors have not grown but what is learnt has left what was trained on (see `lipcore.online.departure`).
     """
 
     at: float

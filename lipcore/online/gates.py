@@ -8,15 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.outliers import LARGEST_TORQUE
 from lipcore.data.samples import Array
 from lipcore.vocabulary import CODES, LEARNT
 
 Codes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
-
-LARGEST_TORQUE = 1e6
-"""|tau| in N·m (N) that no robot reaches (the largest arms: some 1e4): a damaged number, not a torque. Its square would
-drown whatever was summed before. Applies where no limits are given, too."""
 
 
 @dataclass(frozen=True)

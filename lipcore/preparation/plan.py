@@ -150,18 +150,25 @@ class _Rows:
 
 
 def plan(
-    t: Array | None, episode: Array | None, missing: NDArray[np.bool_], given: tuple[str, ...], recipe: Recipe
+    t: Array | None,
+    episode: Array | None,
+    missing: NDArray[np.bool_],
+    given: tuple[str, ...],
+    recipe: Recipe,
+    corrupt: NDArray[np.bool_] | None = None,
 ) -> Plan:
     """Work out what the recipe does to a recording of N rows.
 
     t: (N,) s, rising within an episode, None where not recorded; episode: (N,) numbers, None where there is one;
-    missing: (N,) rows that are to be left out, t or a value being unknown; given: of q, dq, ddq, tau, those recorded.
+    missing: (N,) rows that are to be left out, t or a value being unknown; given: of q, dq, ddq, tau, those recorded;
+    corrupt: (N,) other rows that are to be left out (`data.outliers`), before a filter spreads them.
     Raise PreparationError where the recording does not allow what the recipe asks for.
     """
     given = tuple(name for name in QUANTITIES if name in given)
     to_derive = derived(given)
     steps: list[record.Step] = []
-    rows = _rows(t, episode, missing, steps)
+    damaged = np.zeros_like(missing) if corrupt is None else corrupt & ~missing
+    rows = _rows(t, episode, missing, damaged, steps)
     if t is None:
         _check_times_are_not_needed(given, to_derive, recipe)
         changes = np.diff(rows.episode) != 0
@@ -184,14 +191,22 @@ def plan(
     return _lay_out(rows, ends, clock, work, resamples, to_derive, steps)
 
 
-def _rows(t: Array | None, episode: Array | None, missing: NDArray[np.bool_], steps: list[record.Step]) -> _Rows:
-    """Leave out rows that are missing, and those whose time was there before."""
+def _rows(
+    t: Array | None,
+    episode: Array | None,
+    missing: NDArray[np.bool_],
+    corrupt: NDArray[np.bool_],
+    steps: list[record.Step],
+) -> _Rows:
+    """Leave out rows that are missing or corrupt, and those whose time was there before."""
     numbers = np.zeros(len(missing)) if episode is None else episode
     count = int(missing.sum())
     first = int(missing.argmax()) + 1 if count else None
     if first is not None:
         steps.append(record.left_out("missing", count, first))
-    kept = ~missing
+    if corrupt.any():
+        steps.append(record.left_out("corrupt", int(corrupt.sum()), int(corrupt.argmax()) + 1))
+    kept = ~(missing | corrupt)
     repeated = 0
     if t is not None:
         places = np.flatnonzero(kept)

@@ -10,8 +10,12 @@ Step = dict[str, Any]
 
 
 def left_out(why: str, rows: int, first: int) -> Step:
-    """Rows left out, the first of them counted from 1; why: "missing" or "repeated"."""
-    reason = {"missing": "with missing values", "repeated": "whose time stamp was there before"}[why]
+    """Rows left out, the first of them counted from 1; why: "missing", "corrupt" or "repeated"."""
+    reason = {
+        "missing": "with missing values",
+        "corrupt": "that fit neither what went before nor what follows",
+        "repeated": "whose time stamp was there before",
+    }[why]
     text = f"{_count(rows, 'row')} {reason} left out, the first is row {first}"
     return {"step": "leave_out", "why": why, "rows": rows, "first_row": first, "text": text}
 

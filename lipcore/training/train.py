@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
+from lipcore.data import outliers
 from lipcore.data.independence import recording_weights
 from lipcore.data.motion import check_joint_types
 from lipcore.data.samples import Samples
@@ -35,8 +37,11 @@ def train(
     joint_types: (n,), `revolute` or `prismatic`; estimator: one of `lipcore.fitting.estimators.ESTIMATORS`, or `auto`,
     which chooses (`lipcore.training.auto`); torque_convention: what `samples.tau` holds; on_progress, cancelled: see
     `lipcore.fitting.hyperparameters.fit`; robot: for estimators of rigid bodies, built for the joints of the samples.
-    Raise ValueError for bad arguments, FitCancelledError, or NotPositiveDefiniteError.
+    Corrupt rows are left out before anything sees them, and the fit's report names them (`lipcore.data.outliers`).
+    Raise ValueError for bad arguments, CorruptError, FitCancelledError, or NotPositiveDefiniteError.
     """
+    found = outliers.of_samples(samples)
+    samples = samples.rows(~found.rows) if found.count else samples
     task = Task(
         samples,
         check_joint_types(joint_types),
@@ -47,6 +52,7 @@ def train(
         cancelled=cancelled,
     )
     model = fit_model(task, estimator)
+    model = replace(model, fit={**model.fit, **found.in_fit()})
     weights = recording_weights(samples.t, samples.episode)
     if not conditioning.should_condition(task.options, len(samples), float(weights.sum())):
         return model

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.outliers import CorruptError, corrupt
 from lipcore.data.samples import Array
 from lipcore.preparation.plan import plan
 from lipcore.preparation.recipe import PreparationError, Recipe
@@ -131,9 +132,12 @@ def prepare(raw: Staged, folder: Path, recipe: Recipe, min_samples: int, disk: D
     A few columns are in memory at a time. Raise InvalidDataError where the recording does not allow what the recipe
     asks for, or where fewer than min_samples come out; StorageFullError.
     """
+    t, episode, missing = _or_none(raw, TIME), _or_none(raw, EPISODE), raw.missing()
+    numbers = np.zeros(raw.rows) if episode is None else episode
     try:
-        made = plan(_or_none(raw, TIME), _or_none(raw, EPISODE), raw.missing(), raw.quantities, recipe)
-    except PreparationError as error:
+        found = corrupt(t, numbers, raw.n_joints, lambda *which: raw.read(column(*which)), raw.quantities)
+        made = plan(t, episode, missing, raw.quantities, recipe, found.rows)
+    except (CorruptError, PreparationError) as error:
         raise invalid_data(error.field, error.value, error.expected) from None
     if len(made) < min_samples:
         why = "trimming the filter's edges" if made.cutoff is not None else "leaving out what cannot be used"

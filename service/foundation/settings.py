@@ -95,7 +95,10 @@ class Settings(BaseSettings):
         2000, description="Most rows of a data set that figures on several joints together are taken over."
     )
     max_position: float = Field(
-        12.6, gt=0, description="Largest |q| in rad or m that is taken for SI units: two turns. Beyond it: degrees?"
+        12.6,
+        ge=0.1,
+        le=1e4,
+        description="Largest |q| in rad or m that is taken for SI units: two turns. Beyond it: degrees?",
     )
     max_batch: Count = Field(1000, description="Most queries in one prediction request.")
     max_component_batch: Count = Field(100, description="Most queries in one prediction request with components.")
@@ -139,14 +142,21 @@ class Settings(BaseSettings):
     max_observation_streams: Count = Field(1000, description="Most sources of observations of one model.")
     stream_flush_rows: Count = Field(100, description="Frames of a stream that are logged together, at most.")
     stream_flush_s: float = Field(0.1, gt=0, description="Longest wait in s of a frame to learn from for others.")
-    max_velocity: float = Field(50.0, gt=0, description="Largest |dq| in rad/s or m/s that is learnt from.")
-    max_acceleration: float = Field(2000.0, gt=0, description="Largest |ddq| in rad/s² or m/s² that is learnt from.")
-    max_time_gap_s: float = Field(1.0, gt=0, description="Step of time within a batch that is taken for a jump, s.")
+    max_velocity: float = Field(50.0, ge=0.01, le=1e4, description="Largest |dq| in rad/s or m/s that is learnt from.")
+    max_acceleration: float = Field(
+        2000.0, ge=0.1, le=1e6, description="Largest |ddq| in rad/s² or m/s² that is learnt from."
+    )
+    max_time_gap_s: float = Field(
+        1.0, ge=1e-3, le=3600, description="Step of time within a batch that is taken for a jump, s."
+    )
     stationary_speed: float = Field(
-        1e-3, ge=0, description="Speed of all joints, rad/s or m/s, below which a sample tells of stiction only."
+        1e-3, ge=0, le=1, description="Speed of all joints, rad/s or m/s, below which a sample tells of stiction only."
     )
     contact_patience_s: float = Field(
-        2.0, gt=0, description="How long torques may be far off before it is no contact but a change of the robot."
+        2.0,
+        ge=0.1,
+        le=600,
+        description="How long torques may be far off before it is no contact but a change of the robot.",
     )
     observation_retention_bytes: Count = Field(1024 * MiB, description="Size of a model's log of observations.")
     observation_retention_s: float = Field(30 * 86400.0, gt=0, description="Age up to which they are kept, s.")
@@ -165,7 +175,10 @@ class Settings(BaseSettings):
     )
     novelty_rows: Count = Field(2000, description="Samples that share is taken over.")
     linearisation_error: float = Field(
-        0.5, gt=0, description="Error of a learnt arm's linearisation at which it is refreshed; 1: as large as stated."
+        0.5,
+        ge=0.01,
+        le=10,
+        description="Error of a learnt arm's linearisation at which it is refreshed; 1: as large as stated.",
     )
     refresh_pause_s: float = Field(600.0, ge=0, description="Shortest time between two automatic refreshes, s.")
     max_refresh_samples: Count = Field(200_000, description="Most logged samples that a refresh learns from.")

@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 
 from service.foundation.errors import invalid_request, not_found
 from service.journal import log
-from service.learning.schema import LearningOptions
+from service.learning.schema import CONTACT_THRESHOLD, FORGETTING_S, TORQUE_LIMIT, LearningOptions
 from service.storage.database import AlarmRow, Database, LearningRow, ModelRow, now
 from service.web.rows import Page, newest
 
@@ -19,7 +19,23 @@ AlarmKind = Literal["change", "novelty", "linearisation", "refresh", "promotion"
 def options(session: Session, model: str) -> LearningOptions:
     """What is set for a model, the defaults where nothing is."""
     row = session.get(LearningRow, model)
-    return LearningOptions() if row is None else LearningOptions(**row.options)
+    return LearningOptions() if row is None else LearningOptions(**within_bounds(row.options))
+
+
+def within_bounds(stored: dict[str, Any]) -> dict[str, Any]:
+    """Options of a model, those that an earlier release took beyond today's bounds at the bound that is nearest."""
+
+    def near(value: float, bounds: tuple[float, float]) -> float:
+        return min(max(value, bounds[0]), bounds[1])
+
+    kept = dict(stored)
+    if (threshold := stored.get("contact_threshold")) is not None:
+        kept["contact_threshold"] = near(threshold, CONTACT_THRESHOLD)
+    if (limits := stored.get("torque_limits")) is not None:
+        kept["torque_limits"] = [near(each, TORQUE_LIMIT) for each in limits]
+    if (forgetting_s := stored.get("forgetting_s")) is not None:
+        kept["forgetting_s"] = near(forgetting_s, FORGETTING_S)
+    return kept
 
 
 def set_options(database: Database, model: str, chosen: LearningOptions, n_joints: int, received: float) -> None:

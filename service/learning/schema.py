@@ -8,10 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema
 
+from lipcore.data.outliers import LARGEST_TORQUE
 from service.foundation.errors import ServiceError
 from service.foundation.fields import numbers, rows_of_numbers
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+CONTACT_THRESHOLD = (3.0, 100.0)
+"""Bounds of the gate of contacts. Within three standard deviations lie the errors of an honest model, so that the gate
+would choose what is learnt; beyond a hundred nothing is gated: what would be learnt is no torque of this robot."""
+TORQUE_LIMIT = (1e-3, LARGEST_TORQUE)
+FORGETTING_S = (1.0, 1e9)
+"""Up to thirty years: a longer memory is none that forgets."""
+TorqueLimit = Annotated[float, Field(ge=TORQUE_LIMIT[0], le=TORQUE_LIMIT[1], allow_inf_nan=False)]
 
 
 class LearningOptions(BaseModel):
@@ -22,7 +29,8 @@ class LearningOptions(BaseModel):
     enabled: bool = Field(True, description="Whether observations are taken at all")
     forgetting_s: float | None = Field(
         None,
-        ge=1,
+        ge=FORGETTING_S[0],
+        le=FORGETTING_S[1],
         allow_inf_nan=False,
         description="Age in s at which a sample counts 1/e of a new one, in event time; null: nothing is forgotten",
     )
@@ -31,11 +39,15 @@ class LearningOptions(BaseModel):
         description="What follows a detected change of the robot. `hold`: nothing is learnt until its owner decides; "
         "`adapt`: a new regime begins; `learn`: learning goes on as before",
     )
-    torque_limits: list[Positive] | None = Field(
+    torque_limits: list[TorqueLimit] | None = Field(
         None, description="Largest |tau| of each joint's actuator in N·m, to tell saturated samples; null: not known"
     )
-    contact_threshold: Positive = Field(
-        8.0, description="Predictive standard deviations, noise included, beyond which a torque is taken for a contact"
+    contact_threshold: float = Field(
+        8.0,
+        ge=CONTACT_THRESHOLD[0],
+        le=CONTACT_THRESHOLD[1],
+        allow_inf_nan=False,
+        description="Predictive standard deviations, noise included, beyond which a torque is taken for a contact",
     )
     auto_refresh: bool = Field(True, description="Train a new version by itself where motion leaves what is known")
     auto_promote: bool = Field(True, description="Let such a version answer by itself once it predicts better")

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from lipcore.data import independence
+from lipcore.data import independence, outliers
+from lipcore.data.outliers import Corrupt, CorruptError
 from lipcore.data.samples import Array, Samples
 from lipcore.data.splits import Mask, Numbers
 from lipcore.kernels.geometry import Geometry
@@ -28,7 +29,7 @@ from service.models.schema import Holdout, HoldoutLineage
 from service.robots import store as robots
 from service.storage.database import Database, DatasetRow, VersionRow
 from service.storage.files import Files
-from service.storage.sample_file import Reader
+from service.storage.sample_file import ARRAYS, Reader
 from service.training import holding_out, refresh_data
 from service.training.holding_out import Clock, Divided
 
@@ -156,6 +157,19 @@ def opened(files: Files, rows: Sequence[DatasetRow]) -> list[Part]:
     return [Part(row, Reader(files.samples_file(row.id, row.sha256))) for row in rows]
 
 
+def sound(part: Part) -> Corrupt:
+    """The corrupt rows of a data set as a whole; raise CorruptError, naming it."""
+
+    def take(first: int, last: int) -> Samples:
+        values = {name: part.reader.array(name, first, last) for name in ARRAYS}
+        return Samples(joint_names=tuple(part.row.joint_names), **values)
+
+    try:
+        return outliers.of_long(part.reader.rows, take)
+    except CorruptError as error:
+        raise CorruptError(f"{error.value}, of data set {part.row.id!r}", error.expected) from None
+
+
 class NothingToLearnError(ValueError):
     """No samples are left to train on."""
 
@@ -199,15 +213,16 @@ def recorded(settings: Settings, database: Database, files: Files, request: dict
     divided = Divided([None] * len(parts), [None] * len(parts), None)
     if asked is not None:
         divided = holding_out.hold_out(rows, [part.clock() for part in parts], Holdout.model_validate(asked))
-    table = _learnt(parts, divided)
+    found = [sound(part) for part in parts]
+    table = _learnt(parts, divided, found)
     names, robot = rows[0].joint_names, request.get("robot")
     return Material(
         *_candidates(table, None),
         table,
         rows[0].torque_convention,  # type: ignore[arg-type]  # checked when it was stored
         None if robot is None else robots.resolve(database, robot, names, request["joint_types"]),
-        {"datasets": named(rows), **_holdout(divided.lineage)},
-        held_out=_held_out(settings, parts, divided),
+        {"datasets": named(rows), **_holdout(divided.lineage), **_corrupt(rows, found)},
+        held_out=_held_out(settings, parts, divided, found),
     )
 
 
@@ -230,7 +245,8 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
     )
     parts = opened(files, rows)
     divided = holding_out.hold_out_again(rows, [part.clock() for part in parts], version.manifest["lineage"])
-    table = _learnt([replace(part, factor=_aged(part.row, within)) for part in parts], divided)
+    found = [sound(part) for part in parts]
+    table = _learnt([replace(part, factor=_aged(part.row, within)) for part in parts], divided, found)
     if not table.parts and logged.rows < settings.min_samples:
         raise NothingToLearnError(f"the log has {logged.rows} rows to train on, expected {settings.min_samples}")
     log_lineage: dict[str, Any] = {"through": within.through, "rows": 0, "found": logged.rows}
@@ -249,27 +265,44 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
         {
             "datasets": named(rows),
             **_holdout(divided.lineage),
+            **_corrupt(rows, found),
             "refresh": {**refresh, "left_out": left_out},
             "log": log_lineage,
         },
         weighted,
         seen,
-        _held_out(settings, parts, divided),
+        _held_out(settings, parts, divided, found),
         () if base.arm is None else (base.arm.geometry, *(each.geometry for each in base.arm.alternatives[1:])),
     )
 
 
-def _learnt(parts: list[Part], divided: Divided) -> Table:
+def _learnt(parts: list[Part], divided: Divided, found: list[Corrupt]) -> Table:
     """What is learnt from of data sets, those left out that nothing is learnt from."""
-    chosen = [replace(part, chosen=mask) for part, mask in zip(parts, divided.train, strict=True)]
+    each = zip(parts, divided.train, found, strict=True)
+    chosen = [replace(part, chosen=_without(mask, corrupt)) for part, mask, corrupt in each]
     return Table([part for part in chosen if len(part)])
 
 
-def _held_out(settings: Settings, parts: list[Part], divided: Divided) -> tuple[Samples, int] | None:
+def _held_out(
+    settings: Settings, parts: list[Part], divided: Divided, found: list[Corrupt]
+) -> tuple[Samples, int] | None:
     """What is evaluated on, thinned to as much as an evaluation takes, and how much there is of it."""
-    both = zip(parts, divided.held_out, strict=True)
-    table = Table([replace(part, chosen=mask) for part, mask in both if mask is not None])
-    return (table.thinned(settings.max_evaluation_samples), len(table)) if table.parts else None
+    each = zip(parts, divided.held_out, found, strict=True)
+    table = Table([replace(part, chosen=_without(mask, corrupt)) for part, mask, corrupt in each if mask is not None])
+    return (table.thinned(settings.max_evaluation_samples), len(table)) if len(table) else None
+
+
+def _without(mask: Mask | None, corrupt: Corrupt) -> Mask | None:
+    """Rows that are chosen and not corrupt, (N,); None for all."""
+    if not corrupt.count:
+        return mask
+    return ~corrupt.rows if mask is None else mask & ~corrupt.rows
+
+
+def _corrupt(rows: Sequence[DatasetRow], found: list[Corrupt]) -> dict[str, Any]:
+    """What of each data set is left out as corrupt, learnt from or held out, for the lineage."""
+    sets = [{"id": row.id, **each.report()} for row, each in zip(rows, found, strict=True) if each.count]
+    return {"corrupt": sets} if sets else {}
 
 
 def _candidates(table: Table, logged: Samples | None) -> tuple[Samples, Samples | None]:

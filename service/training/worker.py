@@ -149,7 +149,9 @@ def _fit(settings: Settings, claim: Claim, material: Material, pulse: Pulse) -> 
         pulse.cancelled,
     )
     trained = fit_model(task, request["estimator"], material.geometries)
-    trained = replace(trained, fit={**trained.fit, "samples_given": material.rows})
+    corrupt = sum(each["rows"] for each in material.lineage.get("corrupt", ()))
+    counts = {"samples_given": material.rows} | ({"samples_corrupt": corrupt} if corrupt else {})
+    trained = replace(trained, fit={**trained.fit, **counts})
     if not every:
         return trained
     return all_rows(settings, trained, material, table, options, pulse.cancelled, pulse.share)

@@ -15,7 +15,7 @@ from tests.service.learning.lessons import QUERIES, Pupil, publish
 from tests.service.learning.pendulums import trained
 
 Result = TypeVar("Result")
-HARMLESS = {"contact_threshold": 1e6, "on_change": "learn", "auto_refresh": False}
+HARMLESS = {"contact_threshold": 100.0, "on_change": "learn", "auto_refresh": False}
 """How a model learns for which contacts are far off."""
 
 

@@ -97,7 +97,7 @@ def test_restarts_under_load_lose_nothing_that_was_acknowledged(shared, postgres
 
     with Server(shared.home("one"), **shared.env(), LIPSERVE_PUBLISH_EVERY_S="0.1") as server:
         pupil = Pupil(server.client, ARM)
-        pupil.put("learning", {"contact_threshold": 1e6, "on_change": "learn", "auto_refresh": False})
+        pupil.put("learning", {"contact_threshold": 100.0, "on_change": "learn", "auto_refresh": False})
         dataset = upload(server.client, stream())["id"]
         panda = upload(server.client, stream("panda", samples=200))["id"]
         job = queue(server.client, "endless", panda, options=ENDLESS)["id"]

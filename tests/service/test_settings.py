@@ -69,6 +69,13 @@ def test_hosts_beyond_loopback_need_keys(host, loopback):
         ("keys", "off"),
         ("uds_mode", "rw-rw----"),
         ("uds_mode", "1777"),
+        ("max_velocity", "1e308"),
+        ("max_acceleration", "5e-324"),
+        ("max_position", "0"),
+        ("max_time_gap_s", "inf"),
+        ("stationary_speed", "2"),
+        ("contact_patience_s", "nan"),
+        ("linearisation_error", "1e9"),
     ],
 )
 def test_wrong_values_are_named(monkeypatch, name, text):

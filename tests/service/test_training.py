@@ -1,8 +1,27 @@
 """A training job from the request to the version it makes."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
-from tests.service.data import ENDLESS, QUICK, eventually, job, queue, running, stream, train, upload
+from lipcore.data.outliers import Corrupt
+from service.datasets import staging
+from tests.service.data import (
+    ENDLESS,
+    QUICK,
+    arrays,
+    error,
+    eventually,
+    job,
+    npz,
+    post,
+    queue,
+    running,
+    stream,
+    train,
+    upload,
+)
 
 QUERY = {"q": [0.3, -0.2], "dq": [0.1, 0.4], "ddq": [1.0, -0.5]}
 
@@ -72,3 +91,36 @@ def test_the_convention_of_the_data_and_the_options_of_the_job_are_kept(api):
     version = api.get("/v1/models/compensated/versions/1").json()
     assert (version["torque_convention"], version["options"]["tied"]) == ("gravity_compensated", False)
     assert api.post("/v1/models/compensated/predict", json=QUERY).json()["torque_convention"] == "gravity_compensated"
+
+
+def test_corrupt_rows_are_left_out_when_uploaded_and_said(api):
+    sound = stream(samples=300, seed=8)
+    tau = sound.tau.copy()
+    tau[120, 1] = 1e12
+    seen = upload(api, replace(sound, tau=tau))["report"]
+    assert (seen["rows_uploaded"], seen["rows"]) == (300, 299)
+    assert (
+        "1 row that fit neither what went before nor what follows left out, the first is row 121" in seen["preparation"]
+    )
+    tau[::30] = 1e9
+    body = error(post(api, npz(**arrays(replace(sound, tau=tau)))), 422, "invalid_data")
+    assert body["detail"][0]["field"] == "rows"
+    assert "10 corrupt ones of 300: the first are 1, 31" in body["detail"][0]["value"]
+    assert body["detail"][0]["expected"] == "at most 6"
+
+
+def test_a_job_learns_nothing_from_corrupt_rows_of_a_data_set(api, monkeypatch):
+    """As of a data set that an earlier release took in as it was."""
+    sound, row = stream(samples=300, seed=9), 120
+    tau = sound.tau.copy()
+    tau[row, 0] = 1e12
+    monkeypatch.setattr(staging, "corrupt", lambda t, episode, *_: Corrupt(np.zeros(len(episode), bool), episode))
+    spoilt = upload(api, replace(sound, tau=tau))["id"]
+    without = upload(api, sound.rows(np.arange(300) != row))["id"]
+    for name, dataset in (("spoilt", spoilt), ("without", without)):
+        train(api, name, dataset)
+    version, expected = (api.get(f"/v1/models/{name}/versions/1").json() for name in ("spoilt", "without"))
+    assert version["lineage"]["corrupt"] == [{"id": spoilt, "rows": 1, "first": [row], "why": {"magnitude": 1}}]
+    assert (version["fit"]["samples_corrupt"], version["fit"]["samples_given"]) == (1, 299)
+    assert "corrupt" not in expected["lineage"]
+    np.testing.assert_allclose(version["noise_std"], expected["noise_std"], rtol=1e-6)

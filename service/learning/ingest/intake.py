@@ -141,6 +141,7 @@ class Intake:
                 "own": [screened.own.start, screened.own.stop],
                 "open": verdict.watch.gate.open,
                 "gate": verdict.watch.gate.to_json(),
+                "departure": None if verdict.watch.departure is None else verdict.watch.departure.to_json(),
                 "waited": held,
                 "until": screened.until,
                 "surprise": None if verdict.surprise is None else verdict.surprise.tolist(),
@@ -183,10 +184,10 @@ def _alarm(session: Session, served: Served, options: LearningOptions, verdict: 
     assert change is not None
     evidence = verdict.evidence(names) | {"stream_id": event.stream_id, "sequence": event.sequence}
     joints = ", ".join(names[joint] for joint in change.joints)
-    message = (
-        f"the torque of {joints} does not fit what was learnt any more: {evidence['suspect']}? "
-        f"{CONSEQUENCES[options.on_change]}"
-    )
+    found = f"does not fit what was learnt any more: {evidence['suspect']}?"
+    if verdict.departed is not None:
+        found = f"has left what version {verdict.departed.version} was trained on, step by step ({evidence['cause']}):"
+    message = f"the torque of {joints} {found} {CONSEQUENCES[options.on_change]}"
     owner.raise_alarm(session, served.name, "change", message, evidence)
     if options.on_change == "hold":
         owner.hold(session, served.name, {"at": change.at, "event": event.number, "evidence": evidence})

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
 from lipcore.online.change import RATIO, Change, ChangeDetector, friction_share
+from lipcore.online.departure import Departure
 from lipcore.online.gates import Patience, is_contact
 from lipcore.online.record import Record
 from lipcore.vocabulary import CODES, LEARNT
-from service.learning.ingest.screening import Screened
+from service.learning.ingest.screening import Screened, Trained
 from service.learning.schema import LearningOptions
 
 CONTACT, CHANGE = CODES.index("contact"), CODES.index("change")
@@ -104,11 +105,13 @@ class Innovations:
 
 @dataclass(frozen=True)
 class Watch:
-    """State of judging after the rows before: the stream's gate, the model's detector and innovations; immutable."""
+    """State of judging after the rows before: the stream's gate, the model's detector, innovations and departure from
+    what it was trained on; immutable."""
 
     gate: ContactGate
     detector: ChangeDetector
     innovations: Innovations
+    departure: Departure | None = None
 
 
 @dataclass(frozen=True)
@@ -118,7 +121,8 @@ class Verdict:
     surprise: mean of e²/s² of the same rows, (n,), with s less the floor of past errors, which would
     hide a change from the detector.
 
-    change: detected with these rows. held: whether these rows had to wait for a decision.
+    change: detected with these rows. held: whether these rows had to wait for a decision. departed: what shows the
+    change where that is the distance from the version as trained.
     """
 
     rows: Rows
@@ -127,11 +131,13 @@ class Verdict:
     watch: Watch
     change: Change | None
     held: bool
+    departed: Departure | None = None
 
     def evidence(self, joint_names: Sequence[str]) -> dict[str, Any]:
         """Evidence of the change, for JSON."""
         assert self.change is not None
-        return self.change.evidence(joint_names, self.watch.innovations.friction(self.change.at))
+        evidence = self.change.evidence(joint_names, self.watch.innovations.friction(self.change.at))
+        return evidence if self.departed is None else evidence | self.departed.evidence(joint_names)
 
 
 def judge(batch: Screened, watch: Watch, held: bool, options: LearningOptions, usual: Callable[[], Record]) -> Verdict:
@@ -145,27 +151,45 @@ def judge(batch: Screened, watch: Watch, held: bool, options: LearningOptions, u
     counted = np.ones(len(rows), np.bool_) if passing else ~contact
     everything = Record.of(rows.tau, batch.mean, batch.std, batch.noise_std)
     detector, change, record, surprise = watch.detector, None, None, None
+    departure, departed = watch.departure, None
     if counted.any():
         error, bare = (rows.tau - batch.mean)[counted], batch.bare[counted]
         record = Record.of(rows.tau[counted], batch.mean[counted], batch.std[counted], batch.noise_std)
         surprise = (error**2 / (bare**2 + batch.noise_std**2)).mean(axis=0)
         detector, change = detector.step(replace(record, standardised=surprise), float(rows.time.max()))
+        if not held and not watch.gate.open and batch.trained is not None:
+            departure = _followed(departure, batch.trained, rows.take(counted), counted, batch.noise_std)
     if held or watch.gate.open:
         change = None  # the consequence of a change that is known
     elif change is None and gate.exhausted:
         change = _lasting(gate, everything, usual(), rows)
+    elif change is None and departure is not None and departure.joints:
+        departed = departure
+        change = Change(departure.began, departure.joints, usual(), everything, "departure")
     if change is not None and options.on_change == "hold":
         held = True
-    elif change is not None:
-        gate = gate.stand_back()
+    elif change is not None and departed is None:
+        gate = gate.stand_back()  # after a departure it does not, as what is learnt is followed too well
+    if departure is not None and change is not None and not held:
+        departure = departure.decided()
     if not held and not gate.open:
         detector = detector.acknowledged()
     codes = batch.rows.code.copy()
     learnt = np.where(contact & (not (passing or gate.open)), CONTACT, LEARNT)
     codes[batch.predicted] = CHANGE if held else learnt
     judged = replace(batch.rows, code=codes)
-    following = Watch(gate, detector, watch.innovations.then(rows, batch.mean))
-    return Verdict(judged, record, surprise, following, change, held)
+    following = Watch(gate, detector, watch.innovations.then(rows, batch.mean), departure)
+    return Verdict(judged, record, surprise, following, change, held, departed)
+
+
+def _followed(
+    before: Departure | None, trained: Trained, rows: Rows, counted: NDArray[np.bool_], noise_std: Array
+) -> Departure:
+    """The departure from a version as trained after some of the rows that it has predicted."""
+    if before is None or before.version != trained.version:
+        before = Departure.start(trained.version, rows.tau.shape[1])
+    error, std = rows.tau - trained.mean[counted], trained.std[counted]
+    return before.step(rows.time, rows.weight, error, std, noise_std)
 
 
 def _lasting(gate: ContactGate, record: Record, usual: Record, rows: Rows) -> Change:

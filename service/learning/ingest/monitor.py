@@ -15,6 +15,7 @@ from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session
 
 from lipcore.online.change import ChangeDetector
+from lipcore.online.departure import Departure
 from lipcore.online.record import Record
 from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.settings import Settings
@@ -86,6 +87,7 @@ class Monitor:
         self._patience, self._most_streams = settings.contact_patience_s, settings.max_observation_streams
         self._gates: OrderedDict[str, ContactGate] = OrderedDict()
         self._detector, self._innovations = ChangeDetector(), Innovations.empty(n)
+        self._departure: Departure | None = None
 
     @classmethod
     def rebuilt(
@@ -95,7 +97,9 @@ class Monitor:
         made = cls(joint_names, settings)
         made.number = log.newest(session, model)
         since = now - max(*settings.quality_windows_s, DETECTOR_S)
-        for event in _batches(session, model, EventRow.received > since, EventRow.number <= made.number):
+        lately = (EventRow.received > since, EventRow.number <= made.number)
+        events = list(_batches(session, model, *lately)) or list(_batches(session, model, most=1))
+        for event in events:  # the last one in any case: how far learning has gone is not forgotten in a quiet hour
             made._remember(event, event.received > now - DETECTOR_S)
         return made
 
@@ -108,7 +112,7 @@ class Monitor:
     def watch(self, stream_id: str) -> Watch:
         """State of judging before the next rows of a stream."""
         gate = self._gates.get(stream_id) or ContactGate.start(self._patience)
-        return Watch(gate, self._detector, self._innovations)
+        return Watch(gate, self._detector, self._innovations, self._departure)
 
     def usual(self, now: float) -> Record:
         """Record of the shortest window before a Unix time, s."""
@@ -132,6 +136,7 @@ class Monitor:
     def decided(self) -> None:
         """Learning goes on after it was held; `lock` is held. What has changed is no contact."""
         self.held = False
+        self._departure = self._departure and self._departure.decided()
         self._gates.update({stream_id: gate.stand_back() for stream_id, gate in self._gates.items()})
 
     def _remember(self, event: EventRow, recent: bool) -> None:
@@ -145,6 +150,8 @@ class Monitor:
         if self.held and not report.get("waited", True):
             self.decided()
         self.held, waits = report["held"], report["held"] or report["open"]
+        departure = report.get("departure")  # not in what an earlier release has logged
+        self._departure = None if departure is None else Departure.from_json(departure)
         if event.stream_id is not None:
             if (values := report.get("gate")) is not None:
                 gate = ContactGate.from_json(values, self._patience)
@@ -165,12 +172,14 @@ class Monitor:
             self._detector = self._detector.acknowledged()
 
 
-def _batches(session: Session, model: str, *conditions: ColumnElement[bool]) -> Iterator[EventRow]:
+def _batches(
+    session: Session, model: str, *conditions: ColumnElement[bool], most: int = MOST_EVENTS
+) -> Iterator[EventRow]:
     """The last batches of a model that meet conditions, as many as are taken in, in order."""
     query = select(EventRow).where(
         EventRow.model == model, EventRow.kind == "batch", EventRow.report.is_not(None), *conditions
     )
-    return reversed(list(session.scalars(query.order_by(EventRow.number.desc()).limit(MOST_EVENTS))))
+    return reversed(list(session.scalars(query.order_by(EventRow.number.desc()).limit(most))))
 
 
 def _counts(report: Mapping[str, Any]) -> dict[str, int]:

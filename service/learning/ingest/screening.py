@@ -25,6 +25,7 @@ from service.foundation.errors import invalid_request
 from service.foundation.settings import Settings
 from service.journal import log
 from service.learning.schema import DerivedAcceleration, LearningOptions
+from service.models.served import Served
 from service.storage.database import EventRow, StreamRow
 
 NON_FINITE, LIMIT, TIME_JUMP, EDGE = (CODES.index(code) for code in ("non_finite", "limit", "time_jump", "edge"))
@@ -127,11 +128,21 @@ class Dated:
 
 
 @dataclass(frozen=True)
+class Trained:
+    """What the version as trained, which learns nothing, predicts of the same rows: mean, std (P, n)."""
+
+    version: int
+    mean: Array
+    std: Array
+
+
+@dataclass(frozen=True)
 class Screened:
     """Rows, and the predictions of the model that serves for those that passed so far.
 
     own: which of the rows are of this batch, the others had waited for it. predicted: (N,); mean, std, bare: (P, n) of
-    these, bare the standard deviation without the floor that past errors put under `std`. noise_std: (n,).
+    these, bare the standard deviation without the floor that past errors put under `std`. noise_std: (n,). trained: see
+    there; None where nothing is compared with it.
     """
 
     rows: Rows
@@ -142,6 +153,7 @@ class Screened:
     std: Array
     bare: Array
     noise_std: Array
+    trained: Trained | None = None
 
     @property
     def until(self) -> float | None:
@@ -189,13 +201,15 @@ def dated(measured: Measured, clock: Clock, bounds: Limits, previous: float | No
 
 def predict(
     rows: Rows,
-    model: TorqueModel,
+    served: Served,
     own: slice,
     derived: DerivedAcceleration | None = None,
     answered: tuple[Array, Array] | None = None,
 ) -> Screened:
-    """Let a model predict the rows that passed; those it has no finite answer for are beyond its limits. answered: mean
-    and std, (N, n) each, of all rows, where a stream has answered them already."""
+    """Let a version predict the rows that passed, with what it has learnt and as trained; those it has no finite answer
+    for are beyond its limits. answered: mean and std, (N, n) each, of all rows, where a stream has answered them
+    already."""
+    model = served.model
     codes, predicted = rows.code.copy(), rows.code == LEARNT
     good, floor = rows.take(predicted), model.posterior.floor.numpy()
     if answered is None:
@@ -208,7 +222,8 @@ def predict(
     codes[predicted] = np.where(known, LEARNT, LIMIT)
     predicted[predicted] = known
     checked = replace(rows, code=codes)
-    return Screened(checked, own, derived, predicted, mean[known], std[known], bare[known], model.noise_std)
+    trained = Trained(served.version, *_answers(good.take(known), served.base))
+    return Screened(checked, own, derived, predicted, mean[known], std[known], bare[known], model.noise_std, trained)
 
 
 def _answers(rows: Rows, model: TorqueModel) -> tuple[Array, Array]:

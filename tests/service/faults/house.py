@@ -43,7 +43,7 @@ def furnish(home: Path) -> None:
             if candidate:
                 registry.serve(session, ARM, 2)
                 registry.serve(session, ARM, 1)
-    options = LearningOptions(contact_threshold=1e6, on_change="learn", auto_refresh=False)
+    options = LearningOptions(contact_threshold=100.0, on_change="learn", auto_refresh=False)
     with database.transaction() as session:
         session.add(LearningRow(model=ARM, options=options.model_dump(), held=None))
     database.close()

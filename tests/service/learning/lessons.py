@@ -51,7 +51,7 @@ class School:
         """A new model, as trained, that learns with these options; contacts are far off unless said."""
         self.publish(model)
         pupil = Pupil(self.client, model)
-        pupil.put("learning", {"contact_threshold": 1e6, "on_change": "learn", "auto_refresh": False, **options})
+        pupil.put("learning", {"contact_threshold": 100.0, "on_change": "learn", "auto_refresh": False, **options})
         return pupil
 
     def publish(self, model: str, **how: Any) -> int:

@@ -175,6 +175,48 @@ def test_a_service_that_starts_again_still_waits_and_still_follows(school, tmp_p
         assert codes(third, pupil)[-BATCH:] == ["learnt"] * BATCH
 
 
+def flatter(pupil: Pupil, number: int) -> tuple[dict[str, Any], np.ndarray]:
+    """Send half a second of the recording labelled with what the model answers and one standard deviation more; return
+    what was said, and the answers."""
+    body = part(recording(samples=20_000), number * BATCH, (number + 1) * BATCH)
+    seen = pupil.predict({name: body[name] for name in ("q", "dq", "ddq")})
+    tau, std = (np.array(seen[name]) for name in ("tau", "tau_std"))
+    said = send(pupil, number, body | {"tau": (tau + np.hypot(std, seen["noise_std"])).tolist()})
+    pupil.settled(said["revision"])
+    return said, tau
+
+
+@pytest.mark.slow
+def test_who_leads_a_model_away_step_by_step_is_stopped(school, tmp_path):
+    """Every label is one standard deviation from what is answered; 700 batches moved the answer by two of them."""
+    home = tmp_path / "home"
+    number, said = 0, {"held": False}
+    with lessons.school(home, school.trained) as first:
+        pupil = first.enrol("led-away", **WATCHFUL, on_change="hold")
+        queries = part(recording(samples=20_000), 0, 200)
+        before = pupil.predict({name: queries[name] for name in ("q", "dq", "ddq")})
+        for number in range(5):
+            assert flatter(pupil, number)[0]["accepted"] == BATCH
+    with lessons.school(home, school.trained) as second:  # what has added up so far is not forgotten
+        pupil = Pupil(second.client, "led-away")
+        while not said["held"] and number < 90:
+            number += 1
+            said = flatter(pupil, number)[0]
+        assert said["held"]
+        assert number < 45  # at 0.5 a row and ten rows a second it takes 12 batches, and some for what is stated
+        (alarm,) = pupil.get("alarms")["items"]
+        assert "has left what version 1 was trained on" in alarm["message"]
+        held = pupil.get("learning")["status"]["held"]
+        assert held["evidence"]["cause"] == "drift against the trained version"
+        assert held["evidence"]["trained"]["version"] == 1
+        assert held["evidence"]["kind"] == "departure"
+        after = pupil.predict({name: queries[name] for name in ("q", "dq", "ddq")})
+        moved = np.abs(np.array(after["tau"]) - before["tau"]) - np.array(before["tau_std"])
+        assert np.maximum(moved, 0).mean() < 0.5 * np.max(after["noise_std"])
+        pupil.post("learning/change", {"decision": "ignore"})
+        assert not drive(pupil, range(number + 1, number + 2))[0]["held"]
+
+
 def nothing():
     return Record.empty(1)
 
@@ -201,7 +243,7 @@ def test_a_gate_that_stood_back_returns_once_rows_fit():
     assert judging.judge(screened(10, 20.0, 5.0), watch, False, options, nothing).rows.rejected() == {"contact": 10}
 
 
-HIDDEN = ("_gates", "_detector", "held", "number")
+HIDDEN = ("_gates", "_detector", "_departure", "held", "number")
 
 
 def comparable(value: Any) -> Any:

@@ -42,7 +42,7 @@ def refreshed(school):
     pupil = Pupil(school.client, "asked")
     dataset = upload(school.client, stream(), name="recorded")
     train(school.client, pupil.model, dataset["id"], robot=None, options={**QUICK, "max_iterations": 5})
-    pupil.put("learning", {"contact_threshold": 1e6, "on_change": "learn", "auto_refresh": False})
+    pupil.put("learning", {"contact_threshold": 100.0, "on_change": "learn", "auto_refresh": False})
     pupil.teach(0, 1, 2, 3)
     answer = school.client.post(pupil.url("refresh"), json={})
     assert answer.status_code == 202, answer.text
@@ -133,7 +133,7 @@ def test_a_refresh_goes_on_after_the_service_was_killed(tmp_path):
     with Server(tmp_path / "home") as server:
         dataset = upload(server.client, recorded)["id"]
         train(server.client, "arm", dataset, options=LONG)
-        answered(server.client.put("/v1/models/arm/learning", json={"contact_threshold": 1e6}))
+        answered(server.client.put("/v1/models/arm/learning", json={"contact_threshold": 100.0}))
         answered(server.client.post("/v1/models/arm/observations", json={"stream_id": "s", "sequence": 0, **body}))
         job = server.client.post("/v1/models/arm/refresh", json={}).json()
         assert running(server.client, job["id"])["state"] == RUNNING

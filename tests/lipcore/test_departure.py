@@ -1,0 +1,96 @@
+"""Labels that follow what a model answers are told by what it was trained on; honest ones are not."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from lipcore.online.departure import BOUND, SLACK, Departure
+from tests.choosing import slow
+
+HOUR = 36_000
+"""Rows of an hour at 10 Hz, each of them effective."""
+NOISE = np.array([0.05, 0.2])
+
+
+def step(state, error, std=0.0, weight=1.0, at=0.0):
+    error = np.asarray(error)
+    count = len(error)
+    return state.step(at + np.arange(count), np.full(count, weight), error, np.broadcast_to(std, error.shape), NOISE)
+
+
+@pytest.mark.parametrize("seed", [0, slow(1), slow(2)])
+@pytest.mark.parametrize("bias", [0.0, 1.0, -1.0])
+@pytest.mark.parametrize("persist", [0, 3])
+def test_an_honest_hour_is_quiet(seed, bias, persist):
+    """Errors of the function, within its standard deviation, last for the whole hour; noise may last for some rows."""
+    white = np.random.default_rng(seed).standard_normal((HOUR, 2))
+    if persist:
+        keep = np.exp(-1 / persist)
+        white = lfilter([np.sqrt(1 - keep**2)], [1, -keep], white, axis=0)
+    std = 0.5 * NOISE
+    assert step(Departure.start(1, 2), NOISE * white + bias * std, std).level.max() < BOUND
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_errors_that_stay_beyond_what_is_stated_add_up(sign):
+    """An error of one standard deviation gains 1 − SLACK a row, less STATED shares of the function's own."""
+    error = sign * np.tile([1.0, 0.0], (200, 1)) * NOISE
+    state = Departure.start(3, 2)
+    for count in range(1, 101):
+        state = step(state, error[:1], at=float(count))
+        gained = (1 - SLACK) * count
+        assert state.level == pytest.approx([gained, 0.0])
+        assert bool(state.joints) is (gained > BOUND) or gained == pytest.approx(BOUND)
+    assert state.joints == (0,)
+    assert (state.began, state.drift[0]) == (1.0, pytest.approx(sign))
+    evidence = state.evidence(("a", "b"))
+    assert evidence == {
+        "cause": "drift against the trained version",
+        "trained": {"version": 3, "drift": {"a": state.drift[0]}},
+    }
+    stated = step(Departure.start(3, 2), error, std=NOISE)  # a wide interval allows as much
+    assert stated.level.max() == 0.0
+
+
+def test_fast_streams_count_by_their_time():
+    """A thousand rows a second are ten effective ones, in batches or row by row."""
+    error = np.full((1000, 2), 1.0) * NOISE
+    at_once = step(Departure.start(1, 2), error, weight=0.01)
+    assert at_once.level == pytest.approx([5.0, 5.0])
+    one_by_one = Departure.start(1, 2)
+    for row in error:
+        one_by_one = step(one_by_one, row[None], weight=0.01)
+    assert one_by_one.level == pytest.approx(at_once.level)
+
+
+def test_few_rows_far_off_are_left_to_the_gates():
+    state = step(Departure.start(1, 2), np.full((5, 2), 1e6))
+    assert state.joints == ()
+
+
+def test_what_was_decided_about_is_where_it_may_be():
+    state = step(Departure.start(1, 2), np.tile([2.0, 0.0], (100, 1)) * NOISE)
+    assert state.joints == (0,)
+    decided = state.decided()
+    assert decided.joints == ()
+    assert decided.centre == pytest.approx([2.0, 0.0])
+    assert step(decided, np.tile([2.0, 0.0], (1000, 1)) * NOISE).level.max() == pytest.approx(0.0, abs=1e-9)
+    assert step(decided, np.tile([0.0, 0.0], (1000, 1)) * NOISE).joints == (0,)  # back is a departure, too
+
+
+def test_after_another_change_the_version_is_no_reference_any_more():
+    state = step(Departure.start(1, 2), np.tile([2.0, 0.0], (20, 1)) * NOISE).decided()
+    assert state.retired
+    assert step(state, np.tile([2.0, 0.0], (1000, 1)) * NOISE) is state
+    assert Departure.from_json(state.to_json()).retired
+
+
+def test_it_is_stored_to_the_last_bit():
+    rng = np.random.default_rng(8)
+    error = NOISE * (rng.standard_normal((900, 2)) + 0.4)
+    state = step(Departure.start(7, 2), error[:450], weight=0.3)
+    stored = Departure.from_json(json.loads(json.dumps(state.to_json())))
+    one, other = (step(each, error[450:], weight=0.3, at=450.0) for each in (state, stored))
+    assert one.to_json() == other.to_json()

@@ -1,0 +1,123 @@
+"""Corrupt rows are left out before anything is learnt from them, and sound ones never."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import lipcore
+from lipcore.data import outliers
+from lipcore.data.outliers import CorruptError, of_long, of_samples
+from lipcore.data.samples import Samples
+from lipcore.fitting.options import FitOptions
+from lipcore.robots.dirt import Dirt
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
+from tests.choosing import slow
+
+ROBOT = load_robot("double-pendulum")
+NOISE = 0.05
+CLEAN = simulate(ROBOT, Stream(300, 20.0, noise=NOISE, speed=3.0, coulomb=0.3, viscous=0.1), 41)
+ROW = 110
+"""Where no joint turns back: friction leaps there, which is no corruption."""
+QUICK = FitOptions(hyperparameter_samples=40, posterior_samples=80, max_iterations=3, starts=1)
+
+
+def spoilt(samples, *spikes):
+    """Samples with (quantity, row, joint, amount) added."""
+    arrays = {name: getattr(samples, name).copy() for name in outliers.LARGEST}
+    for name, row, joint, amount in spikes:
+        arrays[name][row, joint] += amount
+    return replace(samples, **arrays)
+
+
+def corrupt_rows(samples):
+    return np.flatnonzero(of_samples(samples).rows).tolist()
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize(
+    ("quantity", "amount"),
+    [("tau", 1e12), ("tau", -1e4), ("tau", 50 * NOISE), ("q", 1.0), ("dq", -3.0), ("ddq", 60.0), ("q", 1e308)],
+)
+def test_one_corrupt_row_is_found(quantity, amount, joint):
+    assert corrupt_rows(spoilt(CLEAN, (quantity, ROW, joint, amount))) == [ROW]
+
+
+def test_several_are_found_and_reported_with_why():
+    found = of_samples(spoilt(CLEAN, ("tau", 20, 0, 1e12), ("tau", 21, 1, 4.0), ("dq", 200, 0, 3.0)))
+    assert found.report() == {"rows": 3, "first": [20, 21, 200], "why": {"magnitude": 1, "course": 2}}
+    assert found.in_fit()["samples_corrupt"] == 3
+    assert "rows 20, 21, 200" in found.in_fit()["corrupt"]
+    assert of_samples(CLEAN).in_fit() == {}
+
+
+def test_the_order_of_rows_does_not_matter():
+    order = np.random.default_rng(3).permutation(len(CLEAN))
+    shuffled = spoilt(CLEAN, ("tau", 77, 1, 3.0)).rows(order)
+    assert order[corrupt_rows(shuffled)].tolist() == [77]
+
+
+def test_more_than_accident_is_an_error_that_names_rows():
+    spikes = [("tau", row, 0, 1e9) for row in range(10, 80, 10)]
+    with pytest.raises(CorruptError, match=r"7 corrupt ones of 300: the first are 11, 21, .*, expected at most 6"):
+        of_samples(spoilt(CLEAN, *spikes))
+    assert len(corrupt_rows(spoilt(CLEAN, *spikes[:6]))) == 6
+
+
+SOUND = {
+    "sinusoids": Stream(300, 10.0),
+    "noiseless": Stream(300, 10.0, noise=0.0),
+    "fast": Stream(300, 10.0, speed=10.0),
+    "friction": Stream(300, 10.0, speed=5.0, coulomb=1.0, viscous=0.3),
+    "rests": Stream(300, 20.0, course="rests", coulomb=1.0),
+    "rests at 100 Hz": Stream(600, 100.0, course="rests", speed=2.0, coulomb=1.0),
+    "periodic": Stream(300, 20.0, course="periodic", speed=5.0),
+    "dirt": Stream(400, 20.0, dirt=Dirt(seed=5), noise=0.0),
+    "dirt with rests": Stream(600, 50.0, course="rests", dirt=Dirt(seed=6), noise=0.0),
+}
+
+
+@pytest.mark.parametrize("name", SOUND)
+def test_sound_recordings_keep_all_rows(name):
+    """On other seeds than the thresholds were tuned on."""
+    samples = simulate(ROBOT, SOUND[name], 51)
+    assert corrupt_rows(samples) == []
+    assert corrupt_rows(samples.rows(slice(None, None, 2))) == []  # thinned
+    short = replace(samples, episode=np.arange(len(samples), dtype=np.int64) // 5)
+    assert corrupt_rows(short) == []  # no course can be told
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_samples_without_a_course_keep_all_rows_but_absurd_ones(seed):
+    """Independent instants, torques of a heavy tail among them."""
+    rng = np.random.default_rng(seed)
+    q, dq, ddq = rng.uniform(-2, 2, (300, 2)), rng.standard_t(4, (300, 2)), rng.standard_t(4, (300, 2))
+    tau = 20 * np.sin(q) + 5 * ddq + 3 * np.sign(dq)
+    places = np.arange(300)
+    samples = Samples(("a", "b"), places.astype(float), np.zeros(300, np.int64), q, dq, ddq, tau)
+    assert corrupt_rows(samples) == []
+    assert corrupt_rows(spoilt(samples, ("tau", 9, 1, 1e12), ("tau", 40, 0, 1e5))) == [9, 40]
+
+
+def test_a_long_recording_is_looked_at_in_blocks(monkeypatch):
+    monkeypatch.setattr(outliers, "BLOCK", 110)
+    samples = spoilt(CLEAN, ("tau", 109, 0, 3.0), ("tau", 110, 1, 1e12), ("tau", 250, 0, 3.0))
+    found = of_long(300, lambda first, last: samples.rows(slice(first, last)))
+    assert np.flatnonzero(found.rows).tolist() == [109, 110, 250]
+
+
+@pytest.mark.parametrize("estimator", ["lip-chain", slow("rigid-body"), slow("auto")])
+@pytest.mark.parametrize("joint", [0, 1])
+def test_a_corrupt_row_changes_nothing_but_its_own_rejection(estimator, joint):
+    """The model is that of the recording without the row: noise, answers and uncertainty, of both joints."""
+    without = CLEAN.rows(np.arange(300) != ROW)
+    expected = lipcore.train(without, ROBOT.joint_types, estimator, QUICK)
+    for amount in (1e12, 50 * NOISE):
+        made = lipcore.train(spoilt(CLEAN, ("tau", ROW, joint, amount)), ROBOT.joint_types, estimator, QUICK)
+        assert (made.fit["samples_corrupt"], made.fit["samples_given"]) == (1, 299)
+        np.testing.assert_allclose(made.noise_std, expected.noise_std, rtol=1e-9)
+        query = CLEAN.q[:20], CLEAN.dq[:20], CLEAN.ddq[:20]
+        for name in ("tau", "tau_std"):
+            one, other = (getattr(model.predict(*query), name) for model in (made, expected))
+            np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-10)
