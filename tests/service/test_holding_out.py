@@ -56,7 +56,7 @@ def rows_of(samples, result):
 
 def material(api, *datasets, **holdout):
     service = service_of(api)
-    request = {"datasets": list(datasets), "holdout": holdout}
+    request = {"datasets": list(datasets), "holdout": holdout, "joint_types": ["revolute"] * 2}
     return recorded(service.settings, service.database, service.files, request)
 
 
@@ -73,7 +73,7 @@ def held(api, dataset):
 
 
 def test_only_the_rest_is_trained_on(api, held, dataset):
-    assert held[1]["holdout"] == {"kind": "last", "share": 0.3, "blocks": 10, "guard_s": None, "seed": 0}
+    assert held[1]["holdout"] == {"kind": "auto", "share": 0.3, "blocks": 10, "guard_s": None, "seed": 0}
     assert version(api, held[0])["fit"]["samples_given"] == TRAIN.stop
     result = material(api, dataset, share=0.3)
     assert rows_of(recording(), result.samples) == list(range(ROWS))[TRAIN]
