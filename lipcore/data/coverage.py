@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.special import betaincinv
 
-from lipcore.data.independence import residual_correlation
 from lipcore.data.metrics import LEVEL, Answer, quantile
 from lipcore.data.samples import Array, Samples
 
@@ -32,15 +33,15 @@ class CoverageInterval:
 def coverage_interval(samples: Samples, answer: Answer) -> CoverageInterval:
     """How far the coverage of the 95 % interval is known from samples (N, n) in order of time, N >= 1.
 
-    N rows count for N / τ errors, τ the larger of the correlation times of the errors and of whether the interval
-    holds them; see `residual_correlation`.
+    N rows count for N / τ errors, τ the larger of the correlation times of the errors, in their standard deviations,
+    and of whether the interval holds them.
     """
     error, spread = samples.tau - answer.mean, np.hypot(answer.std, answer.noise_std)
     inside = np.abs(error) <= quantile(LEVEL) * spread
-    apart = _apart(samples)
+    runs = _runs(samples)
     independent = np.array(
         [
-            len(samples) / max(_correlation(error[:, joint] / spread[:, joint], apart), _correlation(hits, apart))
+            len(samples) / max(_correlation(error[:, joint] / spread[:, joint], runs), _correlation(hits, runs))
             for joint, hits in enumerate(inside.T.astype(np.float64))
         ]
     )
@@ -62,14 +63,30 @@ def clopper_pearson(share: Array, count: Array, level: float = LEVEL) -> tuple[A
     return low, high
 
 
-def _correlation(values: Array, samples: Samples) -> float:
-    """Rows that one independent row of these values (N,) counts for."""
-    return residual_correlation((values - values.mean())[:, None], samples)
+def _correlation(values: Array, runs: Sequence[slice]) -> float:
+    """Rows that one independent row of these values (N,) counts for, at least 1: 1 + 2 Σ c_k / c_0.
+
+    c_k is the sum of products of values less their mean that are k rows apart in one run, up to the lag at which their
+    mean correlation falls to chance level: for white values below 2/√(pairs).
+    """
+    centred = values - values.mean()
+    longest = max(run.stop - run.start for run in runs)
+    sums, pairs = np.zeros(longest), np.zeros(longest)
+    for run in runs:
+        part = centred[run]
+        rows = len(part)
+        sums[:rows] += np.fft.irfft(np.abs(np.fft.rfft(part, 2 * rows)) ** 2, 2 * rows)[:rows]
+        pairs[:rows] += np.arange(rows, 0, -1)
+    if sums[0] <= 0:
+        return 1.0
+    chance = np.flatnonzero(sums / pairs < 2 / np.sqrt(pairs) * sums[0] / pairs[0])
+    end = chance[0] if len(chance) else longest
+    return float(1 + 2 * sums[1:end].sum() / sums[0])
 
 
-def _apart(samples: Samples) -> Samples:
-    """The samples with a new episode wherever time steps back or too far; thinning, which is even, is no gap."""
+def _runs(samples: Samples) -> list[slice]:
+    """Rows that follow each other in time; thinning, which is even, is no gap."""
     steps = np.diff(samples.t)
     usual = np.median(steps[steps > 0]) if (steps > 0).any() else np.inf
-    begins = (steps <= 0) | (steps > LARGEST_STEP * usual)
-    return replace(samples, episode=np.concatenate([[0], np.cumsum(begins)]).astype(np.int64))
+    begins = np.flatnonzero((steps <= 0) | (steps > LARGEST_STEP * usual)) + 1
+    return [slice(first, last) for first, last in pairwise([0, *begins.tolist(), len(samples)])]

@@ -81,13 +81,14 @@ def _coverage(joint_names: tuple[str, ...], figures: dict[str, Any]) -> tuple[li
     """What is wrong with the coverage, and what is right."""
     by_joint = zip(joint_names, *(figures[name] for name in ("coverage", "coverage_high", "independent")), strict=True)
     narrow = [
-        f"{joint} {share:.0%} (at most {high:.0%}, from {count:.0f} independent errors)"
+        f"{joint} {100 * share:.0f} % (at most {100 * high:.0f} %, from {count:.0f} independent errors)"
         for joint, share, high, count in by_joint
         if high < LEAST_COVERAGE
     ]
+    least = f"{100 * LEAST_COVERAGE:.0f} %"
     if narrow:
-        return [f"the 95 % intervals hold less than {LEAST_COVERAGE:.0%} of what was held out: {', '.join(narrow)}"], []
-    return [], [f"its 95 % intervals hold {LEAST_COVERAGE:.0%} of what was held out, as far as that can tell"]
+        return [f"the 95 % intervals hold less than {least} of what was held out: {', '.join(narrow)}"], []
+    return [], [f"its 95 % intervals hold {least} of what was held out, as far as that can tell"]
 
 
 def _against(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -98,7 +99,8 @@ class Evaluation(Plain):
         return "\n".join([text_table(self.title, self._columns()), *(f"careful: {each}" for each in self.warnings)])
 
     def _repr_html_(self) -> str:
-        return html_table(self.title, self._columns())
+        careful = (f"<p>careful: {escape(each)}</p>" for each in self.warnings)
+        return html_table(self.title, self._columns()) + "".join(careful)
 
     def _columns(self) -> dict[str, list[str]]:
         heads = {
