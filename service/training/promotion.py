@@ -2,7 +2,8 @@
 
 It waits where the 95 % intervals of a joint hold less than LEAST_COVERAGE of that, by the upper end of the confidence
 interval, as 85 % of ten errors tell nothing; and where it is worse than the version that serves, by paired differences.
-Both are compared as they were trained. With few blocks of samples as good a version waits in up to 8 % of cases.
+Both are compared as they were trained. Of versions that are as good 1 to 7 % wait (simulated: 5 to 60 s held out, errors
+that stay alike for 0.1 to 3 s).
 """
 
 from __future__ import annotations
@@ -47,9 +48,8 @@ def judge(
     problems, passes = _coverage(trained.joint_names, lineage["holdout"])
     if serving is not None:
         problem, note = _against(files, serving, trained, held_out, lineage)
-        problems += problem
-        passes += note
-    reason = "; ".join(problems or passes)
+        problems, passes = problems + problem, passes + note
+    reason = "; ".join(problems + passes)
     if not problems:
         return Promotion(answers=True, passed=True, serving=before, reason=reason)
     if serving is None:
@@ -119,7 +119,8 @@ def _verdict(compared: Comparison, name: str) -> tuple[list[str], list[str]]:
         return [f"it predicts what was held out worse than {name}: negative log density {amount}"], []
     if larger and nmse > 0 and not clear:
         return [f"its errors are larger than those of {name}: mean nMSE {nmse:+.2g} ± {half_nmse:.1g}"], []
-    return [], [f"it predicts that no worse than {name}: negative log density {amount}"]
+    how = "better" if clear else "no worse"
+    return [], [f"it predicts what was held out {how} than {name}: negative log density {amount}"]
 
 
 def _is_new_to(earlier: dict[str, Any], holdout: dict[str, Any]) -> bool:
