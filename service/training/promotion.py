@@ -2,8 +2,8 @@
 
 It waits where the 95 % intervals of a joint hold less than LEAST_COVERAGE of that, by the upper end of the confidence
 interval, as 85 % of ten errors tell nothing; and where it is worse than the version that serves, by paired differences.
-Both are compared as they were trained. Of versions that are as good 1 to 7 % wait (simulated: 5 to 60 s held out, errors
-that stay alike for 0.1 to 3 s).
+Both are compared as they were trained. Of versions that are as good 1 to 7 % wait (simulated: 5 to 60 s held out,
+errors that stay alike for 0.1 to 3 s).
 """
 
 from __future__ import annotations
