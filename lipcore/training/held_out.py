@@ -18,7 +18,7 @@ BLOCK_ROWS, BLOCK_S = 15, 4 * GUARD_S
 SHARE = 0.25
 """Of the blocks, held out."""
 MOST_EPISODES, MOST_SHARE = 50, 0.5
-"""Most episodes that count as blocks, and largest share that is held out, unless more is asked for."""
+"""Most episodes that count as blocks, and largest share that is held out, unless more is asked for: or twice that."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def unrepeated(samples: Samples, joint_types: Sequence[str], share: float, seed:
     if len(sizes) < 2:
         return None
     held = np.repeat(choose(sizes, share, seed)[group], lengths)
-    if held.mean() > max(MOST_SHARE, share) or share_repeated(states[~held], states[held]) >= REPEATED:
+    if held.mean() > max(share, min(MOST_SHARE, 2 * share)) or share_repeated(states[~held], states[held]) >= REPEATED:
         return None
     border = np.flatnonzero(np.diff(np.concatenate([[False], held, [False]])))
     return list(zip(border[::2].tolist(), border[1::2].tolist(), strict=True))
