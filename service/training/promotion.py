@@ -44,7 +44,7 @@ def judge(
         serving = session.get(VersionRow, (model, number))
     before = None if serving is None else number
     if held_out is None:
-        return Promotion(answers=True, passed=None, serving=before, reason="not judged: nothing was held out")
+        return Promotion(answers=True, passed=None, serving=before, reason="not judged, as nothing was held out")
     problems, passes = _coverage(trained.joint_names, lineage["holdout"])
     if serving is not None:
         problem, note = _against(files, serving, trained, held_out, lineage)
@@ -62,7 +62,7 @@ def judge(
 def settle(session: Session, model: str, judged: Promotion, option: PromotionOption) -> Promotion:
     """The same as of the moment when the version is added: it waits where another one answers by now."""
     serving = registry.answering(session, model) or None
-    if serving == judged.serving or judged.passed is None or option == "always":
+    if serving in (None, judged.serving) or judged.passed is None or option == "always":
         return judged
     reason = f"version {serving} answers since it was judged, and was not compared with it"
     return Promotion(answers=False, passed=False, serving=serving, reason=reason)

@@ -53,7 +53,7 @@ def outcome(api, number):
 
 def test_without_a_held_out_part_a_version_answers_and_is_not_judged(api, judged):
     assert outcome(api, 1) == (True, None, None)
-    assert reason(api, "judged", 1) == "not judged: nothing was held out"
+    assert reason(api, "judged", 1) == "not judged, as nothing was held out"
 
 
 def test_a_version_whose_intervals_are_too_narrow_waits(api, judged):
