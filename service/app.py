@@ -160,7 +160,7 @@ def _open(settings: Settings) -> tuple[Storage, JobQueue, Learners]:
     registry.install_shipped(database, files)
     loaded = LoadedModels(storage, LearntVersions(database, files))
     logger.info("loaded %d models", loaded.preload())
-    jobs = queue_of(settings)(storage, lambda model, _: loaded.adopt(model))
+    jobs = queue_of(settings)(storage, lambda model, _: loaded.changed(model))
     if recovered := jobs.recover():
         logger.warning("queued again after an interruption: %s", ", ".join(recovered))
     learners = Learners(loaded)

@@ -7,7 +7,7 @@ sides meet in time the rows next to the other side belong to neither.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from typing import TYPE_CHECKING, Literal, get_args
@@ -76,13 +76,15 @@ class Parts:
         return len(self.train) - int(np.count_nonzero(self.train)) - int(np.count_nonzero(self.held_out))
 
 
-def split(episode: Numbers, t: Array, how: Split) -> Parts:
+def split(episode: Numbers, t: Array, how: Split, stretches: Sequence[Sequence[int]] | None = None) -> Parts:
     """Hold part of a recording out.
 
-    episode: (N,), equal over one contiguous recording; t: (N,) s. Episodes count as one course of time, in the order of
-    their numbers, for as long as time goes on from one to the next: pieces of a recording with gaps are as near as
-    their times, episodes whose clocks start anew are far from each other. Equal arguments give equal parts, on every
-    machine and in every release, and rows in another order the same parts in that order.
+    episode: (N,), equal over one contiguous recording; t: (N,) s; stretches: rows to hold out in place of what `how`
+    chooses, first and last exclusive, in order of episode and time.
+    Episodes count as one course of time, in the order of their numbers, for as long as time goes on from one to the
+    next: pieces of a recording with gaps are as near as their times, episodes whose clocks start anew are far from each
+    other. Equal arguments give equal parts, on every machine and in every release, and rows in another order the same
+    parts in that order.
     Raise SplitError where nothing is left of a side, ValueError for wrong shapes or times that are not finite.
     """
     if episode.ndim != 1 or episode.shape != t.shape:
@@ -92,7 +94,8 @@ def split(episode: Numbers, t: Array, how: Split) -> Parts:
     if len(t) < 2:
         raise SplitError("rows", len(t), "at least 2, one for each side")
     order = np.lexsort((t, episode))
-    parts = guarded(episode, t, order, _HELD[how.kind](episode[order], how), how.guard_s)
+    held = _HELD[how.kind](episode[order], how) if stretches is None else _within(stretches, len(t))
+    parts = guarded(episode, t, order, held, how.guard_s)
     for side, rows in (("held out", parts.held_out), ("to train on", parts.train)):
         if not rows.any():
             expected = f"fewer: no row {side} is further than {how.guard_s:g} s from the other side"
@@ -144,6 +147,13 @@ def taken(samples: Samples, rows: Mask) -> Samples:
     begins = (np.diff(index) > 1) | (np.diff(samples.episode[index]) != 0)
     numbered = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(begins, dtype=np.int64)])
     return replace(samples.rows(index), episode=numbered[: len(index)])
+
+
+def _within(stretches: Sequence[Sequence[int]], rows: int) -> Mask:
+    held = np.zeros(rows, dtype=bool)
+    for first, last in stretches:
+        held[first:last] = True
+    return held
 
 
 def _episodes(episode: Numbers, how: Split) -> Mask:

@@ -1,7 +1,4 @@
-"""What to judge estimators on: blocks of a recording whose motion the rest of it does not repeat.
-
-A held-out block that repeats motion of the training flatters: it is predicted well by what has only been remembered.
-"""
+"""What to judge on: parts of a recording whose motion the rest of it does not repeat, where there are any."""
 
 from __future__ import annotations
 
@@ -10,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lipcore.data.samples import Array, Samples
-from lipcore.data.splits import GUARD_S, Mask, Numbers, Parts, SplitError, guarded
+from lipcore.data.repetition import REPEATED, features, groups, period, repeated, share_repeated
+from lipcore.data.samples import Samples
+from lipcore.data.splits import GUARD_S, Mask, Numbers, Parts, SplitError, choose, guarded
 
 LEAST_ROWS, LEAST_BLOCKS, MOST_BLOCKS = 60, 4, 20
 """Fewest rows that some are held out of, and how many blocks a recording is divided into."""
@@ -19,15 +17,8 @@ BLOCK_ROWS, BLOCK_S = 15, 4 * GUARD_S
 """Rows and seconds that a block has at least."""
 SHARE = 0.25
 """Of the blocks, held out."""
-NEAR, NEAREST = 0.25, 0.1
-"""Two instants are alike where they lie nearer to each other than half a step from one instant to the next, but nearer
-than the first share of the usual distance of two instants, and no nearer than the second need be."""
-REPEATED = 0.5
-"""Share of a block's instants that have their like elsewhere in time, from which on it repeats."""
-ASKED = 60
-"""Instants of a block that are looked at."""
-LEAST_SPREAD = (0.01, 0.02, 0.1)
-"""Smallest spreads of position, velocity and acceleration that count as motion: rad, rad/s and rad/s² (m)."""
+MOST_EPISODES, MOST_SHARE = 50, 0.5
+"""Most episodes that count as blocks, and largest share that is held out, unless more is asked for: or twice that."""
 
 
 @dataclass(frozen=True)
@@ -50,9 +41,9 @@ def hold_out(samples: Samples, joint_types: Sequence[str]) -> Unseen:
     if len(samples) < LEAST_ROWS:
         raise SplitError("rows", len(samples), f"at least {LEAST_ROWS} to hold some out")
     order = np.lexsort((samples.t, samples.episode))
-    lasts = float(np.maximum(np.diff(samples.t[order]), 0.0).sum())
-    count = int(min(MOST_BLOCKS, len(samples) // BLOCK_ROWS, lasts // BLOCK_S))
+    count = _count(samples.rows(order))
     if count < LEAST_BLOCKS:
+        lasts = float(np.maximum(np.diff(samples.t[order]), 0.0).sum())
         raise SplitError("seconds", round(lasts, 3), f"at least {LEAST_BLOCKS * BLOCK_S:g} to hold some out")
     edges = np.linspace(0, len(samples), count + 1).round().astype(np.int64)
     number = max(1, round(SHARE * count))
@@ -65,38 +56,50 @@ def hold_out(samples: Samples, joint_types: Sequence[str]) -> Unseen:
     return Unseen(guarded(samples.episode, samples.t, order, held, GUARD_S), number, repeats)
 
 
-def features(samples: Samples, joint_types: Sequence[str]) -> Array:
-    """The state of a robot at N instants, (N, k): cos q and sin q, of sliding joints q, dq and ddq, by their spread.
+def unrepeated(samples: Samples, joint_types: Sequence[str], share: float, seed: int) -> list[tuple[int, int]] | None:
+    """Stretches of rows, first and last exclusive, to hold out in place of the last part, where that repeats motion of
+    the rest: groups of blocks that repeat each other and nothing else. None where the last part does not, or nothing
+    else is better.
 
-    joint_types: (n,).
+    A block is a period of the motion, an episode, or one of equal stretches. samples: in order of episode and time;
+    joint_types: (n,); share, seed: see `splits.choose`.
     """
-    turns = np.array([each == "revolute" for each in joint_types])
-    parts = []
-    for angle, least in zip((samples.q, samples.dq, samples.ddq), LEAST_SPREAD, strict=True):
-        columns = angle[:, None, :]
-        if angle is samples.q:
-            columns = np.stack([np.where(turns, np.cos(angle), angle), np.where(turns, np.sin(angle), 0.0)], axis=1)
-        spread = np.sqrt(columns.var(axis=0).sum(axis=0))
-        parts.append((columns / np.maximum(spread, least)).reshape(len(angle), -1))
-    return np.concatenate(parts, axis=1)
+    if len(samples) < LEAST_ROWS:
+        return None
+    states = features(samples, joint_types)
+    first = round((1 - share) * len(samples))
+    if share_repeated(states[:first], states[first:]) < REPEATED:
+        return None
+    edges = _edges(samples, joint_types)
+    if edges is None:
+        return None
+    group, lengths = groups(states, edges), np.diff(edges)
+    sizes = np.bincount(group, weights=lengths).astype(np.int64)
+    if len(sizes) < 2:
+        return None
+    held = np.repeat(choose(sizes, share, seed)[group], lengths)
+    if held.mean() > max(share, min(MOST_SHARE, 2 * share)) or share_repeated(states[~held], states[held]) >= REPEATED:
+        return None
+    border = np.flatnonzero(np.diff(np.concatenate([[False], held, [False]])))
+    return list(zip(border[::2].tolist(), border[1::2].tolist(), strict=True))
 
 
-def repeated(states: Array, edges: Numbers) -> Array:
-    """Share of the instants of each of B blocks that have their like elsewhere in time: (B,).
+def _edges(samples: Samples, joint_types: Sequence[str]) -> Numbers | None:
+    """Where blocks begin and end that may repeat each other; None where there is too little for any."""
+    episodes = samples.episodes()
+    if LEAST_BLOCKS <= len(episodes) <= MOST_EPISODES:
+        return np.array([0, *(each.stop for each in episodes)], np.int64)
+    again = period(samples, joint_types) if len(episodes) == 1 else None
+    if again is not None:
+        number = (samples.t - samples.t[0]) / again
+        several = max(1, int(np.ceil(number[-1] / MOST_BLOCKS)))
+        begins = np.flatnonzero(np.diff(np.floor(number / several))) + 1
+        return np.array([0, *begins.tolist(), len(samples)], np.int64)
+    count = _count(samples)
+    return None if count < LEAST_BLOCKS else np.linspace(0, len(samples), count + 1).round().astype(np.int64)
 
-    states: (N, k), in order of time; edges: (B + 1,), where blocks begin and end. Elsewhere is neither in the block nor
-    in those beside it, which a motion leaves and enters slowly.
-    """
-    usual = np.sqrt(2 * states.var(axis=0).sum())
-    steps = np.linalg.norm(np.diff(states, axis=0, append=states[-2:-1]), axis=1)
-    limits = np.clip(0.5 * steps, NEAREST * usual, NEAR * usual)
-    squares = np.square(states).sum(axis=1)
-    shares = np.zeros(len(edges) - 1)
-    for block in range(len(shares)):
-        rows = np.unique(np.linspace(edges[block], edges[block + 1] - 1, ASKED).round().astype(np.int64))
-        near = slice(edges[max(block - 1, 0)], edges[min(block + 2, len(shares))])
-        elsewhere = np.delete(np.arange(len(states)), near)
-        if len(elsewhere):
-            nearest = (squares[elsewhere] - 2 * states[rows] @ states[elsewhere].T).min(axis=1) + squares[rows]
-            shares[block] = np.mean(np.sqrt(np.maximum(nearest, 0.0)) <= limits[rows])
-    return shares
+
+def _count(samples: Samples) -> int:
+    """Blocks of equal length that samples in order are divided into."""
+    lasts = float(np.maximum(np.diff(samples.t), 0.0).sum())
+    return int(min(MOST_BLOCKS, len(samples) // BLOCK_ROWS, lasts // BLOCK_S))

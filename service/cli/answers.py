@@ -11,7 +11,7 @@ from rich.table import Table
 
 from lipcore.vocabulary import COMPONENTS
 from service.cli.connecting import connected, dataset_of
-from service.cli.consoles import out, print_json
+from service.cli.consoles import out, print_json, print_warnings
 from service.cli.options import Alias, Data, Json, Model, Url, Version, alone, group, names, numbers
 from service.foundation.settings import DEFAULT_URL
 
@@ -96,6 +96,7 @@ def evaluate(
     from service.cli.tables import evaluation_table  # noqa: PLC0415 - takes long to import; help needs none
 
     out.print(evaluation_table(answer))
+    print_warnings(answer.warnings)
 
 
 bench_app = group("Measure this machine.")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,6 +30,12 @@ def echo(text: str) -> None:
 def note(text: str) -> None:
     """Print a line that is no result to standard error."""
     err.print(escape(text), highlight=False, soft_wrap=True)
+
+
+def print_warnings(texts: Iterable[str]) -> None:
+    """Print what to be careful with, a line each."""
+    for text in texts:
+        out.print(f"[yellow]careful:[/yellow] {escape(text)}", highlight=False, soft_wrap=True)
 
 
 def print_json(value: Any, one_line: bool = False) -> None:

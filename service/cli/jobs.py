@@ -15,8 +15,8 @@ from lipcore.vocabulary import CHOICES, DEFAULT_ESTIMATOR
 from service.cli import connecting
 from service.cli.connecting import connected, dataset_of, watch
 from service.cli.consoles import INTERRUPTED, CommandError, echo, note, out, print_json
-from service.cli.models import print_selection
-from service.cli.options import HELD_OUT_BY, JobId, Json, Limit, Url, alone, group, names, pairs
+from service.cli.models import print_held_out, print_promotion, print_selection
+from service.cli.options import HELD_OUT_BY, PROMOTION, JobId, Json, Limit, Url, alone, group, names, pairs
 from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
@@ -137,8 +137,17 @@ def train(
     hold_out_by: Annotated[
         str | None,
         typer.Option(
-            help="What is held out: whole `episodes`, the `last` part (default), or some of ten `blocks`.",
+            help="What is held out: the `last` part, whole `episodes`, some of ten `blocks`; or `auto` (default), the "
+            "last part, unless that repeats what is trained on and other motion does not.",
             autocompletion=lambda: HELD_OUT_BY,
+        ),
+    ] = None,
+    promotion: Annotated[
+        str | None,
+        typer.Option(
+            help="Whether the version answers: `ask`, if it does well on what was held out, or `always`; by default as "
+            "the service is set.",
+            autocompletion=lambda: PROMOTION,
         ),
     ] = None,
     wait: Annotated[bool, typer.Option(help="Wait for the job's end; --no-wait leaves it to `lipserve jobs`.")] = True,
@@ -165,6 +174,7 @@ def train(
             options or None,
             robot=robot,
             holdout=asked or None,
+            promotion=promotion,  # type: ignore[arg-type]  # the service checks it
             idempotency_key=new_key(),
         )
         try:
@@ -189,14 +199,18 @@ def train(
     if not wait:
         echo(f"{job.id} is queued: `lipserve jobs follow {job.id}`")
         return
-    echo(f"{model} version {job.version} is trained and answers")
-    if made is not None and made.selection is not None:
+    if made is None:
+        return
+    judged = made.promotion
+    waits = judged is not None and not judged.answers
+    echo(f"{model} version {job.version} is trained and {'waits as candidate' if waits else 'answers'}")
+    if made.selection is not None:
         print_selection(made.selection)
-    if made is not None and asked:
-        from service.cli.tables import figures_table  # noqa: PLC0415 - as above
-
-        held = made.lineage["holdout"]
-        out.print(figures_table(f"on {held['samples']} samples held out", made.joint_names, held))
+    if asked:
+        print_held_out(made)
+    print_promotion(made)
+    if waits:
+        note(f"`lipserve models promote {model} {job.version}` lets it answer all the same")
 
 
 def _value(text: str) -> Any:

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from service.cli import connecting
 from service.cli.connecting import connected, dataset_of
-from service.cli.consoles import CommandError, echo, note, out, print_json, print_result
+from service.cli.consoles import CommandError, echo, note, out, print_json, print_result, print_warnings
 from service.cli.options import Alias, Data, Json, Limit, Model, Url, Version, Yes, confirm, group
 from service.foundation.settings import DEFAULT_URL
 
@@ -154,8 +154,7 @@ def compare(
 
     out.print(comparison_table(comparison))
     echo(comparison.verdict)
-    for warning in comparison.warnings:
-        out.print(f"[yellow]careful:[/yellow] {escape(warning)}", highlight=False)
+    print_warnings(comparison.warnings)
 
 
 @app.command("export")
@@ -245,6 +244,26 @@ def print_selection(selection: Selection) -> None:
         echo("  all of the motion repeats itself, also what was held out: these figures flatter")
 
 
+def print_held_out(version: VersionRecord) -> None:
+    """Print how well a version predicts what its training held out."""
+    from service.cli.tables import figures_table  # noqa: PLC0415 - takes long to import; help needs none
+
+    held = version.lineage["holdout"]
+    out.print(figures_table(f"on {held['samples']} samples held out", version.joint_names, held))
+    print_warnings(held.get("warnings", ()))
+
+
+def print_promotion(version: VersionRecord) -> None:
+    """Print why a version answers by itself, or does not; nothing where it was not judged."""
+    judged = version.promotion
+    if judged is None or judged.passed is None:
+        return
+    if judged.passed:
+        echo(f"  it answers by itself: {judged.reason}")
+    else:
+        print_warnings([judged.reason])
+
+
 def _print_version(version: VersionRecord) -> None:
     names = version.joint_names
     echo(f"version {version.version}: {version.estimator}, {len(names)} joints: {', '.join(names)}")
@@ -256,15 +275,12 @@ def _print_version(version: VersionRecord) -> None:
     sets = [each.get("name") or each.get("id") for each in lineage.get("datasets") or () if isinstance(each, dict)]
     if sets:
         echo(f"  trained on {', '.join(map(str, sets))}")
-    held = lineage.get("holdout")
-    if held is not None:
-        from service.cli.tables import figures_table  # noqa: PLC0415 - takes long to import; help needs none
-
-        out.print(figures_table(f"on {held['samples']} samples held out", names, held))
+    if lineage.get("holdout") is not None:
+        print_held_out(version)
     else:
         echo("  nothing was held out of its data: `lipserve evaluate` on a recording it has not seen tells how good")
-    for warning in version.warnings:
-        out.print(f"[yellow]careful:[/yellow] {escape(warning)}", highlight=False)
+    print_promotion(version)
+    print_warnings(version.warnings)
     arm = version.arm
     if arm is not None:
         from service.cli.tables import arm_tables  # noqa: PLC0415 - as above

@@ -17,7 +17,8 @@ ROBOTS = [
     *("pr2-left", "pr2-right", "talos-left", "tiago", "tiago-pro-left", "tiago-pro-right", "double-pendulum"),
     *("asr-twodof", "finger-edu"),
 ]
-HELD_OUT_BY = ["last", "episodes", "blocks"]
+HELD_OUT_BY = ["auto", "last", "episodes", "blocks"]
+PROMOTION = ["ask", "always"]
 
 
 Url = Annotated[

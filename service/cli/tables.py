@@ -36,18 +36,24 @@ def prediction_tables(answer: Prediction) -> list[Table]:
     return [joints, *matrices, *([numbers] if numbers.row_count else [])]
 
 
+FIGURES = ("nmse", "rmse", "coverage", "coverage_low", "coverage_high", "independent", "interval_width", "nlpd")
+"""Of each joint."""
+
+
 def evaluation_table(result: Evaluation) -> Table:
     """Figures of an evaluation, joint by joint."""
-    figures = {name: getattr(result, name).tolist() for name in ("nmse", "rmse", "coverage", "nlpd")}
+    figures = {name: getattr(result, name).tolist() for name in FIGURES}
     return figures_table(result.title, result.joint_names, figures)
 
 
 def figures_table(title: str, joint_names: Sequence[str], figures: Mapping[str, Sequence[float | None]]) -> Table:
-    """nmse, rmse, coverage and nlpd per joint, as an evaluation or a version's lineage tells them."""
-    table = Table("joint", "nMSE", "RMSE N·m", "coverage of 95%", "NLPD nats", title=title)
-    columns = [figures[name] for name in ("nmse", "rmse", "coverage", "nlpd")]
-    for joint, nmse, rmse, coverage, nlpd in zip(joint_names, *columns, strict=True):
-        table.add_row(joint, _figure(nmse, ".2e"), _figure(rmse, ".4f"), _figure(coverage, ".1%"), _figure(nlpd, ".3f"))
+    """Figures per joint, as an evaluation or a version's lineage tells them; older lineages have fewer."""
+    table = Table("joint", "nMSE", "RMSE N·m", "coverage of 95%", "known to be", "width N·m", "NLPD nats", title=title)
+    columns = [figures.get(name) or [None] * len(joint_names) for name in FIGURES]
+    for joint, nmse, rmse, coverage, low, high, count, width, nlpd in zip(joint_names, *columns, strict=True):
+        known = "-" if count is None else f"{low:.0%} to {high:.0%}, by {count:.0f} errors"
+        cells = [_figure(nmse, ".2e"), _figure(rmse, ".4f"), _figure(coverage, ".1%"), known]
+        table.add_row(joint, *cells, _figure(width, ".3f"), _figure(nlpd, ".3f"))
     return table
 
 

@@ -182,6 +182,11 @@ class Settings(BaseSettings):
     )
     refresh_pause_s: float = Field(600.0, ge=0, description="Shortest time between two automatic refreshes, s.")
     max_refresh_samples: Count = Field(200_000, description="Most logged samples that a refresh learns from.")
+    promotion: Literal["ask", "always"] = Field(
+        "ask",
+        description="Whether a version that was trained answers by itself: `ask`, if it does well on what was held "
+        "out, else it waits under the alias `candidate`; `always`, in any case. A job may say otherwise.",
+    )
     promotion_rows: Count = Field(2000, description="Samples on which a refreshed version must be better.")
     promotion_patience_s: float = Field(3600.0, gt=0, description="Time after which one that is not is dismissed, s.")
 

@@ -11,21 +11,22 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.data.metrics import LEVELS, RELIABILITY_LEVELS, Metrics
+from lipcore.data.coverage import coverage_interval
+from lipcore.data.metrics import LEVELS, RELIABILITY_LEVELS, Answer, Metrics
 from lipcore.data.metrics import evaluate as compare
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array, Samples
 from lipcore.model import dynamics
 from service.datasets import store
-from service.foundation.errors import invalid_request
+from service.foundation.errors import DamagedDataError, invalid_request
 from service.foundation.fields import finite
 from service.inference import schema
 from service.inference.predicting import check_offered
-from service.models import registry
+from service.models import lineage, registry
 from service.models.loaded import LoadedModels, Served
 from service.storage import sample_file
 from service.storage.database import DatasetRow
-from service.training import holding_out
+from service.training import holding_out, repeating
 from service.training.holding_out import CannotHoldOutError, SetSplit
 
 FEWEST_EPISODES, MOST_EPISODES = 5, 200
@@ -131,6 +132,8 @@ def evaluate(
     used = recorded.used
     answer = known.predict(used.q, used.dq, used.ddq)
     metrics = compare(used.tau, answer.tau, answer.tau_std, answer.noise_std)
+    interval = coverage_interval(used, Answer(answer.tau, answer.tau_std, answer.noise_std))
+    in_training = all_of_it and served.has_learnt_from(recorded.id, recorded.sha256)
     return schema.EvaluateResponse(
         model=served.name,
         version=served.version,
@@ -142,14 +145,28 @@ def evaluate(
         samples_used=len(used),
         level=metrics.level,
         **figures(metrics),
+        **lineage.known(interval),
         coverages=[
             schema.Interval(level=each, coverage=coverage.tolist(), interval_width=width.tolist())
             for each, coverage, width in zip(LEVELS, metrics.coverages, metrics.widths, strict=True)
         ],
         reliability=schema.Reliability(nominal=list(RELIABILITY_LEVELS), observed=metrics.reliability.T.tolist()),
         stretches=stretches(used, answer.tau),
-        in_training=all_of_it and served.has_learnt_from(recorded.id, recorded.sha256),
+        in_training=in_training,
+        **_repeats(loaded, served, used, in_training),
     )
+
+
+def _repeats(loaded: LoadedModels, served: Served, used: Samples, in_training: bool) -> dict[str, Any]:
+    """How much of the samples repeats what a version was trained on, where it was not trained on these."""
+    if in_training:
+        return repeating.look([], used, served.model.joint_types)
+    version = registry.find(loaded.database, served.name, served.version)
+    try:
+        training = repeating.trained_on(loaded.database, loaded.files, version.manifest["lineage"])
+        return repeating.look(training, used, served.model.joint_types)
+    except (CannotHoldOutError, DamagedDataError) as error:  # the samples judged can be read, and figures be had
+        return {**repeating.look([], used, ()), "warnings": [f"whether they repeat the training is not known: {error}"]}
 
 
 def figures(metrics: Metrics) -> dict[str, Any]:

@@ -200,9 +200,21 @@ class EvaluateResponse(BaseModel):
     coverages: list[Interval] = Field(description="Coverage and width of the 50, 80, 95 and 99 % intervals")
     reliability: Reliability
     stretches: Stretches
+    independent: list[float] = Field(
+        description="Independent errors that the coverage stands on: neighbouring ones tell the same"
+    )
+    coverage_low: list[float] = Field(description="Lower end of the coverage's 95 % confidence interval, from these")
+    coverage_high: list[float] = Field(description="Its upper end: where it is below 0.9, intervals are too narrow")
     in_training: bool = Field(
         description="Whether the model was trained on these samples: then the figures flatter. Not on what it held out"
     )
+    repeats_training: float | None = Field(
+        description="Share of the samples whose motion (position, velocity and acceleration) repeats what the version "
+        "was trained on, so that figures flatter; null where it was trained on these samples, and where its data sets "
+        "are gone"
+    )
+    period_s: float | None = Field(description="Time after which that motion repeats itself, s; null where it does not")
+    warnings: list[str] = Field(description="What else makes the figures flatter")
 
 
 TraceComponent = Literal["inertial", "coriolis", "gravity", "friction"]

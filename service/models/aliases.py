@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sqlalchemy import func, select
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from service.foundation.errors import ConflictError, invalid_request, not_found
@@ -17,8 +17,7 @@ def page(loaded: LoadedModels, model: str) -> AliasList:
     """Every alias of a model, `serving` first; raise NotFoundError."""
     with loaded.moving, loaded.database.session() as session:  # all of it as of one moment
         _check_model(session, model)
-        names = list(session.scalars(select(AliasRow.alias).where(AliasRow.model == model).order_by(AliasRow.alias)))
-        return AliasList(items=[_show(loaded, session, model, name) for name in (SERVING, *names)])
+        return AliasList(items=[_show(loaded, session, model, name) for name in (SERVING, *names(session, model))])
 
 
 def put(loaded: LoadedModels, model: str, alias: str, request: AliasRequest) -> Alias:
@@ -139,10 +138,14 @@ def _check_model(session: Session, model: str) -> None:
         raise not_found("model", model)
 
 
+def names(session: Session, model: str) -> list[str]:
+    """The aliases of a model but for `serving`, in order."""
+    return list(session.scalars(select(AliasRow.alias).where(AliasRow.model == model).order_by(AliasRow.alias)))
+
+
 def _check_room(loaded: LoadedModels, session: Session, model: str, alias: str) -> None:
-    most = loaded.storage.settings.max_aliases
-    known = session.scalar(select(func.count()).select_from(AliasRow).where(AliasRow.model == model)) or 0
-    if session.get(AliasRow, (model, alias)) is None and known >= most:
+    most, known = loaded.storage.settings.max_aliases, names(session, model)
+    if alias not in known and len(known) >= most:
         raise ConflictError(f"model {model!r} has {most} aliases, the most it may have: remove one first")
 
 

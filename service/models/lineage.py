@@ -13,6 +13,8 @@ import numpy as np
 import torch
 
 from lipcore.data import metrics
+from lipcore.data.coverage import CoverageInterval, coverage_interval
+from lipcore.data.metrics import Answer
 from lipcore.data.samples import Samples
 from lipcore.files.manifest import FORMAT_VERSION
 from lipcore.model.torque_model import TorqueModel
@@ -68,14 +70,31 @@ def learnt_from(lineage: dict[str, Any]) -> frozenset[str]:
 
 def figures(model: TorqueModel, samples: Samples, most: int, of: int) -> dict[str, Any]:
     """How well a model answers for samples, thinned evenly to at most so many of them; `of`: how many they stand for.
-    Per joint: nmse (None where the torque did not vary), rmse in N·m, coverage of the 95 % interval, nlpd in nats."""
+    Per joint: nmse (None where the torque did not vary), rmse in N·m, coverage of the 95 % interval with the confidence
+    interval from so many `independent` errors, the width of the former in N·m, and nlpd in nats."""
     count = min(len(samples), most)
     used = samples.rows(np.linspace(0, len(samples) - 1, count).round().astype(np.int64))
-    # not by the compiled form of the model: a process that trains and never serves would wait for it
-    answer = model.posterior.predict(used.motion())
-    compared = metrics.evaluate(used.tau, answer.mean.numpy(), answer.std.numpy(), model.noise_std)
+    answer = answer_of(model, used)
+    compared = metrics.evaluate(used.tau, *answer)
     per_joint = {name: finite(getattr(compared, name)) for name in ("nmse", "rmse", "coverage", "nlpd")}
-    return {"samples": len(used), "of": of, **per_joint}
+    width = {"interval_width": compared.width.tolist()}
+    return {"samples": len(used), "of": of, **per_joint, **width, **known(coverage_interval(used, answer))}
+
+
+def answer_of(model: TorqueModel, samples: Samples) -> Answer:
+    """What a model predicts of samples, not by its compiled form: a process that trains and never serves would wait for
+    that."""
+    answer = model.posterior.predict(samples.motion())
+    return Answer(answer.mean.numpy(), answer.std.numpy(), model.noise_std)
+
+
+def known(interval: CoverageInterval) -> dict[str, list[float]]:
+    """How far coverages are known, as the API and lineages name it."""
+    return {
+        "independent": interval.independent.tolist(),
+        "coverage_low": interval.low.tolist(),
+        "coverage_high": interval.high.tolist(),
+    }
 
 
 @cache

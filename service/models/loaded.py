@@ -185,6 +185,13 @@ class LoadedModels:
             if serving.change > known[model].change:
                 self.adopt(model)
 
+    def changed(self, model: str) -> None:
+        """Answer with what a job has changed of a model: the version that serves, and where its aliases point. Not for
+        the event loop."""
+        with self.moving:
+            self.repoint(registry.pointers(self.database, [model]), [model])
+        self.adopt(model)
+
     def adopt(self, model: str) -> None:
         """Load the version of a model that now serves, and answer with it. Not for the event loop."""
         for serving in registry.serving(self.database, [model]).values():

@@ -14,7 +14,7 @@ import lipcore
 from lipcore.files.persistence import checksums, read_manifest
 from service.foundation.errors import NotFoundError, not_found
 from service.foundation.settings import shipped_models
-from service.models.schema import Model, ModelPage, Version, VersionSummary
+from service.models.schema import Model, ModelPage, Promotion, Version, VersionSummary
 from service.storage.database import (
     AliasMoveRow,
     AliasRow,
@@ -52,11 +52,12 @@ def publish(
     job: str | None,
     candidate: bool = False,
     start: int | None = None,
+    promotion: Promotion | None = None,
 ) -> int:
     """Add a version whose files are complete; it is visible once the session commits. Return its number.
 
     It answers from then on, unless it is a candidate for that of a model that has a version. start: number of the last
-    event of the model that it contains by training, the newest where None.
+    event of the model that it contains by training, the newest where None; promotion: why it answers, or does not.
     """
     row, latest = _row(session, model), _newest(session, model)
     if latest and session.get(ServingRow, model) is None:  # of a home from before there were candidates
@@ -69,7 +70,7 @@ def publish(
             folder=folder,
             created_at=now(),
             job=job,
-            manifest=manifest,
+            manifest=manifest if promotion is None else {**manifest, "promotion": promotion.model_dump()},
             checksums=checksums(manifest),
         )
     )

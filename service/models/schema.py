@@ -48,6 +48,18 @@ class Selection(BaseModel):
     table: list[SelectionCandidate] = Field(description="All that were trained, what knows most of the arm first")
 
 
+class Promotion(BaseModel):
+    """Whether a version that was trained answers by itself, and why: judged by what its training held out."""
+
+    answers: bool = Field(description="Whether it answered once it was trained; else it waits under alias `candidate`")
+    passed: bool | None = Field(
+        description="Whether its intervals hold 90 % on every joint, as far as can be told, and it is not worse than "
+        "the version that serves; null where it was not judged"
+    )
+    serving: int | None = Field(description="The version that answered until then; null where it is the first")
+    reason: str
+
+
 class Version(BaseModel):
     """An immutable trained version."""
 
@@ -81,6 +93,9 @@ class Version(BaseModel):
         description="Data sets with their hashes, when and with which `software` it was trained, and how well it fits "
         "them (`training_metrics`); of an imported version also where it comes from (`imported`)"
     )
+    promotion: Promotion | None = Field(
+        None, description="Whether it answers by itself; null for one that was refreshed, imported or shipped"
+    )
     selection: Selection | None = Field(
         None, description="How the estimator was chosen; null where it was named when the training was asked for"
     )
@@ -108,8 +123,8 @@ class Model(BaseModel):
     created_at: str
     latest_version: int = Field(description="The newest version")
     serving_version: int = Field(
-        description="The version that answers where none is named: the newest, unless that is a refreshed one that has "
-        "yet to prove better, or an earlier one was chosen"
+        description="The version that answers where none is named: the newest, unless that waits as candidate, or an "
+        "earlier one was chosen"
     )
     aliases: dict[str, int] = Field(description="Names that were given to versions, `serving` aside")
     versions: list[VersionSummary]
@@ -162,15 +177,21 @@ class AliasList(BaseModel):
 _DEFAULTS = Split()
 
 
+HoldoutKind = Literal["auto", Kind]
+"""How a part is chosen to be held out; `auto` looks at the motion."""
+
+
 class Holdout(BaseModel):
     """Part of the data that is not learnt from, so that the version can be evaluated on it: never rows at random."""
 
     model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [{"share": 0.3}]})
 
-    kind: Kind = Field(
-        _DEFAULTS.kind,
-        description="Of each data set: whole `episodes`, chosen by the seed; its `last` part; or some of many equal "
-        "`blocks`, chosen by the seed. Of several data sets of one episode each, `episodes` holds out whole data sets",
+    kind: HoldoutKind = Field(
+        "auto",
+        description="Of each data set: whole `episodes`, chosen by the seed; its `last` part; some of many equal "
+        "`blocks`, chosen by the seed; or `auto`, the last part, unless that repeats motion that is learnt from and "
+        "there are periods, episodes or stretches of motion that do not: then some of these, chosen by the seed. Of "
+        "several data sets of one episode each, `episodes` holds out whole data sets",
     )
     share: float = Field(
         _DEFAULTS.share, gt=0, lt=1, description="Of the samples, as nearly as whole episodes or blocks allow"
@@ -198,6 +219,14 @@ class HeldOutSet(BaseModel):
     guard_unit: Literal["s", "rows"]
     rows: int = Field(ge=1, lt=2**63, description="Samples held out")
     guarded: int = Field(ge=0, lt=2**63, description="Samples left out of both sides")
+    stretches: (
+        list[Annotated[list[Annotated[int, Field(ge=0, lt=2**63)]], Field(min_length=2, max_length=2)]] | None
+    ) = Field(
+        None,
+        max_length=1000,
+        description="Which rows these were before the guard, first and last exclusive, in order of episode and "
+        "time; null where the split alone says it",
+    )
 
 
 class HoldoutLineage(BaseModel):

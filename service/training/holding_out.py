@@ -6,7 +6,7 @@ of the same samples, which neither has seen.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -30,14 +30,16 @@ class CannotHoldOutError(ValueError):
 
 @dataclass(frozen=True)
 class SetSplit:
-    """How one data set is split. entire: nothing of it is learnt from; guard: in `unit`; known: rows held out and
-    guarded where it was split before."""
+    """How one data set is split. entire: nothing of it is learnt from; guard: in `unit`; stretches: rows to hold out
+    in order of episode and time, None where `asked` alone says which; known: rows held out and guarded where it was
+    split before."""
 
     dataset: str
     asked: Holdout
     entire: bool
     guard: float
     unit: Literal["s", "rows"]
+    stretches: list[list[int]] | None = None
     known: tuple[int, int] | None = None
 
     @property
@@ -52,9 +54,11 @@ class SetSplit:
         if self.entire:
             parts = Parts(np.zeros(len(t), dtype=bool), np.ones(len(t), dtype=bool))
         else:
-            how = Split(self.asked.kind, self.asked.share, self.asked.blocks, self.guard, self.asked.seed)
+            kind = "last" if self.asked.kind == "auto" else self.asked.kind
+            how = Split(kind, self.asked.share, self.asked.blocks, self.guard, self.asked.seed)
+            clock = t if self.unit == "s" else np.arange(len(t), dtype=np.float64)
             try:
-                parts = split(episode, t if self.unit == "s" else np.arange(len(t), dtype=np.float64), how)
+                parts = split(episode, clock, how, self.stretches)
             except SplitError as error:
                 raise CannotHoldOutError(f"data set {self.dataset!r}: {error}") from error
         counts = (int(np.count_nonzero(parts.held_out)), parts.guarded)
@@ -99,9 +103,15 @@ def check(rows: Sequence[DatasetRow], asked: Holdout, min_samples: int) -> None:
         raise invalid_request("holdout.share", asked.share, expected)
 
 
-def hold_out(rows: Sequence[DatasetRow], clocks: Sequence[Clock], asked: Holdout) -> Divided:
+def hold_out(
+    rows: Sequence[DatasetRow],
+    clocks: Sequence[Clock],
+    asked: Holdout,
+    unrepeated: Callable[[int], list[list[int]] | None],
+) -> Divided:
     """Divide data sets for the first time; raise CannotHoldOutError.
 
+    unrepeated: what to hold out of the data set at a place where `auto` is asked for; None: its last part.
     Each is split on its own, but those of one episode stand for an episode where whole ones are held out. What it does
     to a data set does not depend on the order of the others.
     """
@@ -110,9 +120,9 @@ def hold_out(rows: Sequence[DatasetRow], clocks: Sequence[Clock], asked: Holdout
         single = set()
     entire = _entire([row for row in rows if row.id in single], asked) if len(single) > 1 else set()
     splits = {}
-    for row in rows:
+    for place, row in enumerate(rows):
         if row.id in entire or row.id not in single:  # else the one episode that it has is learnt from
-            splits[row.id] = _first(row, asked, row.id in entire)
+            splits[row.id] = _first(row, asked, row.id in entire, unrepeated(place) if asked.kind == "auto" else None)
     return _divide(rows, clocks, splits)
 
 
@@ -131,7 +141,7 @@ def remembered(row: DatasetRow, lineage: dict[str, Any]) -> SetSplit | None:
     for each in sorted(holdout.datasets, key=lambda one: one.id != row.id):  # itself first
         if row.id == each.id or row.sha256 == each.sha256:
             counts = (each.rows, each.guarded)
-            return SetSplit(row.id, holdout.split, each.whole, each.guard, each.guard_unit, counts)
+            return SetSplit(row.id, holdout.split, each.whole, each.guard, each.guard_unit, each.stretches, counts)
     return None
 
 
@@ -157,6 +167,7 @@ def _divide(rows: Sequence[DatasetRow], clocks: Sequence[Clock], splits: dict[st
                 guard_unit=how.unit,
                 rows=int(np.count_nonzero(parts.held_out)),
                 guarded=parts.guarded,
+                stretches=how.stretches,
             )
         )
     if not sets:
@@ -166,15 +177,15 @@ def _divide(rows: Sequence[DatasetRow], clocks: Sequence[Clock], splits: dict[st
     return Divided(train, held, HoldoutLineage(split=asked, datasets=sets, **total))
 
 
-def _first(row: DatasetRow, asked: Holdout, entire: bool) -> SetSplit:
+def _first(row: DatasetRow, asked: Holdout, entire: bool, stretches: list[list[int]] | None) -> SetSplit:
     """How a data set is split that was not split before."""
     if not _is_timed(row):
-        return SetSplit(row.id, asked, entire, UNTIMED_GUARD, "rows")
+        return SetSplit(row.id, asked, entire, UNTIMED_GUARD, "rows", stretches)
     guard = asked.guard_s
     if guard is None:  # one period of the low-pass that it was prepared with, where it says so
         cutoff = (row.report.get("recipe") or {}).get("cutoff_hz")
         guard = GUARD_S if cutoff is None else 1.0 / float(cutoff)
-    return SetSplit(row.id, asked, entire, guard, "s")
+    return SetSplit(row.id, asked, entire, guard, "s", stretches)
 
 
 def _entire(rows: Sequence[DatasetRow], asked: Holdout) -> set[str]:

@@ -12,6 +12,7 @@ from service.foundation.states import JobState
 from service.models.schema import Holdout, ModelName
 
 _DEFAULTS = FitOptions()
+PromotionOption = Literal["ask", "always"]
 
 
 class Options(BaseModel):
@@ -91,6 +92,12 @@ class JobRequest(BaseModel):
         None,
         description="What to hold out of the data sets, to evaluate the version on: its lineage keeps the figures",
     )
+    promotion: PromotionOption | None = Field(
+        None,
+        description="Whether the version answers by itself: `ask`, if on what was held out its 95 % intervals hold "
+        "90 % on every joint, as far as can be told, and it is not worse than the version that serves, else it waits "
+        "under the alias `candidate`; `always`, in any case. The setting LIPSERVE_PROMOTION by default",
+    )
 
 
 class JobProgress(BaseModel):
@@ -149,6 +156,9 @@ class Job(BaseModel):
     datasets: list[str]
     holdout: Holdout | None = Field(
         None, description="What it holds out of the data sets; a refresh holds out what its version held out"
+    )
+    promotion: PromotionOption | None = Field(
+        None, description="What was asked for; the version's `promotion` says what came of it"
     )
     refresh: Refresh | None = Field(None, description="What it refreshes; null for a job with data sets alone")
     progress: JobProgress

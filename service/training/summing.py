@@ -30,7 +30,8 @@ from service.compute.executors import placed, sent, shard_executor, summed
 from service.foundation.settings import Settings
 from service.storage.files import PATIENCE_S, Files
 from service.storage.sample_file import Reader
-from service.training.material import Material, Shard, Table
+from service.training.material import Material
+from service.training.table import Shard, Table
 
 Made = TypeVar("Made")
 

@@ -22,13 +22,15 @@ from service.foundation.settings import Settings
 from service.foundation.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, JobState
 from service.models import registry
 from service.models.lineage import MOST_SAMPLES, figures, software
+from service.models.schema import Promotion
 from service.storage.database import Database, JobRow, LearnerRow, now
 from service.storage.files import PATIENCE_S, Files
 from service.storage.storage import Disk
-from service.training import lifecycle, refresh_data
+from service.training import lifecycle, promotion, refresh_data, repeating
 from service.training.holding_out import CannotHoldOutError
 from service.training.material import CANDIDATES, Material, observed, recorded
 from service.training.pulse import Pulse, Remaining, SupersededError
+from service.training.schema import PromotionOption
 from service.training.summing import all_rows
 from service.web import storage_errors
 from service.web.observability.logs import job_id
@@ -102,7 +104,9 @@ def _train(settings: Settings, database: Database, files: Files, claim: Claim) -
                 pulse.stage("evaluating")
                 held_out, of = material.held_out
                 held_out_figures = figures(trained, held_out, settings.max_evaluation_samples, of)
-                lineage["holdout"] = {**lineage["holdout"], **held_out_figures}
+                repeats = repeating.look(material.table.parts, held_out, trained.joint_types)
+                lineage["holdout"] = {**lineage["holdout"], **held_out_figures, **repeats}
+            judged = _judged(settings, database, files, claim, material, trained, lineage)
             pulse.stage("saving")
             folder = lifecycle.new_folder(claim.job)
             Disk(settings).require()
@@ -112,9 +116,9 @@ def _train(settings: Settings, database: Database, files: Files, claim: Claim) -
             row = _own(session, claim)
             if row.cancel_requested:
                 raise lipcore.FitCancelledError("cancelled after the last look at the flag")
-            row.version = _publish(session, claim, material, folder, manifest)
+            row.version, outcome = _publish(session, settings, claim, material, folder, manifest, judged)
             row.progress = {**pulse.as_json(), "stage": "done", "fraction": 1.0, "remaining_s": 0.0}
-            lifecycle.enter(row, SUCCEEDED, f"version {row.version} is trained")
+            lifecycle.enter(row, SUCCEEDED, f"version {row.version} is trained{outcome}")
     except lipcore.FitCancelledError:
         _finish(database, files, claim, CANCELLED, "cancelled while it ran")
     except SupersededError:
@@ -157,16 +161,52 @@ def _fit(settings: Settings, claim: Claim, material: Material, pulse: Pulse) -> 
     return all_rows(settings, trained, material, table, options, pulse.cancelled, pulse.share)
 
 
-def _publish(session: Session, claim: Claim, material: Material, folder: str, manifest: dict[str, Any]) -> int:
-    """Add the version that was trained: it answers from then on; one of a refresh has to prove better first."""
-    refresh = claim.request.get("refresh")
-    if refresh is None:
-        return registry.publish(session, claim.model, folder, manifest, claim.job)
+def _option(settings: Settings, claim: Claim) -> PromotionOption:
+    """Whether the version answers by itself, as the job or else the settings say."""
+    option: PromotionOption = claim.request.get("promotion") or settings.promotion
+    return option
+
+
+def _judged(
+    settings: Settings,
+    database: Database,
+    files: Files,
+    claim: Claim,
+    material: Material,
+    trained: TorqueModel,
+    lineage: dict[str, Any],
+) -> Promotion | None:
+    """Whether the version answers by itself; None for one of a refresh, which has to prove better first."""
+    if claim.request.get("refresh") is not None:
+        return None
+    held_out = None if material.held_out is None else material.held_out[0]
+    return promotion.judge(database, files, claim.model, trained, held_out, lineage, _option(settings, claim))
+
+
+def _publish(
+    session: Session,
+    settings: Settings,
+    claim: Claim,
+    material: Material,
+    folder: str,
+    manifest: dict[str, Any],
+    judged: Promotion | None,
+) -> tuple[int, str]:
+    """Add the version that was trained; return its number, and in words what came of it where it was judged."""
+    if judged is not None:
+        judged = promotion.settle(session, claim.model, judged, _option(settings, claim))
+        waits = not judged.answers
+        version = registry.publish(session, claim.model, folder, manifest, claim.job, candidate=waits, promotion=judged)
+        if waits:
+            promotion.wait(session, claim.model, version, settings.max_aliases)
+        return version, f" and {'waits as candidate' if waits else 'answers'}: {judged.reason}"
+    refresh = claim.request["refresh"]
     if refresh_data.taken_back(session, claim.model, refresh["through"], material.seen):
         raise TakenBackError("part of what was observed has been taken back while it was trained on: refresh again")
     earlier = (LearnerRow.model == claim.model, LearnerRow.role == "candidate")
     session.execute(update(LearnerRow).where(*earlier).values(role="dismissed"))  # the newer one has seen more
-    return registry.publish(session, claim.model, folder, manifest, claim.job, candidate=True, start=refresh["through"])
+    start = refresh["through"]
+    return registry.publish(session, claim.model, folder, manifest, claim.job, candidate=True, start=start), ""
 
 
 def _code(error: Exception) -> str:

@@ -1,7 +1,9 @@
 """A model's page: what is drawn of a long recording, where there is nothing to draw, aliases, lineage and a query."""
 
 import re
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from tests.browser.accessibility import audit, expect
@@ -94,6 +96,25 @@ def test_a_motion_outside_the_training_is_said_to_be_a_guess(visitor: Visitor, m
     page.get_by_role("button", name="Ask", exact=True).click()
     expect(page.get_by_text("dq outside")).to_be_visible()
     expect(page.get_by_text("Do not send this torque to a robot unchecked")).to_be_visible()
+    assert audit(page) == []
+
+
+def test_a_version_that_waits_says_why_and_is_let_answer(visitor: Visitor, dashboard: Dashboard) -> None:
+    good = stream(samples=120, rate=10.0, seed=11)
+    noise = np.random.default_rng(0).standard_normal(good.tau.shape) * (np.arange(120) >= 84)[:, None]
+    first, second = (upload(dashboard.client, each)["id"] for each in (good, replace(good, tau=good.tau + 5 * noise)))
+    train(dashboard.client, "waits", first)
+    job = train(dashboard.client, "waits", second, holdout={"share": 0.3})
+    page = visitor.open(f"#/jobs/{job['id']}")
+    expect(page.get_by_text("waits as candidate and did not answer by itself")).to_be_visible()
+    assert audit(page) == []
+
+    page = visitor.open(f"#/models/waits?version=2&dataset={second}&part=held_out")
+    expect(page.get_by_text("95 % intervals hold less than 90 % of what was held out")).to_be_visible()
+    expect(page.get_by_text("bands too narrow here").first).to_be_visible()
+    page.get_by_role("button", name="Serve version 2").click()
+    page.get_by_role("dialog").get_by_role("button", name="Serve version 2").click()
+    expect(page.get_by_text("Version 2 of waits answers from now on.")).to_be_visible()
     assert audit(page) == []
 
 

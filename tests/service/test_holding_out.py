@@ -56,7 +56,7 @@ def rows_of(samples, result):
 
 def material(api, *datasets, **holdout):
     service = service_of(api)
-    request = {"datasets": list(datasets), "holdout": holdout}
+    request = {"datasets": list(datasets), "holdout": holdout, "joint_types": ["revolute"] * 2}
     return recorded(service.settings, service.database, service.files, request)
 
 
@@ -73,7 +73,7 @@ def held(api, dataset):
 
 
 def test_only_the_rest_is_trained_on(api, held, dataset):
-    assert held[1]["holdout"] == {"kind": "last", "share": 0.3, "blocks": 10, "guard_s": None, "seed": 0}
+    assert held[1]["holdout"] == {"kind": "auto", "share": 0.3, "blocks": 10, "guard_s": None, "seed": 0}
     assert version(api, held[0])["fit"]["samples_given"] == TRAIN.stop
     result = material(api, dataset, share=0.3)
     assert rows_of(recording(), result.samples) == list(range(ROWS))[TRAIN]
@@ -223,6 +223,57 @@ def test_the_guard_is_a_period_of_the_low_pass_that_was_used(api):
     assert result.held_out[0].t[0] - result.samples.t[-1] > 1.0
 
 
+def periodic(rows=600, seed=1):
+    """Motion at 20 Hz that repeats itself every 5 s."""
+    return stream(samples=rows, rate=20.0, seed=seed, course="periodic", speed=2.0)
+
+
+def test_what_repeats_the_training_is_said_to_with_its_period(api):
+    """In the lineage and in an evaluation, of what was held out and of another recording; motion of another kind is
+    not."""
+    dataset = upload(api, periodic())["id"]
+    train(api, "periodic", dataset, holdout={"kind": "last", "share": 0.3})
+    reply = version(api, "periodic")["lineage"]["holdout"]
+    assert reply["datasets"][0]["stretches"] is None
+    assert reply["repeats_training"] > 0.9
+    assert reply["period_s"] == pytest.approx(5.0, rel=0.02)
+    assert "repeat motion that was trained on, which repeats every 5 s" in reply["warnings"][0]
+    held, again, other = (
+        ask(api, "periodic", name, **part).json()
+        for name, part in (
+            (dataset, {"part": "held_out"}),
+            (upload(api, periodic(rows=200))["id"], {}),
+            (upload(api, recording(seed=3))["id"], {}),
+        )
+    )
+    assert {name: held[name] for name in ("repeats_training", "period_s", "warnings")} == {
+        name: reply[name] for name in ("repeats_training", "period_s", "warnings")
+    }
+    assert again["repeats_training"] > 0.9
+    assert other["repeats_training"] < 0.3
+    assert other["warnings"] == []
+    inside = ask(api, "periodic", dataset).json()
+    assert (inside["in_training"], inside["repeats_training"], inside["warnings"]) == (True, None, [])
+
+
+def test_by_itself_a_part_is_held_out_that_repeats_nothing_and_is_found_again(api):
+    """Motion that goes on, then periods: the last part repeats what comes before."""
+    free, again = stream(samples=200, rate=20.0, seed=2, speed=20.0), periodic(500)
+    names = ("q", "dq", "ddq", "tau")
+    both = {name: np.concatenate([getattr(each, name) for each in (free, again)]) for name in names}
+    samples = Samples(free.joint_names, np.arange(700) / 20.0, np.zeros(700, np.int64), **both)
+    dataset = upload(api, samples)["id"]
+    result = material(api, dataset, share=0.3)
+    (entry,) = result.lineage["holdout"]["datasets"]
+    ((first, last),) = entry["stretches"]
+    assert first == 0
+    assert last == pytest.approx(200, abs=100)  # a period
+    assert rows_of(samples, result.held_out[0]) == list(range(last - 5))  # a quarter of a second of guard
+    split = remembered(DatasetRow(id=dataset, sha256="?"), result.lineage)
+    assert np.flatnonzero(split.held_out(samples.episode, samples.t)).tolist() == list(range(last - 5))
+    assert material(api, dataset, share=0.3, kind="last").lineage["holdout"]["datasets"][0]["stretches"] is None
+
+
 ENTRY = {"id": "ds_1", "sha256": "s", "whole": False, "guard": 0.25, "guard_unit": "s", "rows": 34, "guarded": 4}
 HOLDOUT = {"split": {"share": 0.3}, "datasets": [ENTRY], "rows": 34, "guarded": 4, "nmse": [0.1]}
 EPISODE, TIMES = np.zeros(120, dtype=np.int64), np.arange(120) / 10
@@ -252,7 +303,7 @@ def test_a_data_set_is_known_by_its_id_or_its_samples(row):
     assert np.flatnonzero(split.held_out(EPISODE, TIMES)).tolist() == list(range(86, 120))
 
 
-@pytest.mark.parametrize("counts", [{"rows": 35}, {"guarded": 3}])
+@pytest.mark.parametrize("counts", [{"rows": 35}, {"guarded": 3}, {"stretches": [[0, 30]]}])
 def test_a_lineage_that_splits_otherwise_is_not_believed(counts):
     """Counts that do not fit: the samples may not be those that were held out."""
     reply = {**HOLDOUT, "datasets": [{**ENTRY, **counts}]}
@@ -266,6 +317,8 @@ def test_a_lineage_that_splits_otherwise_is_not_believed(counts):
         {**HOLDOUT, "split": {"kind": "rows"}},
         {**HOLDOUT, "datasets": [{**ENTRY, "guard": -1.0}]},
         {**HOLDOUT, "datasets": [{**ENTRY, "rows": "3"}]},
+        {**HOLDOUT, "datasets": [{**ENTRY, "stretches": [[0, 3, 4]]}]},
+        {**HOLDOUT, "datasets": [{**ENTRY, "stretches": [[-1, 3]]}]},
         3,
     ],
 )

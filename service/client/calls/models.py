@@ -9,7 +9,7 @@ from typing import Any
 from service.client.call import KEY_HEADER, Answer, Call, Page, Route, given, new_key, nothing, page, record, route
 from service.client.results.arm import Version
 from service.models.schema import Alias, AliasList, Model
-from service.training.schema import Job
+from service.training.schema import Job, PromotionOption
 
 
 @route("POST", "/v1/jobs", repeatable=True)
@@ -22,14 +22,16 @@ def train(
     options: Mapping[str, Any] | None = None,
     robot: str | None = None,
     holdout: Mapping[str, Any] | None = None,
+    promotion: PromotionOption | None = None,
     *,
     idempotency_key: str | None = None,
 ) -> Call[Job]:
     """Queue a training job.
 
     robot: for rigid bodies, a profile such as panda or the id of an uploaded URDF; holdout: what to hold out of the
-    data sets and evaluate the version on, such as {"kind": "last", "share": 0.3}; idempotency_key: the same request
-    under the same key queues one job, also from another client.
+    data sets and evaluate the version on, such as {"share": 0.3}; promotion: `ask` (default) lets the version answer if
+    it does well there, `always` in any case; idempotency_key: the same request under the same key queues one job, also
+    from another client.
     """
     body: dict[str, Any] = {"model": model, "datasets": list(datasets), "options": dict(options or {})}
     body |= given(
@@ -37,6 +39,7 @@ def train(
         joint_types=None if joint_types is None else list(joint_types),
         robot=robot,
         holdout=None if holdout is None else dict(holdout),
+        promotion=promotion,
     )
     return at(record(Job), names={}, json=body, headers={KEY_HEADER: idempotency_key or new_key()})
 

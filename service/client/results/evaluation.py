@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -47,8 +48,11 @@ class Evaluation(Plain):
 
     samples: of the data set or the part; samples_used: that were compared; nmse: mean squared error / variance of the
     measured torque, NaN where that does not vary; rmse: N·m; coverage: share of measurements inside the interval of
-    probability `level`, noise included; nlpd: mean negative log predictive density, nats; interval_width: N·m;
-    in_training: whether the model was trained on these samples: then the figures flatter.
+    probability `level`, noise included; independent: errors that it stands on; coverage_low, coverage_high: its 95 %
+    confidence interval; nlpd: mean negative log predictive density, nats; interval_width: N·m; in_training: whether the
+    model was trained on these samples: then the figures flatter; repeats_training: share of them that repeat motion it
+    was trained on, and period_s: after which that repeats itself, s, None where not known; warnings: what else
+    flatters.
     """
 
     model: str
@@ -68,7 +72,13 @@ class Evaluation(Plain):
     coverages: tuple[Interval, ...]
     reliability: Reliability
     stretches: Stretches
+    independent: Array
+    coverage_low: Array
+    coverage_high: Array
     in_training: bool
+    repeats_training: float | None
+    period_s: float | None
+    warnings: tuple[str, ...]
 
     def rows(self) -> list[dict[str, Any]]:
         """One dictionary a joint, as for `pandas.DataFrame(evaluation.rows())`."""
@@ -86,16 +96,20 @@ class Evaluation(Plain):
         return f"{self.model} version {self.version} on {self.samples_used} {what} of {self.dataset}{unseen}"
 
     def __str__(self) -> str:
-        return text_table(self.title, self._columns())
+        return "\n".join([text_table(self.title, self._columns()), *(f"careful: {each}" for each in self.warnings)])
 
     def _repr_html_(self) -> str:
-        return html_table(self.title, self._columns())
+        careful = (f"<p>careful: {escape(each)}</p>" for each in self.warnings)
+        return html_table(self.title, self._columns()) + "".join(careful)
 
     def _columns(self) -> dict[str, list[str]]:
         heads = {
             "nMSE": (self.nmse, ".2e"),
             "RMSE N·m": (self.rmse, ".4f"),
             f"coverage of {self.level:.0%}": (self.coverage, ".1%"),
+            "at least": (self.coverage_low, ".0%"),
+            "at most": (self.coverage_high, ".0%"),
+            "independent errors": (self.independent, ".0f"),
             "width N·m": (self.interval_width, ".3f"),
             "NLPD nats": (self.nlpd, ".3f"),
         }
@@ -103,7 +117,7 @@ class Evaluation(Plain):
         return {"joint": list(self.joint_names), **cells}
 
 
-_FIGURES = ("nmse", "rmse", "coverage", "nlpd", "interval_width")
+_FIGURES = ("nmse", "rmse", "coverage", "coverage_low", "coverage_high", "independent", "nlpd", "interval_width")
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,11 @@ def test_from_a_recording_to_figures_on_what_was_held_out_and_a_torque(asked, se
     assert (held["split"]["kind"], held["split"]["share"]) == ("blocks", 0.25)
     assert f"on {held['samples']} samples held out" in text
     assert f"{held['nmse'][1]:.2e}" in text
+    assert (
+        f"{held['coverage_low'][0]:.0%} to {held['coverage_high'][0]:.0%}, by {held['independent'][0]:.0f} errors"
+        in text
+    )
+    assert "it answers by itself: its 95 % intervals hold 90 % of what was held out" in text
 
     dataset = held["datasets"][0]["id"]
     text = asked("evaluate", "from-cli", dataset, "--held-out")

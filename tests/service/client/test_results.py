@@ -23,6 +23,8 @@ EVALUATION = {
     **{"model": "m<b>", "version": 2, "revision": 3, "dataset": "ds_1", "part": "all", "joint_names": ["a", "b"]},
     **{"samples": 100, "samples_used": 50, "level": 0.95, "nmse": [0.0123, None], "rmse": [0.5, 0.25]},
     **{"coverage": [0.94, 1.0], "nlpd": [-1.5, 0.125], "interval_width": [2.0, 1.0], "in_training": True},
+    **{"independent": [12.4, 8.0], "coverage_low": [0.6, 0.63], "coverage_high": [1.0, 1.0]},
+    **{"repeats_training": 0.97, "period_s": 5.0, "warnings": ["97 % repeat: <flatters>"]},
     "coverages": [{"level": 0.5, "coverage": [0.5, 0.6], "interval_width": [0.7, 0.4]}],
     "reliability": {"nominal": [0.5, 0.9], "observed": [[0.5, 0.9], [0.6, 0.95]]},
     "stretches": {"kind": "equal", "samples": [25, 25], "nmse": [[0.01, 0.02], [None, None]]},
@@ -58,11 +60,13 @@ def test_an_evaluation_is_a_table():
     found = read_evaluation(answer(EVALUATION))
     assert str(found).splitlines() == [
         "m<b> version 2 on 50 samples of ds_1, which it was trained on: these figures flatter",
-        "joint      nMSE  RMSE N·m  coverage of 95%  width N·m  NLPD nats",
-        "a      1.23e-02    0.5000            94.0%      2.000     -1.500",
-        "b             -    0.2500           100.0%      1.000      0.125",
+        "joint      nMSE  RMSE N·m  coverage of 95%  at least  at most  independent errors  width N·m  NLPD nats",
+        "a      1.23e-02    0.5000            94.0%       60%     100%                  12      2.000     -1.500",
+        "b             -    0.2500           100.0%       63%     100%                   8      1.000      0.125",
+        "careful: 97 % repeat: <flatters>",
     ]
     html = found._repr_html_()
+    assert html.endswith("<p>careful: 97 % repeat: &lt;flatters&gt;</p>")
     assert "<caption>m&lt;b&gt; version 2" in html
     assert "<td>1.23e-02</td>" in html
     first, second = found.rows()
@@ -77,7 +81,8 @@ def test_an_evaluation_is_a_table():
 def test_an_evaluation_says_what_the_service_says(api, local, trained):
     asked = {"dataset": trained.dataset}
     answered = api.post(f"/v1/models/{trained.name}/evaluate", json=asked).json()
-    assert local.evaluate(trained.name, trained.dataset).as_dict() == answered
+    unknown = {"repeats_training": None, "period_s": None}  # of samples that it was trained on
+    assert local.evaluate(trained.name, trained.dataset).as_dict() | unknown == answered
 
 
 def test_a_comparison_says_its_verdict_and_what_makes_it_unfair(api, local, pendulum):

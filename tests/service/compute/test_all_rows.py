@@ -15,8 +15,9 @@ from service.foundation.settings import Settings
 from service.storage.database import DatasetRow
 from service.storage.files import Files, new_id
 from service.storage.sample_file import Reader
-from service.training.material import CANDIDATES, STRETCHES, Part, Table, opened
+from service.training.material import CANDIDATES
 from service.training.summing import Context, packed, read, shard_statistics
+from service.training.table import STRETCHES, Part, Table, opened
 from tests.service.data import QUICK, stream
 
 ROWS = SHARD + 700

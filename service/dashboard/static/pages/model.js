@@ -12,6 +12,7 @@ import { chooser, firstChoice } from "./model/choice.js";
 import { learning } from "./model/learning.js";
 import { lineage } from "./model/lineage.js";
 import { parts } from "./model/parts.js";
+import { promoted } from "./model/promotion.js";
 import { confirmServing } from "./model/serving.js";
 import { versions } from "./model/versions.js";
 
@@ -108,7 +109,7 @@ function header(state, reload) {
       ["Answers now", `version ${serving}`],
       ["Shown here", `version ${shown}, ${version.estimator}, made ${when(version.created_at)}`],
       ...(names.length ? [["Aliases", names.join(", ")]] : []),
-    ]), warned(version.warnings));
+    ]), promoted(version), warned(version.warnings));
   };
   return [h("div", {}, heading(name, actions), about), update];
 }

@@ -2,12 +2,18 @@
 
 import { pages, post } from "../api.js";
 import { h, replace } from "../dom.js";
-import { card, errorBox, field, heading, notice } from "../ui.js";
+import { card, errorBox, field, heading, notice, select } from "../ui.js";
 import { robotSelect, robots } from "./data/robots.js";
 import { advancedOptions } from "./train/advanced.js";
 import { datasetChoice } from "./train/choice.js";
 import { ESTIMATORS, estimatorChoice } from "./train/estimators.js";
 import { holdoutChoice } from "./train/holdout.js";
+
+const PROMOTION = [
+  ["", "as the service is set"],
+  ["ask", "let it answer if it does well on what was held out"],
+  ["always", "let it answer in any case"],
+];
 
 /** The page `#/train`; `?datasets=ID,ID&model=NAME` chooses beforehand. */
 export async function render(view, { query }, { signal, title }) {
@@ -37,6 +43,8 @@ export async function render(view, { query }, { signal, title }) {
     if (said.size === 1 && !robot.select.value) robot.choose([...said][0]);
   });
   const holdout = holdoutChoice();
+  const promotion = select(PROMOTION, "");
+  promotion.name = "promotion";
   const advanced = advancedOptions(signal);
   const problems = h("div", {});
   const start = h("button", { type: "submit", class: "primary" }, "Start training");
@@ -50,6 +58,7 @@ export async function render(view, { query }, { signal, title }) {
       return;
     }
     const request = { model: model.value.trim(), datasets: picked.map((each) => each.id), estimator, options: advanced.values() };
+    if (promotion.value) request.promotion = promotion.value;
     if (holdout.value()) request.holdout = holdout.value();
     if (!robot.select.disabled && robot.select.value) request.robot = robot.select.value;
     if (advanced.jointTypes().length) request.joint_types = advanced.jointTypes();
@@ -73,7 +82,7 @@ export async function render(view, { query }, { signal, title }) {
     { onsubmit: submit },
     card("Data sets", choice.element),
     card("Model", nameField, estimators, withRobot),
-    card("Held-out part", holdout.element),
+    card("Held-out part", holdout.element, field("When it is trained", promotion, "“Does well”: its 95 % bands hold 90 % on every joint, as far as can be told, and it is not worse than the version that answers.")),
     card("Fit", h("p", { class: "hint" }, "The defaults suit most recordings."), advanced.element),
     problems,
     h("div", { class: "actions" }, start),
@@ -108,7 +117,7 @@ function modelName(known, given) {
     const model = known.get(input.value.trim());
     const has = model?.latest_version === 1 ? "version 1" : `versions up to ${model?.latest_version}`;
     about.textContent = model
-      ? `${model.name} has ${has}. The new version will answer, unless another was chosen to serve.`
+      ? `${model.name} has ${has}. The new version will answer if it does well on what is held out, else wait as candidate.`
       : "";
   };
   input.addEventListener("input", say);

@@ -5,10 +5,10 @@ import { h, replace } from "../../dom.js";
 import { count, number, percent, scientific, shortNames } from "../../format.js";
 import { card, link, table } from "../../ui.js";
 import { warned } from "../data/prose.js";
+import { known, narrowJoints } from "../model/coverage.js";
+import { promoted } from "../model/promotion.js";
 import { selectionCard } from "../model/selection.js";
 
-/** Share of samples in the 95 % band below which it is said to be too narrow. */
-const LEAST_COVERAGE = 0.9;
 const ADVICE = {
   cannot_hold_out: "Hold out less, or in another way, or nothing.",
   not_positive_definite: "The samples may be nearly equal, or their torque without noise. Look at the data sets' reports.",
@@ -41,14 +41,20 @@ async function judged(job, signal) {
   const seen = version.lineage.training_metrics;
   const made = card(
     "Result",
-    h("p", {}, more, job.refresh ? ", which answers once it has predicted better than the old one." : ", which answers from now on unless another version was chosen to serve."),
-    warned(version.warnings),
+    h("p", {}, more, answers(job, version)),
+    promoted(version),
+    warned([...version.warnings, ...(held?.warnings ?? [])]),
     held?.nmse
       ? figures(`On ${count(held.samples)} samples that were held out`, held, version)
       : h("p", { class: "banner" }, "Nothing was held out, so how well it predicts is not known. Evaluate it on a recording that it has not seen."),
     !held?.nmse && seen?.nmse ? figures(`On ${count(seen.samples)} samples it was trained on: these figures flatter`, seen, version) : null,
   );
   return [made, selectionCard(version)];
+}
+
+function answers(job, { promotion }) {
+  if (job.refresh) return ", which answers once it has predicted better than the old one.";
+  return promotion?.answers === false ? ", which waits as candidate." : ", which answers from now on unless another version was chosen to serve.";
 }
 
 function figures(caption, found, version) {
@@ -58,12 +64,12 @@ function figures(caption, found, version) {
 
 /** What the figures say to be careful with. */
 function verdicts(found, names) {
-  const joints = names.map((name, index) => ({ name, nmse: found.nmse[index], coverage: found.coverage[index] }));
-  const narrow = joints.filter((each) => each.coverage !== null && each.coverage < LEAST_COVERAGE);
+  const joints = names.map((name, index) => ({ name, nmse: found.nmse[index] }));
+  const narrow = narrowJoints(found);
   const useless = joints.filter((each) => each.nmse !== null && each.nmse >= 1);
   const said = [];
   if (narrow.length) {
-    const which = narrow.map((each) => `${each.name} (${percent(each.coverage, 0)})`).join(", ");
+    const which = narrow.map((joint) => `${names[joint]} (${percent(found.coverage[joint], 0)})`).join(", ");
     said.push(`The 95 % band is too narrow for ${which}: the model is overconfident there.`);
   }
   if (useless.length) {
@@ -80,8 +86,10 @@ function shownFigures(caption, found, names, types) {
       { label: "nMSE", numeric: true, cell: (row) => scientific(row.nmse) },
       { label: `RMSE, ${unit}`, numeric: true, cell: (row) => number(row.rmse) },
       { label: "Within the 95 % band", numeric: true, cell: (row) => percent(row.coverage) },
+      { label: "which is known to be", numeric: true, cell: (row) => row.known },
+      { label: `95 % width, ${unit}`, numeric: true, cell: (row) => (row.width === undefined ? "–" : number(row.width)) },
     ],
-    names.map((name, index) => ({ name, nmse: found.nmse[index], rmse: found.rmse[index], coverage: found.coverage[index] })),
+    names.map((name, index) => ({ name, nmse: found.nmse[index], rmse: found.rmse[index], coverage: found.coverage[index], known: known(found, index), width: found.interval_width?.[index] })),
     { caption },
   );
 }

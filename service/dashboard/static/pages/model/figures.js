@@ -4,20 +4,13 @@ import { h, replace } from "../../dom.js";
 import { count, counted, number, percent, scientific, shortNames } from "../../format.js";
 import { line, plot } from "../../plots.js";
 import { badge, card, table } from "../../ui.js";
-
-const NARROW = 0.9, WIDE = 0.99;
+import { coverageVerdict, known } from "./coverage.js";
 
 /** Figures of each joint, with what to make of its coverage. */
 export function figures(evaluation) {
   const { joint_names: joints, coverages, stretches } = evaluation;
   const short = shortNames(joints);
   const used = evaluation.samples_used < evaluation.samples ? `${count(evaluation.samples_used)} evenly chosen of ${count(evaluation.samples)}` : `all ${count(evaluation.samples)}`;
-  const at = (joint) => evaluation.coverage[joint];
-  const verdict = (joint) => {
-    if (at(joint) < NARROW) return badge("bands too narrow here", "bad");
-    if (at(joint) > WIDE) return badge("bands wide here", "plain");
-    return badge("about right", "good");
-  };
   const numeric = (label, cell) => ({ label, cell, numeric: true });
   const columns = [
     { label: "Joint", cell: (joint) => short[joint] },
@@ -26,12 +19,14 @@ export function figures(evaluation) {
     ...coverages.map((each, level) => numeric(`in ${percent(each.level, 0)}`, (joint) => percent(coverages[level].coverage[joint]))),
     numeric("95 % width, N·m", (joint) => number(evaluation.interval_width[joint])),
     numeric("NLPD, nats", (joint) => number(evaluation.nlpd[joint])),
-    { label: "95 % band", cell: verdict },
+    { label: "95 % band", cell: (joint) => badge(...coverageVerdict(evaluation, joint)) },
+    numeric("“In 95 %” is known to be", (joint) => known(evaluation, joint)),
   ];
   return card(
     "Accuracy on this recording",
+    evaluation.warnings.map((text) => h("div", { class: "banner", role: "note" }, `${text[0].toUpperCase()}${text.slice(1)}.`)),
     table(columns, joints.map((_name, joint) => joint), { caption: `On ${used} samples${stretches.kind === "episodes" ? `, ${counted(stretches.samples.length, "episode")}` : ""}` }),
-    h("p", { class: "hint" }, "nMSE is the mean squared error / variance of the measured torque. 1 is no better than always answering the mean; a joint whose torque is mostly noise cannot come near 0. “In 95 %” is the share of measurements inside the 95 % band, and should be near 95 %."),
+    h("p", { class: "hint" }, "nMSE is the mean squared error / variance of the measured torque. 1 is no better than always answering the mean; a joint whose torque is mostly noise cannot come near 0. “In 95 %” is the share of measurements inside the 95 % band, and should be near 95 %. Neighbouring errors are alike: the last column says how far so many independent ones tell that share (95 % confidence)."),
   );
 }
 

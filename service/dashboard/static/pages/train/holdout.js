@@ -4,12 +4,14 @@ import { h } from "../../dom.js";
 import { field } from "../../ui.js";
 
 const KINDS = [
+  ["auto", "the last part, or motion that the rest does not repeat"],
   ["last", "the last part of each data set"],
   ["episodes", "whole episodes"],
   ["blocks", "some of many equal blocks"],
   ["", "nothing: learn from all of it"],
 ];
 const SAID = {
+  auto: "The last part, unless it repeats motion that is learnt from and other motion does not: then some of that.",
   last: "This does not test motion of another kind. For that, evaluate on another recording.",
   episodes: "The seed chooses which. If each data set has 1 episode, whole data sets are held out.",
   blocks: "The seed chooses which. Neighbouring blocks resemble each other, so figures look better than on a new recording.",

@@ -1,0 +1,163 @@
+"""Where a motion repeats itself: instants whose state has its like at another time.
+
+A held-out part that repeats motion of the training flatters: it is predicted well by what has only been remembered.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from lipcore.data.samples import Array, Samples
+from lipcore.data.splits import Mask, Numbers
+
+NEAR, NEAREST = 0.25, 0.1
+"""Two instants are alike where they lie nearer to each other than half a step from one instant to the next, but nearer
+than the first share of the usual distance of two instants, and no nearer than the second need be."""
+REPEATED = 0.5
+"""Share of instants that have their like elsewhere in time, from which on a stretch repeats."""
+ASKED = 60
+"""Instants of a block that are looked at."""
+JUDGED, AT_A_TIME = 600, 100
+"""Instants of a part that are looked at, and how many together."""
+LEAST_SPREAD = (0.01, 0.02, 0.1)
+"""Smallest spreads of position, velocity and acceleration that count as motion: rad, rad/s and rad/s² (m)."""
+RETURNING, PERIOD_TOLERANCE, PERIODIC = 0.25, 0.05, 0.6
+"""A motion has a period where at least the first share of its instants return, and of these at least the last share
+after the median time, but for the second share of it. Chosen on simulated arms (`tests/lipcore/test_repetition.py`)."""
+
+
+def features(samples: Samples, joint_types: Sequence[str]) -> Array:
+    """The state of a robot at N instants, (N, k): cos q and sin q, of sliding joints q, dq and ddq, by their spread.
+
+    joint_types: (n,).
+    """
+    turns = np.array([each == "revolute" for each in joint_types])
+    parts = []
+    for angle, least in zip((samples.q, samples.dq, samples.ddq), LEAST_SPREAD, strict=True):
+        columns = angle[:, None, :]
+        if angle is samples.q:
+            columns = np.stack([np.where(turns, np.cos(angle), angle), np.where(turns, np.sin(angle), 0.0)], axis=1)
+        spread = np.sqrt(columns.var(axis=0).sum(axis=0))
+        parts.append((columns / np.maximum(spread, least)).reshape(len(angle), -1))
+    return np.concatenate(parts, axis=1)
+
+
+def repeated(states: Array, edges: Numbers) -> Array:
+    """Share of the instants of each of B blocks that have their like elsewhere in time: (B,).
+
+    states: (N, k), in order of time; edges: (B + 1,), where blocks begin and end. Elsewhere is neither in the block nor
+    in those beside it, which a motion leaves and enters slowly.
+    """
+    shares = np.zeros(len(edges) - 1)
+    for block, like in enumerate(_likes(states, edges)):
+        elsewhere = np.delete(like, slice(max(block - 1, 0), block + 2), axis=1)
+        shares[block] = elsewhere.any(axis=1).mean() if elsewhere.size else 0.0
+    return shares
+
+
+def groups(states: Array, edges: Numbers) -> Numbers:
+    """Number of the group that each of B blocks belongs to, (B,): blocks repeat, directly or through others, those of
+    their group and no other. Arguments as of `repeated`."""
+    # imported late: this takes as long as the rest of the module
+    from scipy.sparse import csr_array  # noqa: PLC0415
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
+    linked = np.array([like.mean(axis=0) >= REPEATED for like in _likes(states, edges)])
+    return np.asarray(connected_components(csr_array(linked), directed=False)[1], np.int64)
+
+
+class Repetition(NamedTuple):
+    """share: of a part's instants that have their like in the training; period: after which the training repeats
+    itself, s, None where it has none."""
+
+    share: float
+    period: float | None
+
+    @property
+    def flatters(self) -> bool:
+        """Whether the part repeats what was learnt from."""
+        return self.share >= REPEATED
+
+
+def repetition(training: Samples, part: Samples, joint_types: Sequence[str]) -> Repetition:
+    """How much of a part repeats motion of the training.
+
+    training, part: at least one row each, the training in order of time within its episodes; joint_types: (n,).
+    """
+    states = features(Samples.concatenate([training, part]), joint_types)
+    share = share_repeated(states[: len(training)], states[len(training) :])
+    return Repetition(share, period(training, joint_types))
+
+
+def share_repeated(known: Array, states: Array) -> float:
+    """Share of some states (R, k) that have their like among those that are known, (N, k), in order of time."""
+    limits, shares = _limits(known, np.concatenate([known, states])), []
+    rows = _evenly(0, len(states), JUDGED)
+    for few in np.array_split(rows, max(1, len(rows) // AT_A_TIME)):
+        squares = _squares(states[few], known)
+        nearest = squares.argmin(axis=1)
+        shares.append(np.sqrt(squares[np.arange(len(few)), nearest]) <= limits[nearest])
+    return float(np.concatenate(shares).mean())
+
+
+def period(samples: Samples, joint_types: Sequence[str]) -> float | None:
+    """Time after which a motion repeats itself, s; None where it has no one such time.
+
+    The median, over instants, of the time until a state that was left by twice the limit of likeness comes again.
+    """
+    states = features(samples, joint_types)
+    limits, lags, asked = _limits(states, states), [], 0
+    ends = np.concatenate([np.flatnonzero(np.diff(samples.episode)) + 1, [len(samples)]])
+    for row in _evenly(0, len(samples), JUDGED // 2):
+        asked += 1
+        end = ends[np.searchsorted(ends, row, side="right")]
+        distances = np.sqrt(_squares(states[row : row + 1], states[row:end])[0])
+        again = _return(distances, limits[row])
+        if again is not None:
+            lags.append(samples.t[row + again] - samples.t[row])
+    if len(lags) < max(1, RETURNING * asked):
+        return None
+    usual = float(np.median(lags))
+    return usual if np.mean(np.abs(np.array(lags) - usual) <= PERIOD_TOLERANCE * usual) >= PERIODIC else None
+
+
+def _return(distances: Array, limit: float) -> int | None:
+    """Place at which a motion is nearest to where it began, when it first comes back; None where it does not."""
+    left = np.flatnonzero(distances > 2 * limit)
+    back = np.flatnonzero(distances[left[0] :] <= limit) + left[0] if len(left) else left
+    if not len(back):
+        return None
+    gone = np.flatnonzero(distances[back[0] :] > limit)
+    end = back[0] + gone[0] if len(gone) else len(distances)
+    return int(back[0] + distances[back[0] : end].argmin())
+
+
+def _likes(states: Array, edges: Numbers) -> Iterator[Mask]:
+    """For each of B blocks, which of the instants that are looked at have their like in which block: (asked, B)."""
+    limits = _limits(states, states)
+    for block in range(len(edges) - 1):
+        rows = _evenly(edges[block], edges[block + 1], ASKED)
+        nearest = np.minimum.reduceat(_squares(states[rows], states), edges[:-1], axis=1)
+        yield np.sqrt(nearest) <= limits[rows, None]
+
+
+def _limits(states: Array, all_states: Array) -> Array:
+    """How near another instant has to be to be like each of these, (N,); see NEAR."""
+    usual = np.sqrt(2 * all_states.var(axis=0).sum())
+    steps = np.linalg.norm(np.diff(states, axis=0, append=states[-2:-1]), axis=1) if len(states) > 1 else np.zeros(1)
+    return np.asarray(np.clip(0.5 * steps, NEAREST * usual, NEAR * usual))
+
+
+def _squares(states: Array, others: Array) -> Array:
+    """Squared distances, (R, N)."""
+    products = states @ others.T
+    squares = np.square(states).sum(axis=1)[:, None] - 2 * products + np.square(others).sum(axis=1)
+    return np.asarray(np.maximum(squares, 0.0))
+
+
+def _evenly(first: int, last: int, most: int) -> Numbers:
+    """Rows from `first` to `last`, exclusive, at most so many."""
+    return np.unique(np.linspace(first, last - 1, most).round().astype(np.int64))

@@ -1,0 +1,138 @@
+"""Whether a version that was trained answers by itself: judged by what its training held out.
+
+It waits where the 95 % intervals of a joint hold less than LEAST_COVERAGE of that, by the upper end of the confidence
+interval, as 85 % of ten errors tell nothing; and where it is worse than the version that serves, by paired differences.
+Both are compared as they were trained. Of versions that are as good 1 to 7 % wait (simulated: 5 to 60 s held out,
+errors that stay alike for 0.1 to 3 s).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from lipcore.data.metrics import Comparison, compare
+from lipcore.data.samples import Samples
+from lipcore.files.manifest import ModelFormatError
+from lipcore.model.torque_model import TorqueModel
+from service.models import aliases, registry
+from service.models.lineage import answer_of, learnt_from
+from service.models.schema import Promotion
+from service.storage.database import Database, LearnerRow, VersionRow
+from service.storage.files import Files
+from service.training.schema import PromotionOption
+
+LEAST_COVERAGE = 0.9
+CANDIDATE = "candidate"
+"""Alias of the version that waits."""
+
+
+def judge(
+    database: Database,
+    files: Files,
+    model: str,
+    trained: TorqueModel,
+    held_out: Samples | None,
+    lineage: dict[str, Any],
+    option: PromotionOption,
+) -> Promotion:
+    """Judge a version before it is added. held_out: what to judge by, None where that is nothing; lineage: of the
+    version, with the figures on these samples."""
+    with database.session() as session:
+        number = registry.answering(session, model)
+        serving = session.get(VersionRow, (model, number))
+    before = None if serving is None else number
+    if held_out is None:
+        return Promotion(answers=True, passed=None, serving=before, reason="not judged, as nothing was held out")
+    problems, passes = _coverage(trained.joint_names, lineage["holdout"])
+    if serving is not None:
+        problem, note = _against(files, serving, trained, held_out, lineage)
+        problems, passes = problems + problem, passes + note
+    reason = "; ".join(problems + passes)
+    if not problems:
+        return Promotion(answers=True, passed=True, serving=before, reason=reason)
+    if serving is None:
+        return Promotion(answers=True, passed=False, serving=None, reason=f"{reason}; no other version could answer")
+    if option == "always":
+        return Promotion(answers=True, passed=False, serving=before, reason=f"{reason}; it answers as was asked for")
+    return Promotion(answers=False, passed=False, serving=before, reason=reason)
+
+
+def settle(session: Session, model: str, judged: Promotion, option: PromotionOption) -> Promotion:
+    """The same as of the moment when the version is added: it waits where another one answers by now."""
+    serving = registry.answering(session, model) or None
+    if serving in (None, judged.serving) or judged.passed is None or option == "always":
+        return judged
+    reason = f"version {serving} answers since it was judged, and was not compared with it"
+    return Promotion(answers=False, passed=False, serving=serving, reason=reason)
+
+
+def wait(session: Session, model: str, version: int, most_aliases: int) -> None:
+    """Let a version wait that was just added as a candidate: it learns nothing and is in no contest, as whoever looks
+    at it says what becomes of it. The alias `candidate` points to it, where there is room for that."""
+    session.get_one(LearnerRow, (model, version)).role = "dismissed"
+    known = aliases.names(session, model)
+    if CANDIDATE in known or len(known) < most_aliases:
+        aliases.point(session, model, CANDIDATE, version)
+
+
+def _coverage(joint_names: tuple[str, ...], figures: dict[str, Any]) -> tuple[list[str], list[str]]:
+    """What is wrong with the coverage, and what is right."""
+    by_joint = zip(joint_names, *(figures[name] for name in ("coverage", "coverage_high", "independent")), strict=True)
+    narrow = [
+        f"{joint} {100 * share:.0f} % (at most {100 * high:.0f} %, from {count:.0f} independent errors)"
+        for joint, share, high, count in by_joint
+        if high < LEAST_COVERAGE
+    ]
+    least = f"{100 * LEAST_COVERAGE:.0f} %"
+    if narrow:
+        return [f"the 95 % intervals hold less than {least} of what was held out: {', '.join(narrow)}"], []
+    return [], [f"its 95 % intervals hold {least} of what was held out, as far as that can tell"]
+
+
+def _against(
+    files: Files, serving: VersionRow, trained: TorqueModel, held_out: Samples, lineage: dict[str, Any]
+) -> tuple[list[str], list[str]]:
+    """How the version is worse than the one that serves, or why that is not said."""
+    name = f"version {serving.version}"
+    if not _is_new_to(serving.manifest["lineage"], lineage["holdout"]):
+        return [], [f"not compared with {name}, which was trained on what was held out"]
+    try:
+        other = files.load_version(serving.folder, serving.checksums)
+    except ModelFormatError:
+        return [], [f"not compared with {name}, which cannot be read"]
+    if (other.joint_names, other.torque_convention) != (trained.joint_names, trained.torque_convention):
+        return [f"{name} has other joints or another torque convention"], []
+    compared = compare(held_out, *(answer_of(each, held_out) for each in (other, trained)))
+    if compared.blocks < 2:
+        return [], [f"what was held out is too short to compare it with {name}"]
+    return _verdict(compared, name)
+
+
+def _verdict(compared: Comparison, name: str) -> tuple[list[str], list[str]]:
+    """Worse by the log predictive density, or by the errors where it is not better by the former."""
+    (density, nmse), (clear, larger) = compared.total.mean.tolist(), compared.total.significant.tolist()
+    half, half_nmse = compared.total.half_width.tolist()
+    amount = f"{density:+.3g} ± {half:.2g} nats a sample"
+    if clear and density > 0:
+        return [f"it predicts what was held out worse than {name}: negative log density {amount}"], []
+    if larger and nmse > 0 and not clear:
+        return [f"its errors are larger than those of {name}: mean nMSE {nmse:+.2g} ± {half_nmse:.1g}"], []
+    how = "better" if clear else "no worse"
+    return [], [f"it predicts what was held out {how} than {name}: negative log density {amount}"]
+
+
+def _is_new_to(earlier: dict[str, Any], holdout: dict[str, Any]) -> bool:
+    """Whether a version with an earlier lineage has seen nothing of what is held out now."""
+    learnt, before = learnt_from(earlier), (earlier.get("holdout") or {})
+    alike = {each["sha256"]: each for each in before.get("datasets", [])}
+    for each in holdout["datasets"]:
+        if learnt.isdisjoint((each["id"], each["sha256"])):
+            continue
+        same = alike.get(each["sha256"])
+        if same is None or before["split"] != holdout["split"]:
+            return False
+        if any(same.get(field) != each[field] for field in ("rows", "guarded", "whole", "stretches")):
+            return False
+    return True

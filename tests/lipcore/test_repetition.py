@@ -1,0 +1,114 @@
+"""Repeated motion: found on simulated arms, and against distances taken one by one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lipcore.data.repetition import NEAREST, features, groups, period, repetition, share_repeated
+from lipcore.data.samples import Samples
+from lipcore.robots.dirt import Dirt
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
+from lipcore.training.held_out import unrepeated
+
+PANDA = load_robot("panda")
+TYPES = ("revolute",) * 7
+
+
+def motion(course="sinusoids", seed=1, rows=2000, speed=2.0, **kwargs) -> Samples:
+    """Panda at 50 Hz; periodic motion repeats every 10 s / speed."""
+    return simulate(PANDA, Stream(n_samples=rows, rate=50.0, course=course, speed=speed, **kwargs), seed)
+
+
+def joined(*parts: Samples) -> Samples:
+    """One recording of several motions, one after the other."""
+    rows = sum(map(len, parts))
+    arrays = {name: np.concatenate([getattr(each, name) for each in parts]) for name in ("q", "dq", "ddq", "tau")}
+    return Samples(parts[0].joint_names, np.arange(rows) / 50.0, np.zeros(rows, np.int64), **arrays)
+
+
+def halves(samples: Samples) -> tuple[Samples, Samples]:
+    cut = len(samples) // 2
+    return samples.rows(slice(0, cut - 15)), samples.rows(slice(cut + 15, None))
+
+
+@pytest.mark.parametrize(("speed", "dirt"), [(1.0, None), (5.0, None), (2.0, Dirt())])
+def test_periodic_motion_is_found_with_its_period(speed: float, dirt: Dirt | None) -> None:
+    found = repetition(*halves(motion("periodic", speed=speed, dirt=dirt)), TYPES)
+    assert found.share > 0.9
+    assert found.flatters
+    assert found.period == pytest.approx(10.0 / speed, rel=0.02)
+
+
+@pytest.mark.parametrize("course", ["sinusoids", "rests"])
+def test_motion_that_goes_on_is_new(course: str) -> None:
+    found = repetition(*halves(motion(course)), TYPES)
+    assert found.share < 0.1
+    assert not found.flatters
+    assert found.period is None
+
+
+def test_motion_of_another_recording_is_known_again() -> None:
+    training = motion("periodic", seed=1)
+    assert repetition(training, motion("periodic", seed=1, rows=600), TYPES).share > 0.9
+    assert repetition(training, motion("periodic", seed=2, rows=600), TYPES).share < 0.1
+
+
+def test_shares_are_those_of_distances_taken_one_by_one() -> None:
+    """Instants half as far as the limit from one that is known, and some of them twice as far."""
+    rng = np.random.default_rng(0)
+    known = np.repeat(rng.standard_normal((40, 5)), 2, axis=0)  # every other step is none: the limit is the least one
+    usual = np.sqrt(2 * np.concatenate([known]).var(axis=0).sum())
+    away = rng.standard_normal((40, 5))
+    away *= NEAREST * usual / np.linalg.norm(away, axis=1)[:, None] * np.where(np.arange(40) < 30, 0.5, 2.0)[:, None]
+    states = known[1::2] + away
+    nearest = [min(np.linalg.norm(state - each) for each in known) for state in states]
+    expected = np.mean(np.array(nearest[:30]) <= NEAREST * usual) * 0.75
+    assert share_repeated(known[1::2].repeat(3, axis=0), states) >= expected > 0.7
+
+
+def test_blocks_that_repeat_each_other_are_of_one_group() -> None:
+    one, two = (motion("periodic", seed=seed, rows=500) for seed in (1, 2))
+    recording = joined(one, two)
+    found = groups(features(recording, TYPES), np.arange(0, 1001, 250))  # 5 s are a period
+    assert found[0] == found[1] != found[2] == found[3]
+
+
+def test_what_is_not_repeated_is_held_out_instead_of_a_last_part_that_is() -> None:
+    free, again = motion(seed=3, rows=600, speed=10.0), motion("periodic", rows=2000)
+    ((first, last),) = unrepeated(joined(free, again), TYPES, 0.25, 0)
+    assert first == 0
+    assert last == pytest.approx(600, abs=250)
+
+
+def test_whole_groups_of_periods_are_held_out() -> None:
+    """Two motions take turns, three periods each: the last part repeats both, a group of one is new."""
+    one, two = (motion("periodic", seed=seed, rows=750) for seed in (1, 2))
+    recording = joined(one, two, one)
+    found = unrepeated(recording, TYPES, 0.3, 0)
+    assert found == [(750, 1500)]
+
+
+@pytest.mark.parametrize("course", ["periodic", "sinusoids"])
+def test_the_last_part_stays_where_all_or_nothing_repeats(course: str) -> None:
+    assert unrepeated(motion(course), TYPES, 0.3, 0) is None
+
+
+def test_episodes_count_as_blocks() -> None:
+    """Six episodes: two motions twice and two others once; the last one repeats the first."""
+    seeds = (1, 2, 3, 4, 2, 1)
+    parts = [motion(seed=seed, rows=300, speed=10.0) for seed in seeds]
+    recording = replace(joined(*parts), episode=np.repeat(np.arange(6), 300))
+    found = unrepeated(recording, TYPES, 0.3, 0)
+    held = {place for first, last in found for place in range(first // 300, last // 300)}
+    assert held
+    for seed in (1, 2):
+        assert len({seeds.index(seed) in held, 5 - seeds[::-1].index(seed) in held}) == 1  # on one side both
+
+
+def test_motion_without_return_has_no_period() -> None:
+    assert period(motion("rests"), TYPES) is None
+    still = motion(rows=100)
+    still = replace(still, q=0 * still.q, dq=0 * still.dq, ddq=0 * still.ddq)
+    assert period(still, TYPES) is None

@@ -1,0 +1,140 @@
+"""Whether a trained version answers by itself: judged by what was held out of its training, unless it shall in any
+case."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.models.registry import answering
+from service.models.schema import Promotion
+from service.storage.database import LearnerRow
+from service.training.promotion import settle
+from tests.service.data import ended, error, queue, service_of, stream, train, upload
+
+ROWS, HELD = 120, {"share": 0.3}
+CUT = 84
+"""Rows of a recording that are learnt from."""
+
+
+def recording(api, seed, spoilt=None, amount=5.0):
+    """The id of a data set: a pendulum, with white noise of so many N·m on some of its torque."""
+    samples = stream(samples=ROWS, rate=10.0, seed=seed)
+    if spoilt is not None:
+        tau = samples.tau.copy()
+        tau[spoilt] += amount * np.random.default_rng(seed).standard_normal(tau[spoilt].shape)
+        samples = replace(samples, tau=tau)
+    return upload(api, samples)["id"]
+
+
+def version(api, model, number):
+    return api.get(f"/v1/models/{model}/versions/{number}").json()
+
+
+def reason(api, model, number):
+    return version(api, model, number)["promotion"]["reason"]
+
+
+@pytest.fixture(scope="module")
+def judged(api):
+    """A model whose version 1 answers, and 2 to 4 were judged: what was held out of 2 is noisier than what it has
+    learnt, as of 4, which was to answer in any case; 3 has learnt from noise, and is as unsure as it should be."""
+    narrow, noisy = recording(api, 32, slice(CUT, None)), recording(api, 34, slice(0, CUT - 10), 20.0)
+    train(api, "judged", recording(api, 31))
+    jobs = [train(api, "judged", each, holdout=HELD) for each in (narrow, noisy)]
+    jobs.append(train(api, "judged", narrow, holdout=HELD, promotion="always"))
+    return jobs
+
+
+def outcome(api, number):
+    found = version(api, "judged", number)["promotion"]
+    return found["answers"], found["passed"], found["serving"]
+
+
+def test_without_a_held_out_part_a_version_answers_and_is_not_judged(api, judged):
+    assert outcome(api, 1) == (True, None, None)
+    assert reason(api, "judged", 1) == "not judged, as nothing was held out"
+
+
+def test_a_version_whose_intervals_are_too_narrow_waits(api, judged):
+    assert outcome(api, 2) == (False, False, 1)
+    why = reason(api, "judged", 2)
+    assert "the 95 % intervals hold less than 90 % of what was held out: joint1" in why
+    assert "independent errors" in why
+    assert judged[0]["history"][-1]["message"] == f"version 2 is trained and waits as candidate: {why}"
+
+
+def test_a_version_that_predicts_worse_waits(api, judged):
+    assert outcome(api, 3) == (False, False, 1)
+    assert "it predicts what was held out worse than version 1" in reason(api, "judged", 3)
+    assert min(version(api, "judged", 3)["lineage"]["holdout"]["coverage"]) > 0.9
+
+
+def test_a_version_answers_where_that_is_asked_for(api, judged):
+    assert judged[2]["promotion"] == "always"
+    assert outcome(api, 4) == (True, False, 1)
+    assert reason(api, "judged", 4).endswith("it answers as was asked for")
+
+
+def test_the_newest_that_waits_has_the_alias_candidate_and_answers_once_it_is_let(api, judged):
+    model = api.get("/v1/models/judged").json()
+    assert (model["serving_version"], model["aliases"]) == (4, {"candidate": 3})
+    query = {"q": [0.1, 0.2], "dq": [0.0, 0.0], "ddq": [0.0, 0.0]}
+    for asked, answers in (({}, 4), ({"alias": "candidate"}, 3)):
+        assert api.post("/v1/models/judged/predict", json=query | asked).json()["version"] == answers
+    with service_of(api).database.session() as session:
+        roles = [session.get_one(LearnerRow, ("judged", number)).role for number in (2, 3)]
+    assert roles == ["dismissed"] * 2  # in no contest
+
+    moved = api.put("/v1/models/judged/aliases/serving", json={"alias": "candidate"})
+    assert moved.status_code == 200, moved.text
+    assert api.post("/v1/models/judged/predict", json=query).json()["version"] == 3
+    assert outcome(api, 3) == (False, False, 1)  # as it was once it was trained
+    problem = error(api.delete("/v1/models/judged/versions/3"), 409, "conflict")
+    assert "'candidate'" in problem["message"]
+    assert api.delete("/v1/models/judged/versions/2").status_code == 204
+
+
+def test_the_first_version_answers_whatever_it_is_like_and_is_said_to_have_failed(api):
+    train(api, "first-bad", recording(api, 35, slice(CUT, None)), holdout=HELD)
+    found = version(api, "first-bad", 1)["promotion"]
+    assert (found["answers"], found["passed"], found["serving"]) == (True, False, None)
+    assert found["reason"].endswith("no other version could answer")
+    assert api.get("/v1/models/first-bad").json()["aliases"] == {}
+
+
+@pytest.mark.slow
+def test_what_the_serving_version_was_trained_on_is_no_fair_comparison(api):
+    dataset = recording(api, 37)
+    train(api, "unfair", dataset)
+    train(api, "unfair", dataset, holdout=HELD)
+    assert "not compared with version 1, which was trained on what was held out" in reason(api, "unfair", 2)
+    train(api, "unfair", dataset, holdout=HELD)  # of which version 2 has held out the same
+    assert "than version 2: negative log density" in reason(api, "unfair", 3)
+    train(api, "unfair", dataset, holdout={"share": 0.4})
+    assert "not compared with version 3" in reason(api, "unfair", 4)
+
+
+def test_a_version_waits_where_another_has_begun_to_answer_since_it_was_judged(api, judged):
+    with service_of(api).database.session() as session:
+        now = answering(session, "judged")
+        good = Promotion(answers=True, passed=True, serving=now + 1, reason="")
+        found = settle(session, "judged", good, "ask")
+        assert (found.answers, found.serving) == (False, now)
+        assert f"version {now} answers since it was judged" in found.reason
+        assert settle(session, "judged", good, "always") is good
+        assert settle(session, "judged", good.model_copy(update={"serving": now}), "ask").answers
+
+
+@pytest.mark.parametrize("option", ["never", True])
+def test_other_options_are_refused(api, option):
+    body = {"model": "m", "datasets": [recording(api, 31)], "promotion": option}
+    assert error(api.post("/v1/jobs", json=body), 422, "invalid_request")["detail"][0]["field"] == "promotion"
+
+
+def test_a_retry_keeps_the_option(api):
+    job = queue(api, "again", recording(api, 39), holdout={"guard_s": 30.0}, promotion="always")
+    assert ended(api, job["id"])["state"] == "failed"
+    again = api.post(f"/v1/jobs/{job['id']}/retry", json={})
+    assert again.json()["promotion"] == "always"
+    ended(api, again.json()["id"])
