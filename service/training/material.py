@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 from lipcore.data import independence, outliers
 from lipcore.data.outliers import Corrupt, CorruptError
 from lipcore.data.samples import Array, Samples
+from lipcore.data.splits import Mask
 from lipcore.kernels.geometry import Geometry
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import TorqueConvention
