@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from lipcore.data.signals import noise_level
 from lipcore.preparation.recipe import Recipe
-from service.datasets.report.fit import shifts
+from service.datasets.report.lag import shifts
 from service.datasets.report.signals import (
     against_limits,
     bounds,
