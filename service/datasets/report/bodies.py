@@ -239,6 +239,11 @@ def joint_order(bodies: Bodies, signals: Signals, against: Against) -> Order | N
         if not error(better) < error(best):
             break
         best = better
+    # joints with little torque stay where they are, unless another place is clearly better
+    for a, b in combinations(range(n), 2):
+        back = _exchanged(best, a, b)
+        if _moved(back) < _moved(best) and n * (error(back) - error(best)) < 2 * np.log(BETTER):
+            best = back
     moved = [joint for joint in range(n) if best[joint] != joint]
     if not moved:
         return None
@@ -251,6 +256,10 @@ def joint_order(bodies: Bodies, signals: Signals, against: Against) -> Order | N
 
 def _mean_log(against: Against) -> float:
     return float(np.log(against.errors + FLOOR).mean())
+
+
+def _moved(order: tuple[int, ...]) -> int:
+    return sum(column != joint for joint, column in enumerate(order))
 
 
 def _exchanged(order: tuple[int, ...], a: int, b: int) -> tuple[int, ...]:

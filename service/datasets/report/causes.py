@@ -201,11 +201,10 @@ class _Case:
         none = inertia is not None and inertia > 1 / OTHER and bool(absent) and len(absent) >= MOST * len(expected)
         none = none and float(np.abs(g[expected]).max()) < 1 / OTHER
         turned = bool(plain) and bool((g[plain] < 0).all())
-        if (none or turned) and self._leans(expected or plain):
-            text = (
-                f"has gravity along another direction than {robot}'s base: is it mounted on a wall, or tilted? {BASE}"
-            )
-            return self._remedy("mounting", expected or plain, text)
+        seen = [j for j in range(self.upload.n_joints) if visible[j] > VISIBLE]
+        if seen and (self.against.explained[seen] < WELL).any() and self._leans(seen):
+            text = f"has gravity along another direction than {robot}'s base: is it on a wall, or tilted? {BASE}"
+            return self._remedy("mounting", seen, text)
         if turned:
             text = f"has gravity upwards ({self._times(plain)} times that of {robot}): does it hang upside down? {BASE}"
             return self._remedy("mounting", plain, text)
@@ -215,9 +214,9 @@ class _Case:
         if plain and all(DOUBLE[0] < g[j] < DOUBLE[1] for j in plain):
             if inertia is not None and not LIKE[0] < inertia < LIKE[1]:
                 return None
-            seen = "cannot be seen" if inertia is None else f"{inertia:.2g} times"
+            other = "cannot be seen" if inertia is None else f"{inertia:.2g} times"
             text = (
-                f"holds gravity twice ({self._times(plain)} times that of {robot}, inertia {seen}): something adds it "
+                f"holds gravity twice ({self._times(plain)} times that of {robot}, inertia {other}): something adds it "
                 "to a torque that has it already; record that torque without it"
             )
             return self._remedy("gravity_doubled", plain, text)
