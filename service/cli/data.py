@@ -38,6 +38,9 @@ def add(
     drop_joints: Annotated[str | None, typer.Option("--drop", help="Joints to leave out.")] = None,
     effort: Annotated[str | None, typer.Option(help="What tau is: measured, commanded or current.")] = None,
     torque_constants: Annotated[str | None, typer.Option(help="N·m/A of each joint, for motor currents.")] = None,
+    torque_factors: Annotated[
+        str | None, typer.Option(help="By which each joint's torque is multiplied: -1 where its sign is opposite.")
+    ] = None,
     torque_convention: Annotated[str | None, typer.Option(help="gravity_included or gravity_compensated.")] = None,
     column: Annotated[
         list[str] | None,
@@ -63,6 +66,7 @@ def add(
         "drop_joints": names(drop_joints),
         "effort": effort,
         "torque_constants": names(torque_constants),
+        "torque_factors": names(torque_factors),
         "torque_convention": torque_convention,
         "columns": {key: _one_or_more(value) for key, value in pairs("--column", column).items()} or None,
         "units": pairs("--unit", unit) or None,

@@ -12,7 +12,7 @@ from rich.table import Table
 from service.client.results.arm import Arm
 from service.client.results.evaluation import Comparison, Evaluation
 from service.client.results.series import Prediction
-from service.datasets.schema import DatasetReport, JointExcitation, Weight
+from service.datasets.schema import AgainstRobot, DatasetReport, JointExcitation, JointNoise, Weight
 from service.models.schema import Selection
 
 
@@ -146,6 +146,8 @@ def report_tables(report: DatasetReport, joint_names: Sequence[str]) -> Iterator
     yield _joints(report, joint_names)
     if report.excitation is not None:
         yield _friction(report.excitation.joints)
+    if report.against_robot is not None:
+        yield _against(report.against_robot)
 
 
 def _joints(report: DatasetReport, joint_names: Sequence[str]) -> Table:
@@ -163,7 +165,7 @@ def _joints(report: DatasetReport, joint_names: Sequence[str]) -> Table:
             f"{low['q']:.2f} … {high['q']:.2f}",
             *(f"{max(-low[name], high[name]):.3g}" for name in ("dq", "ddq")),
             f"{low['tau']:.3g} … {high['tau']:.3g}",
-            _number(report.torque_noise_estimate[index] if known is None else known.torque),
+            _noise(report.torque_noise_estimate[index], known),
             NOTHING if late is None or late.seconds is None else f"{1e3 * late.seconds:.1f}",
             NOTHING if used is None or used.range_used is None else f"{used.range_used:.0%}",
         )
@@ -177,8 +179,29 @@ def _friction(joints: Sequence[JointExcitation]) -> Table:
     return table
 
 
+def _against(found: AgainstRobot) -> Table:
+    table = Table("joint", "gravity", "inertia", "explained", title=f"torque, times that of {found.robot}")
+    for each in found.joints:
+        times = [_times(each.gravity, each.gravity_std), _times(each.inertia, each.inertia_std)]
+        table.add_row(each.joint, *times, f"{each.explained:.0%}")
+    return table
+
+
+def _times(factor: float | None, std: float | None) -> str:
+    return NOTHING if factor is None or std is None else f"{factor:.2f} ± {std:.2g}"
+
+
+def _noise(prepared: float, recorded: JointNoise | None) -> str:
+    if recorded is None:
+        return _number(prepared)
+    return "smoothed" if recorded.smoothed else _number(recorded.torque)
+
+
 def _weight(weight: Weight) -> str:
-    return weight.verdict if weight.std is None else f"{weight.verdict} (±{weight.std:.2g})"
+    if weight.std is None:
+        return weight.verdict
+    value = "" if weight.value is None else f"{weight.value:.2g} "
+    return f"{'implausible' if weight.implausible else weight.verdict} ({value}±{weight.std:.2g})"
 
 
 def _number(value: float | None) -> str:

@@ -42,9 +42,9 @@ MEDIA_TYPE_OF = {suffix: _FIRST[kind] for suffix, kind in SUFFIXES.items()}
 class Reading(TypedDict, total=False):
     """What a client may say of an upload; what is left out is found out, or takes the route's default.
 
-    joint_names, joints, drop_joints: names; torque_constants: N·m/A; columns: for t, episode, q, dq, ddq, tau a pattern
-    with `{joint}` or a list of names; units: of these by name; cutoff, rate: Hz; gap: usual steps of
-    time; trim: s. The others are as in the route's documentation.
+    joint_names, joints, drop_joints: names; torque_constants: N·m/A; torque_factors: of the torques; columns: for t,
+    episode, q, dq, ddq, tau a pattern with `{joint}` or a list of names; units: of these by name; cutoff, rate: Hz;
+    gap: usual steps of time; trim: s. The others are as in the route's documentation.
     """
 
     joint_names: Sequence[str]
@@ -52,6 +52,7 @@ class Reading(TypedDict, total=False):
     torque_convention: str
     effort: str
     torque_constants: Sequence[float]
+    torque_factors: Sequence[float]
     joints: Sequence[str]
     drop_joints: Sequence[str]
     columns: Mapping[str, str | Sequence[str]]

@@ -32,7 +32,7 @@ class ReadOptions:
 
     columns: for t, episode, q, dq, ddq, tau what its columns are called: a pattern with `{joint}`, or a list; units: of
     these by name; topic: of a bag; delimiter: of a CSV; joint_names: of joints 1..n; effort: what tau is;
-    torque_constants: N·m/A a joint, of motor currents.
+    torque_constants: N·m/A a joint, of motor currents; torque_factors: by which each joint's torque is multiplied.
     """
 
     columns: Mapping[str, str | tuple[str, ...]] = field(default_factory=dict)
@@ -42,6 +42,7 @@ class ReadOptions:
     joint_names: tuple[str, ...] | None = None
     effort: Effort | None = None
     torque_constants: tuple[float, ...] | None = None
+    torque_factors: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,13 @@ async def upload_options(
     torque_constants: Annotated[
         Names, Query(description="N·m/A of joints 1..n, separated by commas, for motor currents")
     ] = None,
+    torque_factors: Annotated[
+        Names,
+        Query(
+            description="By which the torques of joints 1..n are multiplied, separated by commas: -1 where the sign is "
+            "opposite, or a gear's ratio"
+        ),
+    ] = None,
     joints: Annotated[Names, Query(description="Joints to keep, in this order; all by default")] = None,
     drop_joints: Annotated[Names, Query(description="Joints to leave out: grippers, those that are locked")] = None,
     columns: Annotated[
@@ -151,7 +159,6 @@ async def upload_options(
     ] = None,
 ) -> UploadOptions:
     """How an upload is read and prepared; raise InvalidRequestError."""
-    constants = None if torque_constants is None else tuple(_number(part) for part in torque_constants.split(","))
     read = ReadOptions(
         columns=_columns(columns),
         units=_units(units),
@@ -159,7 +166,8 @@ async def upload_options(
         delimiter=delimiter,
         joint_names=_names("joint_names", joint_names),
         effort=effort,
-        torque_constants=constants,
+        torque_constants=_numbers("torque_constants", torque_constants, "N·m/A"),
+        torque_factors=_numbers("torque_factors", torque_factors, "no unit"),
     )
     recipe = Recipe(cutoff_hz=cutoff, filtering=filtering, form=form, rate_hz=rate, trim_s=trim, gap_steps=gap)
     dropped = _names("drop_joints", drop_joints)
@@ -175,14 +183,17 @@ def _names(field: str, given: str | None) -> tuple[str, ...] | None:
     return names
 
 
-def _number(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not 0 < abs(value) < 1e6:
-        raise invalid_request("torque_constants", text, "numbers of N·m/A, separated by commas")
-    return value
+def _numbers(field: str, given: str | None, unit: str) -> tuple[float, ...] | None:
+    values = []
+    for text in [] if given is None else given.split(","):
+        try:
+            value = float(text)
+        except ValueError:
+            value = float("nan")
+        if not 0 < abs(value) < 1e6:
+            raise invalid_request(field, text, f"numbers of {unit}, none of them 0, separated by commas")
+        values.append(value)
+    return None if given is None else tuple(values)
 
 
 def _object(field: str, given: str | None) -> Mapping[str, Any]:

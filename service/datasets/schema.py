@@ -62,28 +62,36 @@ class Lag(BaseModel):
     """How long the torque comes after the motion that it belongs to; negative where it comes before."""
 
     joint: str | None = Field(description="Null for all joints together")
-    seconds: float | None = Field(description="Null where the data cannot tell")
-    std_s: float | None = Field(description="Its standard deviation, from leaving out an eighth at a time")
-    cost: Share | None = Field(description="Share of the torque's variance that the lag turns into error")
-    reason: str | None = Field(description="Why the data cannot tell")
+    seconds: float | None = Field(None, description="Null where the data cannot tell")
+    std_s: float | None = Field(None, description="Its standard deviation, from leaving out an eighth at a time")
+    cost: Share | None = Field(None, description="Share of the torque's variance that the lag turns into error")
+    reason: str | None = Field(None, description="Why the data cannot tell")
+    improves: list[str] = Field(
+        [],
+        description="Of a lag that differs from 0: joints whose torque, taken so much later, is clearly predicted "
+        "better on parts held out",
+    )
 
 
 class JointNoise(BaseModel):
     """White noise of the signals as recorded; null where there are too few samples."""
 
     joint: str
-    torque: float | None = Field(description="Standard deviation, N·m")
+    torque: float | None = Field(description="Standard deviation, N·m; null where the torque was smoothed, too")
     torque_share: Share | None = Field(description="Of the torque's spread")
     velocity: float | None = Field(description="Standard deviation, rad/s; null where it was not recorded")
     velocity_share: Share | None = Field(description="Of the velocity's spread")
+    smoothed: bool = Field(False, description="Torque without noise: low-passed, or simulated; nothing tells its noise")
 
 
 class Weight(BaseModel):
     """A weight of a joint's friction: how well these data would tell it."""
 
+    value: float | None = Field(None, description="Its estimate, N·m·s/rad or N·m, beside rigid bodies; else null")
     std: float | None = Field(description="Standard deviation that they leave; null where they say nothing")
     share: Share | None = Field(description="Torque of that deviation over the spread of the joint's torque")
     verdict: Verdict
+    implausible: bool = Field(False, description="Clearly negative friction: no joint has that")
 
 
 class JointExcitation(BaseModel):
@@ -96,6 +104,7 @@ class JointExcitation(BaseModel):
     acceleration_std: float = Field(description="rad/s² or m/s²")
     forwards: Share = Field(description="Share of samples that move forwards, faster than 0.02 rad/s or m/s")
     backwards: Share = Field(description="Share that move backwards")
+    still: Share | None = Field(None, description="Share that does neither")
     reversals: int = Field(description="Changes of direction within an episode")
     slow_forwards: Share = Field(description="Share of samples that move forwards slower than 0.1 rad/s or m/s")
     slow_backwards: Share = Field(description="Share that move backwards as slowly")
@@ -126,8 +135,45 @@ class Excitation(BaseModel):
         "bodies with unknown parameters, or, without them, any smooth function of the motion, which leaves less certain"
     )
     joints: list[JointExcitation]
+    standstill: Share | None = Field(None, description="Share of samples in which no joint moves")
+    motion_dimensions: float | None = Field(
+        None, description="Independent joints' worth of motion: 1 where all move together, n where each moves by itself"
+    )
     whole: WholeExcitation | None
     text: str = Field(description="The same in words")
+
+
+class JointAgainstRobot(BaseModel):
+    """A joint's torque against what the robot's rigid bodies need, friction apart; null where nothing tells it."""
+
+    joint: str
+    gravity: float | None = Field(description="Gravity's torque over the robot's: 1 as the URDF has it, 0 where absent")
+    gravity_std: float | None
+    inertia: float | None = Field(description="The same of inertia and velocities; rotors make it larger")
+    inertia_std: float | None
+    explained: Share = Field(description="Share of the torque's variance that both and friction explain")
+
+
+class AgainstRobot(BaseModel):
+    """Torque against that of a robot's rigid bodies."""
+
+    robot: str = Field(description="The robot of the upload, else the one that the names of the joints suggest")
+    joints: list[JointAgainstRobot]
+
+
+Cause = Literal[
+    "torque_sign", "torque_order", "joint_order", "torque_factor", "no_gravity", "gravity_included", "gravity_doubled",
+    "mounting", "robot", "friction_sign",
+]  # fmt: skip
+
+
+class Remedy(BaseModel):
+    """What ruins a model, and the options of an upload of the same file that put it right."""
+
+    cause: Cause
+    joints: list[str] = Field(description="Those concerned")
+    text: str
+    options: dict[str, str] | None = Field(description="Of the upload's query, to be added; null where none would do")
 
 
 class DatasetReport(BaseModel):
@@ -159,6 +205,10 @@ class DatasetReport(BaseModel):
     lag: list[Lag] | None = Field(None, description="All joints together first, then joint by joint")
     noise: list[JointNoise] | None = None
     excitation: Excitation | None = None
+    against_robot: AgainstRobot | None = Field(None, description="Null without a robot's URDF")
+    remedies: list[Remedy] = Field(
+        [], description="What `warnings` and `advice` say of the upload's options, to act on"
+    )
     advice: list[str] = Field([], description="What to record next, or to correct, one sentence each")
 
 

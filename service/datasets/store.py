@@ -53,8 +53,9 @@ def add(
             recording = read(table, folder, options, profile, settings, disk)
         prepared = prepare(recording.staged, folder, options.recipe, settings.min_samples, disk)
         gravity = recording.torque_convention == "gravity_included"
-        report = make_report(recording.staged, prepared, profile, recording.noted, settings, options.recipe, gravity)
-        report["source"] = recording.facts
+        report = make_report(
+            recording.staged, prepared, profile, recording.noted, settings, options.recipe, gravity, recording.facts
+        )
         report["joint_types"] = None if profile is None else _joint_types(profile, recording.staged.joint_names)
         staged = prepared.staged
         disk.take(sample_file.size(staged.rows, staged.n_joints))

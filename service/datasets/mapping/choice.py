@@ -37,11 +37,12 @@ BY_DEFAULT = "as nothing else is said"
 
 @dataclass(frozen=True)
 class Torque:
-    """How the column of torque is taken. constants: N·m/A by joint, of motor currents."""
+    """How the column of torque is taken. constants: N·m/A by joint, of motor currents; factors: of the torques."""
 
     effort: Effort
     convention: TorqueConvention
     constants: tuple[float, ...] | None
+    factors: tuple[float, ...] | None
     notes: tuple[str, ...]
 
 
@@ -90,11 +91,27 @@ def torque(
     given: tuple[float, ...] | None = None
     if effort == "current":
         given = _constants(options, constants, len(units))
-        notes.append(f"torque is current times {', '.join(f'{value:g}' for value in given)} N·m/A of the joints")
+        notes.append(f"torque is current times {listed(given)} N·m/A of the joints")
+    elif options.read.torque_constants is not None:
+        raise invalid_request(
+            "torque_constants",
+            listed(options.read.torque_constants),
+            f"nothing, as {family.pattern} is {MEANINGS[effort]}, {why}; or effort=current where it is motor current",
+        )
+    factors = options.read.torque_factors
+    if factors is not None:
+        if len(factors) != len(units):
+            raise invalid_request("torque_factors", f"{len(factors)} values", f"{len(units)}, one a joint that is kept")
+        notes.append(f"torque is multiplied by {listed(factors)} of the joints, as the upload asks for")
     convention = options.torque_convention or EFFORT_CONVENTIONS[effort]
     if convention != EFFORT_CONVENTIONS[effort]:
         notes.append(f"the torque convention is {convention}, as the upload says, though effort is {effort}")
-    return Torque(effort, convention, given, tuple(notes))
+    return Torque(effort, convention, given, factors, tuple(notes))
+
+
+def listed(values: Sequence[float]) -> str:
+    """Numbers as an option of the upload takes them, four digits each."""
+    return ", ".join(f"{value:.4g}" for value in values)
 
 
 def _effort(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from lipcore.profiles import Profile
 from service.datasets.mapping.choice import Torque, choose, source, source_or_none, torque
@@ -29,7 +29,8 @@ class Source:
 
 @dataclass(frozen=True)
 class ColumnMap:
-    """What to read. t: columns that add up to the time, none where there is no time; joints: names of those kept.
+    """What to read. t: columns that add up to the time, none where there is no time; joints: names of those kept;
+    places: theirs among all joints of the file.
 
     quantities: of q, tau, and of dq and ddq where there are any, one column a joint; dropped: of joints left out, by
     name, the column of their position; unused: names of all other columns; notes: what was understood, in sentences.
@@ -38,6 +39,7 @@ class ColumnMap:
     t: tuple[Source, ...]
     episode: Source | None
     joints: tuple[str, ...]
+    places: tuple[int, ...]
     quantities: Mapping[str, tuple[Source, ...]]
     dropped: Mapping[str, Source]
     unused: tuple[str, ...]
@@ -68,11 +70,11 @@ def resolve(
     tau = chosen["tau"]
     tau_units = [each.unit for each in quantities["tau"]]
     meaning = torque(tau, tau_units, options, robot, order.constants)
-    if meaning.constants is not None:
-        quantities["tau"] = tuple(
-            Source(each.index, each.name, each.factor * constant, each.unit)
-            for each, constant in zip(quantities["tau"], meaning.constants, strict=True)
-        )
+    for factors in (meaning.constants, meaning.factors):
+        if factors is not None:
+            quantities["tau"] = tuple(
+                replace(each, factor=each.factor * by) for each, by in zip(quantities["tau"], factors, strict=True)
+            )
     times, episode = _time(names, units, options), _episode(names, options)
     dropped = {each.name: _source(names, units, options, families.positions, each) for each in order.dropped}
     read = [*(each for row in quantities.values() for each in row), *times, *([episode] if episode else [])]
@@ -86,7 +88,15 @@ def resolve(
     if unused:
         notes.append(f"{len(unused)} columns are not used: {_listed(unused)}")
     return ColumnMap(
-        times, episode, tuple(joint.name for joint in order.kept), quantities, dropped, unused, meaning, tuple(notes)
+        times,
+        episode,
+        tuple(joint.name for joint in order.kept),
+        tuple(joint.place for joint in order.kept),
+        quantities,
+        dropped,
+        unused,
+        meaning,
+        tuple(notes),
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from service.datasets.report.excitation import SELDOM, SLOW
+from service.datasets.report.lag import clear
 from service.datasets.schema import Excitation, JointExcitation, JointLimits, JointNoise, JointSaturation, Lag, Timing
 
 TERMS = (("viscous friction", "viscous"), ("Coulomb friction", "coulomb"), ("constant torque", "offset"))
@@ -22,12 +23,14 @@ LATE = 1e-3
 """Share of the torque's variance from which on a lag is worth a warning."""
 VERY_LATE = 5e-3
 """The same where only one joint is late."""
-SURE = 3.0
-"""Standard deviations that a lag has to differ by."""
 UNEVEN = 0.25
 MISSING = 0.01
 COLLINEAR = 0.99
 SHORT_S = 60.0
+TOGETHER = 0.5
+"""Independent motions, as a share of the joints, below which joints count as moving together."""
+STANDING = 0.5
+"""Share of samples at standstill from which on it is said."""
 
 
 def listed(names: Iterable[str], most: int = 8) -> str:
@@ -71,24 +74,23 @@ def warnings(
 
 def _late(lags: list[Lag]) -> list[str]:
     """A lag that all joints share is one of clocks or filters; that of one joint alone may be its friction's."""
-    (_, shared, shared_std, _), *others = (
-        (each.joint, each.seconds or 0.0, each.std_s or 0.0, each.cost or 0.0) for each in lags
-    )
-    late = [each for each in others if each[3] > LATE and abs(each[1]) > SURE * each[2]]
-    if abs(shared) > SURE * shared_std:
-        alike = [cost for _, seconds, std, cost in late if abs(seconds - shared) < SURE * std + shared_std]
-        if alike:
+    shared, *others = lags
+    late = [each for each in others if (each.cost or 0.0) > LATE and clear(each)]
+    if clear(shared) and 2 * len(shared.improves) > sum(each.seconds is not None for each in others):
+        cost = max((each.cost or 0.0 for each in late if each.joint in shared.improves), default=0.0)
+        if cost:
+            seconds, std = shared.seconds or 0.0, shared.std_s or 0.0
             return [
-                f"torque and motion are not of the same time: torque comes {1e3 * abs(shared):.1f} ms "
-                f"(± {1e3 * shared_std:.1f}) {'after' if shared > 0 else 'before'} motion, which turns up to "
-                f"{max(alike):.1%} of a joint's torque variance into error; use signals of one clock, filtered alike"
+                f"torque and motion are not of the same time: torque comes {1e3 * abs(seconds):.1f} ms "
+                f"(± {1e3 * std:.1f}) {'after' if seconds > 0 else 'before'} motion, which turns up to "
+                f"{cost:.1%} of a joint's torque variance into error; use signals of one clock, filtered alike"
             ]
     return [
-        f"the torque of {joint} comes {1e3 * abs(seconds):.0f} ms (± {1e3 * std:.0f}) "
-        f"{'after' if seconds > 0 else 'before'} its motion, which other joints do not show: time stamps do not "
-        "explain it, filters of this joint or friction that depends on more than speed may"
-        for joint, seconds, std, cost in late
-        if cost > VERY_LATE
+        f"the torque of {each.joint} comes {1e3 * abs(each.seconds or 0.0):.0f} ms (± {1e3 * (each.std_s or 0.0):.0f}) "
+        f"{'after' if (each.seconds or 0.0) > 0 else 'before'} its motion, which other joints do not show: time stamps "
+        "do not explain it, filters of this joint or friction that depends on more than speed may"
+        for each in late
+        if (each.cost or 0.0) > VERY_LATE and each.improves
     ]
 
 
@@ -145,6 +147,22 @@ def advice(timing: Timing, excitation: Excitation, limits: list[JointLimits], no
         out.append(
             f"{listed(loud)}: noise is more than {LOUD:.0%} of the torque's spread; record larger or faster motion, "
             "and longer"
+        )
+    if smooth := [each.joint for each in noise if each.smoothed]:
+        out.append(
+            f"{listed(smooth)}: torque was smoothed before it was recorded, or simulated, so that its noise cannot be "
+            "told; record it as it is measured, at least as a live stream will have it"
+        )
+    if (excitation.standstill or 0.0) > STANDING:
+        out.append(
+            f"the robot stands still in {excitation.standstill:.0%} of the samples, which teach gravity and stiction "
+            "at few places only; record motion"
+        )
+    dimensions = excitation.motion_dimensions
+    if dimensions is not None and 0 < dimensions < TOGETHER * len(joints) and len(joints) - len(still) > 1:
+        out.append(
+            f"joints move together, like {dimensions:.1f} independent ones of {len(joints)}: torques of other motion "
+            "are extrapolated; record motion in which each moves by itself, or plan it with `lipserve excite`"
         )
     if timing.duration_s is not None and timing.duration_s < SHORT_S:
         out.append(f"{timing.duration_s:.3g} s in all: record some minutes, so that a part can be held out to judge by")

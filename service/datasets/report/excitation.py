@@ -31,6 +31,8 @@ from service.datasets.schema import JointExcitation, Verdict, Weight, WholeExcit
 
 DETERMINED: tuple[tuple[float, Verdict], ...] = ((0.02, "well"), (0.1, "poorly"))
 """Largest share of the torque's spread that a weight's standard deviation may stand for, by verdict."""
+CLEAR, NOTICED = 2.0, 0.03
+"""Standard deviations below zero, and share of the torque's spread, from which on friction counts as negative."""
 SLOW = 0.1
 """rad/s or m/s below which motion is slow: Coulomb friction and stiction show there."""
 SELDOM = 0.005
@@ -54,6 +56,7 @@ def joint_excitation(
     worst, term = collinearity(q[fit.rows], dq[fit.rows], ddq[fit.rows])
     slow = np.abs(dq) < SLOW
     forwards, backwards = float(np.mean(dq > SIGN_WIDTH)), float(np.mean(dq < -SIGN_WIDTH))
+    speed = float(np.sqrt(np.mean(dq**2)))
     return JointExcitation(
         joint=name,
         span=float(np.ptp(q)),
@@ -62,33 +65,43 @@ def joint_excitation(
         acceleration_std=spread(ddq),
         forwards=forwards,
         backwards=backwards,
+        still=1.0 - forwards - backwards,
         reversals=reversals(dq, part),
         slow_forwards=float(np.mean(slow & (dq > SIGN_WIDTH))),
         slow_backwards=float(np.mean(slow & (dq < -SIGN_WIDTH))),
-        **weights(stds, float(np.sqrt(np.mean(dq**2))), spread(tau), min(forwards, backwards) < SELDOM),
+        **weights([(None, std) for std in stds], speed, spread(tau), min(forwards, backwards) < SELDOM),
         collinear=worst,
         collinear_term=term,
     )
 
 
-def weights(stds: Sequence[float | None], speed: float, torque: float, one_way: bool) -> dict[str, Weight]:
-    """Judge the standard deviations of a joint's viscous, Coulomb and offset weights.
+Estimate = tuple[float | None, float | None]
+"""A weight and its standard deviation, None where the data say nothing of it."""
+
+
+def weights(friction: Sequence[Estimate], speed: float, torque: float, one_way: bool) -> dict[str, Weight]:
+    """Judge a joint's viscous, Coulomb and offset weights.
 
     speed: root mean square; torque: standard deviation of the joint's; one_way: whether one direction is
     absent, so that nothing but standstill would tell Coulomb friction from an offset, which it does not.
     """
     sizes = (float(speed), 1.0, 1.0)
-    out = {kind: _weight(std, size, float(torque)) for kind, std, size in zip(FRICTION_TERMS, stds, sizes, strict=True)}
+    out = {
+        kind: _weight(*each, size, float(torque), kind != "offset")
+        for kind, each, size in zip(FRICTION_TERMS, friction, sizes, strict=True)
+    }
     if one_way:
         for kind in ("coulomb", "offset"):
-            out[kind] = out[kind].model_copy(update={"verdict": "not determined"})
+            out[kind] = out[kind].model_copy(update={"verdict": "not determined", "implausible": False})
     return out
 
 
 def friction_stds(fit: Fit, joint: int, noise: float, torque: float) -> tuple[float | None, float | None, float]:
     """Standard deviations of viscous, Coulomb and offset weights, None where the data say nothing of one.
 
-    torque: root mean square of the joint's, N·m; nothing else that is fitted may be more than PRIOR of it.
+    The weights themselves, beside terms that may be any function of motion, are not worth much: on simulated arms some
+    were many standard deviations off. torque: root mean square of the joint's, N·m; nothing else that is fitted may be
+    more than PRIOR of it.
     """
     variance = noise**2 * len(fit.rows) / fit.independent
     known = np.isfinite(fit.scales)
@@ -141,11 +154,14 @@ def _visited(q: Array, lower: float, upper: float) -> float | None:
     return float(np.count_nonzero(np.bincount(bins, minlength=BINS))) / BINS
 
 
-def _weight(std: float | None, factor: float, torque: float) -> Weight:
+def _weight(value: float | None, std: float | None, factor: float, torque: float, friction: bool) -> Weight:
     if std is None or torque == 0:
-        return Weight(std=std, share=None, verdict="not determined")
+        return Weight(value=value, std=std, share=None, verdict="not determined")
     share = std * factor / torque
-    return Weight(std=std, share=share, verdict=next((v for most, v in DETERMINED if share <= most), "not determined"))
+    verdict = next((v for most, v in DETERMINED if share <= most), "not determined")
+    negative = friction and verdict == "well" and value is not None and value < -CLEAR * std
+    negative = negative and -(value or 0.0) * factor > NOTICED * torque
+    return Weight(value=value, std=std, share=share, verdict=verdict, implausible=negative)
 
 
 MOST_EQUATIONS = 14_000
@@ -167,10 +183,10 @@ N_TERMS = len(FRICTION_TERMS)
 
 @dataclass(frozen=True)
 class RigidExcitation:
-    """What the URDF tells of a recording. friction: std of each joint's weights in the order FRICTION_TERMS, (n, 3)."""
+    """What the URDF tells of a recording. friction: each joint's weights in the order FRICTION_TERMS."""
 
     whole: WholeExcitation
-    friction: Array
+    friction: list[list[Estimate]]
 
 
 @dataclass(frozen=True)
@@ -190,11 +206,12 @@ def judge_rigid_bodies(
     names: tuple[str, ...],
     limits: Limits,
     motion: tuple[Array, Array, Array],
+    tau: Array,
     noise: Array,
     independent: float,
     gravity: bool,
 ) -> RigidExcitation | str:
-    """Judge rows of motion q, dq, ddq, (R, n) each; a sentence says why where the URDF cannot be used for these joints.
+    """Judge rows of motion q, dq, ddq and torque, (R, n) each; a sentence says why the URDF cannot be used for them.
 
     noise: std of what is left of each joint's torque, (n,) N·m; independent: samples that the rows stand for; gravity:
     whether torques contain it.
@@ -209,14 +226,16 @@ def judge_rigid_bodies(
     n, size = len(names), len(names) * PARAMETERS
     reference = _reference(kernel, limits)
     rows = np.linspace(0, len(motion[0]) - 1, min(len(motion[0]), MOST_EQUATIONS // n)).astype(np.int64)
-    q, dq, ddq = (each[rows] for each in motion)
+    q, dq, ddq, tau = (each[rows] for each in (*motion, tau))
     gram, information = np.zeros((size, size)), np.zeros((size + N_TERMS * n, size + N_TERMS * n))
+    projected = np.zeros(len(information))
     loudness = np.maximum(noise, 1e-9 * max(float(noise.max()), 1e-9))
     for first, block in _regressors(kernel, q, dq, ddq):
         gram += block.T @ block
         some = dq[first : first + len(block) // n]
         both = np.hstack([block, _friction(some)]) / np.tile(loudness, len(some))[:, None]
         information += both.T @ both
+        projected += both.T @ (tau[first : first + len(some)] / loudness).reshape(-1)
     excited, modes = np.linalg.eigh(reference.back.T @ gram @ reference.back / (n * len(q)))
     shares = np.sqrt(np.maximum(excited, 0.0))
     # whose parameters the least excited mode moves, weighed by the torque that random motion makes of them
@@ -228,7 +247,8 @@ def judge_rigid_bodies(
         weakest=float(shares[0]),
         weakest_body=names[int(np.square(weakest).sum(axis=0).argmax())],
     )
-    return RigidExcitation(whole, _friction_stds(information * independent / len(q), reference.back))
+    each_row = independent / len(q)
+    return RigidExcitation(whole, _friction_weights(information * each_row, projected * each_row, reference.back))
 
 
 def _reference(kernel: ArmKernel, limits: Limits) -> _Reference:
@@ -252,8 +272,8 @@ def _friction(dq: Array) -> Array:
     return out.reshape(rows * n, N_TERMS * n)
 
 
-def _friction_stds(information: Array, back: Array) -> Array:
-    """Std of the friction's weights beside unknown inertial parameters, (n, 3); information: (13 n, 13 n)."""
+def _friction_weights(information: Array, projected: Array, back: Array) -> list[list[Estimate]]:
+    """The friction's weights beside unknown inertial parameters; information: (13 n, 13 n); projected: (13 n,)."""
     size, count = back.shape
     turn = np.zeros((len(information), count + len(information) - size))
     turn[:size, :count], turn[size:, count:] = back, np.eye(len(information) - size)
@@ -261,7 +281,10 @@ def _friction_stds(information: Array, back: Array) -> Array:
     scale = np.sqrt(np.maximum(np.diag(base), 1e-300))
     values, vectors = np.linalg.eigh(base / np.outer(scale, scale))
     inverse = (vectors / np.maximum(values, RESOLUTION)) @ vectors.T
-    return np.asarray((np.sqrt(np.diag(inverse)) / scale)[count:].reshape(-1, N_TERMS))
+    std = (np.sqrt(np.diag(inverse)) / scale)[count:].tolist()
+    mean = (inverse @ (turn.T @ projected / scale) / scale)[count:].tolist()
+    estimates: list[Estimate] = list(zip(mean, std, strict=True))
+    return [estimates[first : first + N_TERMS] for first in range(0, len(estimates), N_TERMS)]
 
 
 def _condition(gram: Array) -> float | None:

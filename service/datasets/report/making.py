@@ -7,23 +7,33 @@ from typing import Any
 
 import numpy as np
 
+from lipcore import profiles
+from lipcore.data.independence import motion_dimensions
 from lipcore.data.samples import Array
+from lipcore.kernels.friction import SIGN_WIDTH
 from lipcore.preparation.recipe import Recipe
 from lipcore.profiles import Profile
 from service.datasets import schema
 from service.datasets.report.advice import advice, in_words, warnings
+from service.datasets.report.bodies import Against, Bodies, Signals, compare
+from service.datasets.report.causes import Work, causes
 from service.datasets.report.excitation import SELDOM, RigidExcitation, joint_excitation, judge_rigid_bodies, weights
-from service.datasets.report.fit import Lags, make_fit, no_lags, shifts
+from service.datasets.report.fit import make_fit
+from service.datasets.report.lag import Lags, clear, no_lags, shifts
+from service.datasets.report.remedies import Upload
+from service.datasets.report.robots import bodies_of, proposed, suggestion
 from service.datasets.report.signals import (
     Clock,
     Limits,
     against_limits,
     bounds,
+    finite,
     limits_of,
     look_at_clock,
     noise_or_share,
     number_parts,
     saturation,
+    smoothed,
     spread,
     thin,
     white_noise,
@@ -31,6 +41,8 @@ from service.datasets.report.signals import (
 from service.datasets.staging import EPISODE, QUANTITIES, Prepared, Staged, column
 from service.foundation.settings import Settings
 
+UNSEEN = 1e-3
+"""Share of a torque's spread below which a factor of it would be one of rounding."""
 WARNING = "warning: "
 """What a sentence of the reading begins with that belongs to the warnings."""
 
@@ -43,11 +55,12 @@ def make_report(
     settings: Settings,
     recipe: Recipe | None = None,
     gravity: bool = True,
+    source: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The report as JSON, see DatasetReport.
 
     noted: what was found while the file was read; recipe: that of the preparation, the defaults where None; gravity:
-    whether torques contain it.
+    whether torques contain it; source: what the file's columns were taken as, None where that is not known.
     """
     recipe = recipe or Recipe()
     names = raw.joint_names
@@ -70,6 +83,7 @@ def make_report(
         reading.append(f"joints were taken for those of robot {profile.name} by their order")
     if isinstance(rigid, str):
         reading.append(rigid)
+    against, remedies, candidates = _against_robot(profile, Upload(names, gravity, source), samples, excitation)
     report = schema.DatasetReport(
         rows_uploaded=raw.rows,
         rows=prepared.staged.rows,
@@ -85,9 +99,11 @@ def make_report(
         torque_noise_estimate=samples.noise,
         warnings=warned
         + constant
+        + [each.text for each in remedies]
         + warnings(clock.timing, recorded.saturation, recorded.limits, samples.lags, raw.rows),
         reading=reading,
         recipe=recipe.to_json(),
+        source=source,
         steps=prepared.steps,
         robot=None if profile is None or limits is None else profile.name,
         timing=clock.timing,
@@ -96,7 +112,9 @@ def make_report(
         lag=samples.lags,
         noise=recorded.noise,
         excitation=excitation,
-        advice=advice(clock.timing, excitation, recorded.limits, recorded.noise),
+        against_robot=against,
+        remedies=remedies + candidates,
+        advice=[each.text for each in candidates] + advice(clock.timing, excitation, recorded.limits, recorded.noise),
     )
     return report.model_dump(mode="json")
 
@@ -113,8 +131,8 @@ class _Recorded:
 @dataclass(frozen=True)
 class _Samples:
     """What the samples show. ranges: smallest and largest by quantity and joint; noise: white, of the torque; left: std
-    of the torque that no motion explains, both N·m; motion: q, dq, ddq at few rows, (R, n) each; speeds, torques: root
-    mean square and standard deviation, (n,).
+    of the torque that no motion explains, both N·m; motion: q, dq, ddq at few rows, (R, n) each, tau: torque there;
+    speeds, torques: root mean square and standard deviation, (n,); work: of all torques.
     """
 
     ranges: dict[str, list[tuple[float, float]]]
@@ -125,6 +143,8 @@ class _Samples:
     lags: list[schema.Lag]
     excitation: list[schema.JointExcitation]
     motion: tuple[Array, Array, Array]
+    tau: Array
+    work: Work
 
 
 def _look_at_raw(raw: Staged, clock: Clock, limits: Limits | None) -> _Recorded:
@@ -133,11 +153,12 @@ def _look_at_raw(raw: Staged, clock: Clock, limits: Limits | None) -> _Recorded:
     for joint, name in enumerate(raw.joint_names):
         columns = raw.joint(joint)
         noise = {each: white_noise(columns[each], clock.part, robust=True) for each in ("tau", "dq") if each in columns}
+        smooth = smoothed(columns["tau"], clock.part, noise["tau"])
         if some_missing:
             columns = {each: values[~clock.missing] for each, values in columns.items()}
         out.limits.append(against_limits(joint, name, columns, limits))
         out.saturation.append(saturation(joint, name, columns["q"], columns["tau"], limits))
-        torque, velocity = noise["tau"], noise.get("dq")
+        torque, velocity = None if smooth else noise["tau"], noise.get("dq")
         out.noise.append(
             schema.JointNoise(
                 joint=name,
@@ -145,6 +166,7 @@ def _look_at_raw(raw: Staged, clock: Clock, limits: Limits | None) -> _Recorded:
                 torque_share=_share(torque, columns["tau"]),
                 velocity=velocity,
                 velocity_share=None if velocity is None else _share(velocity, columns["dq"]),
+                smoothed=smooth,
             )
         )
     return out
@@ -162,16 +184,18 @@ def _look_at_samples(prepared: Prepared, limits: Limits | None, most: int) -> _S
     steps = None if rate is None else shifts(rate, int((ends - starts).max()))
     rows = thin(part, most, 0 if steps is None else int(steps[-1]))
     motion = (staged.table("q", rows), staged.table("dq", rows), staged.table("ddq", rows))
-    fit = make_fit(rows, *motion, tau=staged.table("tau", rows), independent=_independent(prepared))
+    tau = staged.table("tau", rows)
+    fit = make_fit(rows, *motion, tau=tau, independent=_independent(prepared))
     lags = None if steps is None or rate is None else Lags(fit, steps, rate)
     ranges: dict[str, list[tuple[float, float]]] = {quantity: [] for quantity in QUANTITIES}
     levels, left, speeds, torques = np.empty((4, staged.n_joints))
-    joint_lags, excitation = [], []
+    joint_lags, excitation, power = [], [], np.zeros(staged.rows)
     for joint, name in enumerate(staged.joint_names):
         columns = {quantity: staged.read(column(quantity, joint)) for quantity in QUANTITIES}
         for quantity, values in columns.items():
             ranges[quantity].append((float(values.min()), float(values.max())))
         levels[joint] = noise_or_share(columns["tau"], part)
+        power += columns["tau"] * columns["dq"]
         speeds[joint], torques[joint] = np.sqrt(np.mean(columns["dq"] ** 2)), columns["tau"].std()
         if lags is None:
             left[joint] = np.sqrt(np.mean(fit.residuals(columns["tau"][rows, None]) ** 2))
@@ -184,7 +208,12 @@ def _look_at_samples(prepared: Prepared, limits: Limits | None, most: int) -> _S
         joint_lags = no_lags(staged.joint_names, why)
     else:
         joint_lags.insert(0, lags.of_all())
-    return _Samples(ranges, levels.tolist(), left, speeds, torques, joint_lags, excitation, motion)
+        for joint, name in enumerate(staged.joint_names):
+            torque = staged.read(column("tau", joint))
+            for lag in (joint_lags[0], joint_lags[joint + 1]):
+                if clear(lag) and lags.lowers(torque, lag.seconds or 0.0):
+                    lag.improves.append(name)
+    return _Samples(ranges, levels.tolist(), left, speeds, torques, joint_lags, excitation, motion, tau, Work.of(power))
 
 
 def _independent(prepared: Prepared) -> float:
@@ -202,7 +231,7 @@ def _rigid_bodies(
         return None
     names, independent = prepared.staged.joint_names, _independent(prepared)
     return judge_rigid_bodies(
-        profile.urdf, profile.name, names, limits, samples.motion, samples.left, independent, gravity
+        profile.urdf, profile.name, names, limits, samples.motion, samples.tau, samples.left, independent, gravity
     )
 
 
@@ -212,11 +241,47 @@ def _excitation(samples: _Samples, rigid: RigidExcitation | str | None) -> schem
         out = schema.Excitation(friction_beside="any motion", joints=samples.excitation, whole=None, text="")
     else:
         joints = [
-            each.model_copy(update=weights(stds, speed, torque, min(each.forwards, each.backwards) < SELDOM))
-            for each, stds, speed, torque in zip(
-                samples.excitation, rigid.friction.tolist(), samples.speeds, samples.torques, strict=True
+            each.model_copy(update=weights(friction, speed, torque, min(each.forwards, each.backwards) < SELDOM))
+            for each, friction, speed, torque in zip(
+                samples.excitation, rigid.friction, samples.speeds, samples.torques, strict=True
             )
         ]
         out = schema.Excitation(friction_beside="rigid bodies", joints=joints, whole=rigid.whole, text="")
+    dq = samples.motion[1]
+    out.standstill = float(np.mean(np.all(np.abs(dq) < SIGN_WIDTH, axis=1)))
+    out.motion_dimensions = motion_dimensions(dq)
     out.text = in_words(out)
     return out
+
+
+def _against_robot(
+    profile: Profile | None, upload: Upload, samples: _Samples, excitation: schema.Excitation
+) -> tuple[schema.AgainstRobot | None, list[schema.Remedy], list[schema.Remedy]]:
+    """Torque against the robot's, or that of the robot which the joints' names suggest; what is wrong; that robot."""
+    suggested, signals = [], Signals(*samples.motion, samples.tau)
+    if profile is None:
+        candidates, best = proposed(upload.names, signals)
+        if (proposal := suggestion(upload, candidates, best)) is not None:
+            suggested.append(proposal)
+        profile = None if best is None else profiles.profile(best)
+    bodies = None if profile is None else bodies_of(profile, upload.names)
+    against = None if bodies is None else compare(bodies, signals)
+    wrong = causes(upload, bodies, against, signals, excitation.joints, samples.work)
+    return None if bodies is None or against is None else _figures(bodies, against), wrong, suggested
+
+
+def _figures(bodies: Bodies, against: Against) -> schema.AgainstRobot:
+    joints = []
+    for joint, name in enumerate(bodies.names):
+        shown = [bool(visible > UNSEEN) for visible in against.visible[joint]]
+        joints.append(
+            schema.JointAgainstRobot(
+                joint=name,
+                gravity=finite(against.gravity[joint]) if shown[0] else None,
+                gravity_std=finite(against.gravity_std[joint]) if shown[0] else None,
+                inertia=finite(against.inertia[joint]) if shown[1] else None,
+                inertia_std=finite(against.inertia_std[joint]) if shown[1] else None,
+                explained=float(against.explained[joint]),
+            )
+        )
+    return schema.AgainstRobot(robot=bodies.name, joints=joints)

@@ -259,6 +259,38 @@ def white_noise(values: Array, part: Rows, robust: bool = False) -> float | None
     return min(levels) if levels else None
 
 
+SEGMENT, SEGMENTS = 128, 200
+"""Rows of a piece of a signal whose spectrum is taken, and most pieces."""
+MIDDLE, TOP = slice(19, 32), slice(45, 61)
+"""Places in that spectrum: 0.15 to 0.25, and 0.35 to 0.48 of the sampling rate."""
+FALLING = 0.02
+"""Power at the top of a spectrum, over that in its middle, below which a filter of two poles or more must be behind it:
+white noise has 1, one pole 0.2, and so have jumps, as of friction."""
+NO_NOISE = 1e-6
+"""Noise over the spread below which it is that of numbers."""
+
+
+def smoothed(values: Array, part: Rows, level: float | None) -> bool:
+    """Whether a torque's noise was filtered out before it was recorded, so that its level tells nothing.
+
+    values: (N,), missing ones NaN; part: of each row, as in `white_noise`; level: what that says.
+    """
+    wide = spread(values[np.isfinite(values)])
+    if level is None or wide == 0:
+        return False
+    if level < NO_NOISE * wide:
+        return True
+    starts, ends = bounds(part)
+    firsts = np.concatenate([np.arange(a, b - SEGMENT + 1, SEGMENT // 2) for a, b in zip(starts, ends, strict=True)])
+    if len(firsts) == 0:
+        return False
+    firsts = firsts[np.linspace(0, len(firsts) - 1, min(len(firsts), SEGMENTS)).astype(np.int64)]
+    pieces = values[firsts[:, None] + np.arange(SEGMENT)]
+    window = np.hanning(SEGMENT)
+    power = np.median(np.abs(np.fft.rfft((pieces - pieces.mean(1, keepdims=True)) * window, axis=1)) ** 2, axis=0)
+    return bool(power[TOP].mean() < FALLING * power[MIDDLE].mean())
+
+
 def _size(differences: Array, robust: bool) -> float:
     """Their root mean square, or what it would be by their median; coarse signals mostly have none that is not 0."""
     if robust:

@@ -18,6 +18,7 @@ CHOICES: dict[str, dict[str, str]] = {
     "form": {"anticausal": "form"},
     "effort": {"volts": "effort"},
     "torque_constants": dict.fromkeys(("", "1,,2", "0", "nan", "1e9"), "torque_constants"),
+    "torque_factors": dict.fromkeys(("", "1,,2", "0", "1e9"), "torque_factors"),
     "delimiter": dict.fromkeys(("", ",,"), "delimiter"),
     "robot": dict.fromkeys(("r2d2", "urdf_0123456789abcdef", "a" * 201), "robot"),
     "columns": {

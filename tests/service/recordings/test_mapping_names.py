@@ -183,6 +183,12 @@ def test_what_cannot_be_read_is_refused_by_name(names, given, message):
         ({"joints": ("joint1", "joint1")}, "every joint once"),
         ({"effort": "current", "torque_constants": (1.0,)}, "torque_constants is 1 values, expected 3"),
         ({"effort": "current", "torque_constants": (1.0, 0.0, 1.0)}, "none of them 0"),
+        (
+            {"torque_constants": (1.0, 2.5, 3.0)},
+            "torque_constants is 1, 2.5, 3, expected nothing, as tau{joint} is torque as measured, gravity included",
+        ),
+        ({"effort": "commanded", "torque_constants": (1.0,) * 3}, "or effort=current where it is motor current"),
+        ({"torque_factors": (1.0,)}, "torque_factors is 1 values, expected 3, one a joint that is kept"),
     ],
 )
 def test_options_that_are_wrong_are_refused(given, message):

@@ -121,6 +121,9 @@ def test_currents_become_torques(reading):
     del columns["tau1"], columns["tau2"]
     result = reading(columns, options(torque_constants=(0.5, -2.0)))
     np.testing.assert_array_equal(result.staged.table("tau"), data["tau"] * [0.5, -2.0])
+    turned = reading(columns, options(torque_constants=(0.5, -2.0), torque_factors=(1.0, -1.0)))
+    assert (turned.staged.table("tau") == result.staged.table("tau") * [1.0, -1.0]).all()
+    assert turned.facts["torque_factors"] == [1.0, -1.0]
     small = reading(columns, options(units={"tau": "mA"}, torque_constants=(1.0, 2.0)))
     np.testing.assert_allclose(small.staged.table("tau"), data["tau"] * [1e-3, 2e-3], rtol=1e-14)
     assert (result.facts["effort"], result.facts["torque_constants"]) == ("current", [0.5, -2.0])

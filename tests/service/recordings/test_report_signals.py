@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.signal import butter, lfilter, sosfiltfilt
 
 from lipcore.data.signals import noise_level
 from lipcore.preparation.recipe import Recipe
-from service.datasets.report.fit import shifts
+from service.datasets.report.advice import warnings
+from service.datasets.report.fit import Fit
+from service.datasets.report.lag import shifts
 from service.datasets.report.signals import (
     against_limits,
     bounds,
@@ -18,10 +21,11 @@ from service.datasets.report.signals import (
     noise_or_share,
     number_parts,
     saturation,
+    smoothed,
     thin,
     white_noise,
 )
-from service.datasets.schema import DatasetReport
+from service.datasets.schema import DatasetReport, Lag, Timing
 from service.datasets.store import extremes
 from tests.service.recordings.report_data import FakeProfile, recording, report_on, staged
 
@@ -141,12 +145,59 @@ def test_a_known_lag_is_found(tmp_path: Path, rate: float, late: float) -> None:
     for each in report.lag:
         assert each.seconds == pytest.approx(late, abs=2e-3)
         assert each.std_s < 5e-3
+    assert all(each.improves == list(PENDULUM) for each in report.lag[:1]) == (abs(late) > 0.01)
     reply = " ".join(report.warnings)
     assert ("not of the same time" in reply) == (abs(late) > 0.01)
     if late > 0.01:
         assert "after motion" in reply
     if late < -0.01:
         assert "before motion" in reply
+
+
+def test_errors_held_out_are_those_of_fits_without_an_eighth() -> None:
+    rng = np.random.default_rng(2)
+    features, y, penalty = rng.standard_normal((203, 6)), rng.standard_normal((203, 2)), 7.0
+    features -= features.mean(axis=0)
+    lower = np.linalg.cholesky(features.T @ features + penalty * np.eye(6))
+    whitened = np.linalg.solve(lower, features.T)
+    fit = Fit(np.arange(203), whitened, np.eye(6), np.zeros(6), np.ones(6), 203.0)
+    both = np.column_stack([np.ones(203), features])
+    shrink = np.diag([0.0, *[penalty] * 6])
+    for part, errors in zip(
+        np.split(np.arange(203), np.linspace(0, 203, 9).astype(int)[1:-1]), fit.held_out(y), strict=True
+    ):
+        rest = np.delete(both, part, axis=0)
+        weights = np.linalg.solve(rest.T @ rest + shrink, rest.T @ np.delete(y, part, axis=0))
+        assert errors == pytest.approx(((y[part] - both[part] @ weights) ** 2).sum(axis=0), rel=1e-5)
+
+
+def test_a_lag_that_shifting_does_not_mend_is_no_warning() -> None:
+    certain = {"seconds": 0.03, "std_s": 0.003, "cost": 0.05}
+    timing = Timing(**dict.fromkeys(Timing.model_fields, None) | {"gaps": [], "repeated_stamps": 0, "missing_rows": 0})
+
+    def reply(shared: list[str], *joints: list[str]) -> list[str]:
+        each = [Lag(joint=f"j{k}", improves=improves, **certain) for k, improves in enumerate(joints)]
+        return warnings(timing, [], [], [Lag(joint=None, improves=shared, **certain), *each], 1000)
+
+    assert reply([], [], [], []) == []
+    assert "not of the same time: torque comes 30.0 ms" in reply(["j0", "j1"], ["j0"], ["j1"], [])[0]
+    (alone,) = reply(["j1"], [], ["j1"], [])
+    assert alone.startswith("the torque of j1 comes 30 ms")
+
+
+@pytest.mark.parametrize("rate", [30.0, 125.0, 1000.0])
+def test_noise_of_smoothed_torque_is_not_taken_for_its_own(rate: float) -> None:
+    t = np.arange(4000) / rate
+    part = np.zeros(4000, np.int64)
+    signal = 10 * np.sin(0.05 * rate * t) + 3 * np.tanh(50 * np.cos(0.02 * rate * t))
+    noisy = signal + 0.05 * np.random.default_rng(3).standard_normal(4000)
+    smooth = sosfiltfilt(butter(2, 0.1 * rate, fs=rate, output="sos"), noisy)
+    assert smoothed(smooth, part, white_noise(smooth, part))
+    coloured = lfilter([0.4], [1, -0.6], noisy)  # one pole, as of a current sensor
+    for values in (noisy, coloured, np.round(noisy, 1)):
+        assert not smoothed(values, part, white_noise(values, part))
+    exact = 10 * np.sin(0.05 * rate * t)
+    assert smoothed(exact, part, white_noise(exact, part))
 
 
 def test_torque_that_motion_does_not_explain_has_no_lag(tmp_path: Path) -> None:

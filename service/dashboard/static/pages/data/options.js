@@ -18,6 +18,7 @@ export function uploadOptions() {
   const inputs = {
     effort: select("effort", [["", "as the robot or the file says"], ...pairs(EFFORTS, ["measured", "commanded", "current"])]),
     torque_constants: text("torque_constants", "0.11, 0.11, 0.08"),
+    torque_factors: text("torque_factors", "1, 1, -1"),
     torque_convention: select("torque_convention", [
       ["", "as the effort implies"],
       ["gravity_included", "gravity included"],
@@ -79,6 +80,7 @@ export function uploadOptions() {
       field("Robot", robot.select, "Its limits, joint order and the meaning of its effort."),
       field("What the torque column holds", inputs.effort, "A wrong answer here teaches a wrong torque."),
       constants,
+      field("Torque factors", inputs.torque_factors, "By which the torques of joints 1 to n are multiplied: −1 where the sign is opposite."),
     ),
     robot.note,
     robot.add,

@@ -49,6 +49,7 @@ export function reportCards(report, joints) {
     h(
       "div",
       { class: "grid wide", style: "align-items: start" },
+      againstRobot(report.against_robot, joints),
       limits(report.limits, joints),
       noise(report, joints),
       saturation(report.saturation, joints),
@@ -67,8 +68,9 @@ const short = (joints) => {
 function excitation(found, joints) {
   if (!found) return null;
   const weight = (name) => (row) => {
-    const { verdict, std } = row[name];
-    return [badge(verdict), std === null ? "" : ` ±${number(std, 2)}`];
+    const { verdict, std, value, implausible } = row[name];
+    const figure = value == null ? "" : ` ${number(value, 2)}`;
+    return [implausible ? badge("implausible", "bad") : badge(verdict), figure, std === null ? "" : ` ±${number(std, 2)}`];
   };
   const whole = found.whole;
   const beside = found.friction_beside === "rigid bodies" ? "the robot's rigid bodies" : "any smooth function of the motion";
@@ -81,6 +83,7 @@ function excitation(found, joints) {
         { label: "Coulomb friction", cell: weight("coulomb") },
         { label: "Constant torque", cell: weight("offset") },
         { label: "Reversals", numeric: true, cell: (row) => count(row.reversals) },
+        { label: "Still", numeric: true, cell: (row) => percent(row.still, 0) },
         { label: "Forwards / backwards", numeric: true, cell: (row) => `${percent(row.forwards, 0)} / ${percent(row.backwards, 0)}` },
         { label: "Span, rad or m", numeric: true, cell: (row) => number(row.span) },
         { label: "Range visited", numeric: true, cell: (row) => percent(row.visited, 0) },
@@ -97,7 +100,28 @@ function excitation(found, joints) {
           `Weakest: the body that ${whole.weakest_body} moves, with ${percent(whole.weakest)} of what random motion gives.`,
         )
       : h("p", { class: "hint" }, "Rigid bodies are judged only if the upload names a robot with a URDF."),
+    found.motion_dimensions == null
+      ? null
+      : h("p", {}, `The joints move like ${number(found.motion_dimensions, 2)} independent ones of ${found.joints.length}, and all stand still in ${percent(found.standstill, 0)} of the samples.`),
     h("details", {}, h("summary", {}, "The same in words"), h("p", {}, prose(found.text))),
+  );
+}
+
+function againstRobot(found, joints) {
+  if (!found) return null;
+  const times = (part) => (row) => (row[part] === null ? "–" : `${number(row[part], 3)} ± ${number(row[`${part}_std`], 2)}`);
+  return card(
+    `Torque against that of ${found.robot}`,
+    table(
+      [
+        short(joints),
+        { label: "Gravity, times", numeric: true, cell: times("gravity") },
+        { label: "Inertia, times", numeric: true, cell: times("inertia") },
+        { label: "Explained with friction", numeric: true, cell: (row) => percent(row.explained, 0) },
+      ],
+      found.joints,
+      { caption: "1: as the robot's URDF has it. Rotors, which it lacks, make inertia larger, loads both" },
+    ),
   );
 }
 
@@ -147,7 +171,7 @@ function noise(report, joints) {
     table(
       [
         short(joints),
-        { label: "Torque, N·m", numeric: true, cell: (row) => number(row.torque, 2) },
+        { label: "Torque, N·m", numeric: true, cell: (row) => (row.smoothed ? "smoothed" : number(row.torque, 2)) },
         { label: "of its spread", numeric: true, cell: (row) => percent(row.torque_share) },
         { label: "Velocity, per s", numeric: true, cell: (row) => number(row.velocity, 2) },
         { label: "of its spread", numeric: true, cell: (row) => percent(row.velocity_share) },

@@ -1,0 +1,268 @@
+"""Measured torque against what a robot's rigid bodies need for the same motion, gravity apart from the rest.
+
+Joint by joint, with G the torque that the URDF's gravity asks for and B that of inertia and velocities,
+
+    tau = g G + b B + v dq + c sign(dq) + o.
+
+A recording of that robot in SI units has g = 1, and b = 1 or, with rotors that the URDF lacks, somewhat more. Standard
+deviations are those of leaving out an eighth of the recording at a time, and errors are those on the eighth that was
+left out: rows that follow each other err alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Array
+from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.arm_prior import arm_of_robot
+from lipcore.kernels.friction import SIGN_WIDTH
+from lipcore.robots.urdf import RigidBody
+from service.datasets.report.fit import EIGHTHS
+from service.datasets.report.signals import Limits
+
+RIDGE = 1e-10
+"""Of a column's mean square: columns that depend on each other get weights that no two eighths agree on."""
+FLOOR = 1e-4
+"""Error, as a share of a torque's variance, below which less is no better: what units and clocks leave."""
+SELDOM = 0.2
+"""Share of rows that a joint has to move in for the others to be left out."""
+FEW = 400
+"""Rows that are enough to compare orders of joints by."""
+FREE = 5
+"""Columns of a joint's fit: gravity, inertia, velocity, its smoothed sign, a constant."""
+EARTH = 9.81
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Least squares of k columns y with p columns x, and again without each of EIGHTHS blocks of rows.
+
+    weights: (p, k); std: (p, k), by leaving out blocks; errors: (EIGHTHS, k), mean squares on the block left out.
+    """
+
+    weights: Array
+    std: Array
+    errors: Array
+
+    @classmethod
+    def fit(cls, x: Array, y: Array) -> Blocks:
+        """Fit y (R, k) with x (R, p)."""
+        scale = np.sqrt(np.mean(x**2, axis=0))
+        x = x / np.where(scale > 0, scale, 1.0)
+        edges = np.linspace(0, len(x), EIGHTHS + 1).astype(np.int64)
+        parts = [slice(*each) for each in pairwise(edges)]
+        gram = np.array([x[part].T @ x[part] for part in parts])
+        product = np.array([x[part].T @ y[part] for part in parts])
+        ridge = RIDGE * len(x) * np.eye(x.shape[1])
+        weights = np.linalg.solve(gram.sum(0) + ridge, product.sum(0))
+        without = np.linalg.solve(gram.sum(0) - gram + ridge, product.sum(0) - product)
+        std = np.sqrt((EIGHTHS - 1) / EIGHTHS * np.sum((without - without.mean(0)) ** 2, axis=0))
+        errors = np.array(
+            [np.mean((y[part] - x[part] @ w) ** 2, axis=0) for part, w in zip(parts, without, strict=True)]
+        )
+        unit = np.where(scale > 0, scale, np.inf)[:, None]
+        return cls(weights / unit, std / unit, errors)
+
+
+class Signals(NamedTuple):
+    """Motion and measured torque, (R, n) each, rows in order of time."""
+
+    q: Array
+    dq: Array
+    ddq: Array
+    tau: Array
+
+    def take(self, columns: Sequence[int] | NDArray[np.int64]) -> Signals:
+        """The same with joints in another order."""
+        return Signals(*(each[:, columns] for each in self))
+
+
+class Bodies:
+    """Rigid-body torques of a robot whose joints come in the order of the data."""
+
+    def __init__(self, urdf: str, name: str, names: tuple[str, ...], limits: Limits) -> None:
+        """Raise SimulationUnavailableError, or ValueError where the URDF cannot be used for these joints."""
+        robot = RigidBody.from_urdf(urdf, names, limits.joint_types, limits.urdf_joints, name)
+        self.name, self.names, self.urdf_joints = name, names, robot.urdf_joints
+        self._arm = arm_of_robot(robot)
+
+    def torque(self, q: Array, dq: Array, ddq: Array, down: Sequence[float] | Array) -> Array:
+        """Torque (R, n), N·m, of motion (R, n) each, with gravity `down` (3,) m/s² in the base's frame."""
+        kernel = ArmKernel(replace(self._arm, geometry=replace(self._arm.geometry, gravity=np.array(down, np.float64))))
+        weights = kernel.prior_weights()
+        assert weights is not None
+        return kernel.torque(weights.numpy(), Motion.from_arrays(q, dq, ddq))
+
+    def parts(self, signals: Signals) -> tuple[Array, Array]:
+        """Torques of gravity and of the rest, (R, n) each."""
+        rest = self.torque(*signals[:3], (0.0, 0.0, 0.0))
+        return self.torque(*signals[:3], self._arm.geometry.gravity) - rest, rest
+
+    def sideways(self, q: Array) -> tuple[Array, Array]:
+        """Torques of gravity along two horizontal axes of the URDF's base, (R, n) each."""
+        still = np.zeros_like(q)
+        along = np.eye(3)[np.argsort(np.abs(self._arm.geometry.gravity))[:2]]
+        first, second = (self.torque(q, still, still, EARTH * axis) for axis in along)
+        return first, second
+
+
+def design(gravity: Array, rest: Array, dq: Array) -> Array:
+    """Columns that a joint's torque is fitted with, (R, FREE), from its own (R,)."""
+    return np.column_stack([gravity, rest, dq, np.tanh(dq / SIGN_WIDTH), np.ones(len(dq))])
+
+
+@dataclass(frozen=True)
+class Against:
+    """Factors of gravity and of the rest by joint, (n,) each, with standard deviations, and how well they are known.
+
+    visible: (n, 2) standard deviation of gravity's and the rest's torque, as far as the other columns do not explain
+    it, over that of the measured torque; errors: (EIGHTHS, n) mean squares on eighths left out, as shares of its
+    variance.
+    """
+
+    gravity: Array
+    gravity_std: Array
+    inertia: Array
+    inertia_std: Array
+    visible: Array
+    errors: Array
+
+    @property
+    def explained(self) -> Array:
+        """Share of the variance that is explained on eighths left out, (n,), 0 at least."""
+        return np.asarray(np.clip(1 - self.errors.mean(0), 0.0, 1.0))
+
+    def steady(self, joint: int, part: int, least: float = 3.0) -> bool:
+        """Whether a factor, of gravity (0) or the rest (1), is told from 0 by so many standard deviations, and its
+        torque is a visible part of the joint's."""
+        value, std = ((self.gravity, self.gravity_std), (self.inertia, self.inertia_std))[part]
+        return bool(abs(value[joint]) > least * std[joint] and abs(value[joint]) * self.visible[joint, part] > VISIBLE)
+
+
+VISIBLE = 0.2
+"""Share of a torque's standard deviation from which on a part of it is told apart."""
+
+
+def moving(dq: Array) -> NDArray[np.int64]:
+    """Rows in which a joint with velocities (R,) moves; all where it seldom does. At rest it holds any torque."""
+    rows = np.flatnonzero(np.abs(dq) > SIGN_WIDTH)
+    return rows if len(rows) > SELDOM * len(dq) else np.arange(len(dq))
+
+
+def compare(bodies: Bodies, signals: Signals) -> Against:
+    """Fit each joint's torque."""
+    gravity, rest = bodies.parts(signals)
+    dq, tau, n = signals.dq, signals.tau, signals.q.shape[1]
+    factors, stds, visible, errors = np.empty((n, 2)), np.empty((n, 2)), np.zeros((n, 2)), np.empty((EIGHTHS, n))
+    for joint in range(n):
+        rows = moving(dq[:, joint])
+        columns = design(gravity[rows, joint], rest[rows, joint], dq[rows, joint])
+        variance = max(float(tau[rows, joint].var()), 1e-300)
+        fit = Blocks.fit(columns, tau[rows, joint, None])
+        factors[joint], stds[joint] = fit.weights[:2, 0], fit.std[:2, 0]
+        errors[:, joint] = fit.errors[:, 0] / variance
+        for part in (0, 1):
+            others = np.delete(columns, part, axis=1)
+            left = columns[:, part] - others @ np.linalg.lstsq(others, columns[:, part], rcond=1e-9)[0]
+            visible[joint, part] = np.sqrt(np.mean(left**2) / variance)
+    return Against(factors[:, 0], stds[:, 0], factors[:, 1], stds[:, 1], visible, errors)
+
+
+BETTER = 3.0
+"""How many times smaller errors have to be in another order of joints, in the mean over those that change place."""
+EXPLAINED = 0.5
+"""Share of each such joint's torque that the other order has to explain."""
+
+
+@dataclass(frozen=True)
+class Order:
+    """Column of the data that belongs to each joint, (n,), and the mean logarithm of the errors so."""
+
+    column: tuple[int, ...]
+    error: float
+
+
+def torque_order(bodies: Bodies, signals: Signals) -> Order | None:
+    """Columns of the measured torque as joints need them, where these are clearly not their own.
+
+    Every column is fitted with the torque and friction of every joint; the assignment with the least errors counts.
+    """
+    gravity, rest = bodies.parts(signals)
+    dq, tau, n = signals.dq, signals.tau, signals.q.shape[1]
+    errors = np.empty((EIGHTHS, n, n))
+    for joint in range(n):
+        rows = moving(dq[:, joint])
+        fit = Blocks.fit(design(gravity[rows, joint], rest[rows, joint], dq[rows, joint]), tau[rows])
+        errors[:, joint] = fit.errors / np.maximum(tau[rows].var(axis=0), 1e-300)
+    logs = np.log(errors + FLOOR)
+    _, column = linear_sum_assignment(logs.mean(0))
+    moved = np.flatnonzero(column != np.arange(n))
+    if not len(moved):
+        return None
+    gain = logs[:, moved, moved] - logs[:, moved, column[moved]]
+    # columns of joints without much torque might go anywhere: all that change have to be explained
+    explained = 1 - errors.mean(0)[moved, column[moved]]
+    clear = (gain.mean(1) > 0).all() and gain.mean() > np.log(BETTER) and (explained > EXPLAINED).all()
+    return Order(tuple(column.tolist()), float(logs.mean(0)[np.arange(n), column].mean())) if clear else None
+
+
+def joint_order(bodies: Bodies, signals: Signals, against: Against) -> Order | None:
+    """Columns of all data as the robot's joints need them, where these are clearly not those of the data.
+
+    Tried are the order of the alphabet, the reverse and rotations; the best of them is bettered by exchanging two.
+    """
+    rows, n = signals.q.shape
+    few = Signals(*(each[np.linspace(0, rows - 1, min(rows, FEW)).astype(np.int64)] for each in signals))
+    scores: dict[tuple[int, ...], float] = {}
+
+    def error(order: tuple[int, ...]) -> float:
+        if order not in scores:
+            scores[order] = _mean_log(compare(bodies, few.take(order)))
+        return scores[order]
+
+    here = tuple(range(n))
+    by_name = np.argsort(np.argsort(bodies.urdf_joints))
+    starts = {here, here[::-1], tuple(by_name.tolist()), tuple(np.argsort(by_name).tolist())}
+    starts |= {here[k:] + here[:k] for k in range(1, n)}
+    best = min(starts, key=error)
+    while True:
+        better = min((_exchanged(best, a, b) for a, b in combinations(range(n), 2)), key=error, default=best)
+        if not error(better) < error(best):
+            break
+        best = better
+    # joints with little torque stay where they are, unless another place is clearly better
+    for a, b in combinations(range(n), 2):
+        back = _exchanged(best, a, b)
+        if _moved(back) < _moved(best) and n * (error(back) - error(best)) < 2 * np.log(BETTER):
+            best = back
+    moved = [joint for joint in range(n) if best[joint] != joint]
+    if not moved:
+        return None
+    there = compare(bodies, signals.take(best))
+    gain = (np.log(against.errors + FLOOR) - np.log(there.errors + FLOOR)).sum(1) / len(moved)
+    steady = [joint for joint in range(n) if there.steady(joint, 0)]
+    clear = (gain > 0).all() and gain.mean() > np.log(BETTER) and np.median(there.explained[moved]) > EXPLAINED
+    return Order(best, _mean_log(there)) if clear and steady and (there.gravity[steady] > 0).all() else None
+
+
+def _mean_log(against: Against) -> float:
+    return float(np.log(against.errors + FLOOR).mean())
+
+
+def _moved(order: tuple[int, ...]) -> int:
+    return sum(column != joint for joint, column in enumerate(order))
+
+
+def _exchanged(order: tuple[int, ...], a: int, b: int) -> tuple[int, ...]:
+    out = list(order)
+    out[a], out[b] = out[b], out[a]
+    return tuple(out)

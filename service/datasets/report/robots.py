@@ -1,0 +1,89 @@
+"""Which robot a recording is of: by the names of its joints, and by the torque that gravity asks of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lipcore.profiles import Profile, profile, recognise
+from lipcore.robots.library import SimulationUnavailableError
+from service.datasets.report.advice import listed
+from service.datasets.report.bodies import Against, Bodies, Signals, compare
+from service.datasets.report.remedies import Upload, remedy
+from service.datasets.report.signals import limits_of
+from service.datasets.schema import Remedy
+
+LIKE = (0.6, 1.7)
+"""Factors that count as 1: URDFs are wrong by as much, and loads are not in them."""
+ALIKE, UNLIKE = 1.3, 1.5
+"""Factors of gravity up to which a robot is taken for the right one, and from which on for a wrong one."""
+TRUSTED = 0.6
+"""Share of a joint's torque that has to be explained before a factor is believed."""
+
+
+def bodies_of(robot: Profile, names: tuple[str, ...]) -> Bodies | None:
+    """A robot's rigid bodies for joints of these names; None without a URDF that can be used for all of them."""
+    limits = limits_of(robot, names)
+    if limits is None or limits.urdf_joints is None or robot.urdf is None:
+        return None
+    try:
+        return Bodies(robot.urdf, robot.name, names, limits)
+    except (SimulationUnavailableError, ValueError):
+        return None
+
+
+def heavy(against: Against) -> list[int]:
+    """Joints whose torque gravity is a visible and steady part of."""
+    return [j for j in range(len(against.gravity)) if against.steady(j, 0) and against.explained[j] > TRUSTED]
+
+
+def usual_gravity(against: Against) -> float | None:
+    """Median of the joints' factors of gravity, where it has the right sign in all that tell."""
+    factors = against.gravity[heavy(against)]
+    return float(np.median(factors)) if len(factors) and (factors > 0).all() else None
+
+
+def proposed(names: tuple[str, ...], signals: Signals) -> tuple[tuple[str, ...], str | None]:
+    """Robots that the joints' names suggest, and the one to compare with: the only one, or whose gravity fits."""
+    candidates = recognise(names)
+    if len(candidates) == 1:
+        return candidates, candidates[0]
+    off: dict[str, float] = {}
+    for candidate in candidates:
+        bodies = bodies_of(profile(candidate), names)
+        usual = None if bodies is None else usual_gravity(compare(bodies, signals))
+        if usual is not None and LIKE[0] < usual < LIKE[1]:
+            off[candidate] = abs(np.log(usual))
+    return candidates, min(off, key=lambda each: off[each], default=None)
+
+
+def suggestion(upload: Upload, candidates: Sequence[str], best: str | None) -> Remedy | None:
+    """The robot that names of joints suggest, where the upload names none; best: the one to compare with."""
+    if not candidates:
+        return None
+    text = f"the joints are called as those of {listed(candidates)}"
+    if best is None:
+        return remedy("robot", (), f"{text}: name the robot with `--robot`")
+    if len(candidates) > 1:
+        text += f", and the torque is that of {best}"
+    return remedy("robot", (), f"{text}; limits and torque can be compared with its", upload.robot(best))
+
+
+def other_robot(upload: Upload, bodies: Bodies, against: Against, signals: Signals) -> Remedy | None:
+    """A robot whose joints are called alike and whose gravity is that of the torque, where the upload's is not."""
+    own = usual_gravity(against)
+    if own is None or 1 / UNLIKE < own < UNLIKE:
+        return None
+    _, best = proposed(upload.names, signals)
+    other = None if best is None or best == bodies.name else bodies_of(profile(best), upload.names)
+    theirs = None if other is None else usual_gravity(compare(other, signals))
+    if best is None or theirs is None or not 1 / ALIKE < theirs < ALIKE:
+        return None
+    return remedy(
+        "robot",
+        (),
+        f"gravity in the torque is {own:.2g} times that of {bodies.name}, but {theirs:.2g} times that of {best}, whose "
+        "joints are called alike",
+        upload.robot(best),
+    )
