@@ -131,7 +131,8 @@ class Screened:
     """Rows, and the predictions of the model that serves for those that passed so far.
 
     own: which of the rows are of this batch, the others had waited for it. predicted: (N,); mean, std, bare: (P, n) of
-    these, bare the standard deviation without the floor that past errors put under `std`. noise_std: (n,).
+    these, bare the standard deviation without the floor that past errors put under `std`. noise_std: (n,). factor:
+    (P, n), on the half width that they were answered with, where a stream has answered them.
     """
 
     rows: Rows
@@ -142,6 +143,7 @@ class Screened:
     std: Array
     bare: Array
     noise_std: Array
+    factor: Array | None = None
 
     @property
     def until(self) -> float | None:
@@ -193,9 +195,10 @@ def predict(
     own: slice,
     derived: DerivedAcceleration | None = None,
     answered: tuple[Array, Array] | None = None,
+    factor: Array | None = None,
 ) -> Screened:
     """Let a model predict the rows that passed; those it has no finite answer for are beyond its limits. answered: mean
-    and std, (N, n) each, of all rows, where a stream has answered them already."""
+    and std, (N, n) each, of all rows, where a stream has answered them already, and factor, (N, n), on their widths."""
     codes, predicted = rows.code.copy(), rows.code == LEARNT
     good, floor = rows.take(predicted), model.posterior.floor.numpy()
     if answered is None:
@@ -208,7 +211,8 @@ def predict(
     codes[predicted] = np.where(known, LEARNT, LIMIT)
     predicted[predicted] = known
     checked = replace(rows, code=codes)
-    return Screened(checked, own, derived, predicted, mean[known], std[known], bare[known], model.noise_std)
+    factor = None if factor is None else factor[predicted]
+    return Screened(checked, own, derived, predicted, mean[known], std[known], bare[known], model.noise_std, factor)
 
 
 def _answers(rows: Rows, model: TorqueModel) -> tuple[Array, Array]:
