@@ -11,9 +11,9 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from lipcore.data.samples import Array
-from lipcore.online.adaptive import Adaptive, outside, scores
+from lipcore.online.adaptive import Adaptive, outside
 from service.learning import owner
-from service.learning.ingest.screening import Screened
+from service.learning.ingest.screening import Seen
 from service.models.scales import Factor
 from service.storage.database import EventRow
 
@@ -50,17 +50,16 @@ class Held:
         return [number / self.rows if self.rows else None for number in self.inside.tolist()]
 
 
-def follow(state: Adaptive, batch: Screened) -> dict[str, Any]:
+def follow(state: Adaptive, seen: Seen) -> dict[str, Any]:
     """What the report of a batch says of its stream's scale after it, and of what intervals held.
 
-    Every row that was predicted counts: contacts too, and those that wait for a decision."""
-    rows = batch.rows.take(batch.predicted)
-    score = scores(rows.tau - batch.mean, batch.std, batch.noise_std)
-    factor = state.factor if batch.factor is None else batch.factor
-    missed = outside(score, factor).sum(axis=0)
+    Every measurement counts: those of contacts, of rows that wait for a decision, and of rows at rest.
+    """
+    factor = state.factor if seen.factor is None else seen.factor
+    rows, missed = len(seen.score), outside(seen.score, factor).sum(axis=0)
     return {
-        "scale": state.step(rows.time, score, factor).to_json(),
-        "answered": {"rows": len(rows), "inside": (len(rows) - missed).tolist()},
+        "scale": state.step(seen.time, seen.score, factor).to_json(),
+        "answered": {"rows": rows, "inside": (rows - missed).tolist()},
     }
 
 

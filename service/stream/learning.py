@@ -149,7 +149,9 @@ class Learning:
         motions = _columns([each.request[REQUEST.size :] for each in block], 4)
         answers = _columns([each.answer for each in block], 2)
         factor = np.array([each.factor for each in block])
-        return Frames(served.name, self._stream_id, served, sequences, self._times(block), *motions, *answers, factor)
+        return Frames(
+            served.name, self._stream_id, served, sequences, self._times(block), *motions, *answers, factor=factor
+        )
 
     def _times(self, block: list[Taught]) -> Array:
         """Times of arrival, Unix time in s, each later than the one before."""

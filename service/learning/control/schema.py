@@ -34,8 +34,8 @@ class QualityWindow(Figures):
     accepted: int = Field(description="Rows that teach")
     rejected: dict[str, int] = Field(description="Rows that were kept out, by code")
     coverage_answered: Nullable = Field(
-        description="As `coverage`, of intervals as they were answered, wide by their `scale`, and of all rows that "
-        "could be predicted, contacts included; null where the scale is switched off"
+        description="As `coverage`, of intervals as they were answered, wide by their `scale`, and of contacts and "
+        "rows at rest, too; null where the scale is switched off"
     )
 
 

@@ -140,3 +140,13 @@ def test_it_survives_a_restart_to_the_last_bit(school, tmp_path):
             time = log.rows_of(log.find_batch(session, "lasting", "arm", 2)).time
         expected = Adaptive.from_json(known).step(time, error / total)
         assert state(again, pupil, 2)["log"] == pytest.approx(expected.log.tolist(), rel=1e-9)
+
+
+def test_rows_at_rest_are_measured_too(school, pupil):
+    body = off(0)
+    still = body | {"dq": np.zeros((10, 2)).tolist()}
+    assert pupil.post("observations", still)["rejected"] == {"stationary": 10}
+    assert pupil.predict()["scale"][1] > 10.0
+    window = pupil.get("quality")["windows"][0]
+    assert (window["rows"], window["coverage"]) == (0, [None, None])
+    assert window["coverage_answered"][1] == 0.0

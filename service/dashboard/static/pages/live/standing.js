@@ -52,7 +52,7 @@ export function qualityCard({ windows: [latest], joint_names: names, joint_types
       names.map((_name, joint) => joint),
       { caption: `${count(latest.rows)} rows of the last ${span(latest.seconds)}, each predicted before it was learnt` },
     ),
-    h("p", { class: "hint" }, "nMSE: mean squared error / variance of the torque; 0 is best. The band is the model's own belief; as answered, it is widened at once by what streams measure, contacts included, so that ", percent(level, 0), " lie inside."),
+    h("p", { class: "hint" }, "nMSE: mean squared error / variance of the torque; 0 is best. The band is the model's own belief; as answered, it is widened at once by what streams measure, contacts and rest included, so that ", percent(level, 0), " lie inside."),
   );
 }
 
