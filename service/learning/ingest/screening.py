@@ -131,8 +131,7 @@ class Dated:
 
 @dataclass(frozen=True)
 class Seen:
-    """M measurements beside the intervals that the model believes: of the rows that were predicted, and of rows at rest,
-    which teach nothing.
+    """M measurements beside the intervals that the model believes, of rows that were predicted and of rows at rest.
 
     time: (M,) event time, s; score: (M, n), see `adaptive.scores`; factor: (M, n), on the half width that they were
     answered with, where a stream has answered them.
