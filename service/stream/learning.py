@@ -146,12 +146,10 @@ class Learning:
     def _frames(self, block: list[Taught]) -> Frames:
         served = block[0].served
         sequences = np.array([each.sequence for each in block], np.int64)
-        motions = _columns([each.request[REQUEST.size :] for each in block], 4)
-        answers = _columns([each.answer for each in block], 2)
-        factor = np.array([each.factor for each in block])
-        return Frames(
-            served.name, self._stream_id, served, sequences, self._times(block), *motions, *answers, factor=factor
-        )
+        q, dq, ddq, tau = _columns([each.request[REQUEST.size :] for each in block], 4)
+        mean, std = _columns([each.answer for each in block], 2)
+        factor, time = np.array([each.factor for each in block]), self._times(block)
+        return Frames(served.name, self._stream_id, served, sequences, time, q, dq, ddq, tau, mean, std, factor)
 
     def _times(self, block: list[Taught]) -> Array:
         """Times of arrival, Unix time in s, each later than the one before."""

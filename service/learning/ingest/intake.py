@@ -154,7 +154,7 @@ class Intake:
             }
             event.report = report
         monitor.note(event, verdict.watch.innovations)
-        served.scales.take(monitor.factors(served.version))
+        served.scales.take(monitor.factors(served.version) if options.adaptive_intervals else {})
         self._show(Judged(served, batch.stream_id, verdict.rows, screened))
         return report
 

@@ -100,6 +100,7 @@ def test_frames_are_judged_by_what_they_were_answered_with(school, pupil):
 
 def test_switched_off_it_is_one_at_once(school, pupil):
     pupil.post("observations", off(0))
+    pupil.post("observations", off(0, "another"))
     assert pupil.predict()["scale"][1] > 1.0
     pupil.put("learning", {"adaptive_intervals": False, "on_change": "learn", "contact_threshold": 1e6})
     assert pupil.predict()["scale"] == [1.0, 1.0]
@@ -150,3 +151,13 @@ def test_rows_at_rest_are_measured_too(school, pupil):
     window = pupil.get("quality")["windows"][0]
     assert (window["rows"], window["coverage"]) == (0, [None, None])
     assert window["coverage_answered"][1] == 0.0
+
+
+def test_the_open_inference_protocol_answers_the_scale_of_questions(pupil):
+    pupil.post("observations", off(0))
+    inputs = [{"name": name, "shape": [2], "datatype": "FP64", "data": [0.1, 0.2]} for name in KEYS]
+    answer = pupil.client.post(
+        f"/v2/models/{pupil.model}/infer", json={"inputs": inputs, "outputs": [{"name": "scale"}]}
+    )
+    (tensor,) = answer.json()["outputs"]
+    assert (tensor["name"], tensor["shape"], tensor["data"]) == ("scale", [2], pupil.predict()["scale"])
