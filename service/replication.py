@@ -37,6 +37,7 @@ class Replication:
         self._learners = learners
         self._changed = threading.Condition()
         self._models: set[str] = set()
+        self._grown: set[str] = set()
         self._everything = self._ending = False
         self._woken: dict[str, int] = {}
         self._looker = threading.Thread(target=self._run, daemon=True, name="lipserve-replication")
@@ -52,11 +53,11 @@ class Replication:
         self._looker.join()
 
     def _note(self, notice: Notice) -> None:
-        if notice.kind == "log":
+        grown = notice.kind == "log"
+        if grown:
             self._wake([notice.model])
-            return
         with self._changed:
-            self._models.add(notice.model)
+            (self._grown if grown else self._models).add(notice.model)
             self._changed.notify_all()
 
     def _note_everything(self) -> None:
@@ -69,18 +70,20 @@ class Replication:
         while True:
             with self._changed:
                 self._changed.wait_for(
-                    lambda: self._ending or self._everything or self._models, max(0.0, due - time.monotonic())
+                    lambda: self._ending or self._everything or self._models or self._grown,
+                    max(0.0, due - time.monotonic()),
                 )
                 if self._ending:
                     return
-                everything, models = self._everything, self._models
-                self._everything, self._models = False, set()
+                everything, models, grown = self._everything, self._models, self._grown
+                self._everything, self._models, self._grown = False, set(), set()
             try:
                 if everything:
                     look(self._learners, None)
                 elif models:
                     look(self._learners, models)
                     self._wake(models)  # roles may have changed
+                self._learners.follow(grown & self._known())
                 if everything or time.monotonic() >= due:
                     self._look_around()
                     due = time.monotonic() + LOOK_S

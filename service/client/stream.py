@@ -57,11 +57,13 @@ class _Stream(StreamSide):
         first_sequence: int = 1,
         alias: str | None = None,
         key: str | None = None,
+        scale: bool = False,
     ) -> None:
         headers = headers_of(key)
         self.timeout, self._url, self._unix = timeout, url, unix
         self._exchange = Exchange(stream_id, first_sequence)
-        self._destination = destination(url, model, version=version, alias=alias, stream_id=stream_id)
+        asked = {"version": version, "alias": alias, "stream_id": stream_id, "scale": 1 if scale else None}
+        self._destination = destination(url, model, **asked)
         self._options: dict[str, Any] = {
             "compression": None,
             "open_timeout": timeout,
@@ -105,7 +107,7 @@ class StreamClient(_Stream):
     connection, and for one answer, in s; stream_id: name of the source of the torques that are sent to learn from, None
     where only answers are wanted; first_sequence: of the first frame: to send frames again after a lost connection,
     take the first of them above `learnt.through`; key: API key, that of the environment variable LIPSERVE_KEY where
-    None.
+    None; scale: whether answers carry the factor on the half width of their intervals.
     Raise StreamError where the service cannot be reached or refuses.
     """
 

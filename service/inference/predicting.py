@@ -163,6 +163,7 @@ class Prediction(Struct, omit_defaults=True):
     tau: list[Any]
     tau_std: list[Any]
     noise_std: list[float]
+    scale: list[float]
     covariance: list[Any] | None = None
     components: dict[ComponentName, dict[str, Any]] | None = None
 
@@ -256,5 +257,6 @@ def _prediction_of(
         tau=tau,
         tau_std=tau_std,
         noise_std=served.noise_std,
+        scale=served.scales.asked,
         covariance=covariance,
     )

@@ -112,7 +112,8 @@ class ComponentValues(BaseModel):
 
 
 class PredictResponse(BaseModel):
-    """Torques, shaped as the query. An interval that shall hold measurements needs both standard deviations."""
+    """Torques, shaped as the query. An interval that shall hold measurements needs both standard deviations and the
+    scale: tau ± 1.96 · scale · sqrt(tau_std² + noise_std²) for 95 % of them."""
 
     model: str
     version: int
@@ -122,6 +123,10 @@ class PredictResponse(BaseModel):
     tau: list[float] | list[list[float]] = Field(description="Mean torque, N·m (prismatic: N)")
     tau_std: list[float] | list[list[float]] = Field(description="Standard deviation of the function")
     noise_std: list[float] = Field(description="Standard deviation of the measurement, per joint")
+    scale: list[float] = Field(
+        description="Factor on the half width, per joint: what the streams that teach the model need now for intervals "
+        "that hold what they promise, the largest of the recent ones; 1, as the model believes, at least"
+    )
     covariance: list[list[float]] | list[list[list[float]]] | None = Field(None, description="(N·m)², where asked for")
     components: dict[ComponentName, ComponentValues] | None = Field(
         None,

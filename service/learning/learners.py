@@ -8,7 +8,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from contextvars import copy_context
@@ -149,10 +149,15 @@ class Learners:
         """See `Intake.turn`; raise as `monitor` does. Not for the event loop."""
         return self._intake.turn(self._monitor(self.loaded.get(model, None)), model)
 
-    def follow(self) -> None:
-        """Bring all monitors up to the batches that other services have logged. Not for the event loop."""
-        for model, monitor in self.monitors().items():
-            self._intake.follow(monitor, model)
+    def follow(self, models: Collection[str] | None = None) -> None:
+        """Bring the monitors of these models up to the batches that other services have logged, of all that there are
+        where None. Not for the event loop."""
+        if models is None:
+            for model, monitor in self.monitors().items():
+                self._intake.follow(monitor, model)
+        else:
+            for model in models:
+                self.monitor(model)
 
     def monitors(self) -> dict[str, Monitor]:
         """Those of the models that have learnt or have been looked at since the service started."""

@@ -27,6 +27,12 @@ QUALITY = {
 }
 REVISION = MetricKind("gauge", "lipserve_revision", "Revision that answers contain", ("model", "version"))
 NOVEL = MetricKind("gauge", "lipserve_novel_share", "Share of the latest samples that lie beyond the basis", ("model",))
+SCALE = MetricKind(
+    "gauge",
+    "lipserve_interval_scale",
+    "Factor on the half width of intervals that questions are answered with, 1 as the model itself believes",
+    ("model", "joint"),
+)
 LAG = MetricKind(
     "gauge", "lipserve_learning_lag_events", "Events of the log that answers do not contain yet", ("model",)
 )
@@ -37,7 +43,7 @@ ROWS = MetricKind(
     ("model", "outcome"),
 )
 LOADED = MetricKind("gauge", "lipserve_models_loaded", "Model versions in memory")
-KINDS = (*QUALITY.values(), REVISION, NOVEL, LAG, ROWS, LOADED)
+KINDS = (*QUALITY.values(), REVISION, NOVEL, SCALE, LAG, ROWS, LOADED)
 
 
 class Learning(Collector):
@@ -53,20 +59,22 @@ class Learning(Collector):
     def collect(self) -> Iterator[Metric]:
         """Yield every metric with a sample for each model."""
         gauges = {name: kind.family() for name, kind in QUALITY.items()}
-        revision, novel, lag, rows = (kind.family() for kind in (REVISION, NOVEL, LAG, ROWS))
+        revision, novel, scale, lag, rows = (kind.family() for kind in (REVISION, NOVEL, SCALE, LAG, ROWS))
         for model, monitor in self._monitors().items():
             _add_quality(gauges, model, monitor)
             for outcome in CODES:
                 rows.add_metric([model, outcome], monitor.counts[outcome])
             if (served := self._learners.loaded.hot(model, None)) is None:
                 continue
+            for joint, factor in zip(served.model.joint_names, served.scales.asked, strict=True):
+                scale.add_metric([model, joint], factor)
             revision.add_metric([model, str(served.version)], served.revision)
             with self._learners.database.session() as session:
                 behind = status.current(session, model, served.version) - served.revision
             lag.add_metric([model], max(behind, 0))
             if (share := self._learners.status(model, served.version).novel_share) is not None:
                 novel.add_metric([model], share)
-        yield from (*gauges.values(), revision, novel, lag, rows)
+        yield from (*gauges.values(), revision, novel, scale, lag, rows)
         yield LOADED.of([((), len(self._learners.loaded.versions()))])
 
     def _monitors(self) -> dict[str, Monitor]:

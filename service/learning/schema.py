@@ -49,6 +49,11 @@ class LearningOptions(BaseModel):
         allow_inf_nan=False,
         description="Predictive standard deviations, noise included, beyond which a torque is taken for a contact",
     )
+    adaptive_intervals: bool = Field(
+        True,
+        description="Widen and narrow intervals at once, so that 95 % of what streams measure lies inside: the `scale` "
+        "of answers. Otherwise it is 1, as the model itself believes",
+    )
     auto_refresh: bool = Field(True, description="Train a new version by itself where motion leaves what is known")
     auto_promote: bool = Field(True, description="Let such a version answer by itself once it predicts better")
 

@@ -23,6 +23,7 @@ from service.foundation.states import PartState
 from service.models import registry
 from service.models.lineage import learnt_from
 from service.models.registry import SERVING, Serving
+from service.models.scales import Scales
 from service.models.served import Alias, Key, LearntStates, Served, Waiting
 from service.storage.database import VersionRow
 from service.storage.storage import Storage
@@ -87,6 +88,7 @@ class LoadedModels:
         self._clock = itertools.count()
         self._used: dict[Key, int] = {}
         self._unreadable: dict[Key, str] = {}
+        self._scales: dict[Key, Scales] = {}
 
     def hot(self, model: str, version: int | None, alias: str | None = None) -> Served | None:
         """Return a version, or the one that an alias points to, if it is in memory; never waits. With neither, as with
@@ -173,6 +175,7 @@ class LoadedModels:
                 self._held.pop(key, None)
                 self._used.pop(key, None)
                 self._unreadable.pop(key, None)
+                self._scales.pop(key, None)
         self.waiting.wake(model)
         if entirely:
             for deleted in self.when_deleted:
@@ -262,6 +265,11 @@ class LoadedModels:
             served = replace(known_version, model=_warm(learnt.apply(known_version.base)), revision=revision)
             return self._publish(served) is served
 
+    def scales(self, model: str) -> dict[int, Scales]:
+        """The widths of the intervals of a model's versions, of those that have been in memory."""
+        with self._lock:
+            return {version: scales for (name, version), scales in self._scales.items() if name == model}
+
     def preload(self) -> int:
         """Load the versions that serve of the models that changed last, as many as fit; return how many."""
         gc.freeze()  # what was imported, unexamined: looking through it takes 0.3 s
@@ -297,7 +305,8 @@ class LoadedModels:
     def _make(self, row: VersionRow) -> Served:
         base = self._read(row)
         base.warm_up()
-        served = Served(row.model, row.version, base, base, learnt_from(row.manifest["lineage"]))
+        scales = self._scales_of(row, base.n_joints)
+        served = Served(row.model, row.version, base, base, learnt_from(row.manifest["lineage"]), scales)
         if (published := self._revisions.get((row.model, row.version))) is not None:
             revision, learnt = published
             return replace(served, model=_warm(learnt.apply(base)), revision=revision)
@@ -311,6 +320,16 @@ class LoadedModels:
         if known.behind:
             self._wake(row.model)
         return replace(served, model=_warm(known.model), revision=known.revision)
+
+    def _scales_of(self, row: VersionRow, n_joints: int) -> Scales:
+        """The widths that a version's streams had come to when it was last in memory, or the service last ran."""
+        key = (row.model, row.version)
+        if (known := self._scales.get(key)) is not None:
+            return known
+        scales = Scales(n_joints)
+        scales.take(self.learnt.factors(*key))
+        with self._lock:
+            return self._scales.setdefault(key, scales)
 
     def _read(self, row: VersionRow) -> TorqueModel:
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,6 +15,7 @@ from anyio import to_thread
 
 from lipcore.model.torque_model import TorqueModel
 from service.foundation.errors import RevisionNotReachedError, problem
+from service.models.scales import Factor, Scales
 
 if TYPE_CHECKING:
     from service.models.loaded import LoadedModels
@@ -27,7 +28,8 @@ Alias = tuple[str, str]
 
 @dataclass(frozen=True)
 class Served:
-    """One version in memory, immutable: whoever holds it answers from it whatever is learnt or dropped meanwhile.
+    """One version in memory, immutable: whoever holds it answers from it whatever is learnt or dropped meanwhile. Only
+    the widths of its intervals follow its streams at once: `scales`, the same for all revisions.
 
     model: what answers; base: the version as trained; datasets: ids and hashes of the data sets it has learnt
     from; revision: online updates applied to it.
@@ -38,6 +40,7 @@ class Served:
     model: TorqueModel
     base: TorqueModel
     datasets: frozenset[str]
+    scales: Scales
     revision: int = 0
 
     def has_learnt_from(self, dataset: str, sha256: str) -> bool:
@@ -66,6 +69,9 @@ class LearntStates(Protocol):
 
     def find(self, model: str, version: int, base: TorqueModel) -> Learnt | None:
         """As much of it as takes no time."""
+
+    def factors(self, model: str, version: int) -> Mapping[str, Factor]:
+        """What its streams have made of the widths of its intervals, by stream."""
 
     def consolidated(self, model: str, version: int, base: TorqueModel) -> Learnt | None:
         """All of it, as a model that can be saved: it takes the time to learn what came since the last snapshot."""

@@ -24,7 +24,9 @@ Array = NDArray[np.float64]
 Shape = tuple[int, ...]
 
 DEFAULT = ("tau", "tau_std")
-QUICK = frozenset({"tau", "tau_std", "noise_std"})
+OF_MODEL = frozenset({"noise_std", "scale"})
+"""Outputs that are the same for all queries, (n,)."""
+QUICK = OF_MODEL | {"tau", "tau_std"}
 """Outputs of which one query is answered on the event loop."""
 FORWARD: ComponentName = "forward_dynamics"
 _STD = "_std"
@@ -50,7 +52,8 @@ NEED_TORQUE = frozenset(name for name, part in PARTS.items() if part.component =
 def shapes(model: TorqueModel) -> dict[str, Shape]:
     """Every tensor that a model can answer, and its shape at N queries; -1 stands for N."""
     n, offered = model.n_joints, available(model.estimator)
-    tensors: dict[str, Shape] = {"tau": (-1, n), "tau_std": (-1, n), "noise_std": (n,), "covariance": (-1, n, n)}
+    tensors: dict[str, Shape] = {"tau": (-1, n), "tau_std": (-1, n), "covariance": (-1, n, n)}
+    tensors |= dict.fromkeys(sorted(OF_MODEL), (n,))
     for name, part in PARTS.items():
         if part.component in offered:
             tensors[name] = _shape(part.component, n)
@@ -214,12 +217,13 @@ def _listed(tensor: schema.InferInput, count: int) -> Array:
     return values
 
 
-def compute(model: TorqueModel, query: Query, names: frozenset[str]) -> dict[str, Array]:
-    """Tensors by name, their first axis N, noise_std (n,) apart; nothing is computed that they do not need. Raise
+def compute(served: Served, query: Query, names: frozenset[str]) -> dict[str, Array]:
+    """Tensors by name, their first axis N, but for those OF_MODEL; nothing is computed that they do not need. Raise
     InvalidRequestError where inertia cannot be inverted."""
+    model = served.model
     tensors = _torques(model, query.values[:3], names)
-    if "noise_std" in names:
-        tensors["noise_std"] = model.noise_std
+    if names & OF_MODEL:
+        tensors |= {"noise_std": model.noise_std, "scale": served.scales.of(None)}
     parts = {name: PARTS[name] for name in names if name in PARTS}
     if parts:
         estimates = query.components(model, sorted({part.component for part in parts.values()}))
@@ -269,12 +273,12 @@ def read_question(served: Served, message: Message, body: bytes, settings: Setti
 
 def respond(served: Served, request: schema.InferRequest, question: Question) -> Reply:
     """Compute the answer to a query and encode it; raise InvalidRequestError."""
-    values_of = compute(served.model, question.query, frozenset(question.outputs))
+    values_of = compute(served, question.query, frozenset(question.outputs))
     tensors: list[schema.InferTensor] = []
     payload: list[bytes] = []
     for name, binary in question.outputs.items():
         values = values_of[name]
-        if question.query.single and name != "noise_std":
+        if question.query.single and name not in OF_MODEL:
             values = values[0]
         check_answer(name, values)
         tensors.append(_tensor(name, values, payload if binary else None))

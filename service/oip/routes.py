@@ -180,7 +180,7 @@ async def _answer(scope: Scope, body: bytes) -> Reply:
 async def infer(request: Request) -> Response:
     """Answer one query, [n], or a batch, [N, n], in JSON or binary. Only what `outputs` names is computed: `tau` and
     `tau_std` where it names nothing. Nothing is clipped. `noise_std` [n] is the measurement's own deviation; an
-    interval that shall hold measurements needs both.
+    interval that shall hold measurements needs both, and `scale` [n], see `PredictResponse`.
     """
     reply = await _answer(request.scope, await request.body())  # for the documentation: all has been answered before
     return reply.response()

@@ -13,7 +13,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from websockets.exceptions import ConnectionClosed
 
-from service.stream.frames import ANSWER, ASK_LEARN, ASK_STD, ERROR, HAS_STD, LATE, LAYOUT, NUMBER, REQUEST, UNREAD
+from service.stream.frames import (
+    ANSWER,
+    ASK_LEARN,
+    ASK_STD,
+    ERROR,
+    HAS_SCALE,
+    HAS_STD,
+    LATE,
+    LAYOUT,
+    NUMBER,
+    REQUEST,
+    UNREAD,
+)
 
 
 class StreamError(RuntimeError):
@@ -49,7 +61,8 @@ class StreamAnswer:
 
     tau: (n,) mean; tau_std: (n,) standard deviation of the function, where asked for; late: whether the answer left
     the service after its deadline; late_answers: how many of this connection have; seconds: from the arrival of the
-    frame in the service to the departure of the answer.
+    frame in the service to the departure of the answer; scale: (n,) factor on the half width of intervals that hold
+    measurements, where asked for.
     """
 
     sequence: int
@@ -60,6 +73,7 @@ class StreamAnswer:
     late: bool
     late_answers: int
     seconds: float
+    scale: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -116,8 +130,9 @@ def read_answer(data: bytes) -> StreamAnswer | StreamError:
         error = json.loads(data[ANSWER.size :])["error"]
         return StreamError(error["message"], error["code"], error["detail"], None if flags & UNREAD else sequence)
     numbers = np.frombuffer(data, NUMBER, offset=ANSWER.size)
-    std = numbers[n:] if flags & HAS_STD else None
-    return StreamAnswer(sequence, numbers[:n], std, version, revision, bool(flags & LATE), late, seconds)
+    std = numbers[n : 2 * n] if flags & HAS_STD else None
+    scale = numbers[-n:] if flags & HAS_SCALE else None
+    return StreamAnswer(sequence, numbers[:n], std, version, revision, bool(flags & LATE), late, seconds, scale)
 
 
 SEQUENCES = 1 << 32

@@ -16,11 +16,12 @@ Request, 16 + 24 n bytes, or 16 + 32 n with tau:
 
 So the joints of a request begin at 16 (q), 16 + 8 n (dq), 16 + 16 n (ddq) and 16 + 24 n (tau).
 
-Answer, 32 + 8 n bytes, or 32 + 16 n with tau_std:
+Answer, 32 + 8 n bytes, 8 n more with tau_std and 8 n more with scale:
 
     offset  type     field
     0       u32      sequence of the request
-    4       u16      flags: 1 = tau_std follows tau; 2 = late: left after its deadline; 4 = error; 8 = no sequence
+    4       u16      flags: 1 = tau_std follows tau; 2 = late: left after its deadline; 4 = error; 8 = no sequence;
+                     16 = scale comes last
     6       u16      n; 0 in an error
     8       u32      version that answers
     12      u32      answers of this connection that missed their deadlines so far
@@ -28,6 +29,7 @@ Answer, 32 + 8 n bytes, or 32 + 16 n with tau_std:
     24      f64      seconds from the frame's arrival to the answer's departure
     32      f64 n    tau, N·m (prismatic: N): mean torque
     …       f64 n    tau_std, N·m: standard deviation of the function, where asked for
+    …       f64 n    scale, where asked for: factor on the half width of intervals that hold measurements
 
 An error has the same header, and instead of numbers UTF-8 JSON: {"error": {code, message, detail}}. The connection goes
 on. Flag 8 says that the request was too short, or no binary message, so that its sequence is unknown (and 0 here).
@@ -62,7 +64,9 @@ duplicate and is applied once. What was refused is lost, unless it is sent again
 LIPSERVE_STREAM_FLUSH_ROWS wait to be logged, the service reads no further.
 
 The query of the address: `version` pins one, else the newest answers as soon as it is there, between two frames;
-`std=1` answers tau_std to every frame, as if each had flag 1; `stream_id` names the source of torques to learn from, in
+`std=1` answers tau_std to every frame, as if each had flag 1; `scale=1` answers the scale to every frame: tau ± 1.96 ·
+scale · √(tau_std² + noise_std²) holds 95 % of what is measured, by what this stream_id has taught until then, or where
+there is none by what all recent ones have; `stream_id` names the source of torques to learn from, in
 up to 64 letters, digits, dots, underscores and hyphens, a letter or digit first.
 
 The service reads no further while an answer waits to be written, so a client that sends but does not read is slowed
@@ -91,6 +95,7 @@ HAS_STD = 1
 LATE = 2
 ERROR = 4
 UNREAD = 8
+HAS_SCALE = 16
 
 NUMBER = "<f8"
 

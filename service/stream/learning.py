@@ -10,19 +10,17 @@ from collections import deque
 from collections.abc import Awaitable, Callable
 from dataclasses import asdict
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from lipcore.data.samples import Array
 from service.foundation.errors import ErrorBody, ServiceError, invalid_request
 from service.learning.ingest.batches import Frames
 from service.learning.learners import Learners
 from service.models.loaded import Served
 from service.stream.frames import NUMBER, REQUEST
 from service.web.storage_errors import translated
-
-if TYPE_CHECKING:
-    from lipcore.data.samples import Array
 
 logger = logging.getLogger(__name__)
 
@@ -34,13 +32,15 @@ TICK = 1e-6
 
 class Taught(NamedTuple):
     """A frame to learn from. served: what answered it; arrived: time of `time.perf_counter`. request: the whole frame;
-    answer: bytes of mean and standard deviation, (2, n), made before it is learnt."""
+    answer: bytes of mean and standard deviation, (2, n), made before it is learnt; factor: (n,), on the half width of
+    its interval."""
 
     served: Served
     sequence: int
     arrived: float
     request: bytes
     answer: bytes
+    factor: Array
 
 
 class Learning:
@@ -146,9 +146,10 @@ class Learning:
     def _frames(self, block: list[Taught]) -> Frames:
         served = block[0].served
         sequences = np.array([each.sequence for each in block], np.int64)
-        motions = _columns([each.request[REQUEST.size :] for each in block], 4)
-        answers = _columns([each.answer for each in block], 2)
-        return Frames(served.name, self._stream_id, served, sequences, self._times(block), *motions, *answers)
+        q, dq, ddq, tau = _columns([each.request[REQUEST.size :] for each in block], 4)
+        mean, std = _columns([each.answer for each in block], 2)
+        factor, time = np.array([each.factor for each in block]), self._times(block)
+        return Frames(served.name, self._stream_id, served, sequences, time, q, dq, ddq, tau, mean, std, factor)
 
     def _times(self, block: list[Taught]) -> Array:
         """Times of arrival, Unix time in s, each later than the one before."""

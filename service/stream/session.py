@@ -165,7 +165,7 @@ class Session(Conversation):
 
     meter: counts what it answers; pinned: whether it stays with this version; std: whether every answer carries
     tau_std; stream_id: source of the torques that frames carry, None where they carry none; alias: that it follows,
-    None: the version that serves.
+    None: the version that serves; scale: whether every answer carries the factor on its intervals.
     """
 
     def __init__(
@@ -180,12 +180,14 @@ class Session(Conversation):
         std: bool,
         stream_id: str | None = None,
         alias: str | None = None,
+        scale: bool = False,
     ) -> None:
         super().__init__(connection, receive, send, learners.settings)
         self._loaded, self._name = learners.loaded, served.name
         self._pin = served.version if pinned else None
         self._alias = None if alias == SERVING else alias
         self._std, self._late, self._due = std, 0, inf
+        self._scale, self._stream_id = scale, stream_id
         self._meter, self._deadline = meter, learners.settings.stream_deadline_s
         self._learning = None if stream_id is None else Learning(learners, stream_id, self.send_text)
         self._take(served)
@@ -246,15 +248,7 @@ class Session(Conversation):
             logger.error("unexpected error in a stream of model %s", self._name, exc_info=error)
             unexpected = ServiceError("an unexpected error; the service's log says more")
             return self._refuse(sequence, flags, arrived, unexpected)
-        served, numbers = self._served, tau.tobytes()
-        if std is not None:
-            flags = frames.HAS_STD
-            numbers += std.tobytes()
-        if asked > frames.ASK_STD:
-            assert self._learning is not None
-            self._learning.add(Taught(served, sequence, arrived, data, numbers))
-            if asked == frames.ASK_LEARN and not self._std:  # its standard deviation is for the record alone
-                flags, numbers = 0, tau.tobytes()
+        served, (flags, numbers) = self._served, self._numbers(sequence, asked, arrived, data, tau, std)
         now = perf_counter()
         seconds = now - arrived
         self._meter.durations.add(seconds)
@@ -284,6 +278,24 @@ class Session(Conversation):
             )
             raise invalid_request("stream_id", "missing", expected)
         await self._learning.admit(sequence)
+
+    def _numbers(
+        self, sequence: int, asked: int, arrived: float, data: bytes, tau: Array, std: Array | None
+    ) -> tuple[int, bytes]:
+        """Flags and numbers of an answer. A frame to learn from is gathered with all of them."""
+        served = self._served
+        factor = served.scales.of(self._stream_id)
+        flags, numbers = 0, tau.tobytes()
+        if std is not None:
+            flags, numbers = frames.HAS_STD, numbers + std.tobytes()
+        if asked > frames.ASK_STD:
+            assert self._learning is not None  # the frame was admitted
+            self._learning.add(Taught(served, sequence, arrived, data, numbers, factor))
+            if asked == frames.ASK_LEARN and not self._std:  # its standard deviation is for the record alone
+                flags, numbers = 0, tau.tobytes()
+        if self._scale:
+            flags, numbers = flags | frames.HAS_SCALE, numbers + factor.tobytes()
+        return flags, numbers
 
     def _refuse(self, sequence: int, flags: int, arrived: float, error: ServiceError) -> bytes:
         self._meter.refuse(error.code)

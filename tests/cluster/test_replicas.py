@@ -21,6 +21,7 @@ from tests.cluster.servers import S3, Postgres, Shared, sharing
 from tests.service.data import ADDRESS, eventually, service_of
 from tests.service.learning.lessons import QUERIES, Pupil, lesson, publish
 from tests.service.learning.test_changes import PUSH, WATCHFUL, drive, state
+from tests.service.learning.test_intervals import off
 from tests.service.server import Server
 
 QUICK_PUBLISHING = {"publish_every_s": 0.02, "min_revision_wait_s": 20.0}
@@ -101,6 +102,18 @@ def test_who_asks_for_a_revision_gets_it_from_either_service(arm):
         single = {name: rows[0] for name, rows in QUERIES.items()}
         other = arm[number % 2].post("predict", single | {"min_revision": said["revision"], "version": said["version"]})
         assert (other["tau"], other["tau_std"]) == (answer["tau"][0], answer["tau_std"][0])
+
+
+def test_intervals_of_both_are_as_wide_as_what_either_has_measured_asks_for(arm):
+    first, second = arm
+    assert second.predict()["scale"] == [1.0, 1.0]
+    for number, pupil in enumerate((first, second, first)):
+        pupil.post("observations", off(number))
+        here = pupil.predict()["scale"]
+        assert here[1] > 1.0
+        eventually(lambda here=here: [each.predict()["scale"] for each in arm] == [here, here])
+    first.put("learning", HARMLESS | {"adaptive_intervals": False})
+    eventually(lambda: [each.predict()["scale"] for each in arm] == [[1.0, 1.0]] * 2)
 
 
 def test_gates_and_detector_of_both_judge_as_one(pair):

@@ -18,7 +18,7 @@ from service.storage.files import Files
 from tests.service.data import DEADLINE
 from tests.service.server import Server
 
-STD, LATE, ERROR, UNREAD = 1, 2, 4, 8
+STD, LATE, ERROR, UNREAD, SCALE = 1, 2, 4, 8, 16
 LEARN = 2
 STREAM = "/v1/models/pendulum/stream"
 MOTION = np.array([[0.3, -0.2], [0.1, 0.4], [1.0, -0.5]])
@@ -46,6 +46,7 @@ class Answer:
     seconds: float
     tau: np.ndarray | None = None
     std: np.ndarray | None = None
+    scale: np.ndarray | None = None
     error: dict[str, Any] | None = None
 
 
@@ -68,7 +69,7 @@ def read(data: bytes) -> Answer:
     """Read an answer frame, and check that its length is what its header says."""
     assert isinstance(data, bytes)
     sequence, flags, n, version, late, revision, seconds = struct.unpack_from("<IHHIIQd", data)
-    assert flags & ~(STD | LATE | ERROR | UNREAD) == 0
+    assert flags & ~(STD | LATE | ERROR | UNREAD | SCALE) == 0
     assert seconds >= 0
     reply = Answer(sequence, flags, version, late, revision, seconds)
     if flags & ERROR:
@@ -77,10 +78,10 @@ def read(data: bytes) -> Answer:
         assert set(body) == {"error"}
         assert set(body["error"]) == {"code", "message", "detail"}
         return Answer(**{**vars(reply), "error": body["error"]})
-    vectors = 2 if flags & STD else 1
-    assert len(data) == 32 + 8 * n * vectors
-    numbers = np.frombuffer(data, "<f8", offset=32).reshape(vectors, n)
-    return Answer(**{**vars(reply), "tau": numbers[0], "std": numbers[1] if vectors == 2 else None})
+    names = ["tau", *(["std"] if flags & STD else []), *(["scale"] if flags & SCALE else [])]
+    assert len(data) == 32 + 8 * n * len(names)
+    numbers = np.frombuffer(data, "<f8", offset=32).reshape(len(names), n)
+    return Answer(**{**vars(reply), **dict(zip(names, numbers, strict=True))})
 
 
 def dial(server: Server, path: str = STREAM, **options: Any) -> connect:

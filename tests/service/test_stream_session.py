@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from service.foundation.settings import Settings
+from service.models.scales import Factor, Scales
 from service.stream.session import Echo, Session
 from service.web.observability.meters import Meters
 from tests.service.data import DEADLINE
@@ -47,7 +48,9 @@ class Loaded:
 
 
 def served(version, model, revision=0):
-    return SimpleNamespace(name="m", version=version, revision=revision, model=model, noise_std=[0.1, 0.2])
+    return SimpleNamespace(
+        name="m", version=version, revision=revision, model=model, noise_std=[0.1, 0.2], scales=Scales(2)
+    )
 
 
 def connection():
@@ -55,7 +58,7 @@ def connection():
     return SimpleNamespace(arrived=0.0, scope={"subprotocols": []})
 
 
-def session(loaded, version, pinned=False):
+def session(loaded, version, pinned=False, **more):
     """A session and the texts that it sends."""
     spoken = []
 
@@ -64,7 +67,7 @@ def session(loaded, version, pinned=False):
 
     updates = SimpleNamespace(settings=Settings(), loaded=loaded)
     meter = Meters().stream("m")
-    return Session(None, None, send, updates, loaded.stored[version], meter, pinned, std=False), spoken
+    return Session(None, None, send, updates, loaded.stored[version], meter, pinned, std=False, **more), spoken
 
 
 def reply(talk, request=None, arrived=None):
@@ -88,6 +91,22 @@ def test_a_newer_version_is_taken_though_it_is_no_more_in_memory():
     result = reply(talk)
     assert (result.version, result.tau.tolist(), loaded.loads) == (2, [3.0, 6.0], 1)
     assert '"version": 2' in spoken[0]
+
+
+def test_an_answer_carries_the_scale_of_its_stream_as_it_is_then():
+    loaded = Loaded(v1=Model())
+    talk, _ = session(loaded, 1, stream_id="arm", scale=True)
+    asking, _ = session(loaded, 1, scale=True)
+    assert reply(talk).scale.tolist() == [1.0, 1.0]
+    factors = {"arm": Factor(np.array([0.5, 3.0]), 100.0), "other": Factor(np.array([0.7, 2.0]), 101.0)}
+    loaded.memory[1].scales.take(factors)
+    seen = reply(talk)
+    assert (seen.tau.tolist(), seen.scale.tolist()) == ([1.0, 2.0], [0.5, 3.0])
+    assert reply(asking).scale.tolist() == [1.0, 3.0]
+    factors["other"] = Factor(np.array([0.7, 2.0]), 200.0)  # by then the first is of long ago
+    loaded.memory[1].scales.take(factors)
+    assert reply(asking).scale.tolist() == [1.0, 2.0]
+    assert reply(talk).scale.tolist() == [0.5, 3.0]
 
 
 def test_a_pinned_version_is_kept_whatever_is_newer():

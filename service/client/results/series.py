@@ -15,12 +15,15 @@ from service.client.results import Array, Plain, reading, shape_arrays
 from service.learning.control.schema import LiveLost, LiveStatus
 
 
-def interval(mean: Array, std: Array, noise_std: Array, level: float) -> tuple[Array, Array]:
+def interval(
+    mean: Array, std: Array, noise_std: Array, level: float, scale: Array | None = None
+) -> tuple[Array, Array]:
     """Ends of the central interval that a measurement lies in with probability `level`; std: of the function, noise_std
-    of a measurement around it. Raise ValueError unless level is between 0 and 1."""
+    of a measurement around it, scale: (n) factor on its half. Raise ValueError unless level is between 0 and 1."""
     if not 0 < level < 1:
         raise ValueError(f"level is {level}, expected a probability between 0 and 1")
     half = NormalDist().inv_cdf((1 + level) / 2) * np.hypot(std, noise_std)
+    half = half if scale is None else half * scale
     return mean - half, mean + half
 
 
@@ -40,8 +43,9 @@ class Prediction(Plain):
     """Torques at one query, (n), or a batch, (N, n); N·m, of prismatic joints N.
 
     revision: online updates applied to the version; tau: mean; tau_std: standard deviation of the function, which grows
-    where the model knows little; noise_std: (n) of a measurement around the function; covariance: (…, n, n) (N·m)² of
-    the function between joints, where asked for; components: by name, where asked for.
+    where the model knows little; noise_std: (n) of a measurement around the function; scale: (n) factor on the half
+    width of intervals that streams need at the moment, None of an earlier service; covariance: (…, n, n) (N·m)² of the
+    function between joints, where asked for; components: by name, where asked for.
     """
 
     model: str
@@ -52,15 +56,16 @@ class Prediction(Plain):
     tau: Array
     tau_std: Array
     noise_std: Array
+    scale: Array | None = None
     covariance: Array | None = None
     components: Mapping[str, Component] | None = None
 
     def interval(self, level: float = 0.95) -> tuple[Array, Array]:
         """Lower and upper end, shaped as `tau`, of the central interval that a *measurement* lies in with probability
-        `level`: uncertainty of the function and noise of the measurement together. That of the function alone is
-        narrower, and does not hold measurements.
+        `level`: uncertainty of the function and noise of the measurement together, times `scale`. That of the function
+        alone is narrower, and does not hold measurements.
         """
-        return interval(self.tau, self.tau_std, self.noise_std, level)
+        return interval(self.tau, self.tau_std, self.noise_std, level, self.scale)
 
 
 read_prediction = reading(Prediction)

@@ -262,7 +262,7 @@ class _Case:
             both = np.column_stack([columns, sides[0][:, j], sides[1][:, j]])
             upright, leaning = (Blocks.fit(x, self.signals.tau[:, j, None]).errors.mean() for x in (columns, both))
             gains.append(float(np.log(upright) - np.log(leaning)))
-        return float(np.mean(gains)) > np.log(GAIN)
+        return bool(float(np.mean(gains)) > np.log(GAIN))
 
     def _remedy(self, cause: Cause, joints: Sequence[int], text: str, options: dict[str, str] | None = None) -> Remedy:
         names = [self.upload.names[j] for j in joints]

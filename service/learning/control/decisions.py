@@ -136,6 +136,9 @@ def set_options(learners: Learners, model: str, options: LearningOptions) -> Non
     """Set how a model learns from now on; raise NotFoundError or InvalidRequestError."""
     joints = registry.find(learners.database, model, None).manifest["joint_names"]
     owner.set_options(learners.database, model, options, len(joints), time.time())
+    if not options.adaptive_intervals:
+        for scales in learners.loaded.scales(model).values():
+            scales.take({})
     learners.process.wake(model)
 
 

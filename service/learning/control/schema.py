@@ -33,6 +33,10 @@ class QualityWindow(Figures):
     seconds: float
     accepted: int = Field(description="Rows that teach")
     rejected: dict[str, int] = Field(description="Rows that were kept out, by code")
+    coverage_answered: Nullable = Field(
+        description="As `coverage`, of intervals as they were answered, wide by their `scale`, and of contacts and "
+        "rows at rest, too; null where the scale is switched off"
+    )
 
 
 class Quality(BaseModel):
@@ -44,6 +48,7 @@ class Quality(BaseModel):
     joint_names: list[str]
     level: float = Field(LEVEL, description="Probability of the interval whose coverage is told")
     windows: list[QualityWindow]
+    scale: list[float] = Field(description="Per joint, factor on the half width that questions are answered with now")
 
 
 class Observation(BaseModel):
@@ -363,6 +368,7 @@ class LiveStatus(BaseModel):
     )
     level: float = Field(LEVEL, description="Probability of the interval whose coverage is told")
     windows: list[QualityWindow] = Field(description="How well it predicted, over sliding windows")
+    scale: list[float] = Field(description="Per joint, factor on the half width that questions are answered with now")
     answers: LiveAnswers | None = Field(description="null at first, and where there are too many models to tell apart")
     alarms: list[Alarm] = Field(description="The newest ones, newest first")
 

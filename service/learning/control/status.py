@@ -70,6 +70,7 @@ def quality(learners: Learners, model: str) -> schema.Quality:
         revision=served.revision,
         joint_names=list(served.model.joint_names),
         windows=[window(each, now) for each in learners.monitor(model).windows],
+        scale=served.scales.asked,
     )
 
 
@@ -78,7 +79,11 @@ def window(sums: Window, now: float) -> schema.QualityWindow:
     counts = sums.counts(now)
     accepted = counts.pop(CODES[LEARNT], 0)
     return schema.QualityWindow(
-        **figures(sums.record(now)).model_dump(), seconds=sums.seconds, accepted=accepted, rejected=dict(counts)
+        **figures(sums.record(now)).model_dump(),
+        seconds=sums.seconds,
+        accepted=accepted,
+        rejected=dict(counts),
+        coverage_answered=sums.held(now).coverage(),
     )
 
 

@@ -178,7 +178,7 @@ def state(session: Session, event: EventRow) -> State:
 @dataclass(frozen=True)
 class Frames:
     """N frames of one stream with what `served` answered. sequences: (N,), rising; time: (N,) Unix time, s. q, dq, ddq,
-    tau, mean, std: (N, n)."""
+    tau, mean, std: (N, n). factor: (N, n), on the half widths that they were answered with, where that is known."""
 
     model: str
     stream_id: str
@@ -191,6 +191,7 @@ class Frames:
     tau: Array
     mean: Array
     std: Array
+    factor: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -231,7 +232,8 @@ def observe_frames(intake: Intake, frames: Frames) -> FramesResult:
         weights = independence.stream_weights(frames.time[new], None if before is None else before.last)
         rows = Rows(frames.time[new], q, dq, ddq, tau, check_rows(None, q, dq, ddq, tau, bounds), weights)
         answered = frames.mean[new], frames.std[new]
-        screened = screening.predict(rows, frames.served, slice(0, len(rows)), answered=answered)
+        factor = None if frames.factor is None else frames.factor[new]
+        screened = screening.predict(rows, frames.served, slice(0, len(rows)), answered=answered, factor=factor)
         sequences = frames.sequences[new]
         ends = int(sequences[0]), int(sequences[-1])
         content = _digest(sequences, numbers)

@@ -18,7 +18,7 @@ from service.foundation.errors import ConflictError, not_found
 from service.journal import log
 from service.journal.log import NewBatch
 from service.journal.snapshots import retain
-from service.learning import owner
+from service.learning import intervals, owner
 from service.learning.ingest import judging
 from service.learning.ingest.judging import Verdict
 from service.learning.ingest.monitor import Monitor
@@ -90,6 +90,9 @@ class Intake:
         if self.database.shared:
             with self.database.session() as session:
                 monitor.follow(session, model)
+                kept = owner.options(session, model).adaptive_intervals
+            for version, scales in self.loaded.scales(model).items():
+                scales.take(monitor.factors(version) if kept else {})
 
     def append(
         self,
@@ -114,6 +117,9 @@ class Intake:
             verdict = judging.judge(screened, monitor.watch(batch.stream_id), held, options, usual)
             if verdict.change is not None and options.on_change == "adapt":
                 log.append(session, model, "change", {"t": verdict.change.at}, batch.received)
+            adaptive = {}
+            if options.adaptive_intervals and screened.seen is not None:
+                adaptive = intervals.follow(monitor.scale(batch.stream_id, served.version), screened.seen)
             record = None if verdict.record is None else verdict.record.to_json()
             judged = replace(batch, rows=verdict.rows, record=record)
             event = log.append_batch(session, model, judged, self.settings.max_observation_streams)
@@ -144,10 +150,12 @@ class Intake:
                 "departure": None if verdict.watch.departure is None else verdict.watch.departure.to_json(),
                 "waited": held,
                 "until": screened.until,
+                **adaptive,
                 "surprise": None if verdict.surprise is None else verdict.surprise.tolist(),
             }
             event.report = report
         monitor.note(event, verdict.watch.innovations)
+        served.scales.take(monitor.factors(served.version) if options.adaptive_intervals else {})
         self._show(Judged(served, batch.stream_id, verdict.rows, screened))
         return report
 

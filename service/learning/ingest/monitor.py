@@ -14,13 +14,17 @@ import numpy as np
 from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session
 
+from lipcore.online.adaptive import Adaptive
 from lipcore.online.change import ChangeDetector
 from lipcore.online.departure import Departure
 from lipcore.online.record import Record
 from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.settings import Settings
 from service.journal import log
+from service.learning import intervals
 from service.learning.ingest.judging import ContactGate, Innovations, Watch
+from service.learning.intervals import Held, Known
+from service.models.scales import Factor
 from service.storage.database import EventRow
 
 PARTS = 60
@@ -37,15 +41,21 @@ class Window:
     def __init__(self, seconds: float, n_joints: int) -> None:
         self.seconds, self._n_joints = seconds, n_joints
         self._length = max(seconds / PARTS, 1.0)
-        self._buckets: tuple[tuple[int, Record, Counter[str]], ...] = ()
+        self._buckets: tuple[tuple[int, Record, Counter[str], Held], ...] = ()
 
-    def add(self, record: Record | None, counts: Mapping[str, int], at: float) -> None:
-        """Add a batch's record and counts at a Unix time, s. From one thread at a time."""
+    def add(self, record: Record | None, counts: Mapping[str, int], at: float, held: Held | None = None) -> None:
+        """Add a batch's record and counts at a Unix time, s, and what intervals held. From one thread at a time."""
         number = int(at // self._length)
-        *rest, last = self._buckets or ((number, Record.empty(self._n_joints), Counter[str]()),)
+        empty = number, Record.empty(self._n_joints), Counter[str](), Held.none(self._n_joints)
+        *rest, last = self._buckets or (empty,)
         if last[0] != number:
-            rest, last = [*rest, last], (number, Record.empty(self._n_joints), Counter[str]())
-        changed = number, last[1] if record is None else last[1] + record, last[2] + Counter(counts)
+            rest, last = [*rest, last], empty
+        changed = (
+            number,
+            last[1] if record is None else last[1] + record,
+            last[2] + Counter(counts),
+            last[3] if held is None else last[3] + held,
+        )
         # another tuple each time: readers keep the one they have
         self._buckets = tuple(bucket for bucket in (*rest, changed) if self._holds(bucket[0], at))
 
@@ -58,6 +68,11 @@ class Window:
         """Sum of the counts within the window before a Unix time, s."""
         counts = (bucket[2] for bucket in self._buckets if self._holds(bucket[0], now))
         return reduce(add, counts, Counter[str]())
+
+    def held(self, now: float) -> Held:
+        """What intervals, as answered, held of the rows within the window before a Unix time, s."""
+        parts = (bucket[3] for bucket in self._buckets if self._holds(bucket[0], now))
+        return reduce(add, parts, Held.none(self._n_joints))
 
     def _holds(self, number: int, now: float) -> bool:
         return (number + 1) * self._length > now - self.seconds
@@ -86,6 +101,7 @@ class Monitor:
         self._since_due = 0
         self._patience, self._most_streams = settings.contact_patience_s, settings.max_observation_streams
         self._gates: OrderedDict[str, ContactGate] = OrderedDict()
+        self._scales: dict[str, Known] = {}
         self._detector, self._innovations = ChangeDetector(), Innovations.empty(n)
         self._departure: Departure | None = None
 
@@ -95,7 +111,7 @@ class Monitor:
     ) -> Monitor:
         """The monitor of a model from its log. now: Unix time, s."""
         made = cls(joint_names, settings)
-        made.number = log.newest(session, model)
+        made.number, made._scales = log.newest(session, model), intervals.restored(session, model)
         since = now - max(*settings.quality_windows_s, DETECTOR_S)
         lately = (EventRow.received > since, EventRow.number <= made.number)
         events = list(_batches(session, model, *lately)) or list(_batches(session, model, most=1))
@@ -113,6 +129,15 @@ class Monitor:
         """State of judging before the next rows of a stream."""
         gate = self._gates.get(stream_id) or ContactGate.start(self._patience)
         return Watch(gate, self._detector, self._innovations, self._departure)
+
+    def scale(self, stream_id: str, version: int) -> Adaptive:
+        """The scale of a stream's intervals before its next rows, which a version predicts: another begins anew."""
+        known = self._scales.get(stream_id)
+        return Adaptive.start(len(self.joint_names)) if known is None or known.version != version else known.state
+
+    def factors(self, version: int) -> dict[str, Factor]:
+        """What the intervals of a version are wide by now, stream by stream."""
+        return intervals.factors(self._scales, version)
 
     def usual(self, now: float) -> Record:
         """Record of the shortest window before a Unix time, s."""
@@ -145,8 +170,9 @@ class Monitor:
         record = None if event.record is None else Record.from_json(event.record)
         if record is not None and record.n_joints != len(self.joint_names):
             return
+        held = intervals.held(report)
         for window in self.windows:
-            window.add(record, _counts(report), event.received)
+            window.add(record, _counts(report), event.received, held)
         if self.held and not report.get("waited", True):
             self.decided()
         self.held, waits = report["held"], report["held"] or report["open"]
@@ -160,8 +186,11 @@ class Monitor:
                 gate = gate.stand_back() if waits else gate
             self._gates[event.stream_id] = gate
             self._gates.move_to_end(event.stream_id)
+            self._scales.pop(event.stream_id, None)
+            if (scale := intervals.known(event)) is not None:
+                self._scales[event.stream_id] = scale
             if len(self._gates) > self._most_streams:
-                self._gates.popitem(last=False)
+                self._scales.pop(self._gates.popitem(last=False)[0], None)
         at = report.get("until", event.last)
         if at is None or not recent:
             return

@@ -18,6 +18,7 @@ from lipcore.data.samples import Array
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online import acceleration
 from lipcore.online.acceleration import JITTER, RateError
+from lipcore.online.adaptive import scores
 from lipcore.online.batch import Rows
 from lipcore.online.gates import Limits, check_rows, time_span
 from lipcore.vocabulary import CODES, LEARNT
@@ -28,7 +29,9 @@ from service.learning.schema import DerivedAcceleration, LearningOptions
 from service.models.served import Served
 from service.storage.database import EventRow, StreamRow
 
-NON_FINITE, LIMIT, TIME_JUMP, EDGE = (CODES.index(code) for code in ("non_finite", "limit", "time_jump", "edge"))
+NON_FINITE, LIMIT, TIME_JUMP, EDGE, STATIONARY = (
+    CODES.index(code) for code in ("non_finite", "limit", "time_jump", "edge", "stationary")
+)
 
 FAR_AHEAD = 86400.0
 """How far ahead of its arrival a row may be dated, s: as long a recording may be sent in one go."""
@@ -137,12 +140,25 @@ class Trained:
 
 
 @dataclass(frozen=True)
+class Seen:
+    """M measurements beside the intervals that the model believes, of rows that were predicted and of rows at rest.
+
+    time: (M,) event time, s; score: (M, n), see `adaptive.scores`; factor: (M, n), on the half width that they were
+    answered with, where a stream has answered them.
+    """
+
+    time: Array
+    score: Array
+    factor: Array | None
+
+
+@dataclass(frozen=True)
 class Screened:
     """Rows, and the predictions of the model that serves for those that passed so far.
 
     own: which of the rows are of this batch, the others had waited for it. predicted: (N,); mean, std, bare: (P, n) of
     these, bare the standard deviation without the floor that past errors put under `std`. noise_std: (n,). trained: see
-    there; None where nothing is compared with it.
+    there; None where nothing is compared with it. seen: what intervals are judged by.
     """
 
     rows: Rows
@@ -154,6 +170,7 @@ class Screened:
     bare: Array
     noise_std: Array
     trained: Trained | None = None
+    seen: Seen | None = None
 
     @property
     def until(self) -> float | None:
@@ -205,25 +222,31 @@ def predict(
     own: slice,
     derived: DerivedAcceleration | None = None,
     answered: tuple[Array, Array] | None = None,
+    factor: Array | None = None,
 ) -> Screened:
     """Let a version predict the rows that passed, with what it has learnt and as trained; those it has no finite answer
     for are beyond its limits. answered: mean and std, (N, n) each, of all rows, where a stream has answered them
-    already."""
+    already, and factor, (N, n), on their widths."""
     model = served.model
     codes, predicted = rows.code.copy(), rows.code == LEARNT
-    good, floor = rows.take(predicted), model.posterior.floor.numpy()
+    asked = predicted | ((codes == STATIONARY) & np.isfinite(rows.ddq).all(axis=1))
+    good, floor = rows.take(asked), model.posterior.floor.numpy()
     if answered is None:
         mean, bare = _answers(good, model)
         std = np.sqrt(np.maximum(bare**2, floor))
     else:
-        mean, std = (values[predicted] for values in answered)
+        mean, std = (values[asked] for values in answered)
         bare = _answers(good, model)[1] if floor.any() else std
     known = np.isfinite(mean).all(axis=1) & np.isfinite(std).all(axis=1)
+    score = scores(good.tau[known] - mean[known], std[known], model.noise_std)
+    seen = Seen(good.time[known], score, None if factor is None else factor[asked][known])
+    judged, known = known & predicted[asked], known[predicted[asked]]
     codes[predicted] = np.where(known, LEARNT, LIMIT)
     predicted[predicted] = known
     checked = replace(rows, code=codes)
-    trained = Trained(served.version, *_answers(good.take(known), served.base))
-    return Screened(checked, own, derived, predicted, mean[known], std[known], bare[known], model.noise_std, trained)
+    trained = Trained(served.version, *_answers(good.take(judged), served.base))
+    believed = mean[judged], std[judged], bare[judged]
+    return Screened(checked, own, derived, predicted, *believed, model.noise_std, trained, seen)
 
 
 def _answers(rows: Rows, model: TorqueModel) -> tuple[Array, Array]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
@@ -10,7 +12,9 @@ from lipcore.model.torque_model import TorqueModel
 from lipcore.online.record import Record, error_floor
 from lipcore.online.transfer import consolidate
 from service.journal import log, snapshots
+from service.learning import intervals
 from service.learning.learner.restore import Restored, restore
+from service.models.scales import Factor
 from service.models.served import Learnt
 from service.storage.database import Database, EventRow, LearnerRow, ServingRow
 from service.storage.files import Files
@@ -81,6 +85,11 @@ class LearntVersions:
             return Learnt(base, 0, behind)
         variance = floor(self._database, model, version, known.number, base.n_joints)
         return Learnt(known.online.model(variance), known.number - start, behind)
+
+    def factors(self, model: str, version: int) -> Mapping[str, Factor]:
+        """Return the factors on its intervals that the last batches of its streams have led to."""
+        with self._database.session() as session:
+            return intervals.factors(intervals.restored(session, model), version)
 
     def consolidated(self, model: str, version: int, base: TorqueModel) -> Learnt | None:
         """Return all that a version has learnt as a model that can be saved, None where that is nothing; see `find`. It

@@ -59,6 +59,7 @@ class LiveLook:
             novel=novel,
             counts={name: monitor.counts[name] for name in COUNTS},
             windows=[status.window(each, now) for each in monitor.windows],
+            scale=served.scales.asked,
             answers=self._answers.since(passed),
             alarms=decisions.alarms(learners, model, Page(after=None, limit=MOST_ALARMS)).items,
         )

@@ -20,6 +20,7 @@ DEFAULTS = {
     "on_change": "hold",
     "torque_limits": None,
     "contact_threshold": 8.0,
+    "adaptive_intervals": True,
     "auto_refresh": True,
     "auto_promote": True,
 }

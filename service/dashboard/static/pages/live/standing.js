@@ -35,7 +35,7 @@ export function learningCard(status) {
 }
 
 /** How well rows of the last minute were predicted before they were learnt. */
-export function qualityCard({ windows: [latest], joint_names: names, joint_types: types, level }) {
+export function qualityCard({ windows: [latest], joint_names: names, joint_types: types, level, scale }) {
   const short = shortNames(names);
   if (!latest.rows) return panel("Quality", h("p", { class: "muted" }, `No measured torque came in the last ${span(latest.seconds)}.`));
   return panel(
@@ -46,11 +46,13 @@ export function qualityCard({ windows: [latest], joint_names: names, joint_types
         { label: "nMSE", numeric: true, cell: (joint) => scientific(latest.nmse[joint]) },
         { label: "RMSE", numeric: true, cell: (joint) => `${number(latest.rmse[joint], 2)}\u00a0${torqueUnit(types[joint])}` },
         { label: `in ${percent(level, 0)} band`, numeric: true, cell: (joint) => percent(latest.coverage[joint]) },
+        { label: "as answered", numeric: true, cell: (joint) => percent(latest.coverage_answered[joint]) },
+        { label: "widened", numeric: true, cell: (joint) => `×\u00a0${number(scale[joint], 2)}` },
       ],
       names.map((_name, joint) => joint),
       { caption: `${count(latest.rows)} rows of the last ${span(latest.seconds)}, each predicted before it was learnt` },
     ),
-    h("p", { class: "hint" }, "nMSE: mean squared error / variance of the torque; 0 is best. The last column should be near ", percent(level, 0), ". Contacts do not count."),
+    h("p", { class: "hint" }, "nMSE: mean squared error / variance of the torque; 0 is best. The band is the model's own belief; as answered, it is widened at once by what streams measure, contacts and rest included, so that ", percent(level, 0), " lie inside."),
   );
 }
 

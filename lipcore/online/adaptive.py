@@ -1,0 +1,130 @@
+"""Intervals that hold what they promise whatever the robot does: a factor on their width that measurements move."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lipcore.data.samples import Array
+from lipcore.online.record import HALF_WIDTH, LEVEL
+
+RATE = 10.0
+"""What a second of misses moves log s by; where everything lies inside it falls by 0.5 a second.
+
+This and the three below were chosen with benchmarks/studies/adaptive_intervals.py on its streams for tuning, so that
+every minute holds 93 to 97 % and each joint at least 85 % from 0.3 s after a payload on, and for the least width then.
+With 5 some minutes held 98 %.
+"""
+SHARE, FEWEST = 0.7, 5
+"""Where so large a share of so many rows or more lies outside, the scale leaps to what would have held the batch."""
+MARGIN = 1.5
+"""Times the largest error of such a batch: those of a new payload go on growing with the motion."""
+MOST_STEP = 0.25
+"""Of log s by one batch, up or down, unless its errors say more: a batch may bring many seconds of rows."""
+MOST_OWED = 30.0
+"""A minute in which everything lies inside pays as much."""
+MOST_GAIN = 0.5
+"""Of one row, however long ago the row before it was."""
+LONGEST_GAP_S = 1.0
+"""A longer time between two batches is a pause, in which nothing was observed."""
+USUAL_STEP_S = 0.01
+"""Between rows that have no times."""
+SMALLEST, LARGEST = 0.1, 1e4
+"""Of s. A small one is no danger to the stream that has earned it, whose next misses leap; see `widest`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Adaptive:
+    """The scale s of a stream's intervals, mean ± s · 1.96 · √(std² + noise_std²), joint by joint; immutable.
+
+    Quantile tracking (adaptive conformal inference, Gibbs & Candès 2021, with a step for log s): rows that stand for dt
+    seconds each move log s by RATE · dt · (miss − 0.05), where `miss` says whether one lay outside the interval that it
+    was answered with. So, whatever the errors are, over a stretch of T seconds
+
+        |share of misses − 0.05| ≤ (|change of log s| + |change of owed| + leaps) / (RATE · T)
+
+    with the leaps that SHARE adds: a scale that grows tenfold shifts the coverage of that minute by 0.4 to 0.8 %. What
+    the misses of a long batch ask for beyond the errors in it is not paid by a larger scale but `owed`: the scale does
+    not fall before that is paid. It holds for rows that are evenly spaced, within SMALLEST and LARGEST.
+
+    log: (n,), of s; owed: (n,), in the same unit; last: event time of the latest row, s.
+    """
+
+    log: Array
+    owed: Array
+    last: float | None = None
+
+    @staticmethod
+    def start(n: int) -> Adaptive:
+        """What the model itself believes, of n joints: s = 1."""
+        return Adaptive(np.zeros(n), np.zeros(n))
+
+    @property
+    def factor(self) -> Array:
+        """s, (n,)."""
+        return np.asarray(np.exp(self.log))
+
+    def step(self, time: Array, score: Array, answered: Array | None = None) -> Adaptive:
+        """Follow the rows of a batch at event times (N,), s, with their scores (N, n), see `scores`.
+
+        answered: the factors that they were answered with, (N, n) or (n,); that from before the batch where None.
+        """
+        if not len(score):
+            return self
+        missed = outside(score, self.factor if answered is None else answered)
+        moved = min(RATE * self._spacing(time), MOST_GAIN) * (missed - (1 - LEVEL)).sum(axis=0)
+        size = np.log(np.maximum(score, SMALLEST))
+        leap = size.max(axis=0) + np.log(MARGIN) - self.log
+        sudden = (missed.mean(axis=0) >= SHARE) & (len(score) >= FEWEST)
+        moved = np.where(sudden, np.maximum(moved, leap), moved)
+        most = np.maximum(leap, MOST_STEP)
+        paid = np.minimum(self.owed, np.maximum(-moved, 0.0))
+        owed = np.minimum(self.owed - paid + np.maximum(moved - most, 0.0), MOST_OWED)
+        place = int(np.ceil(LEVEL * len(size))) - 1
+        least = np.minimum(np.partition(size, place, axis=0)[place] - self.log, -MOST_STEP)
+        log = self.log + np.clip(moved + paid, least, most)
+        latest = float(time.max())
+        last = latest if self.last is None else max(latest, self.last)
+        return Adaptive(np.clip(log, np.log(SMALLEST), np.log(LARGEST)), owed, last)
+
+    def to_json(self) -> dict[str, Any]:
+        """Its state as numbers and lists; `from_json` gives back the same to the last bit."""
+        return {"log": self.log.tolist(), "owed": self.owed.tolist(), "last": self.last}
+
+    @staticmethod
+    def from_json(values: Mapping[str, Any]) -> Adaptive:
+        """What `to_json` wrote."""
+        log, owed = (np.array(values[name], np.float64) for name in ("log", "owed"))
+        return Adaptive(log, owed, values["last"])
+
+    def _spacing(self, time: Array) -> float:
+        """Seconds that each of these rows stands for."""
+        first, latest = float(time.min()), float(time.max())
+        if self.last is not None and first - LONGEST_GAP_S <= self.last < latest:
+            first = self.last
+        return (latest - first) / len(time) or USUAL_STEP_S
+
+
+def scores(error: Array, std: Array, noise_std: Array) -> Array:
+    """|error| over the half width that the model believes, (N, n): an interval of scale s holds scores of up to s.
+
+    error = tau − mean and std, the function's deviation, (N, n); noise_std (n,), N·m.
+    """
+    return np.asarray(np.abs(error) / (HALF_WIDTH * np.sqrt(std**2 + noise_std**2)))
+
+
+def outside(score: Array, factor: Array) -> NDArray[np.bool_]:
+    """Which measurements of these scores, (N, n), lie outside intervals of these scales, (N, n) or (n,)."""
+    return np.asarray(score > factor)
+
+
+def widest(factors: Sequence[Array]) -> Array:
+    """The largest of several streams' scales and 1, joint by joint, for a question that belongs to no stream.
+
+    Not below 1: a smaller one is earned by the motion of the moment, and the question may be of another.
+    """
+    return np.asarray(np.maximum(np.max(factors, axis=0), 1.0))

@@ -1,0 +1,52 @@
+"""Factors on the widths of a version's intervals, as the measurements that its streams bring have made them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from lipcore.data.samples import Array
+from lipcore.online.adaptive import widest
+
+RECENT_S = 60.0
+"""Streams that taught within so long of the newest one are asked about, s."""
+
+
+@dataclass(frozen=True)
+class Factor:
+    """Of a stream: values (n,), and when the batch came that made them, Unix time, s."""
+
+    values: Array
+    received: float
+
+
+class Scales:
+    """The factors that a version answers with now; any thread may read while one replaces them.
+
+    One of these belongs to a version for as long as the service runs, whatever it learns: all of its revisions have it.
+    """
+
+    def __init__(self, n_joints: int) -> None:
+        self._one = np.ones(n_joints)
+        self._streams: Mapping[str, Factor] = {}
+        self._widest = self._one
+        self.asked: list[float] = self._one.tolist()
+
+    def of(self, stream_id: str | None) -> Array:
+        """Those of a stream, (n,), 1 where it has taught nothing; of no stream those of questions, `asked`.
+
+        A question of HTTP belongs to no stream: it has the largest of those of the recent streams, and 1 at least."""
+        if stream_id is None:
+            return self._widest
+        known = self._streams.get(stream_id)
+        return self._one if known is None else known.values
+
+    def take(self, streams: Mapping[str, Factor]) -> None:
+        """Answer with these from now on."""
+        latest = max((each.received for each in streams.values()), default=0.0)
+        recent = [each.values for each in streams.values() if each.received >= latest - RECENT_S]
+        self._widest = widest(recent) if recent else self._one
+        self.asked = self._widest.tolist()
+        self._streams = streams
