@@ -23,6 +23,8 @@ LATE = 1e-3
 """Share of the torque's variance from which on a lag is worth a warning."""
 VERY_LATE = 5e-3
 """The same where only one joint is late."""
+ODD = 3
+"""Joints that tell a lag, over those that differ, from which on the others speak for the clock."""
 UNEVEN = 0.25
 MISSING = 0.01
 COLLINEAR = 0.99
@@ -85,12 +87,15 @@ def _late(lags: list[Lag]) -> list[str]:
                 f"(± {1e3 * std:.1f}) {'after' if seconds > 0 else 'before'} motion, which turns up to "
                 f"{cost:.1%} of a joint's torque variance into error; use signals of one clock, filtered alike"
             ]
+    odd = [each for each in others if each.improves]
+    if ODD * len(odd) > sum(each.seconds is not None for each in others):
+        return []  # where many disagree, as of motion that repeats itself, a fit may take any lag for one
     return [
         f"the torque of {each.joint} comes {1e3 * abs(each.seconds or 0.0):.0f} ms (± {1e3 * (each.std_s or 0.0):.0f}) "
         f"{'after' if (each.seconds or 0.0) > 0 else 'before'} its motion, which other joints do not show: time stamps "
         "do not explain it, filters of this joint or friction that depends on more than speed may"
         for each in late
-        if (each.cost or 0.0) > VERY_LATE and each.improves
+        if (each.cost or 0.0) > VERY_LATE and each in odd
     ]
 
 
