@@ -159,6 +159,7 @@ def test_nearly_all_defects_are_named_and_hardly_one_wrongly(dirty: bool, tmp_pa
     assert verdicts["named"] >= 0.85 * verdicts.total()
 
 
+@pytest.mark.slow
 def test_an_arm_on_the_ceiling_or_on_a_wall_is_not_without_gravity(tmp_path: Path) -> None:
     columns, arm = recording(*QUICK), profiles.profile(QUICK[0])
     upright = gravity(QUICK[0], columns["q"])
