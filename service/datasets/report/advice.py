@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from service.datasets.report.excitation import SELDOM, SLOW
-from service.datasets.report.lag import clear
+from service.datasets.report.lag import SURE, clear
 from service.datasets.schema import Excitation, JointExcitation, JointLimits, JointNoise, JointSaturation, Lag, Timing
 
 TERMS = (("viscous friction", "viscous"), ("Coulomb friction", "coulomb"), ("constant torque", "offset"))
@@ -23,6 +23,8 @@ LATE = 1e-3
 """Share of the torque's variance from which on a lag is worth a warning."""
 VERY_LATE = 5e-3
 """The same where only one joint is late."""
+ODD = 3
+"""Joints that tell a lag, over those that differ, from which on the others speak for the clock."""
 UNEVEN = 0.25
 MISSING = 0.01
 COLLINEAR = 0.99
@@ -76,7 +78,9 @@ def _late(lags: list[Lag]) -> list[str]:
     """A lag that all joints share is one of clocks or filters; that of one joint alone may be its friction's."""
     shared, *others = lags
     late = [each for each in others if (each.cost or 0.0) > LATE and clear(each)]
-    if clear(shared) and 2 * len(shared.improves) > sum(each.seconds is not None for each in others):
+    known = sum(each.seconds is not None for each in others)
+    alike = [each.joint for each in others if _alike(each, shared)]
+    if clear(shared) and 2 * sum(joint in alike for joint in shared.improves) > known:
         cost = max((each.cost or 0.0 for each in late if each.joint in shared.improves), default=0.0)
         if cost:
             seconds, std = shared.seconds or 0.0, shared.std_s or 0.0
@@ -85,13 +89,23 @@ def _late(lags: list[Lag]) -> list[str]:
                 f"(± {1e3 * std:.1f}) {'after' if seconds > 0 else 'before'} motion, which turns up to "
                 f"{cost:.1%} of a joint's torque variance into error; use signals of one clock, filtered alike"
             ]
+    odd = [each for each in others if each.improves]
+    if ODD * len(odd) > known:
+        return []  # where many disagree, as of motion that repeats itself, a fit may take any lag for one
     return [
         f"the torque of {each.joint} comes {1e3 * abs(each.seconds or 0.0):.0f} ms (± {1e3 * (each.std_s or 0.0):.0f}) "
         f"{'after' if (each.seconds or 0.0) > 0 else 'before'} its motion, which other joints do not show: time stamps "
         "do not explain it, filters of this joint or friction that depends on more than speed may"
         for each in late
-        if (each.cost or 0.0) > VERY_LATE and each.improves
+        if (each.cost or 0.0) > VERY_LATE and each in odd and each.joint not in alike
     ]
+
+
+def _alike(lag: Lag, shared: Lag) -> bool:
+    """Whether a joint's lag may be the one that is shared."""
+    if lag.seconds is None or lag.std_s is None or shared.seconds is None or shared.std_s is None:
+        return False
+    return abs(lag.seconds - shared.seconds) < SURE * lag.std_s + shared.std_s
 
 
 def advice(timing: Timing, excitation: Excitation, limits: list[JointLimits], noise: list[JointNoise]) -> list[str]:

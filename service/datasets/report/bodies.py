@@ -11,7 +11,7 @@ left out: rows that follow each other err alike.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from typing import NamedTuple
@@ -141,6 +141,11 @@ class Against:
         """Share of the variance that is explained on eighths left out, (n,), 0 at least."""
         return np.asarray(np.clip(1 - self.errors.mean(0), 0.0, 1.0))
 
+    @property
+    def error(self) -> float:
+        """Mean logarithm of the errors."""
+        return float(np.log(self.errors + FLOOR).mean())
+
     def steady(self, joint: int, part: int, least: float = 3.0) -> bool:
         """Whether a factor, of gravity (0) or the rest (1), is told from 0 by so many standard deviations, and its
         torque is a visible part of the joint's."""
@@ -158,23 +163,31 @@ def moving(dq: Array) -> NDArray[np.int64]:
     return rows if len(rows) > SELDOM * len(dq) else np.arange(len(dq))
 
 
+def _fits(bodies: Bodies, signals: Signals) -> Iterator[tuple[Array, float, Blocks]]:
+    """Columns of each joint's fit where it moves, the variance of its torque there, and the fit."""
+    gravity, rest = bodies.parts(signals)
+    for joint in range(signals.q.shape[1]):
+        rows = moving(signals.dq[:, joint])
+        columns = design(gravity[rows, joint], rest[rows, joint], signals.dq[rows, joint])
+        tau = signals.tau[rows, joint, None]
+        yield columns, max(float(tau.var()), 1e-300), Blocks.fit(columns, tau)
+
+
 def compare(bodies: Bodies, signals: Signals) -> Against:
     """Fit each joint's torque."""
-    gravity, rest = bodies.parts(signals)
-    dq, tau, n = signals.dq, signals.tau, signals.q.shape[1]
-    factors, stds, visible, errors = np.empty((n, 2)), np.empty((n, 2)), np.zeros((n, 2)), np.empty((EIGHTHS, n))
-    for joint in range(n):
-        rows = moving(dq[:, joint])
-        columns = design(gravity[rows, joint], rest[rows, joint], dq[rows, joint])
-        variance = max(float(tau[rows, joint].var()), 1e-300)
-        fit = Blocks.fit(columns, tau[rows, joint, None])
-        factors[joint], stds[joint] = fit.weights[:2, 0], fit.std[:2, 0]
-        errors[:, joint] = fit.errors[:, 0] / variance
+    factors, stds, visible, errors = [], [], [], []
+    for columns, variance, fit in _fits(bodies, signals):
+        factors.append(fit.weights[:2, 0])
+        stds.append(fit.std[:2, 0])
+        errors.append(fit.errors[:, 0] / variance)
+        sizes = []
         for part in (0, 1):
             others = np.delete(columns, part, axis=1)
             left = columns[:, part] - others @ np.linalg.lstsq(others, columns[:, part], rcond=1e-9)[0]
-            visible[joint, part] = np.sqrt(np.mean(left**2) / variance)
-    return Against(factors[:, 0], stds[:, 0], factors[:, 1], stds[:, 1], visible, errors)
+            sizes.append(np.sqrt(np.mean(left**2) / variance))
+        visible.append(sizes)
+    (gravity, inertia), (gravity_std, inertia_std) = np.transpose(factors), np.transpose(stds)
+    return Against(gravity, gravity_std, inertia, inertia_std, np.array(visible), np.transpose(errors))
 
 
 BETTER = 3.0
@@ -226,7 +239,8 @@ def joint_order(bodies: Bodies, signals: Signals, against: Against) -> Order | N
 
     def error(order: tuple[int, ...]) -> float:
         if order not in scores:
-            scores[order] = _mean_log(compare(bodies, few.take(order)))
+            fits = _fits(bodies, few.take(order))
+            scores[order] = float(np.mean([np.log(fit.errors / variance + FLOOR) for _, variance, fit in fits]))
         return scores[order]
 
     here = tuple(range(n))
@@ -251,11 +265,7 @@ def joint_order(bodies: Bodies, signals: Signals, against: Against) -> Order | N
     gain = (np.log(against.errors + FLOOR) - np.log(there.errors + FLOOR)).sum(1) / len(moved)
     steady = [joint for joint in range(n) if there.steady(joint, 0)]
     clear = (gain > 0).all() and gain.mean() > np.log(BETTER) and np.median(there.explained[moved]) > EXPLAINED
-    return Order(best, _mean_log(there)) if clear and steady and (there.gravity[steady] > 0).all() else None
-
-
-def _mean_log(against: Against) -> float:
-    return float(np.log(against.errors + FLOOR).mean())
+    return Order(best, there.error) if clear and steady and (there.gravity[steady] > 0).all() else None
 
 
 def _moved(order: tuple[int, ...]) -> int:

@@ -16,7 +16,17 @@ import numpy as np
 
 from lipcore.data.samples import Array
 from service.datasets.report.advice import listed
-from service.datasets.report.bodies import VISIBLE, Against, Blocks, Bodies, Signals, design, joint_order, torque_order
+from service.datasets.report.bodies import (
+    FREE,
+    VISIBLE,
+    Against,
+    Blocks,
+    Bodies,
+    Signals,
+    design,
+    joint_order,
+    torque_order,
+)
 from service.datasets.report.excitation import CLEAR, NOTICED
 from service.datasets.report.remedies import Upload, remedy
 from service.datasets.report.robots import LIKE, TRUSTED, heavy, other_robot
@@ -38,6 +48,8 @@ TREND = 1.0
 """How far work has to go one way, over what it goes to and fro: 0.01 to 0.23 on frictionless arms, 0.7 to 42 else."""
 GAIN = 3.0
 """How many times smaller errors have to be with gravity along another direction."""
+DIRECTION = [0, FREE, FREE + 1]
+"""Columns of gravity downwards and along two horizontal axes."""
 BASE = "Give a URDF with the base as it stands, or train with geometry=learn"
 
 
@@ -78,7 +90,10 @@ def causes(
         case = _Case(upload, bodies, against, signals, drags)
         out = case.order() or case.sign() or case.gravity() or other_robot(upload, bodies, against, signals)
         out = out or case.factor()
-    out = out or _taken(upload, signals, work) or _negative_friction(upload, drags)
+    out = out or _taken(upload, signals, work)
+    # friction beside bodies that do not explain the torque is none
+    if against is None or (against.explained[against.visible[:, 0] > VISIBLE] > WELL).all():
+        out = out or _negative_friction(upload, drags)
     return [] if out is None else [out]
 
 
@@ -253,16 +268,22 @@ class _Case:
         return bool(most < NEAR and size * self.against.visible[joint, 0] < VISIBLE)
 
     def _leans(self, joints: Sequence[int]) -> bool:
-        """Whether gravity sideways explains the torque of these joints far better."""
+        """Whether gravity along one other direction explains the torque of these joints far better."""
         gravity, rest = self.bodies.parts(self.signals)
         sides = self.bodies.sideways(self.signals.q)
-        gains = []
+        gains, directions = [], []
         for j in joints:
             columns = design(gravity[:, j], rest[:, j], self.signals.dq[:, j])
             both = np.column_stack([columns, sides[0][:, j], sides[1][:, j]])
-            upright, leaning = (Blocks.fit(x, self.signals.tau[:, j, None]).errors.mean() for x in (columns, both))
-            gains.append(float(np.log(upright) - np.log(leaning)))
-        return bool(float(np.mean(gains)) > np.log(GAIN))
+            upright, leaning = (Blocks.fit(x, self.signals.tau[:, j, None]) for x in (columns, both))
+            gains.append(float(np.log(upright.errors.mean()) - np.log(leaning.errors.mean())))
+            if (leaning.std[DIRECTION] < NEAR).all():
+                directions.append(leaning.weights[DIRECTION, 0])
+        if len(directions) < 2 or np.mean(gains) < np.log(GAIN):
+            return False
+        middle = np.median(directions, axis=0)
+        off = np.median(np.abs(directions - middle).max(axis=1))
+        return bool(LIKE[0] < np.linalg.norm(middle) < LIKE[1] and off < NEAR)
 
     def _remedy(self, cause: Cause, joints: Sequence[int], text: str, options: dict[str, str] | None = None) -> Remedy:
         names = [self.upload.names[j] for j in joints]

@@ -39,9 +39,13 @@ def heavy(against: Against) -> list[int]:
 
 
 def usual_gravity(against: Against) -> float | None:
-    """Median of the joints' factors of gravity, where it has the right sign in all that tell."""
+    """Median of the joints' factors of gravity, where most that tell agree with it and all have the right sign."""
     factors = against.gravity[heavy(against)]
-    return float(np.median(factors)) if len(factors) and (factors > 0).all() else None
+    if not len(factors) or (factors <= 0).any():
+        return None
+    middle = float(np.median(factors))
+    alike = (factors > LIKE[0] * middle) & (factors < LIKE[1] * middle)
+    return middle if 3 * alike.sum() >= 2 * len(factors) else None
 
 
 def proposed(names: tuple[str, ...], signals: Signals) -> tuple[tuple[str, ...], str | None]:
@@ -77,8 +81,11 @@ def other_robot(upload: Upload, bodies: Bodies, against: Against, signals: Signa
         return None
     _, best = proposed(upload.names, signals)
     other = None if best is None or best == bodies.name else bodies_of(profile(best), upload.names)
-    theirs = None if other is None else usual_gravity(compare(other, signals))
-    if best is None or theirs is None or not 1 / ALIKE < theirs < ALIKE:
+    if best is None or other is None:
+        return None
+    fit = compare(other, signals)
+    theirs = usual_gravity(fit)
+    if theirs is None or not 1 / ALIKE < theirs < ALIKE or fit.error > against.error:
         return None
     return remedy(
         "robot",

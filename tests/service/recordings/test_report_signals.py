@@ -175,14 +175,19 @@ def test_a_lag_that_shifting_does_not_mend_is_no_warning() -> None:
     certain = {"seconds": 0.03, "std_s": 0.003, "cost": 0.05}
     timing = Timing(**dict.fromkeys(Timing.model_fields, None) | {"gaps": [], "repeated_stamps": 0, "missing_rows": 0})
 
-    def reply(shared: list[str], *joints: list[str]) -> list[str]:
+    def reply(common: Lag, *joints: list[str]) -> list[str]:
         each = [Lag(joint=f"j{k}", improves=improves, **certain) for k, improves in enumerate(joints)]
-        return warnings(timing, [], [], [Lag(joint=None, improves=shared, **certain), *each], 1000)
+        return warnings(timing, [], [], [common, *each], 1000)
 
-    assert reply([], [], [], []) == []
-    assert "not of the same time: torque comes 30.0 ms" in reply(["j0", "j1"], ["j0"], ["j1"], [])[0]
-    (alone,) = reply(["j1"], [], ["j1"], [])
+    def shared(*improves: str) -> Lag:
+        return Lag(joint=None, improves=list(improves), **certain)
+
+    assert reply(shared(), [], [], []) == []
+    assert "not of the same time: torque comes 30.0 ms" in reply(shared("j0", "j1"), ["j0"], ["j1"], [])[0]
+    (alone,) = reply(Lag(joint=None, seconds=0.0, std_s=0.001), [], ["j1"], [])
     assert alone.startswith("the torque of j1 comes 30 ms")
+    assert reply(shared("j1"), [], ["j1"], []) == []  # others have that lag, too
+    assert reply(Lag(joint=None, seconds=0.0, std_s=0.001), ["j0"], ["j1"], []) == []
 
 
 @pytest.mark.parametrize("rate", [30.0, 125.0, 1000.0])
