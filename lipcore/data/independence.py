@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.data.samples import Array, Samples
+from lipcore.data.samples import Array
 
 INDEPENDENT_HZ = 10.0
 """Rows a second that count as independent.
@@ -67,26 +67,6 @@ def stream_weights(time: Array, before: float | None = None, rate: float = INDEP
     out = np.empty(len(time))
     out[order] = np.minimum(rate * steps, 1.0)
     return out
-
-
-def residual_correlation(residual: Array, samples: Samples) -> float:
-    """Rows that one independent row stands for, from the residuals (N, n) of samples in order of time: at least 1.
-
-    1 + 2 Σ ρ_k over the lags at which the autocorrelation, averaged over the joints and within episodes, stays above
-    its chance level: what a filter has smeared over several rows counts once.
-    """
-    white = residual / np.maximum(np.sqrt(np.mean(residual**2, axis=0)), 1e-12)
-    episodes = [part for part in samples.episodes() if part.stop - part.start > 1]
-    longest = max((part.stop - part.start for part in episodes), default=0)
-    total = 1.0
-    for lag in range(1, longest // 4):
-        products = [white[part][lag:] * white[part][:-lag] for part in episodes if part.stop - part.start > lag]
-        pairs = sum(map(len, products))
-        level = float(np.concatenate(products).mean())
-        if level < 2.0 / np.sqrt(pairs * residual.shape[1]):
-            break
-        total += 2 * level
-    return total
 
 
 def motion_dimensions(dq: Array) -> float:

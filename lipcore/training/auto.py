@@ -75,8 +75,8 @@ def _of_all(work: Work, contest: Contest, chosen: str) -> TorqueModel:
     objective = float(model.fit["objective"])
     work.overall.of(chosen, ALL)(FitProgress("posterior", 0, 0, objective, 0.0, 0.0))
     used = task.samples.rows(spread_out(task.samples.motion(), task.options.posterior_samples).numpy())
-    compression, jitter = compact(task, model.estimator, model.posterior.params, used)
-    counts = {"samples_given": len(task.samples), "samples_posterior": len(used), "jitter": jitter}
+    compression, stands_on = compact(task, model.estimator, model.posterior.params, used)
+    counts = {"samples_given": len(task.samples), "samples_posterior": len(used), **stands_on}
     return replace(
         model,
         posterior=compression.posterior,

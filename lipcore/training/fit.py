@@ -66,8 +66,8 @@ def fit_estimator(
         fewer = options if learnt is None else independent_samples(options, learnt)
         fitted = fit(estimator.kernel, samples, fewer, task.on_progress, task.cancelled, task.stretches, start)
         used = samples.rows(fitted.rows)
-        compression, jitter = compact(task, estimator, fitted.params, used)
-        report = {**asdict(fitted.report), "jitter": jitter}
+        compression, stands_on = compact(task, estimator, fitted.params, used)
+        report = {**asdict(fitted.report), **stands_on}
         if learnt is not None:
             seconds = float(learnt.report["seconds"]) + fitted.report.seconds
             report = {**learnt.report, **report, "seconds": seconds}
@@ -86,8 +86,9 @@ def fit_estimator(
     )
 
 
-def compact(task: Task, estimator: Estimator, params: Params, used: Samples) -> tuple[Compression, float]:
-    """The compact posterior of an estimator with a nonlinear term, and the jitter, (N·m)², that the exact one took.
+def compact(task: Task, estimator: Estimator, params: Params, used: Samples) -> tuple[Compression, dict[str, float]]:
+    """The compact posterior of an estimator with a nonlinear term; for the manifest, the jitter, (N·m)², that the exact
+    one took, and how many independent samples it stands on.
 
     used: samples of the task's recordings. A torque counts as `Misfit.of_row` says; what that is, contiguous samples
     tell. Raise NotPositiveDefiniteError where the exact posterior cannot be computed.
@@ -106,7 +107,8 @@ def compact(task: Task, estimator: Estimator, params: Params, used: Samples) -> 
     variance = misfit.of_row(noise, motion.dq, shared_rows(task.samples, len(used)))
     statistics = collect(posterior.basis, variance, motion, used.torque() - estimator.kernel.mean(motion))
     counted = CompactPosterior.build(estimator.kernel, posterior.basis, statistics, noise, factor, misfit)
-    return replace(compression, posterior=counted), jitter
+    independent = float((noise / variance).mean(dim=1).sum())
+    return replace(compression, posterior=counted), {"jitter": jitter, "independent_samples": independent}
 
 
 def independent_samples(options: FitOptions, learnt: Learnt) -> FitOptions:

@@ -275,6 +275,8 @@ def _print_version(version: VersionRecord) -> None:
     sets = [each.get("name") or each.get("id") for each in lineage.get("datasets") or () if isinstance(each, dict)]
     if sets:
         echo(f"  trained on {', '.join(map(str, sets))}")
+    if (independent := version.fit.get("independent_samples")) is not None:
+        echo(f"  {version.fit['samples_given']} samples, worth {round(independent)} independent ones")
     if lineage.get("holdout") is not None:
         print_held_out(version)
     else:

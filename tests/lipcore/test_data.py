@@ -12,7 +12,6 @@ from lipcore.data.independence import (
     INDEPENDENT_HZ,
     even_weights,
     recording_weights,
-    residual_correlation,
     stream_weights,
 )
 from lipcore.data.motion import Motion, check_joint_types
@@ -187,24 +186,3 @@ def test_rows_of_a_recording_count_for_their_time(rate: float) -> None:
     # a piece with one more row at both ends knows what the whole knows
     np.testing.assert_array_equal(recording_weights(time[29:72], episode[29:72])[1:-1], found[30:71])
     assert len(recording_weights(np.empty(0), np.empty(0, np.int64))) == 0
-
-
-def noisy(size: int, memory: float, seed: int, episodes: int = 1) -> tuple[np.ndarray, Samples]:
-    """An autoregression e_k = φ e_{k−1} + white, in each of several recordings."""
-    rng = np.random.default_rng(seed)
-    white = rng.standard_normal((size, 2))
-    episode = np.arange(size) * episodes // size
-    for k in range(1, size):
-        if episode[k] == episode[k - 1]:
-            white[k] += memory * white[k - 1]
-    nothing = np.zeros((size, 2))
-    return white, Samples(("a", "b"), np.arange(size) * 0.01, episode, nothing, nothing, nothing, white)
-
-
-@pytest.mark.parametrize("episodes", [1, 5])
-def test_rows_that_an_independent_one_stands_for(episodes: int) -> None:
-    assert residual_correlation(*noisy(5000, 0.0, 1, episodes)) == pytest.approx(1.0, abs=0.1)
-    for memory in (0.5, 0.8):  # 1 + 2 Σ φ^k
-        expected = (1 + memory) / (1 - memory)
-        assert residual_correlation(*noisy(20_000, memory, 2, episodes)) == pytest.approx(expected, rel=0.2)
-    assert residual_correlation(np.zeros((3, 2)), noisy(3, 0.0, 3)[1]) == 1.0

@@ -91,6 +91,7 @@ function fit({ fit: said, compact, calibration, lineage: from }) {
     ["Samples given", count(said.samples_given)],
     ["Samples for the hyperparameters", count(said.samples_hyperparameters)],
     ["Samples of the posterior", count(said.samples_posterior)],
+    ["Worth so many independent ones", count(said.independent_samples)],
     ["Standard deviations multiplied by", number(calibration.function_std_factor)],
   ];
   if (compact) {
