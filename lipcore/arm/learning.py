@@ -40,9 +40,9 @@ NEAR = 7.0
 DIFFERS = 0.3
 """An alternative arm matters where its torque differs by this share of the spread that is stated anyway."""
 CHECKS = 200
-STRIBECK_NATS = 10.0
-"""What a fourth term of friction has to gain to be kept. On simulated arms without such friction it lost two to seven,
-a sign that turns over at once instead of smoothly gained seven, 0.5 N·m of such friction gained forty."""
+STRIBECK_NATS = 3.0
+"""What a fourth term of friction has to gain to be kept: odds of twenty to one, from independent samples. On simulated
+arms without such friction it lost two to seven where every row counted."""
 STRIBECK_ROUNDS, REST_ROUNDS = 2, 2
 CORRELATED = 20_000
 """Contiguous rows at most that tell what lasts of the errors."""

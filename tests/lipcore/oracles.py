@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -12,9 +12,13 @@ from torch import Tensor
 from torch.func import jacrev
 
 from lipcore.data.motion import Motion
+from lipcore.data.samples import Samples
 from lipcore.kernels.base import PairKernel, Params, State
 from lipcore.kernels.chain import ChainKernel
 from lipcore.kernels.lip import LipKernel
+from lipcore.model.torque_model import TorqueModel
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.statistics import collect
 
 Instant = tuple[Tensor, Tensor, Tensor]
 """(q, v, a) of one sample, each (n,)."""
@@ -297,3 +301,12 @@ def opposite(kind: str, share: Sequence[float], q: float) -> float:
         return -(sigma + beta) / (alpha * q)
     cosine, sine = alpha * math.cos(q), beta * math.sin(q)
     return math.atan2(sine, cosine) + math.acos(-sigma / math.hypot(cosine, sine))
+
+
+def in_full(model: TorqueModel, samples: Samples) -> TorqueModel:
+    """The model with every sample counted in full, and nothing besides posterior and noise: the textbook's."""
+    posterior, motion = model.posterior, samples.motion()
+    noise, residual = posterior.noise_variance, samples.torque() - posterior.kernel.mean(motion)
+    every = collect(posterior.basis, noise, motion, residual)
+    built = CompactPosterior.build(posterior.kernel, posterior.basis, every, noise, posterior.std_factor)
+    return replace(model, posterior=built)

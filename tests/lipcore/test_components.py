@@ -29,6 +29,7 @@ from tests.lipcore.oracles import (
     Instant,
     chain_energies,
     energy_torque,
+    in_full,
     instant,
     lip_energies,
     torque_terms,
@@ -82,7 +83,7 @@ def case(request: pytest.FixtureRequest) -> Case:
     bodies = None
     if setting.estimator.startswith("rigid-body"):
         bodies = RigidBody.from_profile(setting.robot, samples.joint_names, robot.joint_types)
-    model = train(samples, robot.joint_types, setting.estimator, options, robot=bodies)
+    model = in_full(train(samples, robot.joint_types, setting.estimator, options, robot=bodies), samples)
     unseen = simulate(robot, Stream(n_samples=40, n_sinusoids=100, speed=10, noise=0.0), seed=7)
     tau = torch.from_numpy(unseen.tau)
     found = dynamics.components(model, unseen.motion(), dynamics.COMPONENTS, tau)

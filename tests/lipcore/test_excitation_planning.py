@@ -14,12 +14,11 @@ from lipcore.excitation import Belief, Limits, PlanOptions, Series, plan
 from lipcore.excitation.information import Information
 from lipcore.excitation.motions import Shape, draw, overshoot
 from lipcore.excitation.searching import MARGIN, Goal, TorqueCheck, search
-from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.exact import ExactPosterior
-from lipcore.posterior.statistics import collect
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
 from lipcore.robots.urdf import RigidBody
+from tests.lipcore.oracles import in_full
 
 NOISE = 0.05
 QUICK = lipcore.FitOptions(hyperparameter_samples=20, posterior_samples=40, max_iterations=4, starts=1, device="cpu")
@@ -49,10 +48,7 @@ def samples(robot):
 @pytest.fixture(scope="module")
 def model(robot, samples):
     trained = lipcore.train(samples, robot.joint_types, "lip-chain", replace(QUICK, compact_tolerance=1e-6))
-    posterior, residual = trained.posterior, samples.torque() - trained.posterior.kernel.mean(samples.motion())
-    every = collect(posterior.basis, posterior.noise_variance, samples.motion(), residual)  # each sample in full
-    counted = CompactPosterior.build(posterior.kernel, posterior.basis, every, posterior.noise_variance)
-    return replace(trained, posterior=counted)
+    return in_full(trained, samples)
 
 
 def both(*motions):

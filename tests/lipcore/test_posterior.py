@@ -25,7 +25,7 @@ from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import ROBOT_ESTIMATORS
-from tests.lipcore.oracles import KERNELS, Problem, TorchForm, random_problem
+from tests.lipcore.oracles import KERNELS, Problem, TorchForm, in_full, random_problem
 
 JOINTS = ("revolute", "prismatic", "revolute")
 N_JOINTS = len(JOINTS)
@@ -167,7 +167,7 @@ class Case(NamedTuple):
 def fitted(name: str) -> Case:
     samples = simulate(load_robot(ROBOT), STREAM, seed=1)
     body = RigidBody.from_profile(ROBOT, samples.joint_names, ("revolute",) * 2) if name in ROBOT_ESTIMATORS else None
-    model = train(samples, ("revolute",) * 2, name, OPTIONS, robot=body)
+    model = in_full(train(samples, ("revolute",) * 2, name, OPTIONS, robot=body), samples)
     posterior = model.posterior
     kernel, params, motion = posterior.kernel, posterior.params, samples.motion()
     exact = ExactPosterior.fit(kernel, params, motion, samples.torque(), posterior.std_factor)

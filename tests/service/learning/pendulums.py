@@ -169,10 +169,9 @@ def at_once(numbers: Iterable[int] = (), parts: Iterable[Rows] = ()) -> tuple[np
     if learnt:
         every = Rows.concatenate(learnt).learnt
         residual = torch.from_numpy(every.tau) - posterior.kernel.mean(every.motion())
-        known = merge(known, collect(posterior.basis, posterior.noise_variance, every.motion(), residual))
-    built = CompactPosterior.build(
-        posterior.kernel, posterior.basis, known, posterior.noise_variance, posterior.std_factor
-    )
+        known = merge(known, collect(posterior.basis, posterior.row_variance(every.motion()), every.motion(), residual))
+    noise, misfit = posterior.noise_variance, posterior.misfit
+    built = CompactPosterior.build(posterior.kernel, posterior.basis, known, noise, posterior.std_factor, misfit)
     return predicted(replace(model, posterior=built))
 
 

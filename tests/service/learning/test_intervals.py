@@ -11,7 +11,7 @@ from tests.service.learning.lessons import school as opened
 from tests.service.learning.test_frames import frames
 from tests.service.learning.test_quality import scraped
 
-BEYOND = 5.0
+BEYOND = 0.5
 """N·m: far outside every interval."""
 CAREFUL = {"on_change": "hold", "contact_threshold": 8.0}
 """Rows that are far off are contacts, of which nothing is learnt."""
@@ -56,7 +56,7 @@ def test_one_batch_widens_what_does_not_hold_and_the_belief_stays(pupil):
 
 
 def test_the_record_is_the_models_own_and_what_was_answered_stands_beside_it(school, pupil):
-    pupil.put("learning", {"on_change": "learn", "contact_threshold": 1e6})
+    pupil.put("learning", {"on_change": "learn", "contact_threshold": 100})
     for number in range(3):
         pupil.post("observations", off(number))
     window = pupil.get("quality")["windows"][0]
@@ -102,13 +102,13 @@ def test_switched_off_it_is_one_at_once(school, pupil):
     pupil.post("observations", off(0))
     pupil.post("observations", off(0, "another"))
     assert pupil.predict()["scale"][1] > 1.0
-    pupil.put("learning", {"adaptive_intervals": False, "on_change": "learn", "contact_threshold": 1e6})
+    pupil.put("learning", {"adaptive_intervals": False, "on_change": "learn", "contact_threshold": 100})
     assert pupil.predict()["scale"] == [1.0, 1.0]
     pupil.post("observations", off(1))
     assert pupil.predict()["scale"] == [1.0, 1.0]
     assert state(school, pupil, 1) is None
     assert pupil.get("quality")["windows"][0]["coverage_answered"] != [None, None]  # of the batch before
-    pupil.put("learning", {"on_change": "learn", "contact_threshold": 1e6})
+    pupil.put("learning", {"on_change": "learn", "contact_threshold": 100})
     pupil.post("observations", off(2))
     assert pupil.predict()["scale"][1] > 1.0
 
