@@ -48,7 +48,7 @@ def batch(sequence: int, last: int | None = None, **fields: Any) -> NewBatch:
         "version": 1,
         "revision": 0,
         "rows": rows(seed=sequence),
-        "report": {"accepted": 4},
+        "report": {"accepted": 4, "rejected": {}},
         "record": {"rows": 4},
     }
     return NewBatch(**{**usual, **fields})

@@ -125,7 +125,7 @@ class Arm:
             "version": 1,
             "revision": 0,
             "rows": came,
-            "report": {},
+            "report": {"accepted": 0, "rejected": {}},
             "record": None,
         }
         with self.database.transaction() as session:
