@@ -10,7 +10,7 @@ import lipcore
 from service.storage.database import Database
 from service.storage.files import Files
 from tests.cluster.servers import Shared
-from tests.service.data import service_of
+from tests.service.data import eventually, service_of
 from tests.service.learning.lessons import QUERIES, Pupil, publish
 from tests.service.learning.pendulums import trained
 
@@ -66,7 +66,8 @@ def both(*work: Callable[[], Result]) -> list[Result]:
 
 
 def answers(pupils: Sequence[Pupil], revision: int) -> list[dict[str, Any]]:
-    """What each service answers once it has learnt up to a revision."""
+    """What each service answers once it has learnt up to a revision, and knows what intervals are wide by now."""
     for pupil in pupils:
         pupil.settled(revision)
+    eventually(lambda: len({str(pupil.predict(QUERIES)["scale"]) for pupil in pupils}) == 1)
     return [pupil.predict(QUERIES) for pupil in pupils]

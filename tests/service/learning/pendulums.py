@@ -188,7 +188,7 @@ def same(found: TorqueModel | OnlineModel, expected: tuple[np.ndarray, np.ndarra
         np.testing.assert_allclose(values, wanted, **CLOSE)
 
 
-def differ(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray], least: float = 1e-4) -> bool:
+def differ(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray], least: float = 1e-6) -> bool:
     """Whether torques differ by more than `least` N·m somewhere."""
     return bool(np.abs(one[0] - other[0]).max() > least)
 
