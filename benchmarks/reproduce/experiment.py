@@ -194,8 +194,8 @@ def _run(experiment: Experiment, cell: Cell) -> CellResult:
         answer = model.predict(samples.q, samples.dq, samples.ddq)
         predict_s += time.monotonic() - began
         compared += len(samples)
-        measured = evaluate(samples.tau, answer.tau, answer.tau_std, answer.noise_std)
-        true = evaluate(torque, answer.tau, answer.tau_std, answer.noise_std)
+        measured = evaluate(samples.tau, *answer.interval)
+        true = evaluate(torque, *answer.interval)
         curves.append(measured.reliability)
         tests.append(
             TestResult(

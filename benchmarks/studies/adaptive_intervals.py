@@ -106,7 +106,7 @@ class Ours:
     """What the service does."""
 
     def __init__(self, n: int) -> None:
-        self._state, self._rows = Adaptive.start(n), 0
+        self._state, self._rows = Adaptive.start(np.ones(n)), 0
 
     @property
     def scale(self) -> Array:

@@ -35,7 +35,7 @@ def judge(model: lipcore.TorqueModel, scenes: list[Scene]) -> str:
     for scene in scenes:
         unseen = scene.unseen(0.0)
         answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
-        found = evaluate(scene.measured(unseen), answer.tau, answer.tau_std, answer.noise_std)
+        found = evaluate(scene.measured(unseen), *answer.interval)
         errors.append(np.mean((answer.tau - unseen.tau) ** 2, axis=0) / unseen.tau.var(axis=0))
         inside.append(found.coverage)
     return f"{np.mean(errors):.1e} ({np.mean(inside):.0%})"

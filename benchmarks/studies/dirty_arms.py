@@ -5,8 +5,8 @@
 Every arm is trained on 10 s and on 60 s of random sinusoids at 100 Hz with `Dirt()`, prepared as recordings are (4 Hz
 low-pass, no delay), and judged on LEAST_S seconds or more of other motion of the same kind, of the same played three
 times faster, and of moves from point to point, about as fast as in training, with rests. Width: of the interval, over
-that of one that knows the spread of the errors it has to hold (their central 95 %, as Gaussian), the median over the
-joints.
+that of one that knows the spread of the errors it has to hold (their central 95 %, as Gaussian). A row is the mean over
+the seeds, `lowest` that of one seed and joint, `width` the median over seeds and joints; a cell is an arm's joint.
 """
 
 import sys
@@ -56,11 +56,11 @@ def main() -> None:
     torch.set_num_threads(1)
     estimator, seeds, names = sys.argv[1], int(sys.argv[2]), sys.argv[3:] or ARMS
     print("| arm | s | unseen motion | coverage, joint by joint, % | lowest | width |\n|" + " --- |" * 6)
-    every: dict[str, list[np.ndarray]] = {case: [] for case in CASES}
+    every: dict[tuple[int, str], list[np.ndarray]] = {(seconds, case): [] for seconds in SECONDS for case in CASES}
     for name in names:
         robot = load_robot(name)
         for seconds in SECONDS:
-            cells: dict[str, list[tuple[np.ndarray, float]]] = {case: [] for case in CASES}
+            cells: dict[str, list[np.ndarray]] = {case: [] for case in CASES}
             for seed in range(seeds):
                 dirt = Dirt(seed=seed)  # of one arm
                 known = prepared(simulate(robot, recording(seconds, dirt), 100 + seed))
@@ -68,20 +68,21 @@ def main() -> None:
                 for case in CASES:
                     held = unseen(robot, seconds, dirt, case, seed)
                     answer = model.predict(held.q, held.dq, held.ddq)
-                    metrics = evaluate(held.tau, answer.tau, answer.tau_std, answer.noise_std)
+                    metrics = evaluate(held.tau, *answer.interval)
                     oracle = 2 * quantile(LEVEL) * (held.tau - answer.tau).std(0)
-                    cells[case].append((metrics.coverage, float(np.median(metrics.width / oracle))))
+                    cells[case].append(np.array([metrics.coverage, metrics.width / oracle]))
             for case, pairs in cells.items():
-                coverage = np.array([pair[0] for pair in pairs])
-                every[case].append(coverage.mean(0))
+                coverage, width = np.array(pairs).swapaxes(0, 1)
+                every[seconds, case].append(np.array([coverage.mean(0), width.mean(0)]))
                 shown = " ".join(f"{100 * each:.0f}" for each in coverage.mean(0))
-                width = np.median([pair[1] for pair in pairs])
-                print(
-                    f"| {name} | {seconds} | {case} | {shown} | {100 * coverage.min():.0f} | {width:.2f} |", flush=True
-                )
-    for case, rows in every.items():
-        flat = np.concatenate(rows)
-        print(f"{case}: mean {100 * flat.mean():.1f} %, {np.mean(flat < 0.85):.0%} of arm × joint cells below 85 %")
+                lowest = f"{100 * coverage.min():.0f} | {np.median(width):.2f}"
+                print(f"| {name} | {seconds} | {case} | {shown} | {lowest} |", flush=True)
+    for (seconds, case), rows in every.items():
+        coverage, width = np.concatenate(rows, axis=1)
+        print(
+            f"{seconds} s, {case}: {coverage.size} cells, mean coverage {100 * coverage.mean():.1f} %, "
+            f"{(coverage < 0.85).sum()} below 85 %; widths {np.median(width):.2f}, {(width > 2).sum()} beyond 2"
+        )
 
 
 if __name__ == "__main__":

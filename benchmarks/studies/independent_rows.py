@@ -29,7 +29,7 @@ def judge(scene: Scene, online: OnlineModel, at: float) -> str:
     """Mean nMSE and coverage on the unseen trajectory as of a time of the stream."""
     unseen = scene.unseen(at)
     answer = online.model().predict(unseen.q, unseen.dq, unseen.ddq)
-    metrics = evaluate(scene.measured(unseen), answer.tau, answer.tau_std, answer.noise_std)
+    metrics = evaluate(scene.measured(unseen), *answer.interval)
     nmse = np.mean((answer.tau - unseen.tau) ** 2, axis=0) / unseen.tau.var(axis=0)
     return f"{nmse.mean():.1e} ({metrics.coverage.mean():.0%})"
 

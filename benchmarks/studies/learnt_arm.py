@@ -79,7 +79,7 @@ def rows(seeds: int) -> None:
             unseen = simulate(robot, Stream(500, n_sinusoids=100, speed=speed, motion=motion), seed + 100)
             true = inverse_dynamics(robot, unseen.q, unseen.dq, unseen.ddq)
             answer = found.predict(unseen.q, unseen.dq, unseen.ddq)
-            figures = evaluate(unseen.tau, answer.tau, answer.tau_std, answer.noise_std)
+            figures = evaluate(unseen.tau, *answer.interval)
             errors.append(((answer.tau - true) ** 2).mean(0) / true.var(0))
             covers.append(figures.coverage)
         nmse = " ".join(f"{value:.1e}" for value in np.median(errors, axis=0))
@@ -104,7 +104,7 @@ def search(first: int, last: int, seeds: int) -> None:
             behind = float(found.fit["search_objective"]) - best
             unseen = simulate(robot, stream, seed + 100)
             answer = found.predict(unseen.q, unseen.dq, unseen.ddq)
-            cover = evaluate(unseen.tau, answer.tau, answer.tau_std, answer.noise_std).coverage
+            cover = evaluate(unseen.tau, *answer.interval).coverage
             covers.append(cover.min())
             wins, total = wins + (behind < FOUND), total + 1
             print(

@@ -94,7 +94,7 @@ def judge(title: str, training: Samples, held_out: Samples, estimators: list[str
         for warning in warnings(model, report(model.posterior, model.estimator, model.joint_names)):
             print(f"| {name} warns: {warning} |" + " |" * (n + 1))
         answer = model.predict(held_out.q, held_out.dq, held_out.ddq)
-        metrics = evaluate(held_out.tau, answer.tau, answer.tau_std, answer.noise_std)
+        metrics = evaluate(held_out.tau, *answer.interval)
         for figures, label in (
             (metrics.nmse, f"{name}: nMSE"),
             (metrics.coverage, "coverage"),

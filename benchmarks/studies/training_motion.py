@@ -25,7 +25,7 @@ def main() -> None:
                 for test_seed in TESTS:
                     test = simulate(robot, Stream(speed=speed, n_sinusoids=100), test_seed)
                     answer = model.predict(test.q, test.dq, test.ddq)
-                    metrics = evaluate(test.tau, answer.tau, answer.tau_std, answer.noise_std)
+                    metrics = evaluate(test.tau, *answer.interval)
                     figures.append((metrics.nmse, metrics.coverage))
         for speed, figures in found.items():
             nmse, coverage = (np.array(part) for part in zip(*figures, strict=True))

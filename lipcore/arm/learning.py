@@ -146,8 +146,8 @@ class _Counting:
         """What `estimate` says of what a point leaves of contiguous samples, base to tip."""
         contiguous = self.signals.rows(slice(0, CORRELATED))
         recorded = with_samples(problem, contiguous, self.order)
-        residual, dq = recorded.tau - recorded.mean(point), recorded.motions[:, 1]
-        return estimate(residual, recorded.tau, dq, contiguous.episodes(), least)
+        residual, moved = recorded.tau - recorded.mean(point), recorded.motions[:, 1:].swapaxes(0, 1)
+        return estimate(residual, recorded.tau, moved, contiguous.episodes(), least)
 
 
 def _search(

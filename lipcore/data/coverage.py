@@ -37,7 +37,7 @@ def coverage_interval(samples: Samples, answer: Answer) -> CoverageInterval:
     and of whether the interval holds them.
     """
     error, spread = samples.tau - answer.mean, np.hypot(answer.std, answer.noise_std)
-    inside = np.abs(error) <= quantile(LEVEL) * spread
+    inside = np.abs(error) <= quantile(LEVEL) * answer.scale * spread
     runs = _runs(samples)
     independent = np.array(
         [

@@ -49,10 +49,13 @@ class Metrics:
     reliability: Array
 
 
-def evaluate(tau: Array, mean: Array, std: Array, noise_std: Array, level: float = 0.95) -> Metrics:
+def evaluate(
+    tau: Array, mean: Array, std: Array, noise_std: Array, scale: Array | float = 1.0, level: float = 0.95
+) -> Metrics:
     """Compare measured torques (N, n) with predicted mean, function std (N, n) and noise std (n,) or (N, n).
 
-    nmse is NaN for a joint whose measured torque does not vary. Raise ValueError where shapes differ.
+    scale: (n,), factor on the half widths of intervals; the density is that of the model's own belief. nmse is NaN for
+    a joint whose measured torque does not vary. Raise ValueError where shapes differ.
     """
     if mean.shape != tau.shape or std.shape != tau.shape:
         raise ValueError(f"mean has shape {mean.shape} and std {std.shape}, expected {tau.shape} as tau has")
@@ -64,13 +67,13 @@ def evaluate(tau: Array, mean: Array, std: Array, noise_std: Array, level: float
     return Metrics(
         nmse=np.divide(squared, variance, out=np.full_like(squared, np.nan), where=variance > 0),
         rmse=np.sqrt(squared),
-        coverage=_coverage(error, total, level),
+        coverage=_coverage(error, scale * total, level),
         nlpd=np.mean(negative_log_density(error, total), axis=0),
-        width=_width(total, level),
+        width=_width(scale * total, level),
         level=level,
-        coverages=np.array([_coverage(error, total, each) for each in LEVELS]),
-        widths=np.array([_width(total, each) for each in LEVELS]),
-        reliability=np.array([_coverage(error, total, each) for each in RELIABILITY_LEVELS]),
+        coverages=np.array([_coverage(error, scale * total, each) for each in LEVELS]),
+        widths=np.array([_width(scale * total, each) for each in LEVELS]),
+        reliability=np.array([_coverage(error, scale * total, each) for each in RELIABILITY_LEVELS]),
     )
 
 
@@ -120,11 +123,15 @@ class Difference:
 
 
 class Answer(NamedTuple):
-    """What a model predicts of N samples of n joints: mean and function std (N, n), noise std (n,) or (N, n), N·m."""
+    """What a model predicts of N samples of n joints: mean and function std (N, n), noise std (n,) or (N, n), N·m.
+
+    scale: (n,), factor on the half widths of its intervals.
+    """
 
     mean: Array
     std: Array
     noise_std: Array
+    scale: Array | float = 1.0
 
 
 @dataclass(frozen=True)
@@ -173,7 +180,7 @@ def surprise(tau: Array, answer: Answer) -> Array:
 def _figures(tau: Array, answer: Answer) -> tuple[Array, Array, Array]:
     """Squared error, whether the interval holds the measurement, and negative log density, (N, n) each."""
     error, spread = tau - answer.mean, np.hypot(answer.std, answer.noise_std)
-    inside = np.abs(error) <= quantile(LEVEL) * spread
+    inside = np.abs(error) <= quantile(LEVEL) * answer.scale * spread
     return error**2, inside.astype(np.float64), negative_log_density(error, spread)
 
 

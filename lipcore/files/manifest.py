@@ -22,6 +22,7 @@ from lipcore.fitting.estimators import Calibration
 from lipcore.fitting.options import FitOptions
 from lipcore.kernels.friction import FRICTION_TERMS, STRIBECK
 from lipcore.model.selection import MOST_TEXT, Candidate, HeldOut, Selection
+from lipcore.posterior.conformal import Conformal
 from lipcore.vocabulary import JOINT_TYPES, PRIORS, TORQUE_CONVENTIONS
 
 FORMAT = "lipserve-model"
@@ -139,6 +140,18 @@ def _check_fit(name: str, value: Any, n: int) -> None:
 def _check_compact(name: str, value: Any, n: int) -> None:
     _check_scalars(name, value, n)
     check_numbers(f"{name}.data_samples", value.get("data_samples"), low=0, high=LARGEST)
+
+
+def _check_conformal(name: str, value: Any, n: int) -> None:
+    check_keys(name, value, {each.name for each in fields(Conformal)})
+    check_numbers(f"{name}.scale", value["scale"], (n,), 1, LARGEST)
+    check_numbers(f"{name}.guaranteed", value["guaranteed"], (n,), 0, 1)
+    if isinstance(value["blocks"], bool) or not isinstance(value["blocks"], int):
+        raise wrong(f"{name}.blocks", value["blocks"], "a whole number")
+    try:
+        Conformal(**value)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
 
 
 def _check_calibration(name: str, value: Any, n: int) -> None:
@@ -278,4 +291,5 @@ OPTIONAL: dict[str, Check] = {
     "hyperparameters": _check_hyperparameters,
     "robot": _check_robot,
     "selection": _check_selection,
+    "conformal": _check_conformal,
 }

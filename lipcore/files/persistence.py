@@ -39,6 +39,7 @@ from lipcore.model.parameters import report
 from lipcore.model.torque_model import TorqueModel
 from lipcore.model.warnings import warnings
 from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.conformal import Conformal
 from lipcore.posterior.linalg import pack_symmetric, unpack_symmetric
 from lipcore.posterior.misfit import Misfit
 from lipcore.posterior.statistics import Statistics
@@ -100,6 +101,10 @@ def encode(model: TorqueModel, lineage: Mapping[str, Any] | None = None) -> tupl
     }
     if model.selection is not None:
         manifest["selection"] = model.selection
+    if model.conformal is not None:
+        manifest["conformal"] = {
+            name: each if name == "blocks" else list(each) for name, each in vars(model.conformal).items()
+        }
     files = {TENSORS: payload}
     if model.robot is not None:
         files[ROBOT] = model.robot.urdf.encode()
@@ -289,6 +294,7 @@ def _restore(manifest: Mapping[str, Any], tensors: dict[str, Tensor], robot: Rig
         robot=robot,
         calibration=calibration,
         selection=manifest.get("selection"),
+        conformal=Conformal(**manifest["conformal"]) if "conformal" in manifest else None,
     )
     stated = manifest.get("hyperparameters")
     if stated is not None and stated != {name: value.tolist() for name, value in params.items()}:

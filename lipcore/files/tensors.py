@@ -54,8 +54,12 @@ def read_tensors(payload: bytes, n: int, limits: Limits) -> dict[str, Tensor]:
             raise _bad(f"tensor {name!r} is not made of finite float64 numbers")
     if FLOOR in tensors and bool((tensors[FLOOR] < 0).any()):
         raise _bad(f"tensor {FLOOR!r} has a number below zero, expected variances")
-    if MISFIT in tensors and bool((tensors[MISFIT][0::2] < 0).any() or (tensors[MISFIT][1::2] <= 0).any()):
-        raise _bad(f"tensor {MISFIT!r} has a number below zero, expected variances and speeds")
+    if MISFIT in tensors:
+        rest, slow, lasting, *usual = tensors[MISFIT]
+        if any(bool((each < 0).any()) for each in (rest, lasting)) or any(
+            bool((each <= 0).any()) for each in (slow, *usual)
+        ):
+            raise _bad(f"tensor {MISFIT!r} has a number below zero, expected variances, speeds and accelerations")
     return tensors
 
 
@@ -133,6 +137,6 @@ def _check_sizes(entries: dict[str, Entry], n: int, limits: Limits) -> None:
     if entries[A].shape != (b[0] * (b[0] + 1) // 2,):
         length = b[0] * (b[0] + 1) // 2
         raise _bad(f"{A} has shape {entries[A].shape}, expected M (M + 1) / 2 numbers, {length}, as {B} has {b[0]}")
-    for name, shape in ((FLOOR, (n,)), (MISFIT, (4, n))):
-        if name in entries and entries[name].shape != shape:
-            raise _bad(f"tensor {name!r} has shape {entries[name].shape}, expected {shape}")
+    for name, shapes in ((FLOOR, ((n,),)), (MISFIT, ((5, n), (4, n)))):
+        if name in entries and entries[name].shape not in shapes:
+            raise _bad(f"tensor {name!r} has shape {entries[name].shape}, expected {shapes[0]}")

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 from numpy.typing import ArrayLike
 
+from lipcore.data.metrics import Answer
 from lipcore.data.motion import Motion, motion_arrays
 from lipcore.data.samples import Array
 from lipcore.fitting.estimators import NO_CALIBRATION, Calibration, Estimator
@@ -14,6 +16,7 @@ from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Arm
 from lipcore.model.selection import Selection
 from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.conformal import Conformal
 from lipcore.posterior.evaluator import Evaluator
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import JointType, TorqueConvention
@@ -23,14 +26,24 @@ from lipcore.vocabulary import JointType, TorqueConvention
 class TorquePrediction:
     """Answer for N queries of n joints, N·m.
 
-    tau: (N, n) mean; tau_std: (N, n) standard deviation of the function; noise_std: (n,) of the measurement; an
-    interval for measurements needs both. covariance: (N, n, n) of the function between joints, where asked for.
+    tau: (N, n) mean; tau_std: (N, n) standard deviation of the function; noise_std: (n,) of the measurement; scale:
+    (n,) factor on the half width of intervals, which for 95 % of measurements are
+
+        tau ± 1.96 · scale · √(tau_std² + noise_std²)
+
+    covariance: (N, n, n) of the function between joints, where asked for.
     """
 
     tau: Array
     tau_std: Array
     noise_std: Array
+    scale: Array
     covariance: Array | None = None
+
+    @property
+    def interval(self) -> Answer:
+        """What its intervals are made of, to be judged: `lipcore.data.metrics.evaluate(tau, *prediction.interval)`."""
+        return Answer(self.tau, self.tau_std, self.noise_std, self.scale)
 
 
 TrainingRange = dict[str, dict[str, list[float]]]
@@ -53,7 +66,8 @@ class TorqueModel:
     of the fit; fit: what the fit reported, compact: how near the compact posterior comes to the exact one, both for the
     manifest; training_range: of the samples behind the posterior; robot: the rigid bodies of an estimator that has
     them; calibration: how the posterior's deviations are corrected; selection: how `auto` has chosen the estimator,
-    None where it was named.
+    None where it was named; conformal: what left-out blocks of the training say of the intervals, None where an earlier
+    release has trained it.
     """
 
     estimator: Estimator
@@ -68,6 +82,7 @@ class TorqueModel:
     robot: RigidBody | None = None
     calibration: Calibration = NO_CALIBRATION
     selection: Selection | None = None
+    conformal: Conformal | None = None
 
     @property
     def n_joints(self) -> int:
@@ -86,6 +101,11 @@ class TorqueModel:
         std: Array = self.posterior.noise_variance.sqrt().numpy()
         return std
 
+    @property
+    def scale(self) -> Array:
+        """Factor on the half width of intervals, (n,): what left-out blocks of the training have proved, at least 1."""
+        return np.ones(self.n_joints) if self.conformal is None else np.array(self.conformal.scale)
+
     def predict(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike, covariance: bool = False) -> TorquePrediction:
         """Torque with uncertainty for arrays of shape (n,) or (N, n), SI units.
 
@@ -97,7 +117,7 @@ class TorqueModel:
         if joints != self.n_joints:
             raise ValueError(f"q has {joints} joints, expected {self.n_joints}: {', '.join(self.joint_names)}")
         tau, std, between = self.evaluator.many(*query, covariance)
-        return TorquePrediction(tau, std, self.noise_std, between)
+        return TorquePrediction(tau, std, self.noise_std, self.scale, between)
 
     def answer(self, motion: Array, std: bool = True) -> tuple[Array, Array | None]:
         """Torque at one instant, and its standard deviation where asked for: both (n,) N·m. For control loops.

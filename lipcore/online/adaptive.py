@@ -59,9 +59,9 @@ class Adaptive:
     last: float | None = None
 
     @staticmethod
-    def start(n: int) -> Adaptive:
-        """What the model itself believes, of n joints: s = 1."""
-        return Adaptive(np.zeros(n), np.zeros(n))
+    def start(factor: Array) -> Adaptive:
+        """Before the first row: the version's own factors s, (n,)."""
+        return Adaptive(np.log(factor), np.zeros(len(factor)))
 
     @property
     def factor(self) -> Array:
@@ -122,9 +122,9 @@ def outside(score: Array, factor: Array) -> NDArray[np.bool_]:
     return np.asarray(score > factor)
 
 
-def widest(factors: Sequence[Array]) -> Array:
-    """The largest of several streams' scales and 1, joint by joint, for a question that belongs to no stream.
+def widest(factors: Sequence[Array], own: Array) -> Array:
+    """The largest of several streams' scales and the version's own, (n,), for a question that belongs to no stream.
 
-    Not below 1: a smaller one is earned by the motion of the moment, and the question may be of another.
+    Not below its own: a smaller one is earned by the motion of the moment, and the question may be of another.
     """
-    return np.asarray(np.maximum(np.max(factors, axis=0), 1.0))
+    return np.asarray(np.maximum.reduce([own, *factors]))

@@ -53,11 +53,11 @@ class Record:
         return Record(0, *(np.zeros(n) for _ in range(len(fields(Record)) - 1)))
 
     @staticmethod
-    def of(tau: Array, mean: Array, std: Array, noise_std: Array) -> Record:
+    def of(tau: Array, mean: Array, std: Array, noise_std: Array, scale: Array | float = 1.0) -> Record:
         """Record of measured torques tau (N, n) against mean and function std (N, n) and noise std (n,) or (N, n).
 
-        Raise ValueError where shapes differ, a value is not finite, or an interval has no width: one such row would
-        spoil every sum that it enters.
+        scale: (n,), factor on the half width of the intervals that hold what is `inside`. Raise ValueError where shapes
+        differ, a value is not finite, or an interval has no width: one such row would spoil every sum that it enters.
         """
         total = _deviation(tau, mean, std, noise_std)
         if len(tau) == 0:
@@ -72,7 +72,7 @@ class Record:
             squared=(error**2).mean(axis=0),
             mean=centre,
             spread=((tau - centre) ** 2).mean(axis=0),
-            inside=(np.abs(error) <= HALF_WIDTH * total).mean(axis=0),
+            inside=(np.abs(error) <= HALF_WIDTH * scale * total).mean(axis=0),
             nlpd=negative_log_density(error, total).mean(axis=0),
             standardised=ratio.mean(axis=0),
             variance=(std**2).mean(axis=0),

@@ -125,7 +125,7 @@ class CompactPosterior(Posterior):
         if component is not None:
             return prediction
         variance = prediction.covariance.diagonal(dim1=1, dim2=2)
-        more = torch.maximum(self.misfit.variance(query.dq), self.floor - variance)
+        more = torch.maximum(self.misfit.variance(query), self.floor - variance)
         return Prediction(prediction.mean, prediction.covariance + torch.diag_embed(more))
 
     def whiten(self, cross: Tensor) -> Tensor:

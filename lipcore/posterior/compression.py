@@ -116,22 +116,23 @@ def compress(exact: ExactPosterior, tau: Tensor, tolerance: float, most: int, se
 def linear(
     kernel: TorqueKernel,
     params: Params,
-    motion: Motion,
-    tau: Tensor,
-    counts: Tensor,
+    samples: Samples,
+    variance: Tensor,
     tolerance: float,
+    std_factor: float,
     misfit: Misfit,
 ) -> Compression:
     """The posterior of a kernel whose terms are all linear, which is compact as it is: nothing is left out.
 
-    motion, tau: N samples; counts: (N, n), independent measurements that each torque stands for. Of the motion, STORED
+    samples: N; variance: (N, n) (N·m)², with which each torque teaches; std_factor: calibration. Of the motion, STORED
     spread-out instants are kept: to ask the model where it should know.
     """
+    motion = samples.motion()
     kept = motion[spread_out(motion, STORED)]
     basis = Basis.build(kernel, params, kept, torch.empty(0, dtype=torch.int64))
     noise = torch.exp(2 * params["noise.log_std"])
-    statistics = collect(basis, noise / counts, motion, tau - kernel.mean(motion))
-    posterior = CompactPosterior.build(kernel, basis, statistics, noise, misfit=misfit)
+    statistics = collect(basis, variance, motion, samples.torque() - kernel.mean(motion))
+    posterior = CompactPosterior.build(kernel, basis, statistics, noise, std_factor, misfit)
     return Compression(posterior, Deviation(0.0, 0.0, 0.0, 0), tolerance, True)
 
 

@@ -44,7 +44,7 @@ class Evaluator:
     term: the kernel's nonlinear term, None if it has none. params: hyperparameters of all terms. inducing: S samples,
     None without `term`. outputs: (m,), which of their torques, as sample · n + joint. linear: the linear terms in the
     order of the anchors. weights: (M,). root: Q, (M, M) lower triangular. std_factor: calibration. floor: (n,)
-    (N·m)²; misfit: (4, n), see `Misfit.packed`; none where None.
+    (N·m)²; misfit: (5, n), see `Misfit.packed`; none where None.
 
     Safe from several threads, which answer at the same time: compiled code runs without the GIL and every thread has
     memory of its own. Raises ValueError naming the argument that does not fit.
@@ -84,7 +84,7 @@ class Evaluator:
         self._floor = np.zeros(n) if floor is None else np.array(floor, np.float64)
         if self._floor.shape != (n,):
             raise ValueError(f"floor has shape {self._floor.shape}, expected ({n},)")
-        nothing = np.array([[0.0], [1.0], [0.0], [1.0]]).repeat(n, axis=1)
+        nothing = np.array([[0.0], [1.0], [0.0], [1.0], [1.0]]).repeat(n, axis=1)
         self._misfit = nothing if misfit is None else np.array(misfit, np.float64)
         if self._misfit.shape != nothing.shape:
             raise ValueError(f"misfit has shape {self._misfit.shape}, expected {nothing.shape}")

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lipcore.data.independence import INDEPENDENT_HZ, recording_weights
+from lipcore.data.motion import Motion
 from lipcore.data.samples import Array, Samples
 from lipcore.data.signals import noise_level
+from lipcore.kernels.compiled.answer import ACCELERATED
 from lipcore.kernels.friction import SIGN_WIDTH
 
 LASTS_S = 1.0
@@ -29,6 +31,8 @@ NATS = 10.0
 """What more variance at low speed has to gain to be kept."""
 CHANCE = 1.5
 """Variance over that of white noise, as estimated, that chance explains."""
+NEVER = 1e100
+"""Usual acceleration of versions that know none, rad/s² (m/s²)."""
 LEAST_SHARE = 0.01
 """Of the mean square: variance that is left to faster motion at least."""
 STEPS = 30
@@ -39,32 +43,35 @@ class Misfit:
     """Variance besides noise and posterior, of joints at N velocities dq (eq. 25 of docs/method.md).
 
         at rest      rest_j exp(−(dq_j / slow_j)²)
-        faster       lasting_j max(0, mean_i (dq_i / usual_i)² − 1)
+        faster       lasting_j (max(0, mean_i (dq_i / speed_i)² − 1) + ACCELERATED max(0, mean_i (ddq_i / u_i)² − 1))
 
     rest: (n,) (N·m)², of friction that has not broken away or has just turned round; slow: (n,) rad/s (m/s); lasting:
     (n,) (N·m)², share of the noise's variance that lasts: the error of neighbouring rows is the same, and grows with
-    speed beyond what was seen, as what causes it does; usual: (n,) root mean square of dq in training.
+    motion beyond what was seen, as what causes it does; speed, acceleration u: (n,) root mean squares of dq and ddq in
+    training.
     """
 
     rest: Tensor
     slow: Tensor
     lasting: Tensor
-    usual: Tensor
+    speed: Tensor
+    acceleration: Tensor
 
     @classmethod
     def none(cls, n: int) -> Misfit:
         """No such variance, for n joints."""
         zero, one = torch.zeros(n, dtype=torch.float64), torch.ones(n, dtype=torch.float64)
-        return cls(zero, one, zero, one)
+        return cls(zero, one, zero, one, one)
 
     @classmethod
     def unpacked(cls, values: Tensor) -> Misfit:
-        """From what `packed` returns, (4, n)."""
-        return cls(*values)
+        """From what `packed` returns, (5, n), or its first four rows, as earlier releases have stored."""
+        known = [*values, torch.full_like(values[0], NEVER)]
+        return cls(*known[:5])
 
     def packed(self) -> Tensor:
-        """Its fields one below the other, (4, n)."""
-        return torch.stack([self.rest, self.slow, self.lasting, self.usual])
+        """Its fields one below the other, (5, n)."""
+        return torch.stack([self.rest, self.slow, self.lasting, self.speed, self.acceleration])
 
     def of_joints(self, joints: NDArray[np.int64]) -> Misfit:
         """The same with the joints in another order. joints: (n,), their places in this one."""
@@ -83,10 +90,12 @@ class Misfit:
         """Variance of friction at low speed, (N, n) (N·m)². dq: (N, n)."""
         return self.rest * torch.exp(-((dq / self.slow) ** 2))
 
-    def variance(self, dq: Tensor) -> Tensor:
-        """Variance of a torque, (N, n) (N·m)². dq: (N, n)."""
-        faster = ((dq / self.usual) ** 2).mean(dim=-1, keepdim=True) - 1
-        return self.at_rest(dq) + self.lasting * faster.clamp_min(0.0)
+    def variance(self, motion: Motion) -> Tensor:
+        """Variance of the torques at N instants, (N, n) (N·m)²."""
+        speed = ((motion.dq / self.speed) ** 2).mean(dim=-1, keepdim=True) - 1
+        acceleration = ((motion.ddq / self.acceleration) ** 2).mean(dim=-1, keepdim=True) - 1
+        faster = speed.clamp_min(0.0) + ACCELERATED * acceleration.clamp_min(0.0)
+        return self.at_rest(motion.dq) + self.lasting * faster
 
     def of_row(self, noise: Tensor, dq: Tensor, rows: float = ROWS) -> Tensor:
         """Variance R with which each of N rows teaches, (N, n) (N·m)²: white noise is new in every row, an error that
@@ -104,21 +113,22 @@ def shared_rows(samples: Samples, count: int) -> float:
 
 
 def estimate(
-    residual: Array, tau: Array, dq: Array, episodes: Sequence[slice], least: Array | float = 0.0
+    residual: Array, tau: Array, motion: Array, episodes: Sequence[slice], least: Array | float = 0.0
 ) -> tuple[Misfit, Array]:
     """The misfit that residuals prove, and the variance of the noise in motion, (n,) (N·m)².
 
-    residual: (N, n) N·m, what a model leaves of contiguous samples; tau, dq: (N, n), their torques and velocities;
-    episodes: their rows; least: (n,) (N·m)², that the noise has at least. What differences of neighbours say, of
-    torques or of residuals, is white noise, and CHANCE times that; the rest of the noise lasts.
+    residual: (N, n) N·m, what a model leaves of contiguous samples; tau: (N, n), their torques; motion: (2, N, n),
+    their velocities and accelerations; episodes: their rows; least: (n,) (N·m)², that the noise has at least. What
+    differences of neighbours say, of torques or of residuals, is white noise, and CHANCE times that; the rest of the
+    noise lasts.
     """
-    noise, rest, slow = low_speed_variance(residual, dq)
+    noise, rest, slow = low_speed_variance(residual, motion[0])
     noise = np.maximum(noise, least)
     # residuals may be rougher than torques, where the model's friction turns round at once
     white = np.minimum(*(noise_level([each[part] for part in episodes]) for each in (residual, tau)))
     lasting = np.maximum(noise - CHANCE * white**2, 0.0)
-    usual = np.maximum(np.sqrt(np.mean(dq**2, axis=0)), SIGN_WIDTH)
-    return Misfit(*(torch.from_numpy(each) for each in (rest, slow, lasting, usual))), noise
+    usual = np.maximum(np.sqrt(np.mean(motion**2, axis=1)), SIGN_WIDTH)
+    return Misfit(*(torch.from_numpy(each) for each in (rest, slow, lasting, *usual))), noise
 
 
 def low_speed_variance(residual: Array, dq: Array) -> tuple[Array, Array, Array]:

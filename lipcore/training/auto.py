@@ -75,7 +75,7 @@ def _of_all(work: Work, contest: Contest, chosen: str) -> TorqueModel:
     objective = float(model.fit["objective"])
     work.overall.of(chosen, ALL)(FitProgress("posterior", 0, 0, objective, 0.0, 0.0))
     used = task.samples.rows(spread_out(task.samples.motion(), task.options.posterior_samples).numpy())
-    compression, stands_on = compact(task, model.estimator, model.posterior.params, used)
+    compression, stands_on, conformal = compact(task, model.estimator, model.posterior.params, used)
     counts = {"samples_given": len(task.samples), "samples_posterior": len(used), **stands_on}
     return replace(
         model,
@@ -83,6 +83,7 @@ def _of_all(work: Work, contest: Contest, chosen: str) -> TorqueModel:
         training_range=training_range(used.motion()),
         compact=compression.report(),
         fit={**model.fit, **counts},
+        conformal=conformal,
     )
 
 
@@ -241,7 +242,7 @@ class Contest:
         try:
             model = self.work.fit(self.training, name, place, learnt)
             torque = model.predict(self.held.q, self.held.dq, self.held.ddq)
-            answer = Answer(torque.tau, torque.tau_std, torque.noise_std)
+            answer = torque.interval
             density = -float(evaluate(self.held.tau, *answer).nlpd.sum())
             if not np.isfinite(density):
                 raise ValueError("what it predicts is not finite")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 
+import numpy as np
 import torch
 
 from lipcore.arm.learning import Learnt, learn
@@ -21,6 +22,7 @@ from lipcore.model.parameters import friction_coefficients
 from lipcore.model.torque_model import TorqueModel, training_range
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.compression import Compression, compressed, linear
+from lipcore.posterior.conformal import Conformal, conform
 from lipcore.posterior.misfit import estimate, shared_rows
 from lipcore.posterior.statistics import collect
 from lipcore.vocabulary import ROBOT_ESTIMATORS
@@ -47,18 +49,15 @@ def fit_estimator(
         learnt = learn(task, (*geometries, *installed))
     estimator = make_estimator(name, types, options.tied, None if learnt is None else learnt.arm)
     calibration = calibrate(name)
+    factor = calibration.function_std_factor
     if learnt is not None and name == "rigid-body":
         report = {**learnt.report, "jitter": 0.0}
         used = samples.rows(learnt.rows)
+        variance = torch.exp(2 * learnt.params["noise.log_std"]) / torch.from_numpy(learnt.counts)
         compression = linear(
-            estimator.kernel,
-            learnt.params,
-            used.motion(),
-            used.torque(),
-            torch.from_numpy(learnt.counts),
-            options.compact_tolerance,
-            learnt.misfit,
+            estimator.kernel, learnt.params, used, variance, options.compact_tolerance, factor, learnt.misfit
         )
+        conformal = conform(compression.posterior, used, variance)
     else:
         # not the noise: what rigid bodies leave of the torque is what the other term is there for
         params = {} if learnt is None else learnt.params
@@ -66,7 +65,7 @@ def fit_estimator(
         fewer = options if learnt is None else independent_samples(options, learnt)
         fitted = fit(estimator.kernel, samples, fewer, task.on_progress, task.cancelled, task.stretches, start)
         used = samples.rows(fitted.rows)
-        compression, stands_on = compact(task, estimator, fitted.params, used)
+        compression, stands_on, conformal = compact(task, estimator, fitted.params, used)
         report = {**asdict(fitted.report), **stands_on}
         if learnt is not None:
             seconds = float(learnt.report["seconds"]) + fitted.report.seconds
@@ -78,17 +77,20 @@ def fit_estimator(
         torque_convention=task.torque_convention,
         options=asdict(options),
         fit={**report, "motion_dimensions": motion_dimensions(samples.dq)},
-        posterior=replace(compression.posterior, std_factor=calibration.function_std_factor),
+        posterior=compression.posterior,
         training_range=training_range(used.motion()),
         compact=compression.report(),
         robot=task.robot,
         calibration=calibration,
+        conformal=conformal,
     )
 
 
-def compact(task: Task, estimator: Estimator, params: Params, used: Samples) -> tuple[Compression, dict[str, float]]:
+def compact(
+    task: Task, estimator: Estimator, params: Params, used: Samples
+) -> tuple[Compression, dict[str, float], Conformal]:
     """The compact posterior of an estimator with a nonlinear term; for the manifest, the jitter, (N·m)², that the exact
-    one took, and how many independent samples it stands on.
+    one took, and how many independent samples it stands on; and what left-out blocks say of its intervals.
 
     used: samples of the task's recordings. A torque counts as `Misfit.of_row` says; what that is, contiguous samples
     tell. Raise NotPositiveDefiniteError where the exact posterior cannot be computed.
@@ -101,14 +103,16 @@ def compact(task: Task, estimator: Estimator, params: Params, used: Samples) -> 
     contiguous = task.signals.rows(slice(0, CONTIGUOUS))
     residual = contiguous.tau - posterior.mean(contiguous.motion()).numpy()
     noise = posterior.noise_variance
-    misfit, _ = estimate(residual, contiguous.tau, contiguous.dq, contiguous.episodes(), noise.numpy())
+    moved = np.stack([contiguous.dq, contiguous.ddq])
+    misfit, _ = estimate(residual, contiguous.tau, moved, contiguous.episodes(), noise.numpy())
     misfit = misfit.with_friction(friction_coefficients(posterior, estimator).coulomb)
     motion = used.motion()
     variance = misfit.of_row(noise, motion.dq, shared_rows(task.samples, len(used)))
     statistics = collect(posterior.basis, variance, motion, used.torque() - estimator.kernel.mean(motion))
     counted = CompactPosterior.build(estimator.kernel, posterior.basis, statistics, noise, factor, misfit)
     independent = float((noise / variance).mean(dim=1).sum())
-    return replace(compression, posterior=counted), {"jitter": jitter, "independent_samples": independent}
+    stands_on = {"jitter": jitter, "independent_samples": independent}
+    return replace(compression, posterior=counted), stands_on, conform(counted, used, variance)
 
 
 def independent_samples(options: FitOptions, learnt: Learnt) -> FitOptions:

@@ -264,6 +264,15 @@ def print_promotion(version: VersionRecord) -> None:
         print_warnings([judged.reason])
 
 
+def _print_guarantee(conformal: dict[str, Any]) -> None:
+    """What left-out blocks of the training say of the intervals."""
+    least, widest = min(conformal["guaranteed"]), max(conformal["scale"])
+    blocks = "1 block" if conformal["blocks"] == 1 else f"{conformal['blocks']} blocks"
+    wider = "as wide as believed" if widest == 1 else f"up to {widest:.2f} times as wide as believed"
+    few = "; more would guarantee 95 %" if least < 0.95 - 1e-9 else ""
+    echo(f"  intervals {wider}: {blocks} left out in turn guarantee {100 * least:.0f} % of such motion{few}")
+
+
 def _print_version(version: VersionRecord) -> None:
     names = version.joint_names
     echo(f"version {version.version}: {version.estimator}, {len(names)} joints: {', '.join(names)}")
@@ -277,6 +286,8 @@ def _print_version(version: VersionRecord) -> None:
         echo(f"  trained on {', '.join(map(str, sets))}")
     if (independent := version.fit.get("independent_samples")) is not None:
         echo(f"  {version.fit['samples_given']} samples, worth {round(independent)} independent ones")
+    if version.conformal is not None:
+        _print_guarantee(version.conformal)
     if lineage.get("holdout") is not None:
         print_held_out(version)
     else:

@@ -58,7 +58,8 @@ class Tally:
         self._trips.append(seconds)
         inside = np.zeros(tau.shape, np.bool_)
         if answer.tau_std is not None:
-            inside = np.abs(error) <= BAND * np.hypot(answer.tau_std, self._noise)
+            scale = 1.0 if answer.scale is None else answer.scale
+            inside = np.abs(error) <= BAND * scale * np.hypot(answer.tau_std, self._noise)
         self._sums += np.array((inside, error**2, tau, tau**2))
 
     def merge(self, other: Tally) -> None:

@@ -79,7 +79,7 @@ def stream(
     with (
         Stop().listening() as stop,
         connected(url) as client,
-        client.stream(model, version=version, alias=alias, stream_id=source) as opened,
+        client.stream(model, version=version, alias=alias, stream_id=source, scale=True) as opened,
     ):
         motion = _fitting(motion, opened)
         step = motion.step if deadline is None else deadline / 1e3

@@ -67,7 +67,7 @@ def _versions(loaded: LoadedModels, model: str, request: schema.CompareRequest) 
 
 def _answer(served: Served, samples: Samples) -> Answer:
     answer = served.model.predict(samples.q, samples.dq, samples.ddq)
-    return Answer(answer.tau, answer.tau_std, answer.noise_std)
+    return answer.interval
 
 
 def _verdict(first: int, second: int, compared: Comparison) -> tuple[schema.Outcome, str]:

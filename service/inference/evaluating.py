@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.data.coverage import coverage_interval
-from lipcore.data.metrics import LEVELS, RELIABILITY_LEVELS, Answer, Metrics
+from lipcore.data.metrics import LEVELS, RELIABILITY_LEVELS, Metrics
 from lipcore.data.metrics import evaluate as compare
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array, Samples
@@ -131,8 +131,8 @@ def evaluate(
     recorded = (measured if all_of_it else held_out)(loaded, request.dataset, served)
     used = recorded.used
     answer = known.predict(used.q, used.dq, used.ddq)
-    metrics = compare(used.tau, answer.tau, answer.tau_std, answer.noise_std)
-    interval = coverage_interval(used, Answer(answer.tau, answer.tau_std, answer.noise_std))
+    metrics = compare(used.tau, *answer.interval)
+    interval = coverage_interval(used, answer.interval)
     in_training = all_of_it and served.has_learnt_from(recorded.id, recorded.sha256)
     return schema.EvaluateResponse(
         model=served.name,
@@ -216,6 +216,7 @@ def trace(loaded: LoadedModels, model: str, request: schema.TraceRequest) -> sch
         mean=predicted.tau.tolist(),
         std=predicted.tau_std.tolist(),
         noise_std=predicted.noise_std.tolist(),
+        scale=predicted.scale.tolist(),
         offered=[name for name in get_args(schema.TraceComponent) if name in offered],
         components=_components(served, samples, request.components, loaded.storage.settings.max_component_batch),
         in_training=request.part == "all" and served.has_learnt_from(dataset.id, dataset.sha256),

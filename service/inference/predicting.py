@@ -164,6 +164,7 @@ class Prediction(Struct, omit_defaults=True):
     tau_std: list[Any]
     noise_std: list[float]
     scale: list[float]
+    guaranteed: list[float] | None = None
     covariance: list[Any] | None = None
     components: dict[ComponentName, dict[str, Any]] | None = None
 
@@ -258,5 +259,6 @@ def _prediction_of(
         tau_std=tau_std,
         noise_std=served.noise_std,
         scale=served.scales.asked,
+        guaranteed=served.guaranteed,
         covariance=covariance,
     )

@@ -125,7 +125,13 @@ class PredictResponse(BaseModel):
     noise_std: list[float] = Field(description="Standard deviation of the measurement, per joint")
     scale: list[float] = Field(
         description="Factor on the half width, per joint: what the streams that teach the model need now for intervals "
-        "that hold what they promise, the largest of the recent ones; 1, as the model believes, at least"
+        "that hold what they promise, the largest of the recent ones; at least what left-out blocks of the training "
+        "have proved, and 1"
+    )
+    guaranteed: list[float] | None = Field(
+        None,
+        description="Share of measurements that left-out blocks of the training guarantee for the 95 % interval, per "
+        "joint, for motion of that kind: less where there are fewer than 19; null for versions of earlier releases",
     )
     covariance: list[list[float]] | list[list[list[float]]] | None = Field(None, description="(N·m)², where asked for")
     components: dict[ComponentName, ComponentValues] | None = Field(
@@ -256,8 +262,8 @@ class TraceComponentValues(BaseModel):
 class TraceResponse(BaseModel):
     """Measured and predicted torque at rows of a data set, N·m (prismatic: N), one list of joints a row.
 
-    An interval that shall hold the measurements needs both standard deviations: mean ± 1.96 · sqrt(std² + noise_std²)
-    for 95 % of them.
+    An interval that shall hold the measurements needs both standard deviations and the scale:
+    mean ± 1.96 · scale · sqrt(std² + noise_std²) for 95 % of them.
     """
 
     model: str
@@ -280,6 +286,7 @@ class TraceResponse(BaseModel):
     mean: list[list[float]] = Field(description="Predicted torque")
     std: list[list[float]] = Field(description="Standard deviation of the function")
     noise_std: list[float] = Field(description="Standard deviation of the measurement, per joint")
+    scale: list[float] = Field(description="The version's own factor on the half width of its intervals, per joint")
     offered: list[TraceComponent] = Field(description="Components that may be asked for")
     components: dict[TraceComponent, TraceComponentValues]
     in_training: bool = Field(

@@ -85,7 +85,7 @@ def answer_of(model: TorqueModel, samples: Samples) -> Answer:
     """What a model predicts of samples, not by its compiled form: a process that trains and never serves would wait for
     that."""
     answer = model.posterior.predict(samples.motion())
-    return Answer(answer.mean.numpy(), answer.std.numpy(), model.noise_std)
+    return Answer(answer.mean.numpy(), answer.std.numpy(), model.noise_std, model.scale)
 
 
 def known(interval: CoverageInterval) -> dict[str, list[float]]:

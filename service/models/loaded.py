@@ -15,6 +15,7 @@ import numpy as np
 from fastapi import Depends
 
 import lipcore
+from lipcore.data.samples import Array
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online.transfer import Revision
 from service.foundation.errors import NotFoundError, UnreadableVersionError, not_found
@@ -305,7 +306,7 @@ class LoadedModels:
     def _make(self, row: VersionRow) -> Served:
         base = self._read(row)
         base.warm_up()
-        scales = self._scales_of(row, base.n_joints)
+        scales = self._scales_of(row, base.scale)
         served = Served(row.model, row.version, base, base, learnt_from(row.manifest["lineage"]), scales)
         if (published := self._revisions.get((row.model, row.version))) is not None:
             revision, learnt = published
@@ -321,12 +322,12 @@ class LoadedModels:
             self._wake(row.model)
         return replace(served, model=_warm(known.model), revision=known.revision)
 
-    def _scales_of(self, row: VersionRow, n_joints: int) -> Scales:
+    def _scales_of(self, row: VersionRow, own: Array) -> Scales:
         """The widths that a version's streams had come to when it was last in memory, or the service last ran."""
         key = (row.model, row.version)
         if (known := self._scales.get(key)) is not None:
             return known
-        scales = Scales(n_joints)
+        scales = Scales(own)
         scales.take(self.learnt.factors(*key))
         with self._lock:
             return self._scales.setdefault(key, scales)

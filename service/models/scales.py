@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
-
 from lipcore.data.samples import Array
 from lipcore.online.adaptive import widest
 
@@ -26,27 +24,29 @@ class Scales:
     """The factors that a version answers with now; any thread may read while one replaces them.
 
     One of these belongs to a version for as long as the service runs, whatever it learns: all of its revisions have it.
+    own: (n,), what the training has proved, which holds until streams say otherwise.
     """
 
-    def __init__(self, n_joints: int) -> None:
-        self._one = np.ones(n_joints)
+    def __init__(self, own: Array) -> None:
+        self._own = own
         self._streams: Mapping[str, Factor] = {}
-        self._widest = self._one
-        self.asked: list[float] = self._one.tolist()
+        self._widest = own
+        self.asked: list[float] = own.tolist()
 
     def of(self, stream_id: str | None) -> Array:
-        """Those of a stream, (n,), 1 where it has taught nothing; of no stream those of questions, `asked`.
+        """Those of a stream, (n,), the version's own where it has taught nothing; of no stream those of questions,
+        `asked`.
 
-        A question of HTTP belongs to no stream: it has the largest of those of the recent streams, and 1 at least."""
+        A question of HTTP belongs to no stream: it has the largest of those of the recent streams and its own."""
         if stream_id is None:
             return self._widest
         known = self._streams.get(stream_id)
-        return self._one if known is None else known.values
+        return self._own if known is None else known.values
 
     def take(self, streams: Mapping[str, Factor]) -> None:
         """Answer with these from now on."""
         latest = max((each.received for each in streams.values()), default=0.0)
         recent = [each.values for each in streams.values() if each.received >= latest - RECENT_S]
-        self._widest = widest(recent) if recent else self._one
+        self._widest = widest(recent, self._own)
         self.asked = self._widest.tolist()
         self._streams = streams

@@ -83,6 +83,12 @@ class Version(BaseModel):
     calibration: dict[str, Any] = Field(
         description="`function_std_factor`: what `tau_std` was multiplied by so that intervals hold on unseen motion"
     )
+    conformal: dict[str, Any] | None = Field(
+        None,
+        description="What `blocks` of the training, left out in turn, say of its intervals: `scale`, the factor on the "
+        "half width of each joint's, and `guaranteed`, the share of measurements that they hold then, at least; null "
+        "for versions of earlier releases",
+    )
     hyperparameters: dict[str, Any] | None = Field(
         None, description="Hyperparameters by name, mostly logarithms; null for versions of earlier releases"
     )

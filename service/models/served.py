@@ -53,6 +53,11 @@ class Served:
         numbers: list[float] = self.model.noise_std.tolist()
         return numbers
 
+    @cached_property
+    def guaranteed(self) -> list[float] | None:
+        """Share of measurements that left-out blocks of the training guarantee for its intervals, (n,)."""
+        return None if self.base.conformal is None else list(self.base.conformal.guaranteed)
+
 
 @dataclass(frozen=True)
 class Learnt:

@@ -78,8 +78,9 @@ def with_alternatives(model: TorqueModel, samples: Samples, count: int = 1) -> T
         for place, share in enumerate(shares)
     ]
     chosen = make_estimator("rigid-body", model.joint_types, arm=replace(found, alternatives=tuple(others)))
-    posterior, once = model.posterior, torch.ones_like(samples.torque())
-    made = linear(chosen.kernel, posterior.params, samples.motion(), samples.torque(), once, 0.01, posterior.misfit)
+    posterior = model.posterior
+    once = posterior.noise_variance.expand(samples.tau.shape)
+    made = linear(chosen.kernel, posterior.params, samples, once, 0.01, 1.0, posterior.misfit)
     return replace(model, estimator=chosen, posterior=made.posterior)
 
 
@@ -173,7 +174,7 @@ def test_a_choice_of_arms_has_the_moments_of_their_mixture(learnt: TorqueModel, 
 
 def errors(model: TorqueModel, unseen: Samples) -> np.ndarray:
     answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
-    return np.asarray(evaluate(unseen.tau, answer.tau, answer.tau_std, answer.noise_std).nmse)
+    return np.asarray(evaluate(unseen.tau, *answer.interval).nmse)
 
 
 def heavier(seed: int, size: int) -> Samples:

@@ -97,7 +97,7 @@ def test_a_learnt_arm_knows_motion_that_it_never_saw(kinds: str, share: str) -> 
     seen: list[FitProgress] = []
     model = train(given.samples, given.robot.joint_types, "rigid-body", OPTIONS, f"gravity_{share}", seen.append)
     answer = model.predict(given.unseen.q, given.unseen.dq, given.unseen.ddq)
-    figures = evaluate(given.unseen.tau, answer.tau, answer.tau_std, answer.noise_std)
+    figures = evaluate(given.unseen.tau, *answer.interval)
     assert (figures.nmse < 1e-3).all(), figures.nmse
     assert (figures.coverage > 0.85).all(), figures.coverage
     assert np.allclose(model.noise_std, NOISE, rtol=0.3), model.noise_std

@@ -110,5 +110,5 @@ def test_dynamics_of_a_true_chain_lie_in_the_space_of_the_kernel(kinds: str) -> 
     model = train(training, robot.joint_types, "lip-chain", options)
     unseen = simulate(robot, Stream(100, n_sinusoids=100, speed=10, noise=0.0, motion="full"), seed=2)
     answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
-    nmse = evaluate(unseen.tau, answer.tau, answer.tau_std, answer.noise_std).nmse
+    nmse = evaluate(unseen.tau, *answer.interval).nmse
     assert (nmse < 1e-6).all(), nmse

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from lipcore import FitOptions, Samples, TorqueModel, load, save, train
 from lipcore.data.metrics import evaluate
+from lipcore.data.motion import Motion
 from lipcore.fitting.estimators import (
     ESTIMATORS,
     FUNCTION_STD_FACTOR,
@@ -59,7 +60,7 @@ def test_it_learns_a_small_robot(name: str) -> None:
     model = trained(name, samples.rows(even))
     unseen = samples.rows(~even)
     answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
-    figures = evaluate(unseen.tau, answer.tau, answer.tau_std, answer.noise_std)
+    figures = evaluate(unseen.tau, *answer.interval)
     assert (figures.nmse < (0.1 if name in ("se", "gip", "lse") else 0.01)).all(), figures.nmse
     assert (figures.coverage > 0.7).all(), figures.coverage
     assert model.estimator.name == name
@@ -219,7 +220,7 @@ def test_predictions(plain: TorqueModel, corrected: TorqueModel, samples: Sample
     one, other = (model.predict(*query, covariance=True) for model in (plain, corrected))
     alike(other.tau, one.tau)
     alike(other.noise_std, one.noise_std)
-    unexpressed = torch.diag_embed(plain.posterior.misfit.variance(torch.from_numpy(samples.dq))).numpy()
+    unexpressed = torch.diag_embed(plain.posterior.misfit.variance(Motion.from_arrays(*query))).numpy()
     alike(other.covariance - unexpressed, FACTOR**2 * (one.covariance - unexpressed))
     alike(other.tau_std**2, other.covariance.diagonal(axis1=1, axis2=2))
     assert (one.tau_std > 0).all()

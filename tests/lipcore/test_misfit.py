@@ -9,6 +9,8 @@ import torch
 
 from lipcore import FitOptions, Samples, load, save, train
 from lipcore.data.metrics import evaluate
+from lipcore.data.motion import Motion
+from lipcore.kernels.compiled.answer import ACCELERATED
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.misfit import AT_REST, ROWS, Misfit, estimate, low_speed_variance, shared_rows
 from lipcore.robots.dirt import Dirt
@@ -60,10 +62,12 @@ def test_what_lasts_is_no_white_noise(seconds: float) -> None:
         width = round(50 * seconds)
         residual = np.apply_along_axis(lambda x: np.convolve(x, np.hanning(width), "same"), 0, residual)
     dq = 1.0 + rng.uniform(0, 1, residual.shape)
-    misfit, noise = estimate(residual, residual, dq, [slice(0, 2500), slice(2500, 5000)])
+    moved = np.stack([dq, 3 * dq])
+    misfit, noise = estimate(residual, residual, moved, [slice(0, 2500), slice(2500, 5000)])
     share = misfit.lasting.numpy() / noise
     assert share == pytest.approx(1.0 if seconds else 0.0, abs=0.05)
-    torch.testing.assert_close(misfit.usual, torch.from_numpy(np.sqrt(np.mean(dq**2, axis=0))))
+    usual = torch.from_numpy(np.sqrt(np.mean(dq**2, axis=0)))
+    torch.testing.assert_close((misfit.speed, misfit.acceleration), (usual, 3 * usual))
 
 
 def test_rows_of_one_second_share_what_lasts() -> None:
@@ -71,7 +75,8 @@ def test_rows_of_one_second_share_what_lasts() -> None:
     assert shared_rows(samples, 200) == pytest.approx(10.0)  # of twenty seconds
     assert shared_rows(samples, 5) == 1.0
     noise, dq = torch.tensor([1.0, 1.0]), torch.tensor([[0.0, 3.0]])
-    misfit = Misfit(torch.tensor([0.5, 0.5]), torch.ones(2), torch.tensor([0.25, 1.0]), torch.ones(2))
+    one = torch.ones(2)
+    misfit = Misfit(0.5 * one, one, torch.tensor([0.25, 1.0]), one, one)
     counted = misfit.of_row(noise.double(), dq.double())
     expected = [0.75 + ROWS * (0.25 + 0.5), ROWS * (1.0 + 0.5 * np.exp(-9.0))]
     torch.testing.assert_close(counted, torch.tensor([expected]).double(), check_dtype=False)
@@ -82,24 +87,21 @@ def test_answers_hold_it(model: TorqueModel) -> None:
     posterior, n = model.posterior, 2
     misfit = posterior.misfit
     assert misfit.exists
-    q = np.full((3, n), 0.3)
-    dq = np.array([[0.0, 0.0], [0.01, -0.02], [9.0, -7.0]])
+    q = np.full((4, n), 0.3)
+    dq = np.array([[0.0, 0.0], [0.01, -0.02], [9.0, -7.0], [2.0, 9.0]])
+    ddq = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.0], [-50.0, 90.0]])
     bare = replace(model, posterior=replace(posterior, misfit=Misfit.none(n)))
-    found, without = (each.predict(q, dq, np.zeros((3, n)), covariance=True) for each in (model, bare))
-    rest, slow, lasting, usual = misfit.packed().numpy()
-    faster = np.maximum(np.mean((dq / usual) ** 2, axis=1) - 1, 0.0)
+    found, without = (each.predict(q, dq, ddq, covariance=True) for each in (model, bare))
+    rest, slow, lasting, speed, acceleration = misfit.packed().numpy()
+    faster, harder = (np.maximum(np.mean((x / u) ** 2, axis=1) - 1, 0.0) for x, u in ((dq, speed), (ddq, acceleration)))
+    faster += ACCELERATED * harder
     expected = rest * np.exp(-((dq / slow) ** 2)) + lasting * faster[:, None]
     np.testing.assert_allclose(found.tau_std**2 - without.tau_std**2, expected, rtol=1e-6, atol=1e-9 * expected.max())
-    plain = posterior.predict(samples_of(q, dq).motion())
+    plain = posterior.predict(Motion.from_arrays(q, dq, ddq))
     assert found.covariance is not None
     np.testing.assert_allclose(found.covariance, plain.covariance.numpy(), rtol=1e-6, atol=1e-8)
-    one = model.answer(np.stack([q[2], dq[2], np.zeros(n)]))[1]
-    np.testing.assert_allclose(one, found.tau_std[2], rtol=1e-9)
-
-
-def samples_of(q: np.ndarray, dq: np.ndarray) -> Samples:
-    zeros = np.zeros_like(q)
-    return Samples(("a", "b"), np.arange(len(q), dtype=float), np.zeros(len(q), np.int64), q, dq, zeros, zeros)
+    one = model.answer(np.stack([q[3], dq[3], ddq[3]]))[1]
+    np.testing.assert_allclose(one, found.tau_std[3], rtol=1e-9)
 
 
 def test_at_rest_friction_may_hold_any_torque(model: TorqueModel) -> None:
@@ -119,6 +121,7 @@ def test_it_is_saved_and_loaded(model: TorqueModel, tmp_path: Path) -> None:
     save(model, tmp_path / "model")
     again = load(tmp_path / "model")
     assert torch.equal(again.posterior.misfit.packed(), model.posterior.misfit.packed())
+    assert again.conformal == model.conformal
     query = dirty(2).rows(slice(0, 50))
     for name in ("tau", "tau_std"):
         found, expected = (getattr(each.predict(query.q, query.dq, query.ddq), name) for each in (again, model))

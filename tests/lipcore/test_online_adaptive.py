@@ -14,7 +14,7 @@ MINUTE = 6000
 
 def play(score, batch=BATCH, rate=RATE, delay=0):
     """Which rows lay outside, the scales that they were answered with, and the last state."""
-    state, missed, factors = Adaptive.start(score.shape[1]), [], []
+    state, missed, factors = Adaptive.start(np.ones(score.shape[1])), [], []
     waiting = [state.factor] * (delay + 1)
     for first in range(0, len(score), batch):
         part = score[first : first + batch]
@@ -52,7 +52,7 @@ def test_every_minute_of_any_scores_is_held_as_promised(seed):
 
 def test_an_adversary_who_knows_the_scale_is_held_as_well():
     """Scores right outside or far inside, whichever hurts: misses for 3 s, then none until the scale is back."""
-    state, missed, now = Adaptive.start(1), [], 0.0
+    state, missed, now = Adaptive.start(np.ones(1)), [], 0.0
     hurting = True
     for _ in range(4 * MINUTE // BATCH):
         factor = state.factor
@@ -96,7 +96,7 @@ def test_the_rate_of_a_stream_changes_nothing_of_what_is_promised(rate, batch):
 
 
 def test_what_a_long_batch_cannot_pay_is_owed():
-    state = Adaptive.start(1).step(np.arange(500) / RATE, np.full((500, 1), 3.0))
+    state = Adaptive.start(np.ones(1)).step(np.arange(500) / RATE, np.full((500, 1), 3.0))
     assert state.log[0] == pytest.approx(np.log(3.0 * adaptive.MARGIN))
     assert state.owed[0] == pytest.approx(
         min(0.95 * 500 / RATE * adaptive.RATE - state.log[0], adaptive.MOST_OWED), rel=0.01
@@ -116,7 +116,7 @@ def test_frames_count_by_what_they_were_answered_with():
 
 def test_rows_without_times_or_after_a_pause_count_as_usual():
     score = np.full((1, 1), 5.0)
-    at_once = Adaptive.start(1).step(np.full(1, 7.0), score)
+    at_once = Adaptive.start(np.ones(1)).step(np.full(1, 7.0), score)
     assert at_once.log[0] == pytest.approx(0.95 * adaptive.RATE * adaptive.USUAL_STEP_S)
     paused = at_once.step(np.full(1, 1000.0), score)
     assert paused.log[0] - at_once.log[0] == pytest.approx(at_once.log[0])
@@ -136,4 +136,5 @@ def test_it_is_kept_to_the_last_bit():
 
 def test_scores_and_the_widest():
     assert scores(np.array([[-1.959963984540054]]), np.array([[0.6]]), np.array([0.8])) == pytest.approx(1.0)
-    assert widest([np.array([0.5, 3.0]), np.array([0.7, 2.0])]).tolist() == [1.0, 3.0]
+    streams = [np.array([0.5, 3.0, 1.5]), np.array([0.7, 2.0, 1.2])]
+    assert widest(streams, np.array([1.0, 1.0, 2.0])).tolist() == [1.0, 3.0, 2.0]

@@ -182,5 +182,5 @@ def test_energies_take_what_rigid_bodies_leave(tmp_path: Path) -> None:
     for name in ("rigid-body", "rigid-body+lip-chain"):
         model = train(data, robot.joint_types, name, options, robot=body)
         answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
-        errors[name] = evaluate(unseen.tau, answer.tau, answer.tau_std, answer.noise_std).nmse[1]
+        errors[name] = evaluate(unseen.tau, *answer.interval).nmse[1]
     assert errors["rigid-body+lip-chain"] < 0.1 * errors["rigid-body"], errors

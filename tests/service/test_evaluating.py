@@ -31,7 +31,7 @@ def ask(api, model, dataset, **request):
 
 def expected(model, samples):
     answer = model.predict(samples.q, samples.dq, samples.ddq)
-    return evaluate(samples.tau, answer.tau, answer.tau_std, answer.noise_std)
+    return evaluate(samples.tau, *answer.interval)
 
 
 @pytest.fixture(scope="module")

@@ -91,7 +91,7 @@ def test_the_lineage_keeps_the_split_and_the_figures(api, held, dataset):
     service, unseen = service_of(api), recording().rows(HELD_OUT)
     model = lipcore.load(service.files.version_folder(registry.find(service.database, held[0], 1).folder))
     answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
-    metrics = evaluate(unseen.tau, answer.tau, answer.tau_std, answer.noise_std)
+    metrics = evaluate(unseen.tau, *answer.interval)
     for name in FIGURES:
         np.testing.assert_allclose(reply[name], getattr(metrics, name), rtol=1e-6)
 

@@ -49,7 +49,7 @@ class Loaded:
 
 def served(version, model, revision=0):
     return SimpleNamespace(
-        name="m", version=version, revision=revision, model=model, noise_std=[0.1, 0.2], scales=Scales(2)
+        name="m", version=version, revision=revision, model=model, noise_std=[0.1, 0.2], scales=Scales(np.ones(2))
     )
 
 

@@ -44,8 +44,9 @@ class Prediction(Plain):
 
     revision: online updates applied to the version; tau: mean; tau_std: standard deviation of the function, which grows
     where the model knows little; noise_std: (n) of a measurement around the function; scale: (n) factor on the half
-    width of intervals that streams need at the moment, None of an earlier service; covariance: (…, n, n) (N·m)² of the
-    function between joints, where asked for; components: by name, where asked for.
+    width of intervals that streams need at the moment, None of an earlier service; guaranteed: (n) share of
+    measurements that left-out blocks of the training guarantee for intervals of 95 %, None of an earlier release;
+    covariance: (…, n, n) (N·m)² of the function between joints, where asked for; components: by name, where asked for.
     """
 
     model: str
@@ -57,6 +58,7 @@ class Prediction(Plain):
     tau_std: Array
     noise_std: Array
     scale: Array | None = None
+    guaranteed: Array | None = None
     covariance: Array | None = None
     components: Mapping[str, Component] | None = None
 
@@ -110,8 +112,9 @@ class Trace(Plain):
     samples: of the data set or the part; in_range: of these between start and stop; shown: K, evenly chosen where there
     are more, so that peaks may be missing; rows: (K) counted from 0; t: (K) s; breaks: places in `rows` that lines are
     not to be drawn across; tau: measured; mean: predicted; std: (K, n) of the function; noise_std: (n) of a
-    measurement; offered: components that may be asked for; components: by name, where asked for; in_training: whether
-    the model was trained on these samples: then it looks better than it is.
+    measurement; scale: (n) factor on the half width of intervals, None of an earlier service; offered: components that
+    may be asked for; components: by name, where asked for; in_training: whether the model was trained on these samples:
+    then it looks better than it is.
     """
 
     model: str
@@ -134,6 +137,7 @@ class Trace(Plain):
     offered: tuple[str, ...]
     components: Mapping[str, Component]
     in_training: bool
+    scale: Array | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.rows), len(self.joint_names))
@@ -142,7 +146,7 @@ class Trace(Plain):
 
     def interval(self, level: float = 0.95) -> tuple[Array, Array]:
         """Lower and upper end (K, n) of the interval that shall hold a share `level` of the *measurements*."""
-        return interval(self.mean, self.std, self.noise_std, level)
+        return interval(self.mean, self.std, self.noise_std, level, self.scale)
 
 
 read_trace = reading(Trace)

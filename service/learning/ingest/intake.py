@@ -119,7 +119,8 @@ class Intake:
                 log.append(session, model, "change", {"t": verdict.change.at}, batch.received)
             adaptive = {}
             if options.adaptive_intervals and screened.seen is not None:
-                adaptive = intervals.follow(monitor.scale(batch.stream_id, served.version), screened.seen)
+                scale = monitor.scale(batch.stream_id, served.version, served.base.scale)
+                adaptive = intervals.follow(scale, screened.seen)
             record = None if verdict.record is None else verdict.record.to_json()
             judged = replace(batch, rows=verdict.rows, record=record)
             event = log.append_batch(session, model, judged, self.settings.max_observation_streams)

@@ -14,6 +14,7 @@ import numpy as np
 from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session
 
+from lipcore.data.samples import Array
 from lipcore.online.adaptive import Adaptive
 from lipcore.online.change import ChangeDetector
 from lipcore.online.departure import Departure
@@ -130,10 +131,11 @@ class Monitor:
         gate = self._gates.get(stream_id) or ContactGate.start(self._patience)
         return Watch(gate, self._detector, self._innovations, self._departure)
 
-    def scale(self, stream_id: str, version: int) -> Adaptive:
-        """The scale of a stream's intervals before its next rows, which a version predicts: another begins anew."""
+    def scale(self, stream_id: str, version: int, own: Array) -> Adaptive:
+        """The scale of a stream's intervals before its next rows, which a version predicts: another one begins anew,
+        from its `own`, (n,)."""
         known = self._scales.get(stream_id)
-        return Adaptive.start(len(self.joint_names)) if known is None or known.version != version else known.state
+        return Adaptive.start(own) if known is None or known.version != version else known.state
 
     def factors(self, version: int) -> dict[str, Factor]:
         """What the intervals of a version are wide by now, stream by stream."""

@@ -244,8 +244,9 @@ def predict(
     codes[predicted] = np.where(known, LEARNT, LIMIT)
     predicted[predicted] = known
     checked = replace(rows, code=codes)
-    trained = Trained(served.version, *_answers(good.take(judged), served.base))
     believed = mean[judged], std[judged], bare[judged]
+    as_trained = believed[::2] if model is served.base else _answers(good.take(judged), served.base)
+    trained = Trained(served.version, *as_trained)
     return Screened(checked, own, derived, predicted, *believed, model.noise_std, trained, seen)
 
 

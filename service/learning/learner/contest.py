@@ -236,7 +236,7 @@ class Duel:
         if len(rows) == 0 or (follower.answering is follower.base and follower.number > follower.start):
             return  # nothing to predict, or what has been learnt is not solved for yet
         prediction = follower.answering.predict(rows.q, rows.dq, rows.ddq)
-        answer = Answer(prediction.tau, prediction.tau_std, prediction.noise_std)
+        answer = prediction.interval
         own = _Entry(rows, arrival.event.received, answer)
         other = self._waiting[self.candidate if follower is self.serving else self.serving].pop(number, None)
         if other is not None:

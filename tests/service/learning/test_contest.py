@@ -149,7 +149,8 @@ class Constant:
     n_joints: int = 2
 
     def predict(self, q: np.ndarray, *_: np.ndarray) -> TorquePrediction:
-        return TorquePrediction(np.full_like(q, self.tau), np.zeros_like(q), np.ones(q.shape[1]))
+        one = np.ones(q.shape[1])
+        return TorquePrediction(np.full_like(q, self.tau), np.zeros_like(q), one, one)
 
 
 @dataclass(eq=False)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lipcore.data.metrics import Answer, Comparison, Difference, compare
+from lipcore.data.metrics import Comparison, Difference, compare
 from service.inference.comparison import _verdict
 from tests.service.data import arrays, error, npz, post, stream, upload
 from tests.service.models.test_aliases import CODES
@@ -37,7 +37,7 @@ def ask(api, model, dataset, *versions):
 def expected():
     samples = stream(**SAMPLES)
     answers = [model.predict(samples.q, samples.dq, samples.ddq) for model in (worse(), trained())]
-    return compare(samples, *(Answer(each.tau, each.tau_std, each.noise_std) for each in answers))
+    return compare(samples, *(each.interval for each in answers))
 
 
 def test_the_better_version_is_named_with_the_evidence(api, arm, recorded):

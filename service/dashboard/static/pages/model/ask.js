@@ -50,7 +50,7 @@ function fixed(value, std) {
 
 function shown(found, motion, { training_range: range }) {
   const short = shortNames(found.joint_names);
-  const total = found.tau_std.map((each, joint) => Math.hypot(each, found.noise_std[joint]));
+  const total = found.tau_std.map((each, joint) => found.scale[joint] * Math.hypot(each, found.noise_std[joint]));
   const outside = (joint) => QUANTITIES.map(([quantity]) => quantity).filter((quantity) => motion[quantity][joint] < range[quantity].min[joint] || motion[quantity][joint] > range[quantity].max[joint]);
   const beyond = found.joint_names.some((_name, joint) => outside(joint).length);
   const numeric = (label, cell) => ({ label, numeric: true, cell });

@@ -5,10 +5,10 @@ import { line } from "../../plots.js";
 /** Standard deviations on either side that hold 95 % of a Gaussian. */
 export const Z95 = 1.959963984540054;
 
-/** Standard deviation of a measurement around the mean: what is not known of the function, and noise. */
+/** What 95 % intervals are 2 · Z95 of: what is not known of the function, and noise, times the version's scale. */
 export function measurementStd(trace, joint) {
-  const noise = trace.noise_std[joint];
-  return trace.std.map((row) => Math.hypot(row[joint], noise));
+  const noise = trace.noise_std[joint], scale = trace.scale[joint];
+  return trace.std.map((row) => scale * Math.hypot(row[joint], noise));
 }
 
 /** One joint's column of rows. */

@@ -83,7 +83,7 @@ function figuresCard(version, from) {
   );
 }
 
-function fit({ fit: said, compact, calibration, lineage: from }) {
+function fit({ fit: said, compact, calibration, conformal, lineage: from }) {
   const found = [
     ["Converged", badge(said.converged ? "yes" : "no", said.converged ? "good" : "warn")],
     ["Iterations", count(said.iterations)],
@@ -94,6 +94,13 @@ function fit({ fit: said, compact, calibration, lineage: from }) {
     ["Worth so many independent ones", count(said.independent_samples)],
     ["Standard deviations multiplied by", number(calibration.function_std_factor)],
   ];
+  if (conformal) {
+    found.push(
+      ["Blocks left out to check the intervals", count(conformal.blocks)],
+      ["Intervals widened by", conformal.scale.map((each) => number(each, 3)).join(", ")],
+      ["They guarantee so many of 95 %", conformal.guaranteed.map((each) => percent(each)).join(", ")],
+    );
+  }
   if (compact) {
     found.push(
       ["Inducing outputs", count(compact.inducing_outputs)],

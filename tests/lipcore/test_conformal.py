@@ -1,0 +1,132 @@
+"""What left-out blocks say of intervals: against posteriors of all other samples, and against its promise."""
+
+import numpy as np
+import pytest
+import torch
+
+from lipcore import FitOptions, TorqueModel, train
+from lipcore.data.metrics import LEVEL, blocks, evaluate, quantile
+from lipcore.data.samples import Samples
+from lipcore.data.splits import GUARD_S
+from lipcore.model.torque_model import TorquePrediction
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.conformal import Conformal, _quantile, conform, scores
+from lipcore.posterior.statistics import collect
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
+
+TYPES = ("revolute",) * 2
+QUICK = FitOptions(hyperparameter_samples=40, posterior_samples=150, max_iterations=10, starts=1, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def samples() -> Samples:
+    robot, stream = load_robot("double-pendulum"), Stream(n_samples=50, rate=10.0, speed=5.0, noise=0.05)
+    first, second = (simulate(robot, stream, seed) for seed in (1, 2))
+    return Samples.concatenate([first, second])
+
+
+@pytest.fixture(scope="module", params=["rigid-body", "lip-chain"])
+def model(request: pytest.FixtureRequest, samples: Samples) -> TorqueModel:
+    return train(samples, TYPES, request.param, QUICK)
+
+
+def taught(model: TorqueModel, samples: Samples, variance: torch.Tensor) -> CompactPosterior:
+    """The posterior of these samples, each torque with its own variance."""
+    old, motion = model.posterior, samples.motion()
+    statistics = collect(old.basis, variance, motion, samples.torque() - old.kernel.mean(motion))
+    return CompactPosterior.build(old.kernel, old.basis, statistics, old.noise_variance, 1.5, old.misfit)
+
+
+def test_scores_are_those_of_posteriors_without_the_block(model: TorqueModel, samples: Samples) -> None:
+    rng, starts = np.random.default_rng(0), blocks(samples)
+    noise = model.posterior.noise_variance
+    variance = noise * torch.from_numpy(rng.uniform(1, 3, samples.tau.shape))
+    found = scores(taught(model, samples, variance), samples, variance, starts)
+    assert len(starts) == 10
+    for first, last in zip(starts, [*starts[1:], len(samples)], strict=True):
+        near = np.abs(samples.t[:, None] - samples.t[first:last]).min(axis=1) < GUARD_S
+        kept = ~(near & (samples.episode == samples.episode[first]))
+        assert 90 >= kept.sum() >= 86
+        without = taught(model, samples.rows(kept), variance[torch.from_numpy(kept)])
+        answer = without.predict(samples.rows(slice(first, last)).motion())
+        half = quantile(LEVEL) * (answer.std**2 + noise).sqrt().numpy()
+        expected = np.abs(samples.tau[first:last] - answer.mean.numpy()) / half
+        np.testing.assert_allclose(found[first:last], expected, rtol=1e-5, atol=1e-8)
+
+
+def test_the_order_of_samples_does_not_matter(model: TorqueModel, samples: Samples) -> None:
+    order = np.random.default_rng(1).permutation(len(samples))
+    variance = 2 * model.posterior.noise_variance.expand(samples.tau.shape)
+    posterior = taught(model, samples, variance)
+    found, expected = (conform(posterior, each, variance) for each in (samples.rows(order), samples))
+    np.testing.assert_allclose(found.scale, expected.scale, rtol=1e-9)
+
+
+def errors(rng: np.random.Generator, count: int, rows: int) -> np.ndarray:
+    """Scores in blocks, each with a size of its own: (count rows, 1), alike for all blocks."""
+    size = np.repeat(np.exp(0.5 * rng.standard_normal(count)), rows)
+    return np.asarray(np.abs(size * rng.standard_normal(count * rows))[:, None])
+
+
+@pytest.mark.parametrize("count", [6, 30])
+def test_it_holds_what_it_guarantees(count: int) -> None:
+    """Of blocks that were never seen, over many recordings; a few blocks guarantee less, and that is what they say."""
+    rng, rows = np.random.default_rng(2), 20
+    held, said = [], []
+    for _ in range(400):
+        scale, guaranteed = _quantile(errors(rng, count, rows), np.full(count, rows))
+        held.append(np.mean(errors(rng, 20, rows) <= scale[0]))
+        said.append(guaranteed[0])
+    assert np.mean(held) >= np.mean(said) - 0.005
+    if count >= 19:
+        assert min(said) > LEVEL - 1e-9
+    else:
+        assert max(said) <= count / (count + 1)
+        assert np.mean(said) > 0.95 * count / (count + 1) - 1e-9
+
+
+def test_intervals_are_never_narrower_than_believed() -> None:
+    scale, guaranteed = _quantile(np.full((40, 1), 0.1), np.full(4, 10))
+    assert (scale, guaranteed) == ((1.0,), (0.8,))
+
+
+def test_a_noise_taken_too_small_is_made_up_for(model: TorqueModel, samples: Samples) -> None:
+    """A model that takes all noise for a tenth of what it is covers little; with its scale, what it should."""
+    posterior = model.posterior
+    tenth = posterior.noise_variance / 100
+    old, motion = posterior, samples.motion()
+    residual = samples.torque() - old.kernel.mean(motion)
+    proud = CompactPosterior.build(old.kernel, old.basis, collect(old.basis, tenth, motion, residual), tenth)
+    found = conform(proud, samples, tenth.expand(samples.tau.shape))
+    assert min(found.scale) > 3
+    unseen = simulate(load_robot("double-pendulum"), Stream(n_samples=200, rate=10.0, speed=5.0, noise=0.05), 9)
+    answer = proud.predict(unseen.motion())
+    given = unseen.tau, answer.mean.numpy(), answer.std.numpy(), tenth.sqrt().numpy()
+    assert (evaluate(*given).coverage < 0.6).all()
+    assert (evaluate(*given, np.array(found.scale)).coverage > 0.85).all()
+
+
+def test_trained_models_have_one(model: TorqueModel, samples: Samples) -> None:
+    assert model.conformal is not None
+    assert model.conformal.blocks == 10  # seconds
+    assert max(model.conformal.guaranteed) <= 10 / 11
+    answer = model.predict(samples.q, samples.dq, samples.ddq)
+    assert isinstance(answer, TorquePrediction)
+    assert answer.scale.tolist() == list(model.conformal.scale) == model.scale.tolist()
+    assert (answer.interval.scale == answer.scale).all()
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (((0.5,), (0.9,), 20), "scale is"),
+        (((float("inf"),), (0.9,), 20), "scale is"),
+        (((1.0,), (1.0,), 20), "guaranteed is"),
+        (((1.0, 1.0), (0.9,), 20), "guaranteed is"),
+        (((1.0,), (0.9,), 0), "blocks is 0"),
+    ],
+)
+def test_what_no_blocks_say_is_refused(values: tuple[tuple[float], tuple[float], int], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Conformal(*values)
