@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.special import betaincinv
 
-from lipcore.data.metrics import LEVEL, Answer, quantile
+from lipcore.data.metrics import LEVEL, Answer
 from lipcore.data.samples import Array, Samples
 
 LARGEST_STEP = 2.0
@@ -36,12 +36,11 @@ def coverage_interval(samples: Samples, answer: Answer) -> CoverageInterval:
     N rows count for N / τ errors, τ the larger of the correlation times of the errors, in their standard deviations,
     and of whether the interval holds them.
     """
-    error, spread = samples.tau - answer.mean, np.hypot(answer.std, answer.noise_std)
-    inside = np.abs(error) <= quantile(LEVEL) * answer.scale * spread
+    error, inside = (samples.tau - answer.mean) / answer.spread, answer.holds(samples.tau)
     runs = _runs(samples)
     independent = np.array(
         [
-            len(samples) / max(_correlation(error[:, joint] / spread[:, joint], runs), _correlation(hits, runs))
+            len(samples) / max(_correlation(error[:, joint], runs), _correlation(hits, runs))
             for joint, hits in enumerate(inside.T.astype(np.float64))
         ]
     )

@@ -133,6 +133,15 @@ class Answer(NamedTuple):
     noise_std: Array
     scale: Array | float = 1.0
 
+    @property
+    def spread(self) -> Array:
+        """Standard deviation of a measurement, (N, n), as the model believes."""
+        return np.asarray(np.hypot(self.std, self.noise_std))
+
+    def holds(self, tau: Array) -> NDArray[np.bool_]:
+        """Which torques, (N, n), lie inside its 95 % intervals."""
+        return np.asarray(np.abs(tau - self.mean) <= quantile(LEVEL) * self.scale * self.spread)
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -174,14 +183,12 @@ def compare(samples: Samples, first: Answer, second: Answer) -> Comparison:
 
 def surprise(tau: Array, answer: Answer) -> Array:
     """Negative log predictive density of torques (N, n), nats, noise included: (N, n)."""
-    return negative_log_density(tau - answer.mean, np.hypot(answer.std, answer.noise_std))
+    return negative_log_density(tau - answer.mean, answer.spread)
 
 
 def _figures(tau: Array, answer: Answer) -> tuple[Array, Array, Array]:
     """Squared error, whether the interval holds the measurement, and negative log density, (N, n) each."""
-    error, spread = tau - answer.mean, np.hypot(answer.std, answer.noise_std)
-    inside = np.abs(error) <= quantile(LEVEL) * answer.scale * spread
-    return error**2, inside.astype(np.float64), negative_log_density(error, spread)
+    return (tau - answer.mean) ** 2, answer.holds(tau).astype(np.float64), surprise(tau, answer)
 
 
 def blocks(samples: Samples) -> NDArray[np.int64]:

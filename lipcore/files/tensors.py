@@ -56,9 +56,8 @@ def read_tensors(payload: bytes, n: int, limits: Limits) -> dict[str, Tensor]:
         raise _bad(f"tensor {FLOOR!r} has a number below zero, expected variances")
     if MISFIT in tensors:
         rest, slow, lasting, *usual = tensors[MISFIT]
-        if any(bool((each < 0).any()) for each in (rest, lasting)) or any(
-            bool((each <= 0).any()) for each in (slow, *usual)
-        ):
+        variances, motion = torch.stack([rest, lasting]), torch.stack([slow, *usual])
+        if bool((variances < 0).any() or (motion <= 0).any()):
             raise _bad(f"tensor {MISFIT!r} has a number below zero, expected variances, speeds and accelerations")
     return tensors
 

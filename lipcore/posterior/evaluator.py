@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lipcore.data.motion import Motion
 from lipcore.kernels.base import LinearKernel, PairKernel, Params
 from lipcore.kernels.compiled.answer import COVARIANCE, MEAN, ROWS, STD, WIDTH, answer, pack
+from lipcore.posterior.misfit import Misfit
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -84,7 +85,7 @@ class Evaluator:
         self._floor = np.zeros(n) if floor is None else np.array(floor, np.float64)
         if self._floor.shape != (n,):
             raise ValueError(f"floor has shape {self._floor.shape}, expected ({n},)")
-        nothing = np.array([[0.0], [1.0], [0.0], [1.0], [1.0]]).repeat(n, axis=1)
+        nothing = Misfit.none(n).packed().numpy()
         self._misfit = nothing if misfit is None else np.array(misfit, np.float64)
         if self._misfit.shape != nothing.shape:
             raise ValueError(f"misfit has shape {self._misfit.shape}, expected {nothing.shape}")
