@@ -81,6 +81,12 @@ class Misfit:
         """The same with at least AT_REST of the squares of Coulomb torques, (n,) N·m, at rest, moved or not so far."""
         return replace(self, rest=torch.maximum(self.rest, torch.from_numpy(AT_REST * coulomb**2)))
 
+    def with_rest(self, other: Misfit) -> Misfit:
+        """The same with the variance at rest, and its speed, of another where that is larger."""
+        larger = other.rest > self.rest
+        rest, slow = torch.where(larger, other.rest, self.rest), torch.where(larger, other.slow, self.slow)
+        return replace(self, rest=rest, slow=slow)
+
     @property
     def exists(self) -> bool:
         """Whether there is any."""

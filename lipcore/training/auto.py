@@ -75,7 +75,8 @@ def _of_all(work: Work, contest: Contest, chosen: str) -> TorqueModel:
     objective = float(model.fit["objective"])
     work.overall.of(chosen, ALL)(FitProgress("posterior", 0, 0, objective, 0.0, 0.0))
     used = task.samples.rows(spread_out(task.samples.motion(), task.options.posterior_samples).numpy())
-    compression, stands_on, conformal = compact(task, model.estimator, model.posterior.params, used)
+    rigid = None if contest.learnt is None else contest.learnt.misfit
+    compression, stands_on, conformal = compact(task, model.estimator, model.posterior.params, used, rigid)
     counts = {"samples_given": len(task.samples), "samples_posterior": len(used), **stands_on}
     return replace(
         model,
@@ -145,11 +146,11 @@ class Work:
         return learn(task, known, begin, seed)
 
     def fit(self, samples: Samples, name: str, place: str, learnt: Learnt | None = None) -> TorqueModel:
-        """A model of one estimator, around an arm where that is learnt already.
+        """A model of one estimator, which makes of an arm that is learnt already what `fit_estimator` says.
 
         samples: of the task's recordings; name: of the estimator; place: one of PLACES.
         """
-        robot, learnt = (self.task.robot, learnt) if name in ROBOT_ESTIMATORS else (None, None)
+        robot = self.task.robot if name in ROBOT_ESTIMATORS else None
         task = replace(self.task, samples=samples, robot=robot, on_progress=self.overall.of(name, place))
         return fit_estimator(task, name, learnt)
 
@@ -183,7 +184,7 @@ class Contest:
         """
         self.entries[RIGID], self.learnt = self._rigid(RIGID)
         self.entries[BOTH] = self._enter(BOTH, BOTH, self.learnt) if self.learnt else self.entries[RIGID]
-        self.entries[CHAIN] = self._enter(CHAIN, CHAIN)
+        self.entries[CHAIN] = self._enter(CHAIN, CHAIN, self.learnt)
         if self.learnt and mode_of(self.work.task.options, self.work.task.robot) == "learn" and self._chain_leads():
             entry, learnt = self._rigid(AGAIN, self.learnt)
             if learnt and entry.density > self.entries[RIGID].density:

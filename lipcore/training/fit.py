@@ -23,7 +23,7 @@ from lipcore.model.torque_model import TorqueModel, training_range
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.compression import Compression, compressed, linear
 from lipcore.posterior.conformal import Conformal, conform
-from lipcore.posterior.misfit import estimate, shared_rows
+from lipcore.posterior.misfit import Misfit, estimate, shared_rows
 from lipcore.posterior.statistics import collect
 from lipcore.vocabulary import ROBOT_ESTIMATORS
 
@@ -39,7 +39,8 @@ def fit_estimator(
     """Train one estimator on the samples of a task.
 
     name: one of `lipcore.fitting.estimators.ESTIMATORS`; learnt: what these samples have led to of the rigid bodies,
-    where that is known already; geometries: base to tip, that a search for one looks at first.
+    where that is known already, which tells estimators without them how unsure friction at rest is; geometries: base to
+    tip, that a search for one looks at first.
     Raise ValueError as `check_estimator` does, FitCancelledError, or NotPositiveDefiniteError.
     """
     samples, types, options = task.samples, task.joint_types, task.options
@@ -47,6 +48,8 @@ def fit_estimator(
     if learnt is None and name in ROBOT_ESTIMATORS:
         installed = () if task.robot is not None else known_geometries(types, task.gravity)
         learnt = learn(task, (*geometries, *installed))
+    misfit = None if learnt is None else learnt.misfit
+    learnt = learnt if name in ROBOT_ESTIMATORS else None
     estimator = make_estimator(name, types, options.tied, None if learnt is None else learnt.arm)
     calibration = calibrate(name)
     factor = calibration.function_std_factor
@@ -65,7 +68,7 @@ def fit_estimator(
         fewer = options if learnt is None else independent_samples(options, learnt)
         fitted = fit(estimator.kernel, samples, fewer, task.on_progress, task.cancelled, task.stretches, start)
         used = samples.rows(fitted.rows)
-        compression, stands_on, conformal = compact(task, estimator, fitted.params, used)
+        compression, stands_on, conformal = compact(task, estimator, fitted.params, used, misfit)
         report = {**asdict(fitted.report), **stands_on}
         if learnt is not None:
             seconds = float(learnt.report["seconds"]) + fitted.report.seconds
@@ -87,13 +90,15 @@ def fit_estimator(
 
 
 def compact(
-    task: Task, estimator: Estimator, params: Params, used: Samples
+    task: Task, estimator: Estimator, params: Params, used: Samples, rigid: Misfit | None = None
 ) -> tuple[Compression, dict[str, float], Conformal]:
     """The compact posterior of an estimator with a nonlinear term; for the manifest, the jitter, (N·m)², that the exact
     one took, and how many independent samples it stands on; and what left-out blocks say of its intervals.
 
-    used: samples of the task's recordings. A torque counts as `Misfit.of_row` says; what that is, contiguous samples
-    tell. Raise NotPositiveDefiniteError where the exact posterior cannot be computed.
+    used: samples of the task's recordings; rigid: misfit of the arm that was learnt from them. A torque counts as
+    `Misfit.of_row` says; what that is, contiguous samples tell: of friction at rest less than the arm does, since a
+    nonlinear term follows the few samples that it has there. Raise NotPositiveDefiniteError where the exact posterior
+    cannot be computed.
     """
     options, factor = task.options, calibrate(estimator.name).function_std_factor
     compression, jitter = compressed(
@@ -106,6 +111,7 @@ def compact(
     moved = np.stack([contiguous.dq, contiguous.ddq])
     misfit, _ = estimate(residual, contiguous.tau, moved, contiguous.episodes(), noise.numpy())
     misfit = misfit.with_friction(friction_coefficients(posterior, estimator).coulomb)
+    misfit = misfit if rigid is None else misfit.with_rest(rigid)
     motion = used.motion()
     variance = misfit.of_row(noise, motion.dq, shared_rows(task.samples, len(used)))
     statistics = collect(posterior.basis, variance, motion, used.torque() - estimator.kernel.mean(motion))

@@ -8,15 +8,19 @@ import pytest
 import torch
 
 from lipcore import FitOptions, Samples, load, save, train
+from lipcore.arm.learning import learn
 from lipcore.data.metrics import evaluate
 from lipcore.data.motion import Motion
+from lipcore.fitting.task import Task
 from lipcore.kernels.compiled.answer import ACCELERATED
+from lipcore.kernels.geometry import Geometry
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.misfit import AT_REST, ROWS, Misfit, estimate, low_speed_variance, shared_rows
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate
 from lipcore.robots.urdf import RigidBody
+from lipcore.training.fit import fit_estimator
 
 TYPES = ("revolute",) * 2
 ROBOT = load_robot("double-pendulum")
@@ -126,3 +130,17 @@ def test_it_is_saved_and_loaded(model: TorqueModel, tmp_path: Path) -> None:
     for name in ("tau", "tau_std"):
         found, expected = (getattr(each.predict(query.q, query.dq, query.ddq), name) for each in (again, model))
         np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_the_black_box_is_as_unsure_at_rest_as_the_arm() -> None:
+    samples = dirty(1)
+    task = Task(samples, TYPES, QUICK)
+    robot = RigidBody.from_profile("double-pendulum", samples.joint_names, TYPES)
+    arm = learn(task, begin=[Geometry.from_robot(robot)])
+    louder = replace(arm, misfit=replace(arm.misfit, rest=4 * arm.misfit.rest))
+    for name in ("lip-chain", "rigid-body+lip-chain"):
+        misfit = fit_estimator(task, name, louder).posterior.misfit
+        assert (misfit.rest >= louder.misfit.rest).all()
+        taken = misfit.rest == louder.misfit.rest
+        assert taken.any()
+        assert torch.equal(misfit.slow[taken], arm.misfit.slow[taken])

@@ -15,6 +15,7 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
 from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, copy_model, load, save, train
+from lipcore.data.motion import Motion
 from lipcore.files import persistence
 from lipcore.files.strict_json import MAX_DEPTH, StrictJsonError, quote, read
 from lipcore.robots.library import load_robot
@@ -118,6 +119,15 @@ def test_tampered_tensors_are_refused(folder: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "copy").exists()
 
 
+def test_a_misfit_of_the_last_release_knows_no_accelerations(folder: Path) -> None:
+    """It has four rows: variance grows with speed alone."""
+    rest, slow, lasting, speed = rows = torch.tensor([[4.0, 1.0], [0.1, 0.2], [0.5, 0.0], [2.0, 3.0]]).double()
+    edit_tensors(folder, lambda tensors: tensors.update(misfit=rows))
+    dq = 3 * speed[None]
+    found = load(folder).posterior.misfit.variance(Motion(dq, dq, 100 * dq))
+    torch.testing.assert_close(found, rest * torch.exp(-((dq / slow) ** 2)) + 8 * lasting)
+
+
 def test_file_that_cannot_be_read_is_named(folder: Path) -> None:
     path = folder / "manifest.json"
     content = path.read_bytes()
@@ -147,6 +157,19 @@ def test_file_that_cannot_be_read_is_named(folder: Path) -> None:
         ({"calibration": {"function_std_factor": 0.9}}, "function_std_factor is 0.9, expected a number from 1 to 100"),
         ({"calibration": {"factor": 2.0}}, "calibration lacks function_std_factor"),
         ({"tensors": {}}, "tensors lacks file"),
+        ({"conformal": {"scale": [1, 1], "blocks": 3}}, "conformal lacks guaranteed"),
+        (
+            {"conformal": {"scale": [1, 0.5], "guaranteed": [0.5, 0.5], "blocks": 3}},
+            r"conformal.scale\[1\] is 0.5, expected a number from 1",
+        ),
+        (
+            {"conformal": {"scale": [1, 1], "guaranteed": [0.5, 0.5], "blocks": True}},
+            "conformal.blocks is True, expected a whole number",
+        ),
+        (
+            {"conformal": {"scale": [1, 1], "guaranteed": [0.5, 0.5], "blocks": 0}},
+            "conformal: blocks is 0, expected at least 1",
+        ),
     ],
     ids=str,
 )
@@ -171,6 +194,8 @@ def test_wrong_manifest_entry_is_named(folder: Path, changes: dict[str, Any], me
         ("inducing/outputs", torch.zeros(2).double(), "'inducing/outputs' is of type float64, expected int64"),
         ("inducing/outputs", torch.tensor([0, 0]), "expected distinct places of torques"),
         ("inducing/outputs", torch.tensor([0, 5000]), "outputs reaches from 0 to 5000"),
+        ("misfit", torch.zeros(3, 2).double(), r"'misfit' has shape \(3, 2\), expected \(5, 2\)"),
+        ("misfit", -torch.ones(5, 2).double(), "'misfit' has a number below zero"),
     ],
     ids=lambda value: value if isinstance(value, str) and "/" in value else "",
 )
