@@ -16,9 +16,9 @@ import numpy as np
 import torch
 
 import lipcore
-from benchmarks.studies.real_recordings import from_signals
 from lipcore.data.metrics import LEVEL, evaluate, quantile
 from lipcore.data.samples import Samples
+from lipcore.data.signals import differentiate, low_pass
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import Stream, simulate
@@ -46,9 +46,9 @@ def unseen(robot: Robot, seconds: float, dirt: Dirt, case: str, seed: int) -> Sa
 
 
 def prepared(samples: Samples) -> Samples:
-    """As recordings are prepared, and every fifth row kept."""
-    whole = from_signals(samples.joint_names, RATE, samples.q, samples.dq, samples.tau)
-    return whole.rows(slice(None, None, KEEP))
+    """As recordings are prepared: low-passed alike, acceleration from velocity; and every fifth row kept."""
+    q, dq, tau = (low_pass(signal, RATE) for signal in (samples.q, samples.dq, samples.tau))
+    return replace(samples, q=q, dq=dq, ddq=differentiate(dq, RATE), tau=tau).rows(slice(None, None, KEEP))
 
 
 def main() -> None:

@@ -43,7 +43,7 @@ class Remaining:
                 self._ends = clock + at.elapsed * (1 - at.fraction) / at.fraction
             return
         if at.stage == SEARCH:
-            if self._first is None:
+            if self._first is None or at.iteration <= self._first[1]:  # or another search: that for the arm comes first
                 self._first = (clock, at.iteration)
             elif at.iteration >= LEAST_ITERATIONS:
                 began, before = self._first

@@ -115,6 +115,16 @@ def test_a_steady_search_counts_down_to_the_end(ratio):
     assert left.seconds(111.0) == pytest.approx(2.0 * after - 1.0)
 
 
+def test_a_second_search_begins_anew():
+    """As where an arm is learnt before the hyperparameters of what it leaves: both count from their own start."""
+    left = Remaining(100, 100)
+    for iteration in (3, 4, 5):
+        left.step(at(iteration), 10.0 * iteration)
+    for iteration in (1, 2, 3, 4):
+        left.step(at(iteration), 60.0 + 2.0 * iteration)
+    assert left.seconds(68.0) == pytest.approx(2.0 * (46 + POSTERIOR_ITERATIONS))
+
+
 def test_the_time_that_is_left_of_several_fits_is_that_of_their_share():
     left = Remaining(100, 500)
     left.step(FitProgress("geometry", 1, 150, 0.0, LEAST_FRACTION / 2, 1.0, "rigid-body"), 11.0)
