@@ -97,7 +97,7 @@ def learn(
             polished.add(problem.descend(geometry, sigma, POLISHING, watch.stop))
         ends = polished.points
         watch.step("hyperparameters", ends[0].value, 0.85)
-        counting = _Counting(task.signals, order, shared_rows(samples, len(rows)))
+        counting = _Counting(task.contiguous(CORRELATED), order, shared_rows(samples, len(rows)))
         problem = counting.applied(problem, ends[0], at_rest=False)
         ends = sorted((problem.at(each.geometry, each.sigma) for each in ends), key=lambda each: each.value)
         best, others, problem, stribeck_nats = _refined(problem, ends, counting, watch)
@@ -128,10 +128,10 @@ def learn(
 
 @dataclass(frozen=True)
 class _Counting:
-    """What each torque counts. signals: contiguous samples; order: (n,), the data's joint at each place of the chain;
-    shared: rows of a problem that have an error in common where it lasts."""
+    """What each torque counts. contiguous: samples; order: (n,), the data's joint at each place of the chain; shared:
+    rows of a problem that have an error in common where it lasts."""
 
-    signals: Samples
+    contiguous: Samples
     order: NDArray[np.int64]
     shared: float
 
@@ -144,10 +144,9 @@ class _Counting:
 
     def misfit(self, problem: Problem, point: Point, least: Array | float = 0.0) -> tuple[Misfit, Array]:
         """What `estimate` says of what a point leaves of contiguous samples, base to tip."""
-        contiguous = self.signals.rows(slice(0, CORRELATED))
-        recorded = with_samples(problem, contiguous, self.order)
+        recorded = with_samples(problem, self.contiguous, self.order)
         residual, moved = recorded.tau - recorded.mean(point), recorded.motions[:, 1:].swapaxes(0, 1)
-        return estimate(residual, recorded.tau, moved, contiguous.episodes(), least)
+        return estimate(residual, recorded.tau, moved, self.contiguous.episodes(), least)
 
 
 def _search(

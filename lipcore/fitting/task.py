@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from lipcore.data.motion import check_finite, check_joint_types
 from lipcore.data.samples import Samples
 from lipcore.fitting.hyperparameters import Cancelled, Progress
@@ -13,6 +15,8 @@ from lipcore.vocabulary import TORQUE_CONVENTIONS, JointType, TorqueConvention
 
 MIN_SAMPLES = 10
 """Fewer samples say too little to fit anything to."""
+STRETCHES = 20
+"""Places of a long recording that contiguous samples are taken from."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,17 @@ class Task:
     def signals(self) -> Samples:
         """The contiguous samples that tell the white noise."""
         return self.samples if self.stretches is None else self.stretches
+
+    def contiguous(self, most: int) -> Samples:
+        """`signals`, or of more than `most` so many, in STRETCHES from all over them, each an episode of its own."""
+        signals, length = self.signals, most // STRETCHES
+        if len(signals) <= most:
+            return signals
+        begins = np.linspace(0, len(signals) - length, STRETCHES).round().astype(np.int64)
+        rows = (begins[:, None] + np.arange(length)).reshape(-1)
+        stretch = np.repeat(np.arange(STRETCHES), length)
+        episode = np.unique(np.stack([signals.episode[rows], stretch]), axis=1, return_inverse=True)[1]
+        return replace(signals.rows(rows), episode=episode.reshape(-1))
 
     def on(self, samples: Samples) -> Task:
         """The same task on other samples of the same recordings."""

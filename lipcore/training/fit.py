@@ -30,7 +30,7 @@ from lipcore.vocabulary import ROBOT_ESTIMATORS
 LEAST_SAMPLES = 50
 """That hyperparameters are fitted to."""
 CONTIGUOUS = 4000
-"""Rows that tell the misfit."""
+"""Rows at most that tell the misfit."""
 
 
 def fit_estimator(
@@ -105,7 +105,7 @@ def compact(
         estimator.kernel, params, used, options.compact_tolerance, options.max_inducing_outputs, factor
     )
     posterior = compression.posterior
-    contiguous = task.signals.rows(slice(0, CONTIGUOUS))
+    contiguous = task.contiguous(CONTIGUOUS)
     residual = contiguous.tau - posterior.mean(contiguous.motion()).numpy()
     noise = posterior.noise_variance
     moved = np.stack([contiguous.dq, contiguous.ddq])

@@ -132,6 +132,21 @@ def test_it_is_saved_and_loaded(model: TorqueModel, tmp_path: Path) -> None:
         np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
+def test_stretches_of_a_long_recording_are_from_all_over_it() -> None:
+    slow, fast = dirty(1), dirty(2, speed=50.0)
+    samples = Samples.concatenate([slow, fast])
+    task = Task(samples, TYPES)
+    assert task.contiguous(len(samples)) is samples
+    part = task.contiguous(400)
+    assert len(part) == 400
+    speeds = (np.sqrt(np.mean(each.dq**2, axis=0)) for each in (part, samples))
+    np.testing.assert_allclose(*speeds, rtol=0.2)
+    lengths = {each.stop - each.start for each in part.episodes()}
+    assert lengths == {20}
+    for each in part.episodes():
+        np.testing.assert_allclose(np.diff(part.t[each]), 1 / STREAM.rate, rtol=1e-6)
+
+
 def test_the_black_box_is_as_unsure_at_rest_as_the_arm() -> None:
     samples = dirty(1)
     task = Task(samples, TYPES, QUICK)
