@@ -34,8 +34,8 @@ DEVIATIONS = 12.0
 """Usual deviations that are let pass.
 
 This, USUAL, QUIET, LEAD and TURN were tuned on 612 simulated recordings of a double pendulum and a UR5 (seeds 1 and 2),
-clean, with Coulomb friction and with `Dirt`, at 10 to 250 Hz. In two of them a row was left out that was sound: moves
-of 0.1 to 0.5 s, sampled at 10 Hz.
+clean, with Coulomb friction and with `Dirt`, at 10 to 250 Hz. In two of the UR5's 252 a row was left out that was
+sound: moves of 0.1 to 0.5 s, sampled at 10 Hz.
 """
 SHARE_OF_SPREAD = 0.02
 """What a deviation is to exceed of the column's spread (2nd to 98th percentile), besides DEVIATIONS usual ones."""
