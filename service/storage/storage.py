@@ -240,6 +240,7 @@ def _unusable_files(settings: Settings, error: OSError) -> str:
 
 
 def _unusable_database(settings: Settings, damage: str) -> str:
+    damage = " ".join(damage.split())  # SQLite's comes in several lines
     if settings.database_url is not None:
         return f"the database of LIPSERVE_DATABASE_URL cannot be used: {damage}"
     path = settings.home / FILE

@@ -9,7 +9,8 @@ import pytest
 from service.datasets.asking import MEDIA_TYPE_OF
 from tests.service.data import post, train
 
-PANDA = Path(__file__).parents[3] / "shared/data/panda_exciting_trajectory.db3"
+DATA = Path(__file__).parents[3] / "shared/data"
+PANDA, SCHUNK = DATA / "panda_exciting_trajectory.db3", DATA / "schunk_liu_althoff.npz"
 
 
 @pytest.mark.slow

@@ -10,9 +10,9 @@ from service.datasets.formats.opening import open_table
 from service.datasets.mapping.reading import read
 from service.foundation.settings import Settings
 from service.storage.storage import Disk
-from tests.lipcore.test_real_data import PANDA, SCHUNK
 from tests.service.recordings.mapping_tables import options
 from tests.service.recordings.test_mapping_names import mapped
+from tests.service.test_real_data import PANDA, SCHUNK
 
 
 def test_a_panda_is_known_by_the_names_of_its_driver():
