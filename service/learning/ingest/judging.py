@@ -158,7 +158,7 @@ def judge(batch: Screened, watch: Watch, held: bool, options: LearningOptions, u
         surprise = (error**2 / (bare**2 + batch.noise_std**2)).mean(axis=0)
         detector, change = detector.step(replace(record, standardised=surprise), float(rows.time.max()))
         if not held and not watch.gate.open and batch.trained is not None:
-            departure = _followed(departure, batch.trained, rows.take(counted), counted, batch.noise_std)
+            departure = _followed(departure, batch.trained, rows, counted, batch.noise_std)
     if held or watch.gate.open:
         change = None  # the consequence of a change that is known
     elif change is None and gate.exhausted:
@@ -185,11 +185,13 @@ def judge(batch: Screened, watch: Watch, held: bool, options: LearningOptions, u
 def _followed(
     before: Departure | None, trained: Trained, rows: Rows, counted: NDArray[np.bool_], noise_std: Array
 ) -> Departure:
-    """The departure from a version as trained after some of the rows that it has predicted."""
+    """The departure from a version as trained after rows, (P,), those of them that count: (P,)."""
     if before is None or before.version != trained.version:
         before = Departure.start(trained.version, rows.tau.shape[1])
-    error, std = rows.tau - trained.mean[counted], trained.std[counted]
-    return before.step(rows.time, rows.weight, error, std, noise_std)
+    kept = counted[trained.rows]
+    compared = rows.take(trained.rows[kept])
+    error, std = compared.tau - trained.mean[kept], trained.std[kept]
+    return before.step(compared.time, trained.share * compared.weight, error, std, noise_std)
 
 
 def _lasting(gate: ContactGate, record: Record, usual: Record, rows: Rows) -> Change:

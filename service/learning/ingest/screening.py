@@ -33,6 +33,9 @@ NON_FINITE, LIMIT, TIME_JUMP, EDGE, STATIONARY = (
     CODES.index(code) for code in ("non_finite", "limit", "time_jump", "edge", "stationary")
 )
 
+COMPARED, LEAST_COMPARED = 4.0, 10
+"""Rows that are compared with the version as trained, for each effective row, and of a batch at least: neighbours of a
+fast stream say the same, and each prediction takes time of a core."""
 FAR_AHEAD = 86400.0
 """How far ahead of its arrival a row may be dated, s: as long a recording may be sent in one go."""
 
@@ -132,9 +135,14 @@ class Dated:
 
 @dataclass(frozen=True)
 class Trained:
-    """What the version as trained, which learns nothing, predicts of the same rows: mean, std (P, n)."""
+    """What the version as trained, which learns nothing, predicts of some of the P rows that were predicted.
+
+    rows: (M,), their places among these; share: rows that each stands for; mean, std: (M, n).
+    """
 
     version: int
+    rows: NDArray[np.int64]
+    share: float
     mean: Array
     std: Array
 
@@ -245,9 +253,20 @@ def predict(
     predicted[predicted] = known
     checked = replace(rows, code=codes)
     believed = mean[judged], std[judged], bare[judged]
-    as_trained = believed[::2] if model is served.base else _answers(good.take(judged), served.base)
-    trained = Trained(served.version, *as_trained)
+    compared = evenly(good.weight[judged])
+    share = judged.sum() / max(1, len(compared))
+    if model is served.base:
+        as_trained = mean[judged][compared], bare[judged][compared]
+    else:
+        as_trained = _answers(good.take(judged).take(compared), served.base)
+    trained = Trained(served.version, compared, share, *as_trained)
     return Screened(checked, own, derived, predicted, *believed, model.noise_std, trained, seen)
+
+
+def evenly(weight: Array) -> NDArray[np.int64]:
+    """Places of the rows that are compared, out of rows of these weights, (N,)."""
+    count = min(len(weight), max(LEAST_COMPARED, int(np.ceil(COMPARED * weight.sum()))))
+    return np.linspace(0, len(weight) - 1, count).round().astype(np.int64)
 
 
 def _answers(rows: Rows, model: TorqueModel) -> tuple[Array, Array]:

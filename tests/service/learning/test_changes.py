@@ -11,7 +11,7 @@ from lipcore.online.batch import Rows
 from lipcore.online.change import ChangeDetector
 from lipcore.online.record import Record
 from service.journal import log
-from service.learning.ingest import judging
+from service.learning.ingest import judging, screening
 from service.learning.ingest.judging import ContactGate, Innovations, Watch
 from service.learning.ingest.monitor import Monitor
 from service.learning.ingest.screening import Screened
@@ -315,3 +315,14 @@ def test_a_monitor_of_a_service_that_starts_again_has_the_gates_as_they_were(bes
         again = Monitor.rebuilt(session, beside.pupil.model, names, service.settings, time.time())
     assert again._gates["arm"].patience.contacts > 0
     assert state(again) == state(service.learners.monitor(beside.pupil.model))
+
+
+@pytest.mark.parametrize(
+    ("rows", "rate", "compared"), [(10, 100.0, 10), (100, 1000.0, 10), (400, 100.0, 160), (0, 100.0, 0)]
+)
+def test_of_a_fast_stream_a_few_rows_are_compared_with_the_version_as_trained(rows, rate, compared):
+    """Ten a second count (`data.independence`): at least four for each of these, and ten of a batch."""
+    places = screening.evenly(np.full(rows, 10.0 / rate))
+    assert len(places) == len(set(places.tolist())) == compared
+    if rows:
+        assert (places[0], places[-1]) == (0, rows - 1)
