@@ -64,16 +64,17 @@ def evaluate(
     squared = np.mean(error**2, axis=0)
     # rounding gives a constant column a variance above zero
     variance = np.where(np.ptp(tau, axis=0) > 0, tau.var(axis=0), 0.0)
+    stated = scale * total
     return Metrics(
         nmse=np.divide(squared, variance, out=np.full_like(squared, np.nan), where=variance > 0),
         rmse=np.sqrt(squared),
-        coverage=_coverage(error, scale * total, level),
+        coverage=_coverage(error, stated, level),
         nlpd=np.mean(negative_log_density(error, total), axis=0),
-        width=_width(scale * total, level),
+        width=_width(stated, level),
         level=level,
-        coverages=np.array([_coverage(error, scale * total, each) for each in LEVELS]),
-        widths=np.array([_width(scale * total, each) for each in LEVELS]),
-        reliability=np.array([_coverage(error, scale * total, each) for each in RELIABILITY_LEVELS]),
+        coverages=np.array([_coverage(error, stated, each) for each in LEVELS]),
+        widths=np.array([_width(stated, each) for each in LEVELS]),
+        reliability=np.array([_coverage(error, stated, each) for each in RELIABILITY_LEVELS]),
     )
 
 

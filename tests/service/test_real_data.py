@@ -22,6 +22,6 @@ def test_panda_predicts_what_was_held_out(api: Any) -> None:
     asked = {"estimator": "rigid-body", "options": {}, "holdout": {"share": 0.3}, "promotion": "always"}
     train(api, "real-panda", dataset, **asked)
     figures = api.post("/v1/models/real-panda/evaluate", json={"dataset": dataset, "part": "held_out"}).json()
-    # twice what docs/numbers says; joint 1 turns about the vertical and carries next to nothing
-    assert (np.array(figures["nmse"]) < [0.5, 7e-4, 3e-3, 0.017, 0.09, 0.016, 0.07]).all()
+    # about twice what it is; joint 1 turns about the vertical and carries next to nothing
+    assert (np.array(figures["nmse"]) < [0.5, 7e-4, 3e-3, 0.017, 0.09, 0.011, 0.05]).all()
     assert min(figures["coverage"]) > 0.85

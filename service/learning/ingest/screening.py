@@ -256,7 +256,7 @@ def predict(
     compared = evenly(good.weight[judged])
     share = judged.sum() / max(1, len(compared))
     if model is served.base:
-        as_trained = mean[judged][compared], bare[judged][compared]
+        as_trained = believed[0][compared], believed[2][compared]
     else:
         as_trained = _answers(good.take(judged).take(compared), served.base)
     trained = Trained(served.version, compared, share, *as_trained)
