@@ -134,6 +134,23 @@ def solve(statistics: Statistics, centre: Tensor | None = None) -> Solution:
     return _by_cholesky(statistics.a, right) or _by_eigenvalues(statistics.a, right)
 
 
+def known(mean: Tensor, covariance: Tensor) -> Solution:
+    """The posterior N(mean, Σ) of whitened variables, (M,) and (M, M), as it stands; Σ is nowhere above the prior's I.
+
+    Raise NotPositiveDefiniteError where it is.
+    """
+    explained = -covariance
+    explained.diagonal().add_(1.0)
+    upper, failed = torch.linalg.cholesky_ex(explained.flip(0, 1), upper=True)
+    if not failed:
+        return Solution(mean, upper.flip(0, 1))
+    values, vectors = torch.linalg.eigh(explained)
+    if not float(values[0]) >= -ROUNDING:
+        raise NotPositiveDefiniteError(f"a covariance exceeds the prior's by {-float(values[0]):.3g}, expected less")
+    root = values.clamp_min(0.0).sqrt()[:, None] * vectors.T
+    return Solution(mean, torch.linalg.qr(root.flip(1), mode="r").R.flip(0, 1))
+
+
 def _by_cholesky(a: Tensor, right: Tensor) -> Solution | None:
     """The posterior where samples tell of every variable, so that I − Σ is positive definite; None elsewhere."""
     total = a.clone()

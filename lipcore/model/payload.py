@@ -1,0 +1,251 @@
+"""What an arm carries: a body beside those it was learnt with, and the model that answers with it.
+
+A payload is fixed to the last link, and torque is linear in its ten parameters as in those of that link. Where the
+geometry is learnt, too, torque is bilinear in it and in the payload,
+
+    tau = Y(θ + δθ) (π + payload) ≈ Y(θ) (π + payload) + J(θ, π + payload) δθ,
+
+so that it is linearised around the means of both: with the payload in J, and the payload's own features on the mean
+geometry. The variables of the posterior are those of the arm as it was learnt, and the payload's ten.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Array
+from lipcore.fitting.estimators import Estimator
+from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.base import TorqueKernel
+from lipcore.kernels.payload import CERTAIN, PayloadKernel
+from lipcore.model.plausible import is_plausible
+from lipcore.model.torque_model import TorqueModel
+from lipcore.posterior.basis import Basis
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.statistics import known
+from lipcore.robots.urdf import PARAMETERS
+
+ROOM = 10.0
+"""Prior variance that a payload's parameters get, in units of their own: Σ ≤ k diag Σ holds for every covariance of k
+numbers, so that the posterior is nowhere wider than its prior, as the evaluator has to assume."""
+
+
+class NoArmError(ValueError):
+    """The model knows no rigid bodies, to which a payload could be added."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """A rigid body in the frame of an arm's last link.
+
+    mass: kg, above zero; com: (3,) m, its centre of mass; inertia: (3, 3) kg·m² about the centre of mass, along the
+    axes of the link; that of a point where None. Raise ValueError for a body that cannot exist.
+    """
+
+    mass: float
+    com: Array
+    inertia: Array | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.mass < np.inf:
+            raise ValueError(f"mass is {self.mass!r}, expected a positive number of kg")
+        if self.com.shape != (3,) or not np.isfinite(self.com).all():
+            raise ValueError(f"com is {self.com.tolist()}, expected three finite numbers, m")
+        if self.inertia is None:
+            return
+        if self.inertia.shape != (3, 3) or not np.isfinite(self.inertia).all():
+            raise ValueError(f"inertia is {self.inertia.tolist()}, expected a matrix of 3 × 3 finite numbers, kg·m²")
+        size = np.abs(self.inertia).max()
+        if not np.allclose(self.inertia, self.inertia.T, atol=1e-6 * size):
+            raise ValueError(f"inertia is {self.inertia.tolist()}, expected a symmetric matrix")
+        spread = 0.5 * np.trace(self.inertia) * np.eye(3) - self.inertia
+        if np.linalg.eigvalsh(spread)[0] < -1e-9 * size:
+            raise ValueError(
+                f"inertia is {self.inertia.tolist()}, which no body has: expected no principal moment above the sum of "
+                "the other two"
+            )
+
+    @property
+    def parameters(self) -> Array:
+        """Mass, first moment and inertia about the link's frame, xx, xy, yy, xz, yz, zz: (10,)."""
+        own = np.zeros((3, 3)) if self.inertia is None else self.inertia
+        about = own + self.mass * (self.com @ self.com * np.eye(3) - np.outer(self.com, self.com))
+        return np.concatenate([[self.mass], self.mass * self.com, about[LOWER]])
+
+    @classmethod
+    def of(cls, parameters: Array) -> Body:
+        """The body of ten parameters; raise ValueError where none has these."""
+        mass = float(parameters[0])
+        if not is_plausible(parameters):
+            raise ValueError(f"parameters are {parameters.tolist()}, which no body has")
+        com = parameters[1:4] / mass
+        about = np.zeros((3, 3))
+        about[LOWER] = parameters[4:]
+        about = about + np.tril(about, -1).T
+        return cls(mass, com, about - mass * (com @ com * np.eye(3) - np.outer(com, com)))
+
+
+LOWER = np.tril_indices(3)
+"""Where xx, xy, yy, xz, yz and zz stand in a matrix."""
+
+
+@dataclass(frozen=True)
+class Load:
+    """What is known of a payload and, with it, of a model's whitened variables w, (M,): N(mean, covariance) of (w, π).
+
+    mean: (M + 10,); covariance: (M + 10, M + 10); room: (10,), variances that π has at most, whatever w and π are.
+    """
+
+    mean: Array
+    covariance: Array
+    room: Array
+
+    @property
+    def payload(self) -> Array:
+        """Mean of the payload's parameters, (10,)."""
+        return self.mean[-PARAMETERS:]
+
+    @property
+    def spread(self) -> Array:
+        """Covariance of the payload's parameters, (10, 10)."""
+        return self.covariance[-PARAMETERS:, -PARAMETERS:]
+
+
+@dataclass(frozen=True)
+class Carrier:
+    """A model with an arm, as what may carry a payload. Raise NoArmError where it has no arm."""
+
+    model: TorqueModel
+
+    def __post_init__(self) -> None:
+        if self.model.arm is None:
+            raise NoArmError(
+                f"estimator {self.model.estimator.name!r} knows no rigid bodies, expected a model of estimator "
+                "rigid-body or rigid-body+lip-chain"
+            )
+
+    @property
+    def term(self) -> ArmKernel:
+        """The arm among the model's terms."""
+        kernel = self.model.estimator.terms["rigid_body"]
+        assert isinstance(kernel, ArmKernel)
+        return kernel
+
+    @cached_property
+    def rows(self) -> slice:
+        """Places of the arm's weights among the variables."""
+        return self.model.posterior.basis.rows(self.term)
+
+    @cached_property
+    def mean(self) -> Array:
+        """Mean ŵ of the whitened variables, (M,)."""
+        posterior = self.model.posterior
+        return np.asarray((posterior.basis.root.T @ posterior.weights).numpy())
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance Σ of the whitened variables, (M, M)."""
+        posterior = self.model.posterior
+        learnt = (posterior.root @ posterior.basis.root).numpy()
+        return np.asarray(np.eye(len(learnt)) - learnt.T @ learnt)
+
+    def step(self, mean: Array) -> Array:
+        """Mean step of the geometry, (g,), of variables of this mean, (M,)."""
+        return np.asarray(self.term.geometry_step(mean[self.rows] * self.root[self.rows]))
+
+    @cached_property
+    def root(self) -> Array:
+        """Prior standard deviations of the weights, the diagonal of the basis' root, (M,)."""
+        return np.asarray(self.model.posterior.basis.root.diagonal().numpy())
+
+    def known(self, body: Array, spread: Array | None = None) -> Load:
+        """A payload of ten parameters that is known, with a covariance of (10, 10); exactly where None."""
+        size = len(self.mean)
+        covariance = np.zeros((size + PARAMETERS, size + PARAMETERS))
+        covariance[:size, :size] = self.covariance
+        if spread is not None:
+            covariance[size:, size:] = spread
+        room = ROOM * np.diagonal(covariance)[size:]
+        return Load(np.concatenate([self.mean, body]), covariance, np.maximum(room, CERTAIN))
+
+    def carrying(self, load: Load) -> TorqueModel:
+        """The model that answers with a payload, its intervals with what is not known of it."""
+        posterior, around = self.model.posterior, Linearised(self, load)
+        unit = np.concatenate([np.ones(len(self.mean)), np.sqrt(load.room)])
+        mean, covariance = np.append(load.mean / unit, 0.0), np.zeros((len(unit) + 1, len(unit) + 1))
+        covariance[:-1, :-1] = load.covariance / np.outer(unit, unit)
+        solved = CompactPosterior.solved(
+            around.estimator.kernel,
+            around.basis,
+            known(torch.from_numpy(mean), torch.from_numpy(covariance)),
+            posterior.noise_variance,
+            posterior.std_factor,
+            posterior.floor,
+            posterior.misfit,
+        )
+        return replace(self.model, estimator=around.estimator, posterior=solved)
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """A carrier around a load: terms whose torque is linear in w and π, see the head of this file."""
+
+    carrier: Carrier
+    load: Load
+
+    @cached_property
+    def estimator(self) -> Estimator:
+        """The model's terms, the arm's with the payload in its parameters, and the payload's."""
+        return replace(
+            self.carrier.model.estimator,
+            terms={**self._replaced(self.carrier.model.estimator.terms), "payload": self._payload},
+        )
+
+    @cached_property
+    def basis(self) -> Basis:
+        """Its variables: w, π over the root of its room, and the weight that is known."""
+        basis = self.carrier.model.posterior.basis
+        linear = tuple(self._arm if each is self.carrier.term else each for each in basis.linear)
+        own = self._payload.covariance(basis.params).diagonal().sqrt().diag()
+        root: Tensor = torch.block_diag(basis.root, own)  # type: ignore[no-untyped-call]
+        return replace(basis, linear=(*linear, self._payload), root=root)
+
+    def rows(self, motion: Motion) -> tuple[Array, Array]:
+        """Of N instants: features of (w, π), (M + 10, N, n), and the torque where both are zero, (N, n) N·m."""
+        parts, mean = [], np.zeros(motion.q.shape)
+        for kernel in self.basis.linear:
+            features, weights = kernel.features(motion).numpy(), kernel.prior_weights()
+            parts.append(features)
+            if weights is not None:
+                mean += features @ weights.numpy()
+        own = np.concatenate(parts, axis=2)[..., :-1].transpose(2, 0, 1)
+        own = own * np.append(self.carrier.root[-(len(own) - PARAMETERS) :], np.ones(PARAMETERS))[:, None, None]
+        if self.basis.term is None:
+            return own, mean
+        # of the nonlinear term, whose torques are whitened by a root that is not diagonal
+        basis = self.carrier.model.posterior.basis
+        whitened, _ = basis.features_and_uncovered(motion)
+        nonlinear = whitened[: len(basis.outputs)].reshape(-1, *motion.q.shape)
+        return np.concatenate([nonlinear.numpy(), own]), mean
+
+    @cached_property
+    def _arm(self) -> ArmKernel:
+        arm = self.carrier.term.arm
+        parameters = arm.parameters.copy()
+        parameters[-1] += self.load.payload
+        return ArmKernel(replace(arm, parameters=parameters))
+
+    @cached_property
+    def _payload(self) -> PayloadKernel:
+        step = self.carrier.step(self.load.mean[:-PARAMETERS])
+        return PayloadKernel(self.carrier.term.arm, step, self.load.payload, self.load.room)
+
+    def _replaced(self, terms: Mapping[str, TorqueKernel]) -> dict[str, TorqueKernel]:
+        return {name: self._arm if each is self.carrier.term else each for name, each in terms.items()}

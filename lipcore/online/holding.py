@@ -1,0 +1,310 @@
+"""One stream's payload, followed row by row: noticed, estimated, put down, declared."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from lipcore.data.samples import Array
+from lipcore.model.payload import Body, Carrier, Linearised, Load
+from lipcore.online.batch import Rows
+from lipcore.online.hypotheses import AFTER, BEFORE, CELL_S, LEAST_BEFORE, Cell, Kind, Window, cells_of
+from lipcore.online.payload import ANY, Estimate, Known, estimate, eta_of, known
+from lipcore.robots.urdf import PARAMETERS
+
+State = Literal["none", "payload", "contact", "friction"]
+SURE, BETTER = 20.0, 5.0
+"""Nats by which a payload explains the last cells better than nothing, and than a contact, to be taken for one at once.
+In 60 s each of slow and of fast motion of the dirty Panda of seed 50 there were up to 28 and at most 2 at a time."""
+CERTAIN, ALIKE = 60.0, 0.9
+"""What is so certain is taken for a payload where that explains so large a share of what a contact does: the torques of
+a contact are any, and those of a payload as good as the arm's geometry."""
+LASTING, NEARLY = 6, 0.5
+"""What lasts for so many cells, 0.3 s, is no knock any more, and needs a smaller share."""
+LIKELY, DOUBTFUL = 10.0, 5.0
+"""Nats from which on a contact is named, and above which cells teach nothing of the payload."""
+PRIOR: Mapping[Kind, float] = {"payload": -12.0, "contact": -7.0, "friction": -16.0}
+"""Logarithm of how probable each is to begin within a cell: a contact once a minute, a payload once in two hours, other
+friction all at once in days."""
+MOST_ROWS, BEFORE_ROWS, GROWTH = 160, 10, 1.15
+"""Rows that a payload is estimated from, evenly spread over the time since; rows before it; by how many times they have
+to grow until it is estimated again."""
+TOGETHER = 3
+"""Cells of one batch that are judged together: an instant within the last AFTER is seen all the same."""
+POSITIVE = 1.5
+"""Standard deviations above zero that the mass of a payload lies that is taken up."""
+GAP_S = 0.5
+"""A longer time between two rows: what came before is not compared with what comes after."""
+DECLARED = np.array([0.02, *[0.005] * 3, *[0.3] * 3, *[0.005] * 3])
+"""Standard deviations of η of a payload that was declared: of log mass, m, of log m, m."""
+Gains = Mapping[int, Mapping[Kind, float]]
+KINDS: tuple[Kind, ...] = ("payload", "contact", "friction")
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """A payload that is carried. since: event time, s, from which on; declared: whether it was said and not only seen;
+    rows: that it is estimated from, before: that came before it; every: of how many rows one is kept; count: rows that
+    it was seen on; due: their number at which it is estimated again; prior: what was known of it."""
+
+    since: float
+    declared: bool
+    rows: Rows
+    before: Rows
+    every: int
+    count: int
+    due: float
+    prior: Known
+    estimate: Estimate
+
+    def more(self, carrier: Carrier, rows: Rows) -> Held:
+        """The same with more rows."""
+        first = -self.count % self.every
+        kept = Rows.concatenate([self.rows, rows.take(slice(first, None, self.every))])
+        every, count = self.every, self.count + len(rows)
+        if len(kept) > MOST_ROWS:
+            kept, every = kept.take(slice(0, None, 2)), 2 * every
+        held = replace(self, rows=kept, every=every, count=count)
+        if count < self.due:
+            return held
+        found = estimate(carrier, kept, self.before, self.prior, self.estimate.eta)
+        return replace(held, due=GROWTH * count, estimate=found)
+
+
+@dataclass(frozen=True, eq=False)
+class Watch:
+    """What is known of one stream's payload; immutable. n: joints.
+
+    state: what the last cells show; probabilities: of each hypothesis; since: event time, s, of the last change of
+    whether something is held; waiting: rows that are no cell yet; recent: rows of the last cells, and these as they
+    were seen with `around`.
+    """
+
+    n: int
+    state: State = "none"
+    probabilities: Mapping[str, float] | None = None
+    since: float | None = None
+    held: Held | None = None
+    waiting: Rows | None = None
+    recent: tuple[Rows, ...] = ()
+    cells: tuple[Cell, ...] = ()
+    around: Linearised | None = None
+
+    def step(self, carrier: Carrier, rows: Rows) -> Watch:
+        """Follow rows, in order of event time."""
+        watch = self._seen_by(carrier)
+        for row in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(rows.time) > GAP_S) + 1):
+            part = rows.take(row)
+            last = watch._last
+            if last is not None and part.time[0] - last > GAP_S:
+                watch = replace(watch, waiting=None, recent=(), cells=())
+            watch = watch._run(carrier, part)
+        return watch
+
+    def declare(self, carrier: Carrier, body: Body, at: float) -> Watch:
+        """The same where a payload is known to be carried from event time `at`, s, on."""
+        eta = eta_of(body)
+        prior = Known(eta, np.diag(DECLARED**-2.0))
+        nothing = _none(self.n)
+        held = Held(at, True, nothing, nothing, 1, 0, 1.0, prior, known(carrier, prior))
+        return Watch(self.n, "payload", {"payload": 1.0}, at, held)
+
+    def put_down(self, at: float) -> Watch:
+        """The same where it is known that nothing is carried from event time `at`, s, on."""
+        return Watch(self.n, since=at)
+
+    @property
+    def load(self) -> Load | None:
+        """What is carried; None for nothing."""
+        return None if self.held is None else self.held.estimate.load
+
+    @property
+    def _last(self) -> float | None:
+        latest = self.waiting if self.waiting is not None else self.recent[-1] if self.recent else None
+        return None if latest is None else float(latest.time[-1])
+
+    def _seen_by(self, carrier: Carrier) -> Watch:
+        """The same as another revision of the model sees it."""
+        if self.around is not None and self.around.carrier is carrier:
+            return self
+        held = self.held
+        if held is not None:
+            again = estimate(carrier, held.rows, held.before, held.prior, held.estimate.eta) if len(held.rows) else None
+            held = replace(held, estimate=again or known(carrier, _as_prior(held.estimate)))
+        return replace(self, held=held)._around(carrier)
+
+    def _around(self, carrier: Carrier) -> Watch:
+        """The same with its cells as they look with the payload as it is known by now."""
+        load = carrier.known(np.zeros(PARAMETERS)) if self.load is None else self.load
+        around = Linearised(carrier, load)
+        return replace(self, around=around, cells=cells_of(around, self.recent) if self.recent else ())
+
+    def _run(self, carrier: Carrier, rows: Rows) -> Watch:
+        """Follow rows without a gap."""
+        if self.waiting is not None:
+            rows = Rows.concatenate([self.waiting, rows])
+        # half a step before the end, as times waver
+        step = float(np.median(np.diff(rows.time))) if len(rows) > 1 else 0.0
+        ends, first = [], 0
+        while first < len(rows):
+            until = rows.time[first] + CELL_S - 0.5 * step
+            last = max(int(np.searchsorted(rows.time, until, side="left")), first + 1)
+            if last == len(rows) and rows.time[-1] + step < until:
+                break
+            ends.append((first, last))
+            first = last
+        parts = [rows.take(slice(*each)) for each in ends]
+        watch = replace(self, waiting=rows.take(slice(first, None)) if first < len(rows) else None)
+        for at in range(0, len(parts), TOGETHER):
+            watch = watch._take(carrier, parts[at : at + TOGETHER])
+        return watch
+
+    def _take(self, carrier: Carrier, parts: Sequence[Rows]) -> Watch:
+        """Take in cells, and judge the last ones."""
+        assert self.around is not None
+        most = BEFORE + AFTER[-1]
+        cells = (*self.cells, *cells_of(self.around, parts))[-most:]
+        watch = replace(self, recent=(*self.recent, *parts)[-most:], cells=cells)
+        if len(cells) <= LEAST_BEFORE:
+            return watch if watch.held is None else watch._learn(carrier, parts)
+        window = Window.of(self.around, cells)
+        gains = window.gains()
+        watch = replace(watch, probabilities=_probabilities(gains))
+        return watch._free(carrier, window, gains) if self.held is None else watch._carry(carrier, parts, window, gains)
+
+    def _learn(self, carrier: Carrier, parts: Sequence[Rows]) -> Watch:
+        """Let rows teach the payload."""
+        assert self.held is not None
+        held = self.held.more(carrier, Rows.concatenate(parts))
+        watch = replace(self, state="payload", held=held)
+        return watch if held.estimate is self.held.estimate else watch._around(carrier)
+
+    def _free(self, carrier: Carrier, window: Window, gains: Gains) -> Watch:
+        """Judge cells of an arm that carries nothing as far as is known."""
+        after = _taken(window, gains)
+        return replace(self, state=_state(gains)) if after is None else self._take_up(carrier, after)
+
+    def _take_up(self, carrier: Carrier, after: int) -> Watch:
+        rows, before = Rows.concatenate(self.recent[-after:]), _none(self.n)
+        if self.held is None and len(self.recent) > after:  # rows with another payload tell another beginning
+            before = Rows.concatenate(self.recent[:-after])
+            before = before.take(slice(None, None, -(-len(before) // BEFORE_ROWS)))
+        found = estimate(carrier, rows, before)
+        since = float(rows.time[0])
+        held = Held(since, False, rows, before, 1, len(rows), GROWTH * len(rows), ANY, found)
+        watch = replace(self, state="payload", since=since, held=held, recent=self.recent[-after:])
+        return watch._around(carrier)
+
+    def _carry(self, carrier: Carrier, parts: Sequence[Rows], window: Window, gains: Gains) -> Watch:
+        """Judge cells of an arm that carries a payload."""
+        best = {kind: max(each[kind] for each in gains.values()) for kind in KINDS}
+        if max(best.values()) > LIKELY:
+            down, after = self._without(carrier, window, gains)
+            # nothing is free about an arm without a payload: what explains as much with ten numbers explains less
+            if down >= SURE and down >= NEARLY * max(gains[after].values()):
+                since = float(self.recent[-after].time[0])
+                fresh = Watch(self.n, "none", {"none": 1.0}, since, None, self.waiting, self.recent[-after:])
+                return fresh._around(carrier)
+            if (changed := _taken(window, gains, sign=False)) is not None:
+                return self._take_up(carrier, changed)
+        if max(best.values()) > DOUBTFUL:
+            state = _state(gains)
+            return replace(self, state="payload" if state == "none" else state)
+        return self._learn(carrier, parts)
+
+    def _without(self, carrier: Carrier, window: Window, gains: Gains) -> tuple[float, int]:
+        """Nats by which the arm without its payload explains the last cells better, and how many of them."""
+        assert self.held is not None
+        assert self.around is not None
+        load = self.held.estimate.load
+        mean = load.mean.copy()
+        mean[-PARAMETERS:] = 0.0
+        bare = Linearised(carrier, replace(load, mean=mean))
+        parts = self.recent[-AFTER[-1] :]
+        seen = [replace(each, features=_unloaded(each.features)) for each in cells_of(bare, parts)]
+        found = {}
+        for after in gains:
+            cells = (*window.cells[:-after], *seen[-after:])
+            found[after] = Window.of(self.around, cells).density - window.density
+        after = max(found, key=lambda each: found[each])
+        return found[after], after
+
+    def to_json(self) -> dict[str, Any]:
+        """What a batch's report says of it; `from_json` gives back what is carried."""
+        out: dict[str, Any] = {
+            "state": self.state,
+            "since": self.since,
+            "probabilities": dict(self.probabilities or {"none": 1.0}),
+            "held": None,
+        }
+        if self.held is not None:
+            found = self.held.estimate
+            out["held"] = {
+                "declared": self.held.declared,
+                "rows": self.held.count,
+                "eta": found.eta.tolist(),
+                "covariance": found.covariance.tolist(),
+            }
+        return out
+
+    @staticmethod
+    def from_json(values: Mapping[str, Any], n: int, carrier: Carrier) -> Watch:
+        """What `to_json` wrote, for n joints. Of a payload only what was known of it by itself, not of the arm with it:
+        rows that follow tell."""
+        watch = Watch(n, values["state"], values["probabilities"], values["since"])
+        if (kept := values["held"]) is None:
+            return watch
+        prior = Known(np.array(kept["eta"]), np.linalg.inv(np.array(kept["covariance"])))
+        nothing, count = _none(n), int(kept["rows"])
+        since = float(values["since"])
+        held = Held(since, kept["declared"], nothing, nothing, 1, count, count + 1.0, prior, known(carrier, prior))
+        return replace(watch, held=held)
+
+
+def _taken(window: Window, gains: Gains, sign: bool = True) -> int | None:
+    """For how many cells a payload has been carried; None where it does not show. sign: whether its mass must be
+    positive, as that of one taken up is and of a change need not be."""
+    after = max(gains, key=lambda each: gains[each]["payload"])
+    payload, contact = gains[after]["payload"], gains[after]["contact"]
+    share = NEARLY if after >= LASTING else ALIKE
+    if not (payload >= SURE and payload - contact >= BETTER) and not (
+        payload >= CERTAIN and payload >= share * contact
+    ):
+        return None
+    mass, std = window.mass(after) if sign else (1.0, 0.0)
+    return after if mass > POSITIVE * std else None
+
+
+def _unloaded(features: Array) -> Array:
+    """Features of (w, π) of an arm that carries nothing."""
+    return np.concatenate([features[:-PARAMETERS], np.zeros_like(features[-PARAMETERS:])])
+
+
+def _state(gains: Gains) -> State:
+    best = {kind: max(each[kind] for each in gains.values()) for kind in KINDS}
+    if max(best["contact"], best["friction"]) <= LIKELY:
+        return "none"
+    return "contact" if best["contact"] >= best["friction"] else "friction"
+
+
+def _probabilities(gains: Gains) -> dict[str, float]:
+    """Of nothing new, and of each hypothesis to hold for one of the numbers of cells."""
+    logs: dict[str, float] = {"none": 0.0}
+    for kind, prior in PRIOR.items():
+        logs[kind] = prior + float(np.logaddexp.reduce([each[kind] for each in gains.values()]))
+    values = np.array(list(logs.values()))
+    share = np.exp(values - np.logaddexp.reduce(values))
+    return dict(zip(logs, share.tolist(), strict=True))
+
+
+def _as_prior(found: Estimate) -> Known:
+    return Known(found.eta, np.asarray(np.linalg.inv(found.covariance), np.float64))
+
+
+def _none(n: int) -> Rows:
+    """No rows of n joints."""
+    empty: Array = np.empty((0, n))
+    return Rows(np.empty(0), empty, empty, empty, empty, np.empty(0, np.uint8))
