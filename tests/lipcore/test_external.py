@@ -31,11 +31,8 @@ def test_statistics_are_those_of_dense_matrices(n: int) -> None:
     draw = np.random.default_rng(n)
     mean = draw.normal(size=(20, n))
     tau = mean + draw.normal(size=(20, n)) * np.geomspace(0.01, 10.0, 20)[:, None]
-    seen, error, total = (
-        external(tau, mean, std, noise_std, scale, covariance),
-        tau - mean,
-        whole(covariance, noise_std, scale),
-    )
+    seen = external(tau, mean, std, noise_std, scale, covariance)
+    error, total = tau - mean, whole(covariance, noise_std, scale)
     spread = np.sqrt(np.diagonal(total, axis1=1, axis2=2))
     np.testing.assert_allclose(seen.tau, error, rtol=1e-12)
     np.testing.assert_allclose(seen.std, spread, rtol=1e-12)
@@ -53,9 +50,8 @@ def test_statistics_are_those_of_dense_matrices(n: int) -> None:
 def test_the_probability_is_right_from_the_middle_to_the_far_tail(n: int) -> None:
     tau = np.zeros((60, n))
     tau[:, 0] = np.sqrt(np.geomspace(1e-6, 1200.0, 60))
-    seen = external(
-        tau, np.zeros_like(tau), np.ones_like(tau), np.zeros(n), None, np.broadcast_to(np.eye(n), (60, n, n))
-    )
+    same = np.broadcast_to(np.eye(n), (60, n, n))
+    seen = external(tau, np.zeros_like(tau), np.ones_like(tau), np.zeros(n), None, same)
     np.testing.assert_allclose(seen.statistic, tau[:, 0] ** 2, rtol=1e-12)
     np.testing.assert_allclose(seen.p, stats.chi2.sf(tau[:, 0] ** 2, n), rtol=1e-11)
 
