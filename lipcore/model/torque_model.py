@@ -14,6 +14,7 @@ from lipcore.data.samples import Array
 from lipcore.fitting.estimators import NO_CALIBRATION, Calibration, Estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Arm
+from lipcore.model import external
 from lipcore.model.selection import Selection
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.conformal import Conformal
@@ -127,9 +128,17 @@ class TorqueModel:
         """
         return self.evaluator.one(motion, std)
 
+    def answer_with_covariance(self, motion: Array) -> tuple[Array, Array, Array]:
+        """What `answer` says of one instant, and the covariance of the function between the joints, (n, n) (N·m)²."""
+        covariance = np.empty((1, self.n_joints, self.n_joints))
+        tau, std = self.evaluator.one(motion, covariance=covariance)
+        assert std is not None  # it is asked for
+        return tau, std, covariance[0]
+
     def warm_up(self) -> None:
         """Do all that the first answer would otherwise wait for."""
         self.evaluator.warm_up()
+        external.warm_up()
 
     @cached_property
     def evaluator(self) -> Evaluator:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lipcore.data.outliers import LARGEST_TORQUE
 from lipcore.data.samples import Array
+from lipcore.model.external import external
 from lipcore.vocabulary import CODES, LEARNT
 
 Codes = NDArray[np.uint8]
@@ -100,9 +101,11 @@ def time_span(time: Array, code: Codes) -> tuple[float, float] | None:
 
 
 def is_contact(tau: Array, mean: Array, std: Array, noise_std: Array, threshold: float) -> Mask:
-    """Rows (N,) where |tau − mean| > threshold · √(std² + noise_std²) at any joint: tau, mean, std (N, n)."""
-    outside = np.abs(tau - mean) > threshold * np.sqrt(std**2 + noise_std**2)
-    return np.asarray(outside.any(axis=1))
+    """Rows (N,) where |z| of `external` is above the threshold at any joint: tau, mean, std (N, n).
+
+    Without a stream's `scale`, which follows what it measures: a contact would widen its own gate.
+    """
+    return np.asarray((np.abs(external(tau, mean, std, noise_std).z) > threshold).any(axis=1))
 
 
 LONGEST_SHARE = 0.1

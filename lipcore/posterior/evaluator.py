@@ -108,13 +108,16 @@ class Evaluator:
         other._fixed, other._floor = packed, floor
         return other
 
-    def one(self, motion: Array, std: bool = True) -> tuple[Array, Array | None]:
+    def one(self, motion: Array, std: bool = True, covariance: Array | None = None) -> tuple[Array, Array | None]:
         """Torque (n,) and, if asked for, its standard deviation (n,) at one query, (3, n): q, dq and ddq.
 
-        Neither shape nor finiteness is checked. The same numbers as of `many`, to the last bit.
+        covariance: (1, n, n), takes that between the joints where given, with std. Neither shape nor finiteness is
+        checked. The same numbers as of `many`, to the last bit.
         """
-        scratch = self._one
-        query, blocks, features, covariance, memory, own = scratch.of_one  # slicing takes as long as the arithmetic
+        scratch, what = self._one, STD if std else MEAN
+        query, blocks, features, work, memory, own = scratch.of_one  # slicing takes as long as the arithmetic
+        if covariance is not None:
+            work, what = covariance, COVARIANCE
         query[0] = motion
         if self._cross is not None:
             self._cross.fill_many(query, blocks)
@@ -131,11 +134,11 @@ class Evaluator:
             self._floor,
             self._misfit,
             query,
-            STD if std else MEAN,
+            what,
             memory,
             tau,
             deviation,
-            covariance,
+            work,
         )
         return tau[0], deviation[0] if std else None
 

@@ -21,6 +21,7 @@ from service.stream.exchange import (
     Exchange,
     StreamAnswer,
     StreamError,
+    StreamExternal,
     StreamHello,
     StreamLearnt,
     StreamRefusal,
@@ -37,6 +38,7 @@ __all__ = [
     "StreamAnswer",
     "StreamClient",
     "StreamError",
+    "StreamExternal",
     "StreamHello",
     "StreamLearnt",
     "StreamRefusal",
@@ -137,15 +139,18 @@ class StreamClient(_Stream):
         std: bool = True,
         deadline: float = 0.0,
         tau: ArrayLike | None = None,
+        external: bool = False,
+        learn: bool = True,
     ) -> StreamAnswer:
         """Return the torque at one motion: q, dq, ddq of shape (n,) in SI units.
 
         deadline: seconds that the service may take before it counts the answer as late; 0 for none; tau: (n,) N·m, the
-        torque measured there, to be learnt from after the answer.
+        torque measured there, to be learnt from after the answer where the client has a stream_id, unless learn is
+        false; external: whether to answer how much of tau the model does not explain.
         Raise StreamError where the service refuses the motion (the stream goes on), is gone, or does not answer in
         time: an answer that comes after all is dropped by the next call.
         """
-        sequence = self.send(q, dq, ddq, std, deadline, tau)
+        sequence = self.send(q, dq, ddq, std, deadline, tau, external, learn)
         while (answer := self._answer_to(sequence)) is None:
             self._take(self.timeout)
         return answer
@@ -158,9 +163,11 @@ class StreamClient(_Stream):
         std: bool = True,
         deadline: float = 0.0,
         tau: ArrayLike | None = None,
+        external: bool = False,
+        learn: bool = True,
     ) -> int:
-        """Send one query, with torque to learn from or without, and return its sequence; `receive` has its answer."""
-        sequence, frame = self._exchange.frame(q, dq, ddq, std, deadline, tau)
+        """Send one query, with torque or without, and return its sequence; `receive` has its answer."""
+        sequence, frame = self._exchange.frame(q, dq, ddq, std, deadline, tau, external, learn)
         try:
             self._socket.send(frame)
         except ConnectionClosed as error:
@@ -244,10 +251,12 @@ class AsyncStreamClient(_Stream):
         std: bool = True,
         deadline: float = 0.0,
         tau: ArrayLike | None = None,
+        external: bool = False,
+        learn: bool = True,
     ) -> StreamAnswer:
         """Return the torque at one motion; see `StreamClient.ask`. Where the task is cancelled meanwhile, the answer is
         dropped by the next call."""
-        sequence = await self.send(q, dq, ddq, std, deadline, tau)
+        sequence = await self.send(q, dq, ddq, std, deadline, tau, external, learn)
         while (answer := self._answer_to(sequence)) is None:
             await self._take(self.timeout)
         return answer
@@ -260,9 +269,11 @@ class AsyncStreamClient(_Stream):
         std: bool = True,
         deadline: float = 0.0,
         tau: ArrayLike | None = None,
+        external: bool = False,
+        learn: bool = True,
     ) -> int:
-        """Send one query, with torque to learn from or without, and return its sequence; `receive` has its answer."""
-        sequence, frame = self._exchange.frame(q, dq, ddq, std, deadline, tau)
+        """Send one query, with torque or without, and return its sequence; `receive` has its answer."""
+        sequence, frame = self._exchange.frame(q, dq, ddq, std, deadline, tau, external, learn)
         try:
             await self._open().send(frame)
         except ConnectionClosed as error:

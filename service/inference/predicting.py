@@ -30,7 +30,7 @@ QUANTITIES = ("q", "dq", "ddq", "tau")
 class Query(NamedTuple):
     """Motions that torque is asked for, whatever has brought them: JSON, tensors or a frame.
 
-    values: q, dq and ddq, for forward dynamics tau too, (3 or 4, N, n) in SI units; single: whether this is one query
+    values: q, dq and ddq, tau too where it is needed, (3 or 4, N, n) in SI units; single: whether this is one query
     without an axis of queries, as its answer then is.
     """
 
@@ -52,8 +52,9 @@ class Query(NamedTuple):
 
     def components(self, model: TorqueModel, names: Sequence[ComponentName]) -> dict[str, Estimate]:
         """Estimates of parts of the dynamics by name, (N, …) each; raise InvalidRequestError where inertia cannot be
-        inverted."""
-        q, dq, ddq, *tau = (torch.from_numpy(each) for each in self.values)
+        inverted. Torque is for forward dynamics alone."""
+        parts = self.values if "forward_dynamics" in names else self.values[:3]
+        q, dq, ddq, *tau = (torch.from_numpy(each) for each in parts)
         try:
             return dynamics.components(model, Motion(q, dq, ddq), names, *tau)
         except dynamics.IndefiniteInertiaError as error:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.model.dynamics import available
+from lipcore.model.external import external
 from lipcore.model.torque_model import TorqueModel
 from lipcore.vocabulary import COMPONENTS, ComponentName
 from service.foundation.errors import invalid_request
@@ -26,7 +27,11 @@ Shape = tuple[int, ...]
 DEFAULT = ("tau", "tau_std")
 OF_MODEL = frozenset({"noise_std", "scale"})
 """Outputs that are the same for all queries, (n,)."""
-QUICK = OF_MODEL | {"tau", "tau_std"}
+OF_ARM = {"tau_external_statistic": "statistic", "tau_external_p": "p"}
+"""Outputs of external torque that are one number a query, which take a covariance."""
+EXTERNAL = {"tau_external": "tau", "tau_external_std": "std", "tau_external_z": "z"} | OF_ARM
+"""Outputs of external torque, and what of `External` they are."""
+QUICK = OF_MODEL | EXTERNAL.keys() | {"tau", "tau_std"}
 """Outputs of which one query is answered on the event loop."""
 FORWARD: ComponentName = "forward_dynamics"
 _STD = "_std"
@@ -46,7 +51,7 @@ PARTS: dict[str, Part] = {
     for suffix in ("", _STD)
 }
 """Tensors of components by name; components that are torques begin with `tau_`."""
-NEED_TORQUE = frozenset(name for name, part in PARTS.items() if part.component == FORWARD)
+NEED_TORQUE = {name for name, part in PARTS.items() if part.component == FORWARD} | EXTERNAL.keys()
 
 
 def shapes(model: TorqueModel) -> dict[str, Shape]:
@@ -54,6 +59,7 @@ def shapes(model: TorqueModel) -> dict[str, Shape]:
     n, offered = model.n_joints, available(model.estimator)
     tensors: dict[str, Shape] = {"tau": (-1, n), "tau_std": (-1, n), "covariance": (-1, n, n)}
     tensors |= dict.fromkeys(sorted(OF_MODEL), (n,))
+    tensors |= {name: (-1, 1) if name in OF_ARM else (-1, n) for name in EXTERNAL}
     for name, part in PARTS.items():
         if part.component in offered:
             tensors[name] = _shape(part.component, n)
@@ -133,23 +139,23 @@ def _binary(output: schema.InferOutput, field: str, usual: bool) -> bool:
     return usual if asked.binary_data is None else asked.binary_data
 
 
-def _inputs(request: schema.InferRequest, forward: bool) -> tuple[str, ...]:
+def _inputs(request: schema.InferRequest, torque: bool) -> tuple[str, ...]:
     """Names of the tensors that the query needs; they are all there, each once, and no other."""
-    needed = (*schema.INPUTS, schema.TORQUE) if forward else schema.INPUTS
+    needed = (*schema.INPUTS, schema.TORQUE) if torque else schema.INPUTS
     names = [tensor.name for tensor in request.inputs]
     for index, name in enumerate(names):
-        if name == schema.TORQUE and not forward:
-            raise invalid_request(schema.TORQUE, "given", f"no tau, or {FORWARD} among the outputs")
+        if name == schema.TORQUE and not torque:
+            raise invalid_request(schema.TORQUE, "given", f"no tau, or {FORWARD} or tau_external among the outputs")
         if name not in needed:
             raise invalid_request(f"inputs[{index}].name", name, f"one of {', '.join(needed)}")
         if name in names[:index]:
             raise invalid_request(f"inputs[{index}].name", name, "each input once")
     for name in needed:
         if name not in names:
-            torque = f"the torque that {FORWARD} is asked for, shaped as q"
-            raise invalid_request(
-                name, "missing", torque if name == schema.TORQUE else f"the inputs {', '.join(needed)}"
-            )
+            expected = f"the inputs {', '.join(needed)}"
+            if name == schema.TORQUE:
+                expected = f"the torque that {FORWARD} or tau_external is asked for, shaped as q"
+            raise invalid_request(name, "missing", expected)
     return needed
 
 
@@ -220,22 +226,35 @@ def _listed(tensor: schema.InferInput, count: int) -> Array:
 def compute(served: Served, query: Query, names: frozenset[str]) -> dict[str, Array]:
     """Tensors by name, their first axis N, but for those OF_MODEL; nothing is computed that they do not need. Raise
     InvalidRequestError where inertia cannot be inverted."""
-    model = served.model
-    tensors = _torques(model, query.values[:3], names)
+    model, scale = served.model, served.scales.of(None)
+    compared, of_arm = names & EXTERNAL.keys(), bool(names & OF_ARM.keys())
+    needed = {"covariance"} if of_arm else {"tau", "tau_std"} if compared else set()
+    tensors = _torques(model, query.values[:3], names | needed)
     if names & OF_MODEL:
-        tensors |= {"noise_std": model.noise_std, "scale": served.scales.of(None)}
+        tensors |= {"noise_std": model.noise_std, "scale": scale}
+    if compared:
+        between = tensors["covariance"] if of_arm else None
+        seen = external(query.values[3], tensors["tau"], tensors["tau_std"], model.noise_std, scale, between)
+        tensors |= {name: _rows(getattr(seen, EXTERNAL[name])) for name in compared}
     parts = {name: PARTS[name] for name in names if name in PARTS}
     if parts:
         estimates = query.components(model, sorted({part.component for part in parts.values()}))
         for name, part in parts.items():
             estimate = estimates[part.component]
-            values: Array = (estimate.std if part.std else estimate.mean).numpy()
-            tensors[name] = values[:, None] if values.ndim == 1 else values
+            tensors[name] = _rows((estimate.std if part.std else estimate.mean).numpy())
     return tensors
+
+
+def _rows(values: Array) -> Array:
+    """Values of N queries with an axis besides, should they be one number each."""
+    return values[:, None] if values.ndim == 1 else values
 
 
 def _torques(model: TorqueModel, motion: Array, names: frozenset[str]) -> dict[str, Array]:
     """motion: q, dq and ddq, (3, N, n)."""
+    if "covariance" in names and motion.shape[1] == 1:
+        names_of = "tau", "tau_std", "covariance"
+        return dict(zip(names_of, (each[None] for each in model.answer_with_covariance(motion[:, 0])), strict=True))
     if "covariance" in names:
         batch = model.predict(motion[0], motion[1], motion[2], covariance=True)
         assert batch.covariance is not None  # it is asked for

@@ -16,7 +16,7 @@ from service.models import registry
 from service.models.loaded import LoadedModels, Served
 from service.models.schema import ALIAS
 from service.oip import query, schema, wire
-from service.oip.query import FORWARD, shapes
+from service.oip.query import shapes
 from service.web.observability import readiness as health
 from service.web.observability.readiness import ReadinessDep
 from service.web.route import Reply, Route, hot_route
@@ -38,17 +38,13 @@ def metadata(loaded: LoadedModels, served: Served) -> schema.ModelMetadata:
     """Describe a version and name all of its model; raise NotFoundError. Not for the event loop."""
     model = served.model
     inputs = [schema.TensorMetadata(name=each, shape=[-1, model.n_joints]) for each in schema.INPUTS]
-    outputs = shapes(model)
-    if FORWARD in outputs:
-        inputs.append(
-            schema.TensorMetadata(name=schema.TORQUE, shape=[-1, model.n_joints], parameters={"optional": True})
-        )
+    inputs.append(schema.TensorMetadata(name=schema.TORQUE, shape=[-1, model.n_joints], parameters={"optional": True}))
     return schema.ModelMetadata(
         name=served.name,
         versions=_known(loaded, served.name),
         platform=f"lipserve_{model.estimator.name}",
         inputs=inputs,
-        outputs=[schema.TensorMetadata(name=each, shape=list(shape)) for each, shape in outputs.items()],
+        outputs=[schema.TensorMetadata(name=each, shape=list(shape)) for each, shape in shapes(model).items()],
         parameters=_parameters(served, model),
     )
 
@@ -181,6 +177,11 @@ async def infer(request: Request) -> Response:
     """Answer one query, [n], or a batch, [N, n], in JSON or binary. Only what `outputs` names is computed: `tau` and
     `tau_std` where it names nothing. Nothing is clipped. `noise_std` [n] is the measurement's own deviation; an
     interval that shall hold measurements needs both, and `scale` [n], see `PredictResponse`.
+
+    With the input `tau`, as measured: `tau_external` [n], how much of it the model does not explain, `tau_external_std`
+    = `scale` · √(`tau_std`² + `noise_std`²), `tau_external_z`, the one over the other; `tau_external_statistic` of the
+    arm as one, eᵀ C⁻¹ e, χ² with n degrees of freedom where nothing touches it, and `tau_external_p`. Not a safety
+    function.
     """
     reply = await _answer(request.scope, await request.body())  # for the documentation: all has been answered before
     return reply.response()

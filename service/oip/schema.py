@@ -9,7 +9,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 from pydantic import BaseModel, Field
 
 INPUTS = ("q", "dq", "ddq")
-"""Tensors that every request brings; `forward_dynamics` also needs TORQUE."""
+"""Tensors that every request brings; `forward_dynamics` and `tau_external` also need TORQUE."""
 TORQUE = "tau"
 DATATYPES = ("FP64", "FP32")
 HEADER = "Inference-Header-Content-Length"
@@ -46,7 +46,7 @@ class RequestParameters(Struct):
 class InferInput(Struct, forbid_unknown_fields=True):
     """One tensor: its numbers in `data`, or after the JSON with `binary_data_size`."""
 
-    name: Annotated[str, Meta(description="q, dq, ddq or, for `forward_dynamics`, tau")]
+    name: Annotated[str, Meta(description="q, dq, ddq or, for `forward_dynamics` and `tau_external`, tau")]
     shape: Annotated[list[Size], Meta(description="[n] for one query, [N, n] for a batch")]
     datatype: Annotated[str, Meta(description="FP64 or FP32")]
     data: Annotated[Numbers | None, Meta(description="Numbers in row-major order, flat or in rows")] = None

@@ -15,9 +15,11 @@ from websockets.exceptions import ConnectionClosed
 
 from service.stream.frames import (
     ANSWER,
+    ASK_EXTERNAL,
     ASK_LEARN,
     ASK_STD,
     ERROR,
+    HAS_EXTERNAL,
     HAS_SCALE,
     HAS_STD,
     LATE,
@@ -56,13 +58,29 @@ class StreamHello:
 
 
 @dataclass(frozen=True, slots=True)
+class StreamExternal:
+    """What of a measured torque the model does not explain: a touch, a payload, or an error of model or sensor. Not a
+    safety function.
+
+    tau: (n,) measured − mean, N·m; std: (n,) standard deviation of that where nothing touches the arm; z: (n,) tau /
+    std; statistic: T of the arm as one, χ² with n degrees of freedom then; p: its probability to be larger than T.
+    """
+
+    tau: NDArray[np.float64]
+    std: NDArray[np.float64]
+    z: NDArray[np.float64]
+    statistic: float
+    p: float
+
+
+@dataclass(frozen=True, slots=True)
 class StreamAnswer:
     """Torque at one motion, N·m.
 
     tau: (n,) mean; tau_std: (n,) standard deviation of the function, where asked for; late: whether the answer left
     the service after its deadline; late_answers: how many of this connection have; seconds: from the arrival of the
     frame in the service to the departure of the answer; scale: (n,) factor on the half width of intervals that hold
-    measurements, where asked for.
+    measurements, external: torque that is not explained, where asked for.
     """
 
     sequence: int
@@ -74,6 +92,7 @@ class StreamAnswer:
     late_answers: int
     seconds: float
     scale: NDArray[np.float64] | None = None
+    external: StreamExternal | None = None
 
 
 @dataclass(frozen=True)
@@ -131,8 +150,13 @@ def read_answer(data: bytes) -> StreamAnswer | StreamError:
         return StreamError(error["message"], error["code"], error["detail"], None if flags & UNREAD else sequence)
     numbers = np.frombuffer(data, NUMBER, offset=ANSWER.size)
     std = numbers[n : 2 * n] if flags & HAS_STD else None
+    external = None
+    if flags & HAS_EXTERNAL:
+        numbers, last = numbers[: -3 * n - 2], numbers[-3 * n - 2 :]
+        external = StreamExternal(*last[:-2].reshape(3, n), *last[-2:].tolist())
     scale = numbers[-n:] if flags & HAS_SCALE else None
-    return StreamAnswer(sequence, numbers[:n], std, version, revision, bool(flags & LATE), late, seconds, scale)
+    tau, missed = numbers[:n], bool(flags & LATE)
+    return StreamAnswer(sequence, tau, std, version, revision, missed, late, seconds, scale, external)
 
 
 SEQUENCES = 1 << 32
@@ -177,22 +201,32 @@ class Exchange:
         self.refusals: deque[StreamRefusal] = deque(maxlen=_REFUSALS)
 
     def frame(
-        self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike, std: bool, deadline: float, tau: ArrayLike | None
+        self,
+        q: ArrayLike,
+        dq: ArrayLike,
+        ddq: ArrayLike,
+        std: bool,
+        deadline: float,
+        tau: ArrayLike | None,
+        external: bool = False,
+        learn: bool = True,
     ) -> tuple[int, bytes]:
-        """Return a query's sequence and the frame to send; raise ValueError."""
+        """Return a query's sequence and the frame to send; raise ValueError. Arguments: see `StreamClient.ask`."""
         parts = [np.ascontiguousarray(part, NUMBER) for part in (q, dq, ddq) + (() if tau is None else (tau,))]
         n = parts[0].size
         if any(part.shape != (n,) for part in parts):
             names = "q, dq and ddq" if tau is None else "q, dq, ddq and tau"
             shapes = ", ".join(str(part.shape) for part in parts)
             raise ValueError(f"{names} have the shapes {shapes}, expected (n,) each")
-        flags = ASK_STD if std else 0
-        if tau is not None:
-            if self._stream_id is None:
-                raise ValueError("tau is given, expected a client with stream_id, the name of what it was measured on")
-            flags |= ASK_LEARN
+        if external and tau is None:
+            raise ValueError("tau is missing, expected the torque measured at this motion, to tell what is external")
+        learn = learn and tau is not None and self._stream_id is not None
+        if tau is not None and not learn and not external:
+            source = "a client with stream_id, the name of what it was measured on, and learn"
+            raise ValueError(f"tau is given, expected {source}, or external")
+        flags = (ASK_STD if std else 0) | (ASK_LEARN if learn else 0) | (ASK_EXTERNAL if external else 0)
         self._sequence = (self._sequence + 1) % SEQUENCES
-        if tau is not None:
+        if learn:
             self.unsettled.append(self._sequence)
         header = REQUEST.pack(self._sequence, flags, n, deadline)
         return self._sequence, b"".join((header, *(part.tobytes() for part in parts)))

@@ -6,22 +6,22 @@ Request, 16 + 24 n bytes, or 16 + 32 n with tau:
 
     offset  type     field
     0       u32      sequence: chosen by the client, repeated in the answer
-    4       u16      flags: 1 = answer tau_std too; 2 = tau follows ddq, to be learnt from
+    4       u16      flags: 1 = answer tau_std too; 2 = learn from tau; 4 = answer the external torque of tau
     6       u16      n
     8       f64      deadline budget in s, counted from the frame's arrival in the service; 0 = none
     16      f64 n    q, rad (prismatic: m)
     …       f64 n    dq, rad/s (m/s)
     …       f64 n    ddq, rad/s² (m/s²)
-    …       f64 n    with flag 2: tau, N·m (prismatic: N), as measured at this motion
+    …       f64 n    with flag 2 or 4: tau, N·m (prismatic: N), as measured at this motion
 
 So the joints of a request begin at 16 (q), 16 + 8 n (dq), 16 + 16 n (ddq) and 16 + 24 n (tau).
 
-Answer, 32 + 8 n bytes, 8 n more with tau_std and 8 n more with scale:
+Answer, 32 + 8 n bytes, 8 n more with tau_std, 8 n with scale, 24 n + 16 with external torque:
 
     offset  type     field
     0       u32      sequence of the request
     4       u16      flags: 1 = tau_std follows tau; 2 = late: left after its deadline; 4 = error; 8 = no sequence;
-                     16 = scale comes last
+                     16 = scale follows; 32 = external torque follows, last
     6       u16      n; 0 in an error
     8       u32      version that answers
     12      u32      answers of this connection that missed their deadlines so far
@@ -30,6 +30,12 @@ Answer, 32 + 8 n bytes, 8 n more with tau_std and 8 n more with scale:
     32      f64 n    tau, N·m (prismatic: N): mean torque
     …       f64 n    tau_std, N·m: standard deviation of the function, where asked for
     …       f64 n    scale, where asked for: factor on the half width of intervals that hold measurements
+    …       f64 n    tau_external, where asked for, as all that follows, N·m: the request's tau less the mean
+    …       f64 n    tau_external_std, N·m: scale · √(tau_std² + noise_std²)
+    …       f64 n    tau_external_z: tau_external / tau_external_std
+    …       f64      tau_external_statistic: of the arm as one, T = eᵀ C⁻¹ e, e = tau_external; C has the squares of
+                     tau_external_std on its diagonal, and scaled alike the function's covariance between the joints
+    …       f64      tau_external_p: P(χ² with n degrees of freedom > T)
 
 An error has the same header, and instead of numbers UTF-8 JSON: {"error": {code, message, detail}}. The connection goes
 on. Flag 8 says that the request was too short, or no binary message, so that its sequence is unknown (and 0 here).
@@ -42,6 +48,9 @@ first answer of another version, the service sends one text message, a JSON obje
 A frame arrives when the service has read its last byte, and an answer leaves when it is handed to the socket: what
 either waits in the network or in the sockets' buffers is not counted. An answer that had to wait for a client that
 does not read is counted as late in the header of the next.
+
+External torque is no safety function. It is what the model does not explain: a touch, a payload, a fault of the sensor
+or of the model. tau must be finite then; nothing is learnt of it without flag 2.
 
 Learning. A request with flag 2 is answered like any other: the answer is made before the service learns of its torque.
 It needs `stream_id` in the address, the name of the robot or recording that the torque comes from, and no `version`:
@@ -88,6 +97,7 @@ REQUEST = Struct("<IHHd")
 """sequence, flags, n, deadline budget."""
 ASK_STD = 1
 ASK_LEARN = 2
+ASK_EXTERNAL = 4
 
 ANSWER = Struct("<IHHIIQd")
 """sequence, flags, n, version, late answers, revision, seconds."""
@@ -96,10 +106,11 @@ LATE = 2
 ERROR = 4
 UNREAD = 8
 HAS_SCALE = 16
+HAS_EXTERNAL = 32
 
 NUMBER = "<f8"
 
 
-def request_bytes(n_joints: int, learn: bool = False) -> int:
-    """Length of a request of so many joints; learn: with tau."""
-    return REQUEST.size + (4 if learn else 3) * 8 * n_joints
+def request_bytes(n_joints: int, torque: bool = False) -> int:
+    """Length of a request of so many joints; torque: with tau."""
+    return REQUEST.size + (4 if torque else 3) * 8 * n_joints

@@ -17,6 +17,7 @@ import numpy as np
 from anyio import to_thread
 from starlette.types import Message, Receive, Send
 
+from lipcore.model.external import external
 from service.foundation.errors import ErrorBody, ErrorResponse, ServiceError, invalid_request
 from service.foundation.settings import Settings
 from service.inference.predicting import Query, check_answer
@@ -130,6 +131,12 @@ class Echo(Conversation):
         return data
 
 
+_FLAGS = (
+    f"a sum of {frames.ASK_STD} to be answered tau_std, {frames.ASK_LEARN} to be learnt from, and "
+    f"{frames.ASK_EXTERNAL} to be answered the external torque"
+)
+
+
 class FrameReader:
     """Reads frames of one robot into a single buffer, which the next frame overwrites."""
 
@@ -137,20 +144,18 @@ class FrameReader:
         self.joint_names, self.n_joints, self.max_position = joint_names, len(joint_names), max_position
         self.motion: Array = np.zeros((3, self.n_joints))
         self._numbers, self._query = self.motion.reshape(-1), Query(self.motion[:, None], single=True)
-        self._lengths = {learn: frames.request_bytes(self.n_joints, learn) for learn in (False, True)}
+        self._lengths = {torque: frames.request_bytes(self.n_joints, torque) for torque in (False, True)}
 
     def read(self, data: bytes, flags: int, n: int, budget: float) -> Array:
         """Return q, dq, ddq of a frame, (3, n), whose header is already read; raise InvalidRequestError. Torque that it
-        carries must be there, and is not looked at."""
+        carries must be there, and is not looked at: see `torque`."""
         if n != self.n_joints:
             raise invalid_request("n", n, f"{self.n_joints} joints: {', '.join(self.joint_names)}")
-        both = frames.ASK_STD | frames.ASK_LEARN
-        if flags & ~both:
-            expected = f"0, {frames.ASK_STD} to be answered tau_std, {frames.ASK_LEARN} to be learnt from, or {both}"
-            raise invalid_request("flags", flags, expected)
-        length = self._lengths[learn := flags > frames.ASK_STD]
+        if flags >= 2 * frames.ASK_EXTERNAL:
+            raise invalid_request("flags", flags, _FLAGS)
+        length = self._lengths[torque := flags > frames.ASK_STD]
         if len(data) != length:
-            expected = f"{length} bytes for {n} joints{' with tau' if learn else ''}"
+            expected = f"{length} bytes for {n} joints{' with tau' if torque else ''}"
             raise invalid_request("frame", f"{len(data)} bytes long", expected)
         if not 0.0 <= budget < inf:
             raise invalid_request("deadline", budget, "seconds, or 0 for none")
@@ -158,6 +163,17 @@ class FrameReader:
         self._numbers[:] = np.frombuffer(data, frames.NUMBER, 3 * n, frames.REQUEST.size)
         self._query.check(self.max_position)
         return self.motion
+
+    def torque(self, data: bytes) -> Array:
+        """Return tau, (n,), of a frame that has been read; raise InvalidRequestError where it is not finite."""
+        tau = np.array(
+            np.frombuffer(data, frames.NUMBER, self.n_joints, self._lengths[False]), np.float64
+        )  # see `read`
+        finite = np.isfinite(tau)
+        if not finite.all():
+            joint = int(finite.argmin())
+            raise invalid_request(f"tau[{joint}]", f"{tau[joint]:g}", "a finite number")
+        return tau
 
 
 class Session(Conversation):
@@ -236,19 +252,27 @@ class Session(Conversation):
             if current is not self._served:
                 await self._follow(current)
             motion = self._reader.read(data, asked, n, budget)
-            if asked > frames.ASK_STD:
+            if asked & frames.ASK_LEARN:
                 await self._admit(sequence, asked)
-            tau, std = self._answer(motion, self._std or asked != 0)
+            if asked < frames.ASK_EXTERNAL:
+                tau, std = self._answer(motion, self._std or asked != 0)
+            else:
+                tau, std, covariance = self._answer_with_covariance(motion)
             check_answer("tau", tau)
             if std is not None:
                 check_answer("tau_std", std)
+            factor, more = self._served.scales.of(self._stream_id), b""
+            if asked >= frames.ASK_EXTERNAL:
+                more = self._external(data, tau, std, covariance, factor)
         except ServiceError as error:
             return self._refuse(sequence, flags, arrived, error)
         except Exception as error:  # the next frame may be answered
             logger.error("unexpected error in a stream of model %s", self._name, exc_info=error)
             unexpected = ServiceError("an unexpected error; the service's log says more")
             return self._refuse(sequence, flags, arrived, unexpected)
-        served, (flags, numbers) = self._served, self._numbers(sequence, asked, arrived, data, tau, std)
+        served, (flags, numbers) = self._served, self._numbers(sequence, asked, arrived, data, tau, std, factor)
+        if more:
+            flags, numbers = flags | frames.HAS_EXTERNAL, numbers + more
         now = perf_counter()
         seconds = now - arrived
         self._meter.durations.add(seconds)
@@ -279,19 +303,26 @@ class Session(Conversation):
             raise invalid_request("stream_id", "missing", expected)
         await self._learning.admit(sequence)
 
+    def _external(self, data: bytes, tau: Array, std: Array | None, covariance: Array, factor: Array) -> bytes:
+        """Numbers of the external torque of a frame; raise InvalidRequestError."""
+        assert std is not None  # it comes with the covariance
+        measured, noise_std = self._reader.torque(data), self._noise_std
+        seen = external(measured[None], tau[None], std[None], noise_std, factor, covariance[None])
+        check_answer("tau_external_statistic", seen.statistic)  # no z² is larger
+        return seen.rows.tobytes()
+
     def _numbers(
-        self, sequence: int, asked: int, arrived: float, data: bytes, tau: Array, std: Array | None
+        self, sequence: int, asked: int, arrived: float, data: bytes, tau: Array, std: Array | None, factor: Array
     ) -> tuple[int, bytes]:
-        """Flags and numbers of an answer. A frame to learn from is gathered with all of them."""
-        served = self._served
-        factor = served.scales.of(self._stream_id)
+        """Flags and numbers of an answer, external torque aside. A frame to learn from is gathered with all of them."""
         flags, numbers = 0, tau.tobytes()
         if std is not None:
             flags, numbers = frames.HAS_STD, numbers + std.tobytes()
         if asked > frames.ASK_STD:
-            assert self._learning is not None  # the frame was admitted
-            self._learning.add(Taught(served, sequence, arrived, data, numbers, factor))
-            if asked == frames.ASK_LEARN and not self._std:  # its standard deviation is for the record alone
+            if asked & frames.ASK_LEARN:
+                assert self._learning is not None  # the frame was admitted
+                self._learning.add(Taught(self._served, sequence, arrived, data, numbers, factor))
+            if not (asked & frames.ASK_STD or self._std):  # its standard deviation was for the record, or the test
                 flags, numbers = 0, tau.tobytes()
         if self._scale:
             flags, numbers = flags | frames.HAS_SCALE, numbers + factor.tobytes()
@@ -321,4 +352,5 @@ class Session(Conversation):
 
     def _take(self, served: Served) -> None:
         self._served, self._answer = served, served.model.answer
+        self._answer_with_covariance, self._noise_std = served.model.answer_with_covariance, np.array(served.noise_std)
         self._reader = FrameReader(served.model.joint_names, self.settings.max_position)

@@ -178,6 +178,8 @@ def test_one_query_gives_the_same_bits_as_many(any_case: Case) -> None:
     evaluator, query = any_case.evaluator(), np.stack(asked(any_case.query))
     tau, std, nothing = evaluator.many(*query)
     assert nothing is None
+    between, own = evaluator.many(*query, covariance=True)[2], np.empty((1, *query.shape[2:] * 2))
+    assert between is not None
     for k in range(query.shape[1]):
         one, deviation = evaluator.one(np.ascontiguousarray(query[:, k]))
         assert np.array_equal(one, tau[k])
@@ -186,6 +188,10 @@ def test_one_query_gives_the_same_bits_as_many(any_case: Case) -> None:
         mean_only, nothing = evaluator.one(np.ascontiguousarray(query[:, k]), std=False)
         assert nothing is None
         assert np.array_equal(mean_only, tau[k])
+        one, deviation = evaluator.one(np.ascontiguousarray(query[:, k]), covariance=own)
+        assert np.array_equal(one, tau[k])
+        agree(deviation, std[k])
+        agree(own[0], between[k])
 
 
 @pytest.mark.parametrize("queries", [1, QUERIES - 1, QUERIES, QUERIES + 1, 2 * QUERIES + 3])

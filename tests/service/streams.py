@@ -18,8 +18,8 @@ from service.storage.files import Files
 from tests.service.data import DEADLINE
 from tests.service.server import Server
 
-STD, LATE, ERROR, UNREAD, SCALE = 1, 2, 4, 8, 16
-LEARN = 2
+STD, LATE, ERROR, UNREAD, SCALE, EXTERNAL = 1, 2, 4, 8, 16, 32
+LEARN, ASK_EXTERNAL = 2, 4
 STREAM = "/v1/models/pendulum/stream"
 MOTION = np.array([[0.3, -0.2], [0.1, 0.4], [1.0, -0.5]])
 TAU = np.array([5.0, -2.0])
@@ -36,7 +36,7 @@ class Streaming:
 
 @dataclass(frozen=True)
 class Answer:
-    """An answer frame; error: what it says instead of numbers."""
+    """An answer frame; external: all that it says of external torque; error: what it says instead of numbers."""
 
     sequence: int
     flags: int
@@ -47,6 +47,7 @@ class Answer:
     tau: np.ndarray | None = None
     std: np.ndarray | None = None
     scale: np.ndarray | None = None
+    external: np.ndarray | None = None
     error: dict[str, Any] | None = None
 
 
@@ -57,19 +58,24 @@ def frame(
     n: int | None = None,
     budget: float = 0.0,
     tau: Any = None,
+    learn: bool = True,
 ) -> bytes:
-    """A request frame; motion: q, dq, ddq; tau: to be learnt from, where given, and flagged so."""
+    """A request frame; motion: q, dq, ddq; tau: measured, where given, and flagged to be learnt from unless told."""
     numbers = np.asarray(motion, "<f8")
     n = numbers.shape[-1] if n is None else n
     torque = b"" if tau is None else np.asarray(tau, "<f8").tobytes()
-    return struct.pack("<IHHd", sequence, flags | (LEARN if torque else 0), n, budget) + numbers.tobytes() + torque
+    return (
+        struct.pack("<IHHd", sequence, flags | (LEARN if torque and learn else 0), n, budget)
+        + numbers.tobytes()
+        + torque
+    )
 
 
 def read(data: bytes) -> Answer:
     """Read an answer frame, and check that its length is what its header says."""
     assert isinstance(data, bytes)
     sequence, flags, n, version, late, revision, seconds = struct.unpack_from("<IHHIIQd", data)
-    assert flags & ~(STD | LATE | ERROR | UNREAD | SCALE) == 0
+    assert flags & ~(STD | LATE | ERROR | UNREAD | SCALE | EXTERNAL) == 0
     assert seconds >= 0
     reply = Answer(sequence, flags, version, late, revision, seconds)
     if flags & ERROR:
@@ -78,10 +84,13 @@ def read(data: bytes) -> Answer:
         assert set(body) == {"error"}
         assert set(body["error"]) == {"code", "message", "detail"}
         return Answer(**{**vars(reply), "error": body["error"]})
-    names = ["tau", *(["std"] if flags & STD else []), *(["scale"] if flags & SCALE else [])]
-    assert len(data) == 32 + 8 * n * len(names)
-    numbers = np.frombuffer(data, "<f8", offset=32).reshape(len(names), n)
-    return Answer(**{**vars(reply), **dict(zip(names, numbers, strict=True))})
+    lengths = {"tau": n}
+    lengths |= {"std": n} if flags & STD else {}
+    lengths |= {"scale": n} if flags & SCALE else {}
+    lengths |= {"external": 3 * n + 2} if flags & EXTERNAL else {}
+    assert len(data) == 32 + 8 * sum(lengths.values())
+    parts = np.split(np.frombuffer(data, "<f8", offset=32), np.cumsum(list(lengths.values()))[:-1])
+    return Answer(**{**vars(reply), **dict(zip(lengths, parts, strict=True))})
 
 
 def dial(server: Server, path: str = STREAM, **options: Any) -> connect:

@@ -64,11 +64,11 @@ WRONG = {
     "output twice": (message(MOTION, "tau", "tau"), "outputs[1].name is tau, expected each output once"),
     "no torque": (
         message(MOTION, "forward_dynamics_std"),
-        "tau is missing, expected the torque that forward_dynamics is asked for, shaped as q",
+        "tau is missing, expected the torque that forward_dynamics or tau_external is asked for, shaped as q",
     ),
     "torque in vain": (
         message(MOTION | {"tau": [0.0, 0.0]}, "tau"),
-        "tau is given, expected no tau, or forward_dynamics among the outputs",
+        "tau is given, expected no tau, or forward_dynamics or tau_external among the outputs",
     ),
     "other model": (
         message(MOTION, model_name="x"),

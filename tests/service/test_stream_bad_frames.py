@@ -5,7 +5,7 @@ import pytest
 from websockets.exceptions import ConnectionClosedError
 
 from tests.service.data import DEADLINE
-from tests.service.streams import ERROR, MOTION, TAU, UNREAD, ask, dial, frame, hello
+from tests.service.streams import ASK_EXTERNAL, ERROR, MOTION, TAU, UNREAD, ask, dial, frame, hello
 
 
 def changed(row, joint, value):
@@ -15,12 +15,23 @@ def changed(row, joint, value):
     return motion
 
 
+def external(tau):
+    """A frame that asks how much of a torque is not explained."""
+    return frame(flags=ASK_EXTERNAL, tau=tau, learn=False)
+
+
 BAD = {
     "text": ("what is the torque?", "frame", "a text message", "a binary message"),
     "empty": (b"", "frame", "0 bytes long", "a header of 16 bytes"),
     "another robot": (frame(np.zeros((3, 7))), "n", "7", "2 joints: "),
-    "unknown flag": (frame(flags=4), "flags", "4", "0, 1 to be answered tau_std, 2 to be learnt from, or 3"),
+    "unknown flag": (frame(flags=8), "flags", "8", "a sum of 1 to be answered tau_std, 2 to be learnt from, and 4"),
     "learn, no torque": (frame(flags=2), "frame", "64 bytes long", "80 bytes for 2 joints with tau"),
+    "external, no torque": (frame(flags=ASK_EXTERNAL), "frame", "64 bytes long", "80 bytes for 2 joints with tau"),
+    "torque in vain": (frame(tau=TAU, learn=False), "frame", "80 bytes long", "64 bytes for 2 joints"),
+    "other torque": (external([1.0, 2.0, 3.0]), "frame", "88 bytes long", "80 bytes for 2 joints with tau"),
+    "nan in tau": (external([0.0, np.nan]), "tau[1]", "nan", "a finite number"),
+    "inf in tau": (external([-np.inf, np.nan]), "tau[0]", "-inf", "a finite number"),
+    "torque beyond numbers": (external([1e300, 0.0]), "tau_external_statistic[0]", "", "a finite number"),
     "nobody's torque": (frame(tau=TAU), "stream_id", "missing", "as in ?stream_id=arm-1, for flag 2"),
     "nan deadline": (frame(budget=float("nan")), "deadline", "nan", "seconds, or 0 for none"),
     "nan in q": (frame(changed(0, 1, np.nan)), "q[1]", "nan", "a finite number"),

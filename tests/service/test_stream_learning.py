@@ -18,7 +18,7 @@ from service.learning.ingest.batches import FramesResult
 from service.stream.session import Session
 from service.web.observability.meters import Meters
 from tests.service.data import DEADLINE
-from tests.service.streams import ERROR, STD, TAU, frame, read
+from tests.service.streams import ASK_EXTERNAL, ERROR, EXTERNAL, MOTION, STD, TAU, frame, read
 from tests.service.test_stream_session import Model, served
 
 QUICK = {"stream_flush_rows": 100, "stream_flush_s": 0.01}
@@ -225,6 +225,22 @@ async def test_a_torque_that_is_no_number_is_answered_and_handed_on():
         talk.put(frame(tau=[np.nan, np.inf]))
         assert (await talk.answer()).error is None
     np.testing.assert_array_equal(talk.learners.blocks[0].tau, [[np.nan, np.inf]])
+
+
+@played
+async def test_a_torque_may_be_compared_and_learnt_or_one_of_both():
+    async with Talk() as talk:
+        talk.put(frame(sequence=1, flags=ASK_EXTERNAL, tau=TAU, learn=False))  # of which nothing is learnt
+        talk.put(frame(sequence=1, flags=ASK_EXTERNAL, tau=[np.nan, 1.0]))  # an error takes no sequence
+        talk.put(frame(MOTION, 1, ASK_EXTERNAL, tau=TAU))
+        only, refused, both = [await talk.answer() for _ in range(3)]
+        assert await talk.through() == 1
+    assert refused.error["message"] == "tau[0] is nan, expected a finite number"
+    assert (only.flags, both.flags) == (EXTERNAL, EXTERNAL)
+    np.testing.assert_array_equal(only.external, both.external)
+    np.testing.assert_allclose(both.external[:2], TAU - MOTION[0])
+    (block,) = talk.learners.blocks
+    np.testing.assert_array_equal([block.tau, block.mean, block.std], [[TAU], [MOTION[0]], [[1.0, 1.0]]])
 
 
 @played

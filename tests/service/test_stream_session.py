@@ -11,7 +11,7 @@ from service.models.scales import Factor, Scales
 from service.stream.session import Echo, Session
 from service.web.observability.meters import Meters
 from tests.service.data import DEADLINE
-from tests.service.streams import ERROR, frame, read
+from tests.service.streams import ASK_EXTERNAL, ERROR, EXTERNAL, SCALE, frame, read
 
 
 class Model:
@@ -24,6 +24,9 @@ class Model:
 
     def answer(self, motion, std=True):
         return self.factor * motion[0], np.full_like(motion[0], self.factor) if std else None
+
+    def answer_with_covariance(self, motion):
+        return *self.answer(motion), self.factor**2 * (0.5 + 0.5 * np.eye(motion.shape[1]))
 
 
 class Loaded:
@@ -107,6 +110,23 @@ def test_an_answer_carries_the_scale_of_its_stream_as_it_is_then():
     loaded.memory[1].scales.take(factors)
     assert reply(asking).scale.tolist() == [1.0, 2.0]
     assert reply(talk).scale.tolist() == [0.5, 3.0]
+
+
+def test_external_torque_is_judged_by_the_scale_of_its_stream():
+    loaded = Loaded(v1=Model(2.0))
+    loaded.memory[1].scales.take({"arm": Factor(np.array([0.5, 3.0]), 100.0)})
+    request = frame([[1.0, 2.0], [0, 0], [0, 0]], flags=ASK_EXTERNAL, tau=[3.0, 1.0], learn=False)
+    for options, scale in (({"stream_id": "arm"}, [0.5, 3.0]), ({}, [1.0, 3.0]), ({"stream_id": "new"}, [1.0, 1.0])):
+        talk, _ = session(loaded, 1, scale=True, **options)
+        seen = reply(talk, request)
+        assert (seen.flags, seen.tau.tolist(), seen.scale.tolist()) == (SCALE | EXTERNAL, [2.0, 4.0], scale)
+        error, std, z = seen.external[:-2].reshape(3, 2)
+        np.testing.assert_allclose(error, [1.0, -3.0])
+        np.testing.assert_allclose(std, scale * np.sqrt(4.0 + np.array([0.1, 0.2]) ** 2))
+        np.testing.assert_allclose(z, error / std)
+        function = np.array([[4.01, 2.0], [2.0, 4.04]])
+        statistic = (error / scale) @ np.linalg.solve(function, error / scale)
+        np.testing.assert_allclose(seen.external[-2:], [statistic, np.exp(-0.5 * statistic)])
 
 
 def test_a_pinned_version_is_kept_whatever_is_newer():
