@@ -203,7 +203,7 @@ def at_once(served: Served, motion: Array, max_position: float) -> Prediction | 
     """Torque at one motion (3, n), for the event loop; None where the motion or the answer is not as it should be."""
     if motion.shape[1] != served.model.n_joints or abs(motion[0]).max() > max_position:
         return None
-    mean, deviation = served.model.answer(motion)
+    mean, deviation = served.asked.answer(motion)
     assert deviation is not None  # it is, unless declined
     tau, tau_std = mean.tolist(), deviation.tolist()
     if not isfinite(sum(tau) + sum(tau_std)):
@@ -226,7 +226,7 @@ def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: S
     query.check(settings.max_position)
 
     q, dq, ddq, *_ = query.values
-    answer = known.predict(q, dq, ddq, request.covariance)
+    answer = served.asked.predict(q, dq, ddq, request.covariance)
     arrays = {"tau": answer.tau, "tau_std": answer.tau_std}
     if answer.covariance is not None:
         arrays["covariance"] = answer.covariance
