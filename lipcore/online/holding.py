@@ -24,8 +24,11 @@ CERTAIN, ALIKE = 60.0, 0.9
 a contact are any, and those of a payload as good as the arm's geometry."""
 LASTING, NEARLY = 6, 0.5
 """What lasts for so many cells, 0.3 s, is no knock any more, and needs a smaller share."""
-LIKELY, DOUBTFUL = 10.0, 5.0
-"""Nats from which on a contact is named, and above which cells teach nothing of the payload."""
+LIKELY = 10.0
+"""Nats from which on a contact is named. Cells that are as far off as SURE teach nothing of the payload."""
+POSITIVE, ANOTHER = 1.5, 200.0
+"""Standard deviations above zero that the mass of a payload lies that is taken up; nats by which another payload has to
+explain more than the one that is carried, of which rows go on telling more. Both as SURE."""
 PRIOR: Mapping[Kind, float] = {"payload": -12.0, "contact": -7.0, "friction": -16.0}
 """Logarithm of how probable each is to begin within a cell: a contact once a minute, a payload once in two hours, other
 friction all at once in days."""
@@ -34,12 +37,11 @@ MOST_ROWS, BEFORE_ROWS, GROWTH = 160, 10, 1.15
 to grow until it is estimated again."""
 TOGETHER = 3
 """Cells of one batch that are judged together: an instant within the last AFTER is seen all the same."""
-POSITIVE = 1.5
-"""Standard deviations above zero that the mass of a payload lies that is taken up."""
 GAP_S = 0.5
 """A longer time between two rows: what came before is not compared with what comes after."""
-DECLARED = np.array([0.02, *[0.005] * 3, *[0.3] * 3, *[0.005] * 3])
-"""Standard deviations of η of a payload that was declared: of log mass, m, of log m, m."""
+DECLARED, WRONG = np.array([0.02, *[0.005] * 3, *[0.3] * 3, *[0.005] * 3]), 4.0
+"""Standard deviations of η of a payload that was declared: of log mass, m, of log m, m; and how many of them it lies
+off where rows show that something else is carried."""
 Gains = Mapping[int, Mapping[Kind, float]]
 KINDS: tuple[Kind, ...] = ("payload", "contact", "friction")
 
@@ -71,6 +73,8 @@ class Held:
         if count < self.due:
             return held
         found = estimate(carrier, kept, self.before, self.prior, self.estimate.eta)
+        if self.declared and np.abs((found.eta - self.prior.centre) / DECLARED).max() > WRONG:
+            held, found = replace(held, declared=False, prior=ANY), estimate(carrier, kept, self.before)
         return replace(held, due=GROWTH * count, estimate=found)
 
 
@@ -175,7 +179,8 @@ class Watch:
         if len(cells) <= LEAST_BEFORE:
             return watch if watch.held is None else watch._learn(carrier, parts)
         window = Window.of(self.around, cells)
-        gains = window.gains()
+        # an arm that carries nothing as far as is known may have carried something from before the first cell on
+        gains = window.gains((*AFTER, most) if self.held is None else AFTER)
         watch = replace(watch, probabilities=_probabilities(gains))
         return watch._free(carrier, window, gains) if self.held is None else watch._carry(carrier, parts, window, gains)
 
@@ -212,9 +217,9 @@ class Watch:
                 since = float(self.recent[-after].time[0])
                 fresh = Watch(self.n, "none", {"none": 1.0}, since, None, self.waiting, self.recent[-after:])
                 return fresh._around(carrier)
-            if (changed := _taken(window, gains, sign=False)) is not None:
+            if (changed := _taken(window, gains, self.held)) is not None:
                 return self._take_up(carrier, changed)
-        if max(best.values()) > DOUBTFUL:
+        if max(best.values()) > SURE:
             state = _state(gains)
             return replace(self, state="payload" if state == "none" else state)
         return self._learn(carrier, parts)
@@ -268,18 +273,24 @@ class Watch:
         return replace(watch, held=held)
 
 
-def _taken(window: Window, gains: Gains, sign: bool = True) -> int | None:
-    """For how many cells a payload has been carried; None where it does not show. sign: whether its mass must be
-    positive, as that of one taken up is and of a change need not be."""
+def _taken(window: Window, gains: Gains, held: Held | None = None) -> int | None:
+    """For how many cells something has been carried, or something else; None where that does not show."""
     after = max(gains, key=lambda each: gains[each]["payload"])
-    payload, contact = gains[after]["payload"], gains[after]["contact"]
-    share = NEARLY if after >= LASTING else ALIKE
-    if not (payload >= SURE and payload - contact >= BETTER) and not (
-        payload >= CERTAIN and payload >= share * contact
-    ):
+    contact = gains[after]["contact"]
+    share = NEARLY if LASTING <= after < len(window.cells) else ALIKE
+    sure, certain = (SURE, CERTAIN) if held is None else (ANOTHER, ANOTHER)
+
+    def shows(payload: float) -> bool:
+        return (payload >= sure and payload - contact >= BETTER) or (payload >= certain and payload >= share * contact)
+
+    if not shows(gains[after]["payload"]):
         return None
-    mass, std = window.mass(after) if sign else (1.0, 0.0)
-    return after if mass > POSITIVE * std else None
+    if held is None:
+        mass, std = window.mass(after)
+        if mass < POSITIVE * std:  # something is gone that the arm was trained with, or that was not noticed
+            return None
+    carried = np.zeros(PARAMETERS) if held is None else held.estimate.load.payload
+    return after if shows(window.of_body(after, carried)) else None
 
 
 def _unloaded(features: Array) -> Array:
@@ -291,7 +302,7 @@ def _state(gains: Gains) -> State:
     best = {kind: max(each[kind] for each in gains.values()) for kind in KINDS}
     if max(best["contact"], best["friction"]) <= LIKELY:
         return "none"
-    return "contact" if best["contact"] >= best["friction"] else "friction"
+    return "contact" if best["contact"] + PRIOR["contact"] >= best["friction"] + PRIOR["friction"] else "friction"
 
 
 def _probabilities(gains: Gains) -> dict[str, float]:

@@ -26,7 +26,7 @@ from lipcore.data.samples import Array
 from lipcore.kernels.friction import SIGN_WIDTH
 from lipcore.model.payload import Linearised
 from lipcore.online.batch import Rows
-from lipcore.online.payload import likeness, noise_parts
+from lipcore.online.payload import ANY, likeness, most_likely, noise_parts
 from lipcore.robots.urdf import PARAMETERS
 
 CELL_S = 0.05
@@ -124,18 +124,32 @@ class Window:
         """Logarithm of the density of the residuals, but for a constant."""
         return float(-0.5 * self.residual @ self.residual - np.log(np.diagonal(self.root)).sum())
 
+    def of_body(self, after: int, carried: Array) -> float:
+        """Nats by which a body that can exist explains the last cells better than that which is carried, (10,), does:
+        of ten free numbers seven torques are soon explained, of a real mass they are not."""
+        told, pull = self._of_payload(after)
+        total = pull + told @ carried
+        return most_likely(told, total, ANY, ANY.centre)[3] + float(0.5 * carried @ told @ carried - total @ carried)
+
     def mass(self, after: int) -> tuple[float, float]:
-        """Mean and standard deviation, kg, of a payload's mass where it is carried for the last cells."""
+        """Mean and standard deviation, kg, of the mass that is carried more for the last cells, of either sign."""
+        told, pull = self._of_payload(after)
+        scale = MASSES[1] * SHAPE
+        spread = np.linalg.inv(np.eye(PARAMETERS) + scale[:, None] * told * scale)
+        return MASSES[1] * float(spread[0] @ (scale * pull)), MASSES[1] * float(np.sqrt(spread[0, 0]))
+
+    def _of_payload(self, after: int) -> tuple[Array, Array]:
+        """Λ (10, 10) and ξ (10,) of what the last cells say of a payload, as in `payload`."""
         payload = np.stack([each.features[-PARAMETERS:] for each in self.cells], axis=1)
         late = (np.arange(len(self.cells)) >= len(self.cells) - after)[:, None]
         columns = (payload * late).reshape(PARAMETERS, -1).T
-        whitened = solve_triangular(self.root, columns, lower=True, check_finite=False) * (MASSES[1] * SHAPE)
-        spread = np.linalg.inv(np.eye(PARAMETERS) + whitened.T @ whitened)
-        return MASSES[1] * float(spread[0] @ whitened.T @ self.residual), MASSES[1] * float(np.sqrt(spread[0, 0]))
+        whitened = solve_triangular(self.root, columns, lower=True, check_finite=False)
+        return whitened.T @ whitened, whitened.T @ self.residual
 
-    def gains(self) -> dict[int, dict[Kind, float]]:
-        """Nats by which hypotheses explain the cells better than nothing does, by the number of cells of AFTER that
-        they hold for: of a payload, of a contact, and of other friction."""
+    def gains(self, after: Sequence[int] = AFTER) -> dict[int, dict[Kind, float]]:
+        """Nats by which hypotheses explain the cells better than nothing does, by the number of cells that they hold
+        for: of a payload, of a contact, and of other friction. after: numbers that are looked at, where at least
+        LEAST_BEFORE cells come before, or none does."""
         n, count = len(self.cells[0].q), len(self.cells)
         payload = np.stack([each.features[-PARAMETERS:] for each in self.cells], axis=1)  # (10, N, n)
         contact = np.broadcast_to(np.eye(n)[:, None], (n, count, n))
@@ -148,21 +162,21 @@ class Window:
             "friction": [np.full(n, each * usual) for each in FRICTIONS],
         }
         kinds: dict[Kind, Array] = {"payload": payload, "contact": contact, "friction": friction}
-        spans = [after for after in AFTER if count - after >= LEAST_BEFORE]
+        spans = [each for each in after if count - each >= LEAST_BEFORE or count == each]
         columns = []
         for each in kinds.values():
-            for after in spans:
-                late = (np.arange(count) >= count - after)[:, None]
+            for span in spans:
+                late = (np.arange(count) >= count - span)[:, None]
                 columns.append((each * late).reshape(len(each), -1))
         whitened = solve_triangular(self.root, np.concatenate(columns).T, lower=True, check_finite=False)
-        out: dict[int, dict[Kind, float]] = {after: {} for after in spans}
+        out: dict[int, dict[Kind, float]] = {span: {} for span in spans}
         at = 0
         for kind, each in kinds.items():
             size, number = len(each), len(spans)
             block = whitened[:, at : at + size * number].reshape(-1, number, size).transpose(1, 0, 2)
             at += size * number
-            for after, gain in zip(spans, _mixed(block, self.residual, scales[kind]), strict=True):
-                out[after][kind] = float(gain)
+            for span, gain in zip(spans, _mixed(block, self.residual, scales[kind]), strict=True):
+                out[span][kind] = float(gain)
         return out
 
 

@@ -132,7 +132,7 @@ def estimate(
         told = information[size:, size:] - cross.T @ open_ @ cross
         pull = score[size:] - cross.T @ open_ @ score[:size]
         last = eta
-        eta, spread, slope, gain = _most_likely(told, pull, prior, eta)
+        eta, spread, slope, gain = most_likely(told, pull, prior, eta)
         payload = body(eta)[0]
         of_payload = slope @ spread @ slope.T
         back = -open_ @ cross
@@ -208,7 +208,7 @@ def _whitened(roots: Array, rows: _Rows) -> tuple[Array, Array]:
     return flat[:-1], flat[-1]
 
 
-def _most_likely(told: Array, pull: Array, prior: Known, start: Array) -> tuple[Array, Array, Array, float]:
+def most_likely(told: Array, pull: Array, prior: Known, start: Array) -> tuple[Array, Array, Array, float]:
     """η that minimises ½ πᵀ Λ π − ξᵀ π + prior; its covariance, the slope there, and the evidence gained, nats."""
 
     def cost(eta: Array) -> float:

@@ -1,0 +1,161 @@
+"""A payload beside a trained arm: its parameters, the model that answers with it, its estimate from rows."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lipcore
+from lipcore.fitting.options import FitOptions
+from lipcore.model.payload import Body, Carrier, Linearised, NoArmError
+from lipcore.online.batch import Rows
+from lipcore.online.payload import ANY, body, estimate, eta_of, known
+from lipcore.robots.library import load_robot, pinocchio
+from lipcore.robots.simulation import Payload, Stream, inverse_dynamics, simulate
+from lipcore.robots.urdf import RigidBody
+
+SHIPPED = Path(__file__).parents[2] / "models" / "panda-sim"
+CARRIED = Payload(1.5, 0.0, (0.03, 0.02, 0.1))
+
+
+@pytest.fixture(scope="module")
+def carrier():
+    """The shipped Panda, learnt from torque alone."""
+    return Carrier(lipcore.load(SHIPPED))
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    """Ten seconds of a Panda that carries 1.5 kg off its last axis, and another motion without noise."""
+    robot = load_robot("panda")
+    seen = simulate(robot, Stream(1000, 100.0, speed=5.0, noise=0.05, payload=CARRIED), 7)
+    other = simulate(robot, Stream(3000, 100.0, speed=5.0, noise=0.0, payload=CARRIED, n_sinusoids=100), 11)
+    return seen, other.rows(slice(None, None, 10))
+
+
+def as_rows(samples):
+    return Rows(samples.t, samples.q, samples.dq, samples.ddq, samples.tau, np.zeros(len(samples), np.uint8))
+
+
+def errors(model, samples):
+    """Mean of the joints' nMSE, and share inside the function's 95 % interval, of the worst joint."""
+    answer = model.predict(samples.q, samples.dq, samples.ddq)
+    error = samples.tau - answer.tau
+    inside = np.abs(error) < 1.96 * np.sqrt(answer.tau_std**2 + answer.noise_std**2)
+    return ((error**2).mean(0) / samples.tau.var(0)).mean(), inside.mean(0).min()
+
+
+def test_the_parameters_of_a_body_are_those_of_pinocchio():
+    rng = np.random.default_rng(0)
+    box = np.diag([0.02, 0.03, 0.04])
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    carried = Body(1.3, rng.normal(size=3), turn @ box @ turn.T)
+    expected = pinocchio().Inertia(carried.mass, carried.com, carried.inertia).toDynamicParameters()
+    np.testing.assert_allclose(carried.parameters, expected, rtol=1e-9, atol=1e-12)
+    again = Body.of(carried.parameters)
+    np.testing.assert_allclose(again.com, carried.com, rtol=1e-9)
+    np.testing.assert_allclose(again.inertia, carried.inertia, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("mass", "com", "inertia", "said"),
+    [
+        (0.0, [0, 0, 0], None, "mass"),
+        (np.nan, [0, 0, 0], None, "mass"),
+        (1.0, [0, 0], None, "com"),
+        (1.0, [0, 0, np.inf], None, "com"),
+        (1.0, [0, 0, 0], [[1, 0], [0, 1]], "inertia"),
+        (1.0, [0, 0, 0], [[1, 0.5, 0], [0, 1, 0], [0, 0, 1]], "symmetric"),
+        (1.0, [0, 0, 0], np.diag([3.0, 1.0, 1.0]), "no body has"),
+    ],
+)
+def test_a_body_that_cannot_be_is_refused(mass, com, inertia, said):
+    with pytest.raises(ValueError, match=said):
+        Body(mass, np.array(com, float), None if inertia is None else np.array(inertia, float))
+
+
+def test_every_eta_is_a_body_that_can_exist_and_its_derivative_is_that_of_differences():
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        eta = rng.normal(size=10) * [1, 0.2, 0.2, 0.2, 0.5, 0.5, 0.5, 0.05, 0.05, 0.05] - [0, 0, 0, 0, 3, 3, 3, 0, 0, 0]
+        parameters, slope = body(eta)
+        differences = [(body(eta + step)[0] - body(eta - step)[0]) / 2e-6 for step in 1e-6 * np.eye(10)]
+        np.testing.assert_allclose(slope, np.array(differences).T, rtol=1e-5, atol=1e-8)
+        np.testing.assert_allclose(body(eta_of(Body.of(parameters)))[0], parameters, rtol=1e-2, atol=1e-5)
+
+
+def test_a_model_without_an_arm_carries_nothing():
+    robot = load_robot("double-pendulum")
+    model = lipcore.train(simulate(robot, Stream(30), 0), robot.joint_types, "lip-chain")
+    with pytest.raises(NoArmError, match="knows no rigid bodies"):
+        Carrier(model)
+
+
+def test_without_a_payload_the_model_answers_as_it_did(carrier, recorded):
+    _, other = recorded
+    before = carrier.model.predict(other.q, other.dq, other.ddq)
+    after = carrier.carrying(carrier.known(np.zeros(10))).predict(other.q, other.dq, other.ddq)
+    np.testing.assert_allclose(after.tau, before.tau, atol=1e-6)
+    np.testing.assert_allclose(after.tau_std, before.tau_std, rtol=1e-3)
+
+
+def test_what_answers_is_the_linear_model_around_the_load(carrier, recorded):
+    _, other = recorded
+    rng = np.random.default_rng(2)
+    spread = np.diag(rng.uniform(1e-4, 1e-2, 10))
+    load = carrier.known(body(eta_of(Body(1.5, np.array([0.03, 0.02, 0.1]))))[0], spread)
+    motion = as_rows(other).motion()
+    features, base = Linearised(carrier, load).rows(motion)
+    mean = base + np.einsum("knj,k->nj", features, load.mean)
+    variance = np.einsum("knj,kl,lnj->nj", features, load.covariance, features)
+    variance += carrier.model.posterior.misfit.variance(motion).numpy()
+    answer = carrier.carrying(load).predict(other.q, other.dq, other.ddq)
+    np.testing.assert_allclose(answer.tau, mean, atol=1e-6)
+    np.testing.assert_allclose(answer.tau_std, np.sqrt(variance), rtol=1e-3)
+
+
+def test_a_payload_is_known_within_a_second_and_its_intervals_hold(carrier, recorded):
+    seen, other = recorded
+    unaware, _ = errors(carrier.model, other)
+    rows = as_rows(seen)
+    for count, most in ((10, 0.1), (100, 0.01)):
+        found = estimate(carrier, rows.take(slice(0, count)))
+        mass, std = found.mass
+        assert abs(mass - 1.5) < 3 * std < 0.1
+        nmse, inside = errors(carrier.carrying(found.load), other)
+        assert nmse < most * unaware
+        assert inside > 0.85
+    assert found.gain > 1e4
+
+
+def test_a_payload_that_is_there_no_more_leaves_the_arm_as_it_was(carrier, recorded):
+    seen, _ = recorded
+    mean, covariance = carrier.mean.copy(), carrier.covariance.copy()
+    estimate(carrier, as_rows(seen).take(slice(0, 50)))
+    np.testing.assert_array_equal(carrier.mean, mean)
+    np.testing.assert_array_equal(carrier.covariance, covariance)
+
+
+def test_rows_of_an_arm_that_carries_nothing_speak_against_a_payload(carrier):
+    free = simulate(load_robot("panda"), Stream(100, 100.0, speed=5.0, noise=0.05), 8)
+    assert estimate(carrier, as_rows(free)).gain < 0
+
+
+def test_a_declared_payload_is_what_pinocchio_adds_to_an_arm_whose_frame_is_known():
+    robot = load_robot("panda")
+    still = simulate(robot, Stream(300, 10.0, speed=10.0, noise=0.01), 1)
+    bodies = RigidBody.from_profile("panda", robot.joint_names, robot.joint_types)
+    model = lipcore.train(still, robot.joint_types, "rigid-body", FitOptions(geometry="fixed"), robot=bodies)
+    carrier = Carrier(model)
+    asked = simulate(robot, Stream(100, 10.0, speed=5.0, noise=0.0), 2)
+    carried = Body(2.0, np.array([0.02, -0.03, 0.11]))
+    answer = carrier.carrying(carrier.known(carried.parameters)).predict(asked.q, asked.dq, asked.ddq)
+    more = Payload(2.0, 0.0, (0.02, -0.03, 0.11))
+    expected = inverse_dynamics(robot, asked.q, asked.dq, asked.ddq, np.ones(100), more)
+    assert ((answer.tau - expected) ** 2).mean() < 1e-4 * expected.var()
+
+
+def test_what_is_known_beforehand_is_the_load_without_rows(carrier):
+    found = known(carrier, ANY)
+    np.testing.assert_allclose(found.load.payload, body(ANY.centre)[0])
+    assert found.mass[1] == pytest.approx(1.2 * found.mass[0])

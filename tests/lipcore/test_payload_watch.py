@@ -1,0 +1,128 @@
+"""A stream's payload followed row by row: noticed, put down, declared; quiet streams and contacts are none."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lipcore
+from lipcore.model.payload import Body, Carrier
+from lipcore.online.batch import Rows
+from lipcore.online.holding import Watch
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Payload, Stream, simulate
+
+SHIPPED = Path(__file__).parents[2] / "models" / "panda-sim"
+RATE, UP, DOWN = 100.0, 20.0, 22.0
+
+
+@pytest.fixture(scope="module")
+def carrier():
+    return Carrier(lipcore.load(SHIPPED))
+
+
+def stream(seed, mass=0.0, noise=0.05, first=19.0, last=23.0):
+    """Rows of a Panda that carries a mass from UP to DOWN, off its last axis."""
+    robot, asked = load_robot("panda"), Stream(2400, RATE, speed=5.0, noise=noise)
+    free = simulate(robot, asked, seed)
+    full = simulate(
+        robot, Stream(2400, RATE, speed=5.0, noise=noise, payload=Payload(mass, 0.0, (0.02, 0.02, 0.08))), seed
+    )
+    carried = ((free.t >= UP) & (free.t < DOWN))[:, None] if mass else np.zeros((len(free), 1), bool)
+    tau = np.where(carried, full.tau, free.tau)
+    rows = Rows(free.t, free.q, free.dq, free.ddq, tau, np.zeros(len(free), np.uint8))
+    return rows.take((rows.time >= first) & (rows.time < last))
+
+
+def followed(carrier, rows, block=10):
+    """The watches after each block."""
+    watch, out = Watch(7), []
+    for first in range(0, len(rows), block):
+        watch = watch.step(carrier, rows.take(slice(first, first + block)))
+        out.append((rows.time[min(first + block, len(rows)) - 1], watch))
+    return out
+
+
+@pytest.mark.parametrize(("seed", "mass"), [(300, 0.5), (301, 3.0)])
+def test_a_payload_is_noticed_within_a_tenth_of_a_second_and_so_is_that_it_is_gone(carrier, seed, mass):
+    watches = followed(carrier, stream(seed, mass))
+    held = {round(at, 2): watch.held is not None for at, watch in watches}
+    assert not any(value for at, value in held.items() if at < UP)
+    assert all(value for at, value in held.items() if UP + 0.05 < at < DOWN)
+    assert not any(value for at, value in held.items() if at > DOWN + 0.05)
+    before_down = next(watch for at, watch in reversed(watches) if at < DOWN)
+    found, std = before_down.held.estimate.mass
+    assert abs(found - mass) < 4 * std + 0.01 * mass
+    assert before_down.since == pytest.approx(UP)
+    assert before_down.state == "payload"
+    assert sum(before_down.probabilities.values()) == pytest.approx(1.0)
+
+
+def test_a_quiet_stream_carries_nothing(carrier):
+    watches = followed(carrier, stream(302, first=0.0))
+    assert {watch.state for _, watch in watches} == {"none"}
+    assert all(watch.held is None for _, watch in watches)
+
+
+def test_a_payload_from_before_the_first_row_is_noticed_too(carrier):
+    watches = followed(carrier, stream(303, 1.0, first=20.5))
+    found = next(at for at, watch in watches if watch.held is not None)
+    assert found < 20.5 + 0.7
+
+
+def test_a_push_on_one_joint_is_a_contact_and_no_payload(carrier):
+    rows = stream(304)
+    tau = rows.tau.copy()
+    pushed = (rows.time >= UP) & (rows.time < UP + 0.2)
+    tau[pushed, 0] += 6.0  # about a vertical axis, on which weight does nothing
+    rows = Rows(rows.time, rows.q, rows.dq, rows.ddq, tau, rows.code)
+    watches = followed(carrier, rows)
+    assert all(watch.held is None for _, watch in watches)
+    assert "contact" in {watch.state for _, watch in watches}
+
+
+def test_batches_of_any_size_notice_the_same(carrier):
+    rows = stream(300, 1.0, last=21.0)
+    masses = [followed(carrier, rows, block)[-1][1].held.estimate.mass[0] for block in (3, 10, 77, len(rows))]
+    np.testing.assert_allclose(masses, 1.0, atol=0.02)
+
+
+def test_rows_that_came_before_and_a_gap_are_passed_over(carrier):
+    rows = stream(300, 1.0, last=21.0)
+    watch = Watch(7).step(carrier, rows)
+    again = watch.step(carrier, rows)
+    assert again.held.count == watch.held.count
+    later = rows.take(slice(50, 60))
+    later = Rows(later.time + 100.0, later.q, later.dq, later.ddq, later.tau, later.code)
+    assert len(watch.step(carrier, later).cells) <= 2
+
+
+def test_a_declared_payload_answers_at_once_and_rows_overrule_it(carrier):
+    rows = stream(305, 1.0, last=21.9)
+    carried = rows.take(rows.time >= UP)
+    right = Watch(7).declare(carrier, Body(1.0, np.array([0.0, 0.04, 0.08])), UP)
+    assert right.held.declared
+    np.testing.assert_allclose(right.load.payload[:1], 1.0)
+    wrong = Watch(7).declare(carrier, Body(3.0, np.array([0.0, 0.0, 0.1])), UP)
+    for block in range(0, len(carried), 10):
+        wrong = wrong.step(carrier, carried.take(slice(block, block + 10)))
+    assert wrong.held.estimate.mass[0] == pytest.approx(1.0, abs=0.05)
+    assert not wrong.held.declared
+    assert wrong.put_down(30.0).load is None
+
+
+def test_what_a_report_says_of_a_payload_is_taken_up_again(carrier):
+    watch = followed(carrier, stream(300, 1.0, last=21.0))[-1][1]
+    again = Watch.from_json(watch.to_json(), 7, carrier)
+    assert (again.state, again.since, again.held.count) == (watch.state, watch.since, watch.held.count)
+    np.testing.assert_allclose(again.load.payload, watch.load.payload)
+    np.testing.assert_allclose(again.held.estimate.covariance, watch.held.estimate.covariance)
+    nothing = Watch.from_json(Watch(7).put_down(3.0).to_json(), 7, carrier)
+    assert (nothing.held, nothing.since) == (None, 3.0)
+
+
+def test_another_revision_of_the_model_sees_the_same_payload(carrier):
+    watch = followed(carrier, stream(300, 1.0, last=21.0))[-1][1]
+    other = Carrier(carrier.model)
+    rows = stream(300, 1.0, first=21.0, last=21.1)
+    assert watch.step(other, rows).held.estimate.mass[0] == pytest.approx(watch.held.estimate.mass[0], abs=0.01)
