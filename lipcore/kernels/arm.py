@@ -60,10 +60,6 @@ class ArmKernel(LinearKernel):
         """The arm's geometry with its steps as these weights, (p,), have them."""
         return self.arm.geometry.moved(weights[self.steps]) if self.arm.steps else self.arm.geometry
 
-    def geometry_step(self, weights: Array) -> Array:
-        """Step of the geometry, (g,) rad and m, of whitened weights times their prior deviations, (p,)."""
-        return np.asarray(self.arm.expected + weights[self.steps])
-
     def torque(self, weights: Array, motion: Motion) -> Array:
         """Y(θ + δθ) π + r ∘ ddq of these weights, (p,), not linearised: (N, n) N·m. Alternative arms are left out."""
         n, geometry = self.n_joints, self.geometry(weights)

@@ -5,8 +5,7 @@ geometry is learnt, too, torque is bilinear in it and in the payload,
 
     tau = Y(θ + δθ) (π + payload) ≈ Y(θ) (π + payload) + J(θ, π + payload) δθ,
 
-so that it is linearised around the means of both: with the payload in J, and the payload's own features on the mean
-geometry. The variables of the posterior are those of the arm as it was learnt, and the payload's ten.
+so that it is linearised around the arm's geometry and the payload's mean: J is with the payload, b that of θ. The variables of the posterior are those of the arm as it was learnt, and the payload's ten.
 """
 
 from __future__ import annotations
@@ -24,8 +23,7 @@ from lipcore.data.samples import Array
 from lipcore.fitting.estimators import Estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.base import TorqueKernel
-from lipcore.kernels.payload import CERTAIN, PayloadKernel
-from lipcore.model.plausible import is_plausible
+from lipcore.kernels.payload import PayloadKernel
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.basis import Basis
 from lipcore.posterior.compact import CompactPosterior
@@ -35,6 +33,8 @@ from lipcore.robots.urdf import PARAMETERS
 ROOM = 10.0
 """Prior variance that a payload's parameters get, in units of their own: Σ ≤ k diag Σ holds for every covariance of k
 numbers, so that the posterior is nowhere wider than its prior, as the evaluator has to assume."""
+CERTAIN = 1e-12
+"""Prior variance of parameters that are known."""
 
 
 class NoArmError(ValueError):
@@ -81,17 +81,21 @@ class Body:
 
     @classmethod
     def of(cls, parameters: Array) -> Body:
-        """The body of ten parameters; raise ValueError where none has these."""
+        """The body of ten parameters, a point where no more than rounding is its own inertia; raise ValueError where
+        none has these."""
         mass = float(parameters[0])
-        if not is_plausible(parameters):
-            raise ValueError(f"parameters are {parameters.tolist()}, which no body has")
+        if not mass > 0:
+            raise ValueError(f"parameters are {parameters.tolist()}, expected a mass above zero")
         com = parameters[1:4] / mass
         about = np.zeros((3, 3))
         about[LOWER] = parameters[4:]
         about = about + np.tril(about, -1).T
-        return cls(mass, com, about - mass * (com @ com * np.eye(3) - np.outer(com, com)))
+        own = about - mass * (com @ com * np.eye(3) - np.outer(com, com))
+        return cls(mass, com, None if np.abs(own).max() <= ROUNDING * np.abs(about).max() else own)
 
 
+ROUNDING = 1e-12
+"""Share of the inertia about the link's frame that may be rounding."""
 LOWER = np.tril_indices(3)
 """Where xx, xy, yy, xz, yz and zz stand in a matrix."""
 
@@ -139,11 +143,6 @@ class Carrier:
         return kernel
 
     @cached_property
-    def rows(self) -> slice:
-        """Places of the arm's weights among the variables."""
-        return self.model.posterior.basis.rows(self.term)
-
-    @cached_property
     def mean(self) -> Array:
         """Mean ŵ of the whitened variables, (M,)."""
         posterior = self.model.posterior
@@ -155,10 +154,6 @@ class Carrier:
         posterior = self.model.posterior
         learnt = (posterior.root @ posterior.basis.root).numpy()
         return np.asarray(np.eye(len(learnt)) - learnt.T @ learnt)
-
-    def step(self, mean: Array) -> Array:
-        """Mean step of the geometry, (g,), of variables of this mean, (M,)."""
-        return np.asarray(self.term.geometry_step(mean[self.rows] * self.root[self.rows]))
 
     @cached_property
     def root(self) -> Array:
@@ -179,8 +174,7 @@ class Carrier:
         """The model that answers with a payload, its intervals with what is not known of it."""
         posterior, around = self.model.posterior, Linearised(self, load)
         unit = np.concatenate([np.ones(len(self.mean)), np.sqrt(load.room)])
-        mean, covariance = np.append(load.mean / unit, 0.0), np.zeros((len(unit) + 1, len(unit) + 1))
-        covariance[:-1, :-1] = load.covariance / np.outer(unit, unit)
+        mean, covariance = load.mean / unit, load.covariance / np.outer(unit, unit)
         solved = CompactPosterior.solved(
             around.estimator.kernel,
             around.basis,
@@ -210,7 +204,7 @@ class Linearised:
 
     @cached_property
     def basis(self) -> Basis:
-        """Its variables: w, π over the root of its room, and the weight that is known."""
+        """Its variables: w, and π over the root of its room."""
         basis = self.carrier.model.posterior.basis
         linear = tuple(self._arm if each is self.carrier.term else each for each in basis.linear)
         own = self._payload.covariance(basis.params).diagonal().sqrt().diag()
@@ -225,7 +219,7 @@ class Linearised:
             parts.append(features)
             if weights is not None:
                 mean += features @ weights.numpy()
-        own = np.concatenate(parts, axis=2)[..., :-1].transpose(2, 0, 1)
+        own = np.concatenate(parts, axis=2).transpose(2, 0, 1)
         own = own * np.append(self.carrier.root[-(len(own) - PARAMETERS) :], np.ones(PARAMETERS))[:, None, None]
         if self.basis.term is None:
             return own, mean
@@ -244,8 +238,7 @@ class Linearised:
 
     @cached_property
     def _payload(self) -> PayloadKernel:
-        step = self.carrier.step(self.load.mean[:-PARAMETERS])
-        return PayloadKernel(self.carrier.term.arm, step, self.load.payload, self.load.room)
+        return PayloadKernel(self.carrier.term.arm, self.load.room)
 
     def _replaced(self, terms: Mapping[str, TorqueKernel]) -> dict[str, TorqueKernel]:
         return {name: self._arm if each is self.carrier.term else each for name, each in terms.items()}
