@@ -5,7 +5,8 @@ geometry is learnt, too, torque is bilinear in it and in the payload,
 
     tau = Y(θ + δθ) (π + payload) ≈ Y(θ) (π + payload) + J(θ, π + payload) δθ,
 
-so that it is linearised around the arm's geometry and the payload's mean: J is with the payload, b that of θ. The variables of the posterior are those of the arm as it was learnt, and the payload's ten.
+so that it is linearised around the arm's geometry and the payload's mean: J is with the payload, the payload's own
+features are those of θ. The variables of the posterior are those of the arm as it was learnt, and the payload's ten.
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ from pydantic import (
 from lipcore.vocabulary import COMPONENTS, ComponentName, TorqueConvention
 from service.foundation.errors import invalid_request
 from service.foundation.fields import each_once, rows_of_numbers
+from service.inference.payload import Payload
 from service.models.schema import AliasName, VersionNumber
 
 _NUMBERS: dict[str, Any] = {"type": "array", "items": {"type": "number"}}
@@ -102,6 +103,12 @@ class PredictRequest(VersionChoice):
     )
     tau: Vectors | None = Field(None, description="Torque that `forward_dynamics` is asked for, N·m (prismatic: N)")
     min_revision: MinRevision = None
+    payload: Payload | None = Field(
+        None,
+        description="Answer for the arm with this on its last link, as if nothing else were on it than when it was "
+        "trained. For models with `rigid-body` or `rigid-body+lip-chain`; `tau_std` is that of the arm with it, the "
+        "payload itself is taken as exact",
+    )
 
 
 class ComponentValues(BaseModel):

@@ -15,6 +15,7 @@ from anyio import to_thread
 
 from lipcore.model.torque_model import TorqueModel
 from service.foundation.errors import RevisionNotReachedError, problem
+from service.models.declared import Declared
 from service.models.scales import Factor, Scales
 
 if TYPE_CHECKING:
@@ -46,6 +47,11 @@ class Served:
     def has_learnt_from(self, dataset: str, sha256: str) -> bool:
         """Whether it was trained on a data set or part of it, or on the same samples uploaded another time."""
         return not self.datasets.isdisjoint((dataset, sha256))
+
+    @cached_property
+    def declared(self) -> Declared:
+        """What answers with payloads that queries declare, instead of what its streams carry."""
+        return Declared(self.model)
 
     @cached_property
     def noise_std(self) -> list[float]:
