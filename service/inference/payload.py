@@ -40,8 +40,8 @@ class Payload(BaseModel):
     com: Vector = Field(
         description="Centre of mass, m, in the frame of the last link. Of a model around a URDF that is the frame of "
         "the URDF's last movable joint. An arm that was learnt from torque alone has frames of its own, which "
-        "`parameters.geometry` of the version lists: its last one need not lie at the flange or point as it does, and all may be "
-        "mirrored: a position measured at the flange has to be brought into it first"
+        "`parameters.geometry` of the version lists. Its last one need not lie at the flange or point as it does, and "
+        "the arm may be mirrored: bring a position measured at the flange into that frame first"
     )
     inertia: Matrix | None = Field(
         None,

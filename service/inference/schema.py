@@ -105,9 +105,9 @@ class PredictRequest(VersionChoice):
     min_revision: MinRevision = None
     payload: Payload | None = Field(
         None,
-        description="Answer for the arm with this on its last link, as if nothing else were on it than when it was "
-        "trained. For models with `rigid-body` or `rigid-body+lip-chain`; `tau_std` is that of the arm with it, the "
-        "payload itself is taken as exact",
+        description="Answer for the arm with this on its last link, and nothing else that it did not have in training. "
+        "For models with `rigid-body` or `rigid-body+lip-chain`. It is taken as exact: `tau_std` is what the model "
+        "does not know of the arm with it. A model of gravity-compensated torques leaves out its weight, too",
     )
 
 
