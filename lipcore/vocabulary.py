@@ -42,9 +42,12 @@ Prior = Literal["urdf", "zero"]
 PRIORS: tuple[Prior, ...] = get_args(Prior)
 """What inertial parameters are expected to be before the data speak: those of the URDF, or none."""
 
-CODES = ("learnt", "non_finite", "limit", "time_jump", "saturation", "stationary", "contact", "change", "edge")
+CODES = (
+    *("learnt", "non_finite", "limit", "time_jump", "saturation", "stationary"),
+    *("contact", "change", "edge", "payload"),
+)
 """What may become of a row. All but the first keep it out of learning: a number that is not finite; a position,
 velocity, acceleration or torque beyond its limit; time that goes backwards or leaps; torque at its actuator's limit; a
 robot at rest, whose stiction hides its torque; a contact; a changed robot whose owner has not decided yet; the edge of
-a recording, where an acceleration cannot be derived."""
+a recording, where an acceleration cannot be derived; an arm that carries something, of which it teaches instead."""
 LEARNT = 0

@@ -94,10 +94,14 @@ class Watch:
     around: Linearised | None = None
 
     def step(self, carrier: Carrier, rows: Rows) -> Watch:
-        """Follow rows, in order of event time."""
+        """Follow rows, in order of event time; those from before the latest are passed over."""
         watch = self._seen_by(carrier)
-        for row in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(rows.time) > GAP_S) + 1):
-            part = rows.take(row)
+        if watch._last is not None:
+            rows = rows.take(rows.time > watch._last)
+        if not len(rows):
+            return watch
+        for places in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(rows.time) > GAP_S) + 1):
+            part = rows.take(places)
             last = watch._last
             if last is not None and part.time[0] - last > GAP_S:
                 watch = replace(watch, waiting=None, recent=(), cells=())

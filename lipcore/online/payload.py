@@ -86,6 +86,11 @@ class Estimate:
     load: Load
     gain: float
 
+    @property
+    def mass(self) -> tuple[float, float]:
+        """Mean and standard deviation of the mass, kg."""
+        return float(np.exp(self.eta[0])), float(np.exp(self.eta[0]) * np.sqrt(self.covariance[0, 0]))
+
 
 def known(carrier: Carrier, prior: Known) -> Estimate:
     """A payload of which no more is known than beforehand."""

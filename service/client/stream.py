@@ -60,11 +60,13 @@ class _Stream(StreamSide):
         alias: str | None = None,
         key: str | None = None,
         scale: bool = False,
+        payload: bool = False,
     ) -> None:
         headers = headers_of(key)
         self.timeout, self._url, self._unix = timeout, url, unix
         self._exchange = Exchange(stream_id, first_sequence)
-        asked = {"version": version, "alias": alias, "stream_id": stream_id, "scale": 1 if scale else None}
+        asked = {"version": version, "alias": alias, "stream_id": stream_id}
+        asked |= {"scale": 1 if scale else None, "payload": 1 if payload else None}
         self._destination = destination(url, model, **asked)
         self._options: dict[str, Any] = {
             "compression": None,
@@ -109,7 +111,8 @@ class StreamClient(_Stream):
     connection, and for one answer, in s; stream_id: name of the source of the torques that are sent to learn from, None
     where only answers are wanted; first_sequence: of the first frame: to send frames again after a lost connection,
     take the first of them above `learnt.through`; key: API key, that of the environment variable LIPSERVE_KEY where
-    None; scale: whether answers carry the factor on the half width of their intervals.
+    None; scale, payload: whether answers carry the factor on the half width of their intervals, and what the arm
+    carries.
     Raise StreamError where the service cannot be reached or refuses.
     """
 

@@ -117,10 +117,10 @@ def check_components(model: TorqueModel, request: PredictRequest, limit: int) ->
 
 
 def carrying(served: Served, payload: Payload | None) -> TorqueModel:
-    """What answers for a version with a payload; raise InvalidRequestError where it knows no arm that could carry one,
-    or where no body is like that."""
+    """What answers for a version: with this payload, or where None with what its arm carries. Raise InvalidRequestError
+    where it knows no arm that could carry one, or where no body is like that."""
     if payload is None:
-        return served.model
+        return served.asked
     try:
         return served.declared.model(payload.numbers)
     except NoArmError:
@@ -221,7 +221,7 @@ def to_array(values: Sequence[Any]) -> Array:
 def at_once(served: Served, motion: Array, max_position: float, payload: Payload | None = None) -> Prediction | None:
     """Torque at one motion (3, n), for the event loop; None where the motion or the answer is not as it should be, or
     what answers with a payload has to be made first."""
-    model = served.model if payload is None else served.declared.known(payload.numbers)
+    model = served.asked if payload is None else served.declared.known(payload.numbers)
     if model is None or motion.shape[1] != model.n_joints or abs(motion[0]).max() > max_position:
         return None
     mean, deviation = model.answer(motion)

@@ -24,7 +24,7 @@ from service.web.rows import Page
 from service.web.rows import newest as newest_rows
 
 StreamKind = Literal["batches", "frames"]
-EventKind = Literal["batch", "replay", "unlearn", "rollback", "change", "settings"]
+EventKind = Literal["batch", "replay", "unlearn", "rollback", "change", "settings", "payload"]
 UNTIMED = [CODES.index("non_finite"), CODES.index("time_jump")]
 """Codes of rows whose own time says nothing."""
 MOST_RANGES = 1000

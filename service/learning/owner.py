@@ -13,7 +13,7 @@ from service.learning.schema import CONTACT_THRESHOLD, FORGETTING_S, TORQUE_LIMI
 from service.storage.database import AlarmRow, Database, LearningRow, ModelRow, now
 from service.web.rows import Page, newest
 
-AlarmKind = Literal["change", "novelty", "linearisation", "refresh", "promotion"]
+AlarmKind = Literal["change", "payload", "novelty", "linearisation", "refresh", "promotion"]
 
 
 def options(session: Session, model: str) -> LearningOptions:

@@ -54,6 +54,11 @@ class LearningOptions(BaseModel):
         description="Widen and narrow intervals at once, so that 95 % of what streams measure lies inside: the `scale` "
         "of answers. Otherwise it is 1, as the model itself believes",
     )
+    payloads: bool = Field(
+        True,
+        description="Notice what the arm takes up and puts down, and answer with it at once; for models that know the "
+        "arm. Meanwhile rows teach the payload, and not the arm",
+    )
     auto_refresh: bool = Field(True, description="Train a new version by itself where motion leaves what is known")
     auto_promote: bool = Field(True, description="Let such a version answer by itself once it predicts better")
 
@@ -156,7 +161,8 @@ class ObservationResponse(BaseModel):
     state: State = Field(description="What has become of the batch since")
     rejected: dict[str, int] = Field(
         description="Rows that are kept but not learnt, by code: `non_finite`, `limit`, `time_jump`, `saturation`, "
-        "`stationary`, `contact`, `change` (a changed robot whose owner has not decided), `edge` (acceleration not "
+        "`stationary`, `contact`, `change` (a changed robot whose owner has not decided), `payload` (the arm "
+        "carries something, of which the row teaches instead), `edge` (acceleration not "
         "derivable; where the stream goes on, these are learnt with the next batch)"
     )
     gaps: list[list[int]] = Field(

@@ -23,6 +23,7 @@ from service.foundation.fields import of_app
 from service.foundation.states import PartState
 from service.models import registry
 from service.models.lineage import learnt_from
+from service.models.loads import Loads
 from service.models.registry import SERVING, Serving
 from service.models.scales import Scales
 from service.models.served import Alias, Key, LearntStates, Served, Waiting
@@ -90,6 +91,7 @@ class LoadedModels:
         self._used: dict[Key, int] = {}
         self._unreadable: dict[Key, str] = {}
         self._scales: dict[Key, Scales] = {}
+        self._loads: dict[Key, Loads] = {}
 
     def hot(self, model: str, version: int | None, alias: str | None = None) -> Served | None:
         """Return a version, or the one that an alias points to, if it is in memory; never waits. With neither, as with
@@ -177,6 +179,7 @@ class LoadedModels:
                 self._used.pop(key, None)
                 self._unreadable.pop(key, None)
                 self._scales.pop(key, None)
+                self._loads.pop(key, None)
         self.waiting.wake(model)
         if entirely:
             for deleted in self.when_deleted:
@@ -271,6 +274,10 @@ class LoadedModels:
         with self._lock:
             return {version: scales for (name, version), scales in self._scales.items() if name == model}
 
+    def loads(self, model: str) -> dict[int, tuple[Loads, Served]]:
+        """What the arm carries, of a model's versions that are in memory."""
+        return {version: (each.loads, each) for (name, version), each in self._snapshot.served.items() if name == model}
+
     def preload(self) -> int:
         """Load the versions that serve of the models that changed last, as many as fit; return how many."""
         gc.freeze()  # what was imported, unexamined: looking through it takes 0.3 s
@@ -307,7 +314,11 @@ class LoadedModels:
         base = self._read(row)
         base.warm_up()
         scales = self._scales_of(row, base.scale)
-        served = Served(row.model, row.version, base, base, learnt_from(row.manifest["lineage"]), scales)
+        with self._lock:
+            loads = self._loads.setdefault((row.model, row.version), Loads())
+        served = Served(row.model, row.version, base, base, learnt_from(row.manifest["lineage"]), scales, loads)
+        if served.carrier is not None and loads.fresh:
+            loads.take(self.learnt.carried(row.model, row.version, served.carrier))
         if (published := self._revisions.get((row.model, row.version))) is not None:
             revision, learnt = published
             return replace(served, model=_warm(learnt.apply(base)), revision=revision)

@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Protocol
 
 from anyio import to_thread
 
+from lipcore.model.payload import Carrier
 from lipcore.model.torque_model import TorqueModel
 from service.foundation.errors import RevisionNotReachedError, problem
 from service.models.declared import Declared
+from service.models.loads import Carried, Loads
 from service.models.scales import Factor, Scales
 
 if TYPE_CHECKING:
@@ -30,7 +32,8 @@ Alias = tuple[str, str]
 @dataclass(frozen=True)
 class Served:
     """One version in memory, immutable: whoever holds it answers from it whatever is learnt or dropped meanwhile. Only
-    the widths of its intervals follow its streams at once: `scales`, the same for all revisions.
+    the widths of its intervals and what its arm carries follow its streams at once: `scales` and `loads`, the same for
+    all revisions.
 
     model: what answers; base: the version as trained; datasets: ids and hashes of the data sets it has learnt
     from; revision: online updates applied to it.
@@ -42,11 +45,26 @@ class Served:
     base: TorqueModel
     datasets: frozenset[str]
     scales: Scales
+    loads: Loads
     revision: int = 0
 
     def has_learnt_from(self, dataset: str, sha256: str) -> bool:
         """Whether it was trained on a data set or part of it, or on the same samples uploaded another time."""
         return not self.datasets.isdisjoint((dataset, sha256))
+
+    @property
+    def asked(self) -> TorqueModel:
+        """What answers questions that belong to no stream: with what its arm carries, where that is something."""
+        return self.loads.asked or self.model
+
+    def answering(self, stream_id: str | None) -> TorqueModel:
+        """What answers a stream."""
+        return self.loads.of(stream_id) or self.model
+
+    @cached_property
+    def carrier(self) -> Carrier | None:
+        """The model as what may carry a payload; None where it knows no arm."""
+        return None if self.model.arm is None else Carrier(self.model)
 
     @cached_property
     def declared(self) -> Declared:
@@ -80,6 +98,9 @@ class LearntStates(Protocol):
 
     def find(self, model: str, version: int, base: TorqueModel) -> Learnt | None:
         """As much of it as takes no time."""
+
+    def carried(self, model: str, version: int, carrier: Carrier) -> Mapping[str, Carried]:
+        """What answers for its streams, with what they carry."""
 
     def factors(self, model: str, version: int) -> Mapping[str, Factor]:
         """What its streams have made of the widths of its intervals, by stream."""

@@ -226,7 +226,7 @@ def _listed(tensor: schema.InferInput, count: int) -> Array:
 def compute(served: Served, query: Query, names: frozenset[str]) -> dict[str, Array]:
     """Tensors by name, their first axis N, but for those OF_MODEL; nothing is computed that they do not need. Raise
     InvalidRequestError where inertia cannot be inverted."""
-    model, scale = served.model, served.scales.of(None)
+    model, scale = served.asked, served.scales.of(None)
     compared, of_arm = names & EXTERNAL.keys(), bool(names & OF_ARM.keys())
     needed = {"covariance"} if of_arm else {"tau", "tau_std"} if compared else set()
     tensors = _torques(model, query.values[:3], names | needed)

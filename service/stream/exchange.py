@@ -20,6 +20,7 @@ from service.stream.frames import (
     ASK_STD,
     ERROR,
     HAS_EXTERNAL,
+    HAS_PAYLOAD,
     HAS_SCALE,
     HAS_STD,
     LATE,
@@ -73,6 +74,13 @@ class StreamExternal:
     p: float
 
 
+class StreamPayload(NamedTuple):
+    """Mass that a stream's robot carries, kg; both NaN where it carries nothing as far as is known."""
+
+    mass: float
+    std: float
+
+
 @dataclass(frozen=True, slots=True)
 class StreamAnswer:
     """Torque at one motion, N·m.
@@ -80,7 +88,7 @@ class StreamAnswer:
     tau: (n,) mean; tau_std: (n,) standard deviation of the function, where asked for; late: whether the answer left
     the service after its deadline; late_answers: how many of this connection have; seconds: from the arrival of the
     frame in the service to the departure of the answer; scale: (n,) factor on the half width of intervals that hold
-    measurements, external: torque that is not explained, where asked for.
+    measurements, external: torque that is not explained, payload: what the arm carries, where asked for.
     """
 
     sequence: int
@@ -93,6 +101,7 @@ class StreamAnswer:
     seconds: float
     scale: NDArray[np.float64] | None = None
     external: StreamExternal | None = None
+    payload: StreamPayload | None = None
 
 
 @dataclass(frozen=True)
@@ -149,6 +158,9 @@ def read_answer(data: bytes) -> StreamAnswer | StreamError:
         error = json.loads(data[ANSWER.size :])["error"]
         return StreamError(error["message"], error["code"], error["detail"], None if flags & UNREAD else sequence)
     numbers = np.frombuffer(data, NUMBER, offset=ANSWER.size)
+    carried = None
+    if flags & HAS_PAYLOAD:
+        numbers, carried = numbers[:-2], StreamPayload(*numbers[-2:].tolist())
     std = numbers[n : 2 * n] if flags & HAS_STD else None
     external = None
     if flags & HAS_EXTERNAL:
@@ -156,7 +168,7 @@ def read_answer(data: bytes) -> StreamAnswer | StreamError:
         external = StreamExternal(*last[:-2].reshape(3, n), *last[-2:].tolist())
     scale = numbers[-n:] if flags & HAS_SCALE else None
     tau, missed = numbers[:n], bool(flags & LATE)
-    return StreamAnswer(sequence, tau, std, version, revision, missed, late, seconds, scale, external)
+    return StreamAnswer(sequence, tau, std, version, revision, missed, late, seconds, scale, external, carried)
 
 
 SEQUENCES = 1 << 32

@@ -16,12 +16,12 @@ Request, 16 + 24 n bytes, or 16 + 32 n with tau:
 
 So the joints of a request begin at 16 (q), 16 + 8 n (dq), 16 + 16 n (ddq) and 16 + 24 n (tau).
 
-Answer, 32 + 8 n bytes, 8 n more with tau_std, 8 n with scale, 24 n + 16 with external torque:
+Answer, 32 + 8 n bytes, 8 n more with tau_std, 8 n with scale, 24 n + 16 with external torque, 16 with payload:
 
     offset  type     field
     0       u32      sequence of the request
     4       u16      flags: 1 = tau_std follows tau; 2 = late: left after its deadline; 4 = error; 8 = no sequence;
-                     16 = scale follows; 32 = external torque follows, last
+                     16 = scale follows; 32 = external torque follows; 64 = payload follows, last
     6       u16      n; 0 in an error
     8       u32      version that answers
     12      u32      answers of this connection that missed their deadlines so far
@@ -36,6 +36,8 @@ Answer, 32 + 8 n bytes, 8 n more with tau_std, 8 n with scale, 24 n + 16 with ex
     …       f64      tau_external_statistic: of the arm as one, T = eᵀ C⁻¹ e, e = tau_external; C has the squares of
                      tau_external_std on its diagonal, and scaled alike the function's covariance between the joints
     …       f64      tau_external_p: P(χ² with n degrees of freedom > T)
+    …       f64 2    payload, where asked for: mass that this stream_id carries as far as is known, mean and standard
+                     deviation, kg; both NaN where it carries nothing
 
 An error has the same header, and instead of numbers UTF-8 JSON: {"error": {code, message, detail}}. The connection goes
 on. Flag 8 says that the request was too short, or no binary message, so that its sequence is unknown (and 0 here).
@@ -75,8 +77,9 @@ LIPSERVE_STREAM_FLUSH_ROWS wait to be logged, the service reads no further.
 The query of the address: `version` pins one, else the newest answers as soon as it is there, between two frames;
 `std=1` answers tau_std to every frame, as if each had flag 1; `scale=1` answers the scale to every frame: tau ± 1.96 ·
 scale · √(tau_std² + noise_std²) holds 95 % of what is measured, by what this stream_id has taught until then, or where
-there is none by what all recent ones have; `stream_id` names the source of torques to learn from, in
-up to 64 letters, digits, dots, underscores and hyphens, a letter or digit first.
+there is none by what all recent ones have; `payload=1` answers to every frame what the arm carries; `stream_id` names
+the source of torques to learn from, in up to 64 letters, digits, dots, underscores and hyphens, a letter or digit
+first. What this stream_id's arm carries is part of its answers with or without `payload`.
 
 The service reads no further while an answer waits to be written, so a client that sends but does not read is slowed
 down by its own socket, and cut off when it reads nothing for LIPSERVE_STREAM_WRITE_S. A frame beyond
@@ -107,6 +110,7 @@ ERROR = 4
 UNREAD = 8
 HAS_SCALE = 16
 HAS_EXTERNAL = 32
+HAS_PAYLOAD = 64
 
 NUMBER = "<f8"
 

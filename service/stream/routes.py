@@ -27,6 +27,7 @@ PARAMETERS = {
     "alias": (ALIAS, f"a name that matches {ALIAS}"),
     "std": ("[01]", "0 or 1"),
     "scale": ("[01]", "0 or 1"),
+    "payload": ("[01]", "0 or 1"),
     "stream_id": (STREAM_ID, f"a name that matches {STREAM_ID}"),
     "min_revision": (NUMBER, "a revision of the version"),
 }
@@ -87,7 +88,7 @@ class StreamRoute(EchoRoute):
         served = await reached(learners.loaded, model, version, alias, asked.min_revision)
         pinned = version is not None
         meter = scope["app"].state.meters.stream(served.name)
-        given = (served, meter, pinned, asked.std, asked.stream_id, alias, asked.scale)
+        given = (served, meter, pinned, asked.std, asked.stream_id, alias, asked.scale, asked.payload)
         return Session(_connection(scope), receive, send, learners, *given)
 
 
@@ -108,6 +109,7 @@ class Asked(NamedTuple):
     stream_id: str | None
     min_revision: int
     scale: bool
+    payload: bool
 
 
 def _parameters(query: bytes) -> Asked:
@@ -116,7 +118,7 @@ def _parameters(query: bytes) -> Asked:
     for name, value in parse_qsl(query.decode("ascii", "backslashreplace"), keep_blank_values=True):
         if name not in PARAMETERS:
             raise invalid_request(
-                name, value, "no parameter but version, alias, std, scale, stream_id and min_revision"
+                name, value, "no parameter but version, alias, std, scale, payload, stream_id and min_revision"
             )
         pattern, expected = PARAMETERS[name]
         if not re.fullmatch(pattern, value) or (name in LEAST and not LEAST[name] <= int(value) < 2**31):
@@ -125,7 +127,8 @@ def _parameters(query: bytes) -> Asked:
     version = int(given["version"]) if "version" in given else None
     one_choice(version, given.get("alias"))
     std, revision = given.get("std") == "1", int(given.get("min_revision", 0))
-    return Asked(version, given.get("alias"), std, given.get("stream_id"), revision, given.get("scale") == "1")
+    scale, payload = given.get("scale") == "1", given.get("payload") == "1"
+    return Asked(version, given.get("alias"), std, given.get("stream_id"), revision, scale, payload)
 
 
 def _connection(scope: Scope) -> StreamProtocol:

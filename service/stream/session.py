@@ -9,7 +9,7 @@ import logging
 from abc import ABC, abstractmethod
 from collections import deque
 from contextlib import suppress
-from math import inf
+from math import inf, nan
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -181,7 +181,8 @@ class Session(Conversation):
 
     meter: counts what it answers; pinned: whether it stays with this version; std: whether every answer carries
     tau_std; stream_id: source of the torques that frames carry, None where they carry none; alias: that it follows,
-    None: the version that serves; scale: whether every answer carries the factor on its intervals.
+    None: the version that serves; scale, payload: whether every answer carries the factor on its intervals, and
+    what the arm carries.
     """
 
     def __init__(
@@ -197,13 +198,14 @@ class Session(Conversation):
         stream_id: str | None = None,
         alias: str | None = None,
         scale: bool = False,
+        payload: bool = False,
     ) -> None:
         super().__init__(connection, receive, send, learners.settings)
         self._loaded, self._name = learners.loaded, served.name
         self._pin = served.version if pinned else None
         self._alias = None if alias == SERVING else alias
         self._std, self._late, self._due = std, 0, inf
-        self._scale, self._stream_id = scale, stream_id
+        self._scale, self._payload, self._stream_id = scale, payload, stream_id
         self._meter, self._deadline = meter, learners.settings.stream_deadline_s
         self._learning = None if stream_id is None else Learning(learners, stream_id, self.send_text)
         self._take(served)
@@ -249,7 +251,7 @@ class Session(Conversation):
             sequence, asked, n, budget = frames.REQUEST.unpack_from(data)
             flags = 0
             current = self._loaded.hot(self._name, self._pin, self._alias)
-            if current is not self._served:
+            if current is not self._served or self._loads.of(self._stream_id) is not self._carried:
                 await self._follow(current)
             motion = self._reader.read(data, asked, n, budget)
             if asked & frames.ASK_LEARN:
@@ -270,9 +272,7 @@ class Session(Conversation):
             logger.error("unexpected error in a stream of model %s", self._name, exc_info=error)
             unexpected = ServiceError("an unexpected error; the service's log says more")
             return self._refuse(sequence, flags, arrived, unexpected)
-        served, (flags, numbers) = self._served, self._numbers(sequence, asked, arrived, data, tau, std, factor)
-        if more:
-            flags, numbers = flags | frames.HAS_EXTERNAL, numbers + more
+        served, (flags, numbers) = self._served, self._numbers(sequence, asked, arrived, data, tau, std, factor, more)
         now = perf_counter()
         seconds = now - arrived
         self._meter.durations.add(seconds)
@@ -312,9 +312,17 @@ class Session(Conversation):
         return seen.rows.tobytes()
 
     def _numbers(
-        self, sequence: int, asked: int, arrived: float, data: bytes, tau: Array, std: Array | None, factor: Array
+        self,
+        sequence: int,
+        asked: int,
+        arrived: float,
+        data: bytes,
+        tau: Array,
+        std: Array | None,
+        factor: Array,
+        external: bytes,
     ) -> tuple[int, bytes]:
-        """Flags and numbers of an answer, external torque aside. A frame to learn from is gathered with all of them."""
+        """Flags and numbers of an answer. A frame to learn from is gathered with the torque that it was answered."""
         flags, numbers = 0, tau.tobytes()
         if std is not None:
             flags, numbers = frames.HAS_STD, numbers + std.tobytes()
@@ -326,6 +334,11 @@ class Session(Conversation):
                 flags, numbers = 0, tau.tobytes()
         if self._scale:
             flags, numbers = flags | frames.HAS_SCALE, numbers + factor.tobytes()
+        if external:
+            flags, numbers = flags | frames.HAS_EXTERNAL, numbers + external
+        if self._payload:
+            carried = self._loads.mass(self._stream_id) or (nan, nan)
+            flags, numbers = flags | frames.HAS_PAYLOAD, numbers + np.array(carried).tobytes()
         return flags, numbers
 
     def _refuse(self, sequence: int, flags: int, arrived: float, error: ServiceError) -> bytes:
@@ -340,6 +353,7 @@ class Session(Conversation):
     async def _follow(self, current: Served | None) -> None:
         """Take the version that is current; None: it has been dropped from memory, maybe for a newer one. Raise
         NotFoundError where the version, the alias or the model has been deleted."""
+        self._carry()
         if current is None:
             meant = self._loaded.newest(self._name, self._alias) if self._pin is None else self._pin
             if meant == self._served.version and not self._loaded.is_deleted(self._name, meant):
@@ -351,6 +365,12 @@ class Session(Conversation):
             await self.greet()
 
     def _take(self, served: Served) -> None:
-        self._served, self._answer = served, served.model.answer
-        self._answer_with_covariance, self._noise_std = served.model.answer_with_covariance, np.array(served.noise_std)
+        self._served, self._loads, self._noise_std = served, served.loads, np.array(served.noise_std)
+        self._carry()
         self._reader = FrameReader(served.model.joint_names, self.settings.max_position)
+
+    def _carry(self) -> None:
+        """Answer with what the arm carries, as far as that is known by now."""
+        self._carried = self._loads.of(self._stream_id)
+        model = self._carried or self._served.model
+        self._answer, self._answer_with_covariance = model.answer, model.answer_with_covariance

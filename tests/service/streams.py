@@ -18,7 +18,7 @@ from service.storage.files import Files
 from tests.service.data import DEADLINE
 from tests.service.server import Server
 
-STD, LATE, ERROR, UNREAD, SCALE, EXTERNAL = 1, 2, 4, 8, 16, 32
+STD, LATE, ERROR, UNREAD, SCALE, EXTERNAL, PAYLOAD = 1, 2, 4, 8, 16, 32, 64
 LEARN, ASK_EXTERNAL = 2, 4
 STREAM = "/v1/models/pendulum/stream"
 MOTION = np.array([[0.3, -0.2], [0.1, 0.4], [1.0, -0.5]])
@@ -36,7 +36,7 @@ class Streaming:
 
 @dataclass(frozen=True)
 class Answer:
-    """An answer frame; external: all that it says of external torque; error: what it says instead of numbers."""
+    """An answer frame; external, payload: what it says of them; error: what it says instead of numbers."""
 
     sequence: int
     flags: int
@@ -48,6 +48,7 @@ class Answer:
     std: np.ndarray | None = None
     scale: np.ndarray | None = None
     external: np.ndarray | None = None
+    payload: np.ndarray | None = None
     error: dict[str, Any] | None = None
 
 
@@ -75,7 +76,7 @@ def read(data: bytes) -> Answer:
     """Read an answer frame, and check that its length is what its header says."""
     assert isinstance(data, bytes)
     sequence, flags, n, version, late, revision, seconds = struct.unpack_from("<IHHIIQd", data)
-    assert flags & ~(STD | LATE | ERROR | UNREAD | SCALE | EXTERNAL) == 0
+    assert flags & ~(STD | LATE | ERROR | UNREAD | SCALE | EXTERNAL | PAYLOAD) == 0
     assert seconds >= 0
     reply = Answer(sequence, flags, version, late, revision, seconds)
     if flags & ERROR:
@@ -88,6 +89,7 @@ def read(data: bytes) -> Answer:
     lengths |= {"std": n} if flags & STD else {}
     lengths |= {"scale": n} if flags & SCALE else {}
     lengths |= {"external": 3 * n + 2} if flags & EXTERNAL else {}
+    lengths |= {"payload": 2} if flags & PAYLOAD else {}
     assert len(data) == 32 + 8 * sum(lengths.values())
     parts = np.split(np.frombuffer(data, "<f8", offset=32), np.cumsum(list(lengths.values()))[:-1])
     return Answer(**{**vars(reply), **dict(zip(lengths, parts, strict=True))})

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from service.foundation.settings import Settings
+from service.models.loads import Carried, Loads
 from service.models.scales import Factor, Scales
 from service.stream.session import Echo, Session
 from service.web.observability.meters import Meters
@@ -52,7 +53,13 @@ class Loaded:
 
 def served(version, model, revision=0):
     return SimpleNamespace(
-        name="m", version=version, revision=revision, model=model, noise_std=[0.1, 0.2], scales=Scales(np.ones(2))
+        name="m",
+        version=version,
+        revision=revision,
+        model=model,
+        noise_std=[0.1, 0.2],
+        scales=Scales(np.ones(2)),
+        loads=Loads(),
     )
 
 
@@ -223,3 +230,16 @@ def test_others_have_their_turn_between_frames_sent_ahead():
 
     asyncio.run(both())
     assert turns == [0, "other", 1, "other", 2, "other", 3, "other", 4, "other"]
+
+
+def test_a_stream_is_answered_with_what_its_arm_carries_until_it_is_put_down():
+    loaded = Loaded(v1=Model())
+    talk, _ = session(loaded, 1, stream_id="arm", payload=True)
+    loads, answers = loaded.stored[1].loads, [reply(talk)]
+    loads.take({"arm": Carried(Model(3.0), (1.5, 0.1), 0.0), "other": Carried(Model(9.0), (7.0, 0.1), 0.0)})
+    answers.append(reply(talk))
+    loads.take({"arm": Carried(None, None, 0.0)})
+    answers.append(reply(talk))
+    first = answers[0].tau
+    np.testing.assert_allclose([each.tau for each in answers], [first, 3 * first, first])
+    np.testing.assert_allclose([each.payload for each in answers], [[np.nan] * 2, [1.5, 0.1], [np.nan] * 2])

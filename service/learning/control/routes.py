@@ -16,7 +16,7 @@ from service.foundation.errors import (
     UnreadableVersionError,
     responses,
 )
-from service.learning.control import decisions, schema, status
+from service.learning.control import decisions, payload, schema, status
 from service.learning.learners import LearnersDep
 from service.learning.schema import MOST_SEQUENCE, LearningOptions, StreamId
 from service.training import jobs
@@ -128,6 +128,38 @@ def set_learning(learners: LearnersDep, model: str, options: LearningOptions) ->
 def decide(learners: LearnersDep, model: str, request: schema.ChangeRequest) -> schema.Decided:
     """End the hold that a detected change has led to: adapt to the changed robot, or go on as if nothing had been."""
     return decisions.decide(learners, model, request)
+
+
+@router.get("/{model}/payload", summary="What the arm carries")
+def show_payload(learners: LearnersDep, model: str) -> payload.Payloads:
+    """Mass, centre of mass and inertia of what each stream's robot carries, with what is not known of them.
+
+    A payload is noticed, estimated and answered with by itself, from the rows that streams bring. No safety function.
+    """
+    return payload.show(learners, model)
+
+
+@router.put(
+    "/{model}/payload",
+    summary="Declare what the arm carries",
+    responses=responses(ConflictError, TooLargeError),
+    openapi_extra={"requestBody": {"content": {"application/json": {"example": payload.EXAMPLE}}}},
+)
+def declare_payload(learners: LearnersDep, model: str, request: payload.PayloadRequest) -> payload.Payloads:
+    """Answer with a payload from now on, as robot controllers are told theirs. Rows that say otherwise overrule it."""
+    return payload.declare(learners, model, request)
+
+
+@router.delete("/{model}/payload", summary="Say that the arm carries nothing", responses=responses(ConflictError))
+def remove_payload(
+    learners: LearnersDep,
+    model: str,
+    stream_id: Annotated[
+        StreamId | None, Query(description="The robot that has put it down; all where left out")
+    ] = None,
+) -> payload.Payloads:
+    """Answer without any payload from now on."""
+    return payload.remove(learners, model, stream_id)
 
 
 @router.get("/{model}/alarms", summary="List alarms, newest first")

@@ -72,7 +72,7 @@ def _take(
         rows, own, derived = dated.rows, slice(0, len(batch)), None
         if batch.ddq is None and batch.t is not None:
             rows, own, derived = screening.derive(session, *key, rows, batch.t, bounds)
-    screened = screening.predict(rows, served, own, derived)
+    screened = screening.predict(rows, served, own, derived, carrying=served.loads.of(stream_id))
     new = _new(served, stream_id, "batches", (sequence, sequence), content, rows, dated.offset, received)
     details = {"derived": None if derived is None else Derivation(ddq=derived).model_dump(), "span": dated.span}
     return ObservationResponse.model_validate(intake.append(monitor, served, options, new, screened, details))
@@ -233,7 +233,8 @@ def observe_frames(intake: Intake, frames: Frames) -> FramesResult:
         rows = Rows(frames.time[new], q, dq, ddq, tau, check_rows(None, q, dq, ddq, tau, bounds), weights)
         answered = frames.mean[new], frames.std[new]
         factor = None if frames.factor is None else frames.factor[new]
-        screened = screening.predict(rows, frames.served, slice(0, len(rows)), answered=answered, factor=factor)
+        carrying = frames.served.loads.of(frames.stream_id)
+        screened = screening.predict(rows, frames.served, slice(0, len(rows)), None, answered, factor, carrying)
         sequences = frames.sequences[new]
         ends = int(sequences[0]), int(sequences[-1])
         content = _digest(sequences, numbers)

@@ -10,10 +10,12 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from lipcore.online.batch import Rows
+from lipcore.online.holding import Watch
 from service.foundation.errors import ConflictError, not_found
 from service.journal import log
 from service.journal.log import NewBatch
@@ -36,6 +38,8 @@ ROW_NUMBERS, NUMBER_BYTES = 6, 8
 """What a row takes of the disk, for each joint: motion and torque, and half as much again for times and indices."""
 MOST_GAPS = 100
 """Gaps that an acknowledgement names."""
+PAYLOAD_ALARM_S = 60.0
+"""A robot that picks and places does so all day: of a model, payloads raise no more than one alarm in so long, s."""
 CONSEQUENCES = {
     "hold": "nothing is learnt until its owner has decided",
     "adapt": "a new regime begins, in which what was learnt before counts less",
@@ -108,19 +112,24 @@ class Intake:
         model = served.name
         rows = screened.own.stop - screened.own.start
         self.disk.take(ROW_NUMBERS * NUMBER_BYTES * served.model.n_joints * rows)
+        before, watch = _followed(monitor, served, options, batch, screened)
+        handled = watch is not None and before is not None and (before.held is None) != (watch.held is None)
         with self.database.transaction(model) as session:
             _check_kept(session, served)
             held = owner.held(session, model) is not None
             if monitor.held and not held:
                 monitor.decided()
             usual = partial(monitor.usual, batch.received)
-            verdict = judging.judge(screened, monitor.watch(batch.stream_id), held, options, usual)
+            since = None if watch is None or watch.held is None else watch.since
+            verdict = judging.judge(screened, monitor.watch(batch.stream_id), held, options, usual, since)
             if verdict.change is not None and options.on_change == "adapt":
                 log.append(session, model, "change", {"t": verdict.change.at}, batch.received)
             adaptive = {}
             if options.adaptive_intervals and screened.seen is not None:
                 scale = monitor.scale(batch.stream_id, served.version, served.base.scale)
                 adaptive = intervals.follow(scale, screened.seen)
+                if handled:  # these errors were of the arm without what it carries, or with what it no longer does
+                    adaptive["scale"] = scale.to_json()
             record = None if verdict.record is None else verdict.record.to_json()
             judged = replace(batch, rows=verdict.rows, record=record)
             event = log.append_batch(session, model, judged, self.settings.max_observation_streams)
@@ -131,6 +140,9 @@ class Intake:
                 source.offset = batch.offset
             if verdict.change is not None:
                 _alarm(session, served, options, verdict, event)
+            if watch is not None and handled and batch.received - monitor.told_payload >= PAYLOAD_ALARM_S:
+                monitor.told_payload = batch.received
+                _tell(session, served, watch, event)
             report = details | {
                 "model": model,
                 "version": served.version,
@@ -152,10 +164,14 @@ class Intake:
                 "waited": held,
                 "until": screened.until,
                 **adaptive,
+                **({} if watch is None else {"payload": watch.to_json()}),
                 "surprise": None if verdict.surprise is None else verdict.surprise.tolist(),
             }
             event.report = report
         monitor.note(event, verdict.watch.innovations)
+        if watch is not None and served.carrier is not None:
+            monitor.payloads.take(batch.stream_id, watch, served.version, batch.received)
+            served.loads.take(monitor.payloads.carried(served.carrier, served.version))
         served.scales.take(monitor.factors(served.version) if options.adaptive_intervals else {})
         self._show(Judged(served, batch.stream_id, verdict.rows, screened))
         return report
@@ -168,6 +184,35 @@ class Intake:
                 retain(self.database, self.settings, model, time.time())
             except Exception as error:  # the batch is logged all the same
                 logger.error("the log of model %s was not brought within its limits", model, exc_info=error)
+
+
+def _followed(
+    monitor: Monitor, served: Served, options: LearningOptions, batch: NewBatch, screened: Screened
+) -> tuple[Watch | None, Watch | None]:
+    """The watch of a stream's payload before and after a batch; None where nothing is watched."""
+    carrier = served.carrier
+    if carrier is None or not options.payloads:
+        return None, None
+    before = monitor.payloads.watch(batch.stream_id, carrier, served.version)
+    rows = screened.rows.take(screened.asked)
+    try:
+        return before, before.step(carrier, rows.take(np.argsort(rows.time, kind="stable")))
+    except np.linalg.LinAlgError as error:  # the rows are logged all the same
+        logger.error("the payload of stream %r is watched anew: %s", batch.stream_id, error, exc_info=error)
+        return before, Watch(carrier.model.n_joints)
+
+
+def _tell(session: Session, served: Served, watch: Watch, event: EventRow) -> None:
+    """Raise the alarm of a payload that was taken up or put down."""
+    evidence = {"stream_id": event.stream_id, "sequence": event.sequence, "at": watch.since}
+    if watch.held is None:
+        owner.raise_alarm(
+            session, served.name, "payload", f"stream {event.stream_id} has put its payload down", evidence
+        )
+        return
+    mass, std = watch.held.estimate.mass
+    message = f"stream {event.stream_id} carries {mass:.2f} ± {std:.2f} kg more than it was trained with"
+    owner.raise_alarm(session, served.name, "payload", message, evidence | {"mass": {"mean": mass, "std": std}})
 
 
 def enabled(session: Session, model: str) -> LearningOptions:

@@ -19,7 +19,7 @@ from lipcore.vocabulary import CODES, LEARNT
 from service.learning.ingest.screening import Screened, Trained
 from service.learning.schema import LearningOptions
 
-CONTACT, CHANGE = CODES.index("contact"), CODES.index("change")
+CONTACT, CHANGE, PAYLOAD = (CODES.index(code) for code in ("contact", "change", "payload"))
 MOST_INNOVATIONS = 1000
 """Rows whose innovations are kept to tell friction from a payload."""
 
@@ -140,8 +140,17 @@ class Verdict:
         return evidence if self.departed is None else evidence | self.departed.evidence(joint_names)
 
 
-def judge(batch: Screened, watch: Watch, held: bool, options: LearningOptions, usual: Callable[[], Record]) -> Verdict:
-    """Decide about the rows that were predicted. held: whether learning waits already; usual: the record of before."""
+def judge(
+    batch: Screened,
+    watch: Watch,
+    held: bool,
+    options: LearningOptions,
+    usual: Callable[[], Record],
+    carried: float | None = None,
+) -> Verdict:
+    """Decide about the rows that were predicted. held: whether learning waits already; usual: the record of before;
+    carried: event time, s, from which on the arm carries something, None where it does not: such rows teach what it
+    carries, and not the arm."""
     rows = batch.rows.take(batch.predicted)
     if not len(rows):
         return Verdict(batch.rows, None, None, watch, None, held)
@@ -176,6 +185,8 @@ def judge(batch: Screened, watch: Watch, held: bool, options: LearningOptions, u
         detector = detector.acknowledged()
     codes = batch.rows.code.copy()
     learnt = np.where(contact & (not (passing or gate.open)), CONTACT, LEARNT)
+    if carried is not None:
+        learnt = np.where((learnt == LEARNT) & (rows.time >= carried), PAYLOAD, learnt)
     codes[batch.predicted] = CHANGE if held else learnt
     judged = replace(batch.rows, code=codes)
     following = Watch(gate, detector, watch.innovations.then(rows, batch.mean), departure)

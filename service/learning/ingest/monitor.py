@@ -25,6 +25,7 @@ from service.journal import log
 from service.learning import intervals
 from service.learning.ingest.judging import ContactGate, Innovations, Watch
 from service.learning.intervals import Held, Known
+from service.learning.payloads import Payloads
 from service.models.scales import Factor
 from service.storage.database import EventRow
 
@@ -82,9 +83,10 @@ class Window:
 class Monitor:
     """One model's windows of quality, its gates and its detector of changes.
 
-    joint_names: in whose order records are. lock: held while a batch is judged and logged, one at a time; whoever only
-    reads windows and counts needs none. counts: rows by code and "learnt", "batches" and "duplicates", since the start
-    and that this service has taken. held: whether learning waited for a decision at the last batch. number: of the last
+    joint_names: in whose order records are. payloads: what its streams carry; told_payload: when an alarm was last
+    raised of one, Unix time, s. lock: held while a batch is judged and logged, one at a time; whoever only reads
+    windows and counts needs none. counts: rows by code and "learnt", "batches" and "duplicates", since the start and
+    that this service has taken. held: whether learning waited for a decision at the last batch. number: of the last
     event that was taken in.
 
     Several services take batches of one model in turn, and each follows the log before it judges: gates, detector and
@@ -105,6 +107,8 @@ class Monitor:
         self._scales: dict[str, Known] = {}
         self._detector, self._innovations = ChangeDetector(), Innovations.empty(n)
         self._departure: Departure | None = None
+        self.payloads = Payloads()
+        self.told_payload = -np.inf
 
     @classmethod
     def rebuilt(
@@ -113,6 +117,7 @@ class Monitor:
         """The monitor of a model from its log. now: Unix time, s."""
         made = cls(joint_names, settings)
         made.number, made._scales = log.newest(session, model), intervals.restored(session, model)
+        made.payloads = Payloads.restored(session, model)
         since = now - max(*settings.quality_windows_s, DETECTOR_S)
         lately = (EventRow.received > since, EventRow.number <= made.number)
         events = list(_batches(session, model, *lately)) or list(_batches(session, model, most=1))
@@ -122,8 +127,16 @@ class Monitor:
 
     def follow(self, session: Session, model: str) -> None:
         """Take in the batches that other services have logged since `number`; `lock` is held."""
-        for event in _batches(session, model, EventRow.number > self.number):
-            self._remember(event, True)
+        declared = select(EventRow).where(
+            EventRow.model == model, EventRow.kind == "payload", EventRow.number > self.number
+        )
+        events = [*_batches(session, model, EventRow.number > self.number), *session.scalars(declared)]
+        for event in sorted(events, key=lambda each: each.number):
+            if event.kind == "batch":
+                self._remember(event, True)
+            if event.stream_id is not None:
+                self.payloads.forget(event.stream_id)  # another service has followed its rows since
+            self.payloads.remember(event)
             self.number = event.number
 
     def watch(self, stream_id: str) -> Watch:
@@ -151,6 +164,11 @@ class Monitor:
         self.number, self._innovations = event.number, innovations
         self.counts.update({"batches": 1, **_counts(event.report or {})})
         self._since_due += 1
+
+    def declared(self, event: EventRow) -> None:
+        """Take in what the owner has said of a payload; the model's turn and `lock` are held."""
+        self.payloads.remember(event)
+        self.number = event.number
 
     def due(self, batches: int) -> bool:
         """Whether so many batches have been noted since the last time that this was true."""
@@ -192,7 +210,9 @@ class Monitor:
             if (scale := intervals.known(event)) is not None:
                 self._scales[event.stream_id] = scale
             if len(self._gates) > self._most_streams:
-                self._scales.pop(self._gates.popitem(last=False)[0], None)
+                oldest = self._gates.popitem(last=False)[0]
+                self._scales.pop(oldest, None)
+                self.payloads.forget(oldest)
         at = report.get("until", event.last)
         if at is None or not recent:
             return

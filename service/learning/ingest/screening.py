@@ -164,7 +164,8 @@ class Seen:
 class Screened:
     """Rows, and the predictions of the model that serves for those that passed so far.
 
-    own: which of the rows are of this batch, the others had waited for it. predicted: (N,); mean, std, bare: (P, n) of
+    own: which of the rows are of this batch, the others had waited for it. asked: (N,), rows with a finite answer, at
+    rest or not; predicted: (N,); mean, std, bare: (P, n) of
     these, bare the standard deviation without the floor that past errors put under `std`. noise_std: (n,). trained: see
     there; None where nothing is compared with it. seen: what intervals are judged by.
     """
@@ -172,6 +173,7 @@ class Screened:
     rows: Rows
     own: slice
     derived: DerivedAcceleration | None
+    asked: NDArray[np.bool_]
     predicted: NDArray[np.bool_]
     mean: Array
     std: Array
@@ -231,11 +233,13 @@ def predict(
     derived: DerivedAcceleration | None = None,
     answered: tuple[Array, Array] | None = None,
     factor: Array | None = None,
+    carrying: TorqueModel | None = None,
 ) -> Screened:
     """Let a version predict the rows that passed, with what it has learnt and as trained; those it has no finite answer
-    for are beyond its limits. answered: mean and std, (N, n) each, of all rows, where a stream has answered them
+    for are beyond its limits. carrying: the version with what the arm carries, where it does: it is compared with the
+    version as trained no more. answered: mean and std, (N, n) each, of all rows, where a stream has answered them
     already, and factor, (N, n), on their widths."""
-    model = served.model
+    model = served.model if carrying is None else carrying
     codes, predicted = rows.code.copy(), rows.code == LEARNT
     asked = predicted | ((codes == STATIONARY) & np.isfinite(rows.ddq).all(axis=1))
     good, floor = rows.take(asked), model.posterior.floor.numpy()
@@ -248,11 +252,15 @@ def predict(
     known = np.isfinite(mean).all(axis=1) & np.isfinite(std).all(axis=1)
     score = scores(good.tau[known] - mean[known], std[known], model.noise_std)
     seen = Seen(good.time[known], score, None if factor is None else factor[asked][known])
+    answerable = asked.copy()
+    answerable[asked] = known
     judged, known = known & predicted[asked], known[predicted[asked]]
     codes[predicted] = np.where(known, LEARNT, LIMIT)
     predicted[predicted] = known
     checked = replace(rows, code=codes)
     believed = mean[judged], std[judged], bare[judged]
+    if carrying is not None:
+        return Screened(checked, own, derived, answerable, predicted, *believed, model.noise_std, None, seen)
     compared = evenly(good.weight[judged])
     share = judged.sum() / max(1, len(compared))
     if model is served.base:
@@ -260,7 +268,7 @@ def predict(
     else:
         as_trained = _answers(good.take(judged).take(compared), served.base)
     trained = Trained(served.version, compared, share, *as_trained)
-    return Screened(checked, own, derived, predicted, *believed, model.noise_std, trained, seen)
+    return Screened(checked, own, derived, answerable, predicted, *believed, model.noise_std, trained, seen)
 
 
 def evenly(weight: Array) -> NDArray[np.int64]:

@@ -8,12 +8,15 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from lipcore.data.samples import Array
+from lipcore.model.payload import Carrier
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online.record import Record, error_floor
 from lipcore.online.transfer import consolidate
 from service.journal import log, snapshots
 from service.learning import intervals
 from service.learning.learner.restore import Restored, restore
+from service.learning.payloads import Payloads
+from service.models.loads import Carried
 from service.models.scales import Factor
 from service.models.served import Learnt
 from service.storage.database import Database, EventRow, LearnerRow, ServingRow
@@ -85,6 +88,11 @@ class LearntVersions:
             return Learnt(base, 0, behind)
         variance = floor(self._database, model, version, known.number, base.n_joints)
         return Learnt(known.online.model(variance), known.number - start, behind)
+
+    def carried(self, model: str, version: int, carrier: Carrier) -> Mapping[str, Carried]:
+        """Return what answers for its streams with what their last batches say that they carry."""
+        with self._database.session() as session:
+            return Payloads.restored(session, model).carried(carrier, version)
 
     def factors(self, model: str, version: int) -> Mapping[str, Factor]:
         """Return the factors on its intervals that the last batches of its streams have led to."""

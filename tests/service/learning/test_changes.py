@@ -228,7 +228,8 @@ def screened(count, push, first=0.0):
     time = first + np.arange(count) / 100
     zeros = np.zeros((count, 1))
     rows = Rows(time, zeros, zeros + 0.1, zeros, tau, np.zeros(count, np.uint8))
-    return Screened(rows, slice(0, count), None, np.ones(count, np.bool_), zeros, zeros, zeros, np.ones(1))
+    every = np.ones(count, np.bool_)
+    return Screened(rows, slice(0, count), None, every, every, zeros, zeros, zeros, np.ones(1))
 
 
 def test_a_gate_that_stood_back_returns_once_rows_fit():

@@ -21,6 +21,7 @@ DEFAULTS = {
     "torque_limits": None,
     "contact_threshold": 8.0,
     "adaptive_intervals": True,
+    "payloads": True,
     "auto_refresh": True,
     "auto_promote": True,
 }

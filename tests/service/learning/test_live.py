@@ -126,7 +126,7 @@ def judged(count=4, codes=(), stream_id="one", of=None, seed=0, bare=0.05):
     mean = found.tau[predicted] - 0.5
     std = np.full(mean.shape, 0.3)
     noise = np.array([0.1, 0.2])
-    screened = Screened(found, slice(0, count), None, predicted, mean, std, np.full(mean.shape, bare), noise)
+    screened = Screened(found, slice(0, count), None, predicted, predicted, mean, std, np.full(mean.shape, bare), noise)
     return Judged(of or served(), stream_id, found, screened)
 
 

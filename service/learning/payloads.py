@@ -1,0 +1,149 @@
+"""What the streams of a model carry: followed batch by batch, declared by its owner, taken up again from the log."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from lipcore.model.payload import Body, Carrier
+from lipcore.model.torque_model import TorqueModel
+from lipcore.online.holding import Watch
+from lipcore.online.payload import Estimate
+from service.models.loads import Carried
+from service.storage.database import EventRow
+
+MOST_EVENTS = 3000
+"""Of the log's newest, among which the last batch of a stream is looked for."""
+
+
+@dataclass(frozen=True)
+class Noted:
+    """What the log says of a stream: a batch's report, or a declaration. version: that predicted it, None for a
+    declaration; received: Unix time, s."""
+
+    values: Mapping[str, Any]
+    version: int | None
+    received: float
+
+    def watch(self, carrier: Carrier, version: int) -> Watch:
+        """The watch of the stream from there on, of a version. One whose geometry was learnt has a frame of its own, in
+        which a payload that another version has seen means nothing: it is noticed anew."""
+        n = carrier.model.n_joints
+        learnt = carrier.term.arm.mode == "learn"
+        if learnt and self.version not in (None, version):
+            return Watch(n)
+        if "body" not in self.values:
+            return Watch.from_json(self.values, n, carrier)
+        body = self.values["body"]
+        return (
+            Watch(n).put_down(self.received) if body is None else Watch(n).declare(carrier, _body(body), self.received)
+        )
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A stream's watch after its last batch, which a version predicted and which came at `received`, Unix time, s."""
+
+    watch: Watch
+    version: int
+    received: float
+
+
+class Payloads:
+    """The watches of one model's streams, made from what the log says when they are first needed.
+
+    To be changed in the model's turn only; `all` may be read from any thread.
+    """
+
+    def __init__(self) -> None:
+        self._noted: dict[str, Noted] = {}
+        self._default: Noted | None = None
+        self._watches: dict[str, Watched] = {}
+        self._models: dict[str, tuple[Estimate, Carrier, TorqueModel]] = {}
+
+    @classmethod
+    def restored(cls, session: Session, model: str) -> Payloads:
+        """Those of a model, by the last batch of each stream and what was declared since."""
+        made = cls()
+        newest = select(func.max(EventRow.number)).where(EventRow.model == model).scalar_subquery()
+        recent = EventRow.model == model, EventRow.number > newest - MOST_EVENTS
+        last = select(func.max(EventRow.number)).where(*recent, EventRow.kind == "batch").group_by(EventRow.stream_id)
+        declared = (EventRow.model == model, EventRow.kind == "payload")
+        batches = session.scalars(select(EventRow).where(EventRow.model == model, EventRow.number.in_(last)))
+        events = [*batches, *session.scalars(select(EventRow).where(*declared))]
+        for event in sorted(events, key=lambda each: each.number):
+            made.remember(event)
+        return made
+
+    def remember(self, event: EventRow) -> None:
+        """Take in what an event of the log says."""
+        if event.kind == "payload":
+            detail = event.detail or {}
+            noted = Noted(detail, None, event.received)
+            if detail["stream_id"] is None:
+                self._default = noted
+                self._noted = dict.fromkeys({*self._noted, *self._watches}, noted)
+                self._watches = {}
+            else:
+                self.forget(detail["stream_id"])
+                self._noted[detail["stream_id"]] = noted
+        elif event.stream_id is not None and (values := (event.report or {}).get("payload")) is not None:
+            self._noted[event.stream_id] = Noted(values, event.version, event.received)
+
+    def watch(self, stream_id: str, carrier: Carrier, version: int) -> Watch:
+        """The watch of a stream before its next rows, which a version predicts."""
+        if (known := self._watches.get(stream_id)) is not None and known.version == version:
+            return known.watch
+        noted = self._noted.get(stream_id, self._default)
+        return Watch(carrier.model.n_joints) if noted is None else noted.watch(carrier, version)
+
+    def take(self, stream_id: str, watch: Watch, version: int, received: float) -> None:
+        """Keep the watch of a stream after its latest rows. What it says goes into the log, and back by `remember`."""
+        self._watches = {**self._watches, stream_id: Watched(watch, version, received)}
+
+    def forget(self, stream_id: str) -> None:
+        """Keep nothing of a stream."""
+        self._noted.pop(stream_id, None)
+        self._models.pop(stream_id, None)
+        self._watches = {name: each for name, each in self._watches.items() if name != stream_id}
+
+    def all(self, carrier: Carrier, version: int) -> dict[str, tuple[Watch, float]]:
+        """Watches by stream as a version sees them, and when what they know came, Unix time, s."""
+        out = {name: (each.watch(carrier, version), each.received) for name, each in dict(self._noted).items()}
+        for name, each in self._watches.items():
+            if each.version == version:
+                out[name] = each.watch, each.received
+        return out
+
+    def carried(self, carrier: Carrier, version: int) -> dict[str, Carried]:
+        """What answers for each stream; with None for its model where nothing is carried. The default is that of ""."""
+        out: dict[str, Carried] = {}
+        watches = self.all(carrier, version)
+        if self._default is not None:
+            watches[""] = self._default.watch(carrier, version), self._default.received
+        for stream_id, (watch, received) in watches.items():
+            if watch.held is None:
+                out[stream_id] = Carried(None, None, received)
+            else:
+                found = watch.held.estimate
+                out[stream_id] = Carried(self._answering(stream_id, found, carrier), found.mass, received)
+        return out
+
+    def _answering(self, stream_id: str, found: Estimate, carrier: Carrier) -> TorqueModel:
+        known = self._models.get(stream_id)
+        if known is not None and known[0] is found and known[1] is carrier:
+            return known[2]
+        model = carrier.carrying(found.load)
+        model.answer(np.zeros((3, model.n_joints)))  # whoever asks next does not wait for it to be laid out
+        self._models[stream_id] = found, carrier, model
+        return model
+
+
+def _body(values: Mapping[str, Any]) -> Body:
+    inertia = values["inertia"]
+    return Body(values["mass"], np.array(values["com"]), None if inertia is None else np.array(inertia))
