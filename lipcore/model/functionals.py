@@ -17,9 +17,12 @@ from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.base import Params, State, TorqueKernel, row_chunks
 from lipcore.kernels.chain import ChainKernel
 from lipcore.kernels.lip import LipKernel
+from lipcore.kernels.payload import PayloadKernel
 from lipcore.posterior.exact import Posterior
 
-EnergyKernel = LipKernel | ChainKernel | ArmKernel
+RigidKernel = ArmKernel | PayloadKernel
+"""Energies that are linear in weights."""
+EnergyKernel = LipKernel | ChainKernel | RigidKernel
 """Priors of torques that come from priors of the energies."""
 KINETIC, POTENTIAL = 0, 1
 COLUMNS_PER_CHUNK = 512
@@ -102,7 +105,7 @@ def prior_mean(kernels: Sequence[EnergyKernel], query: Motion) -> Tensor:
     """Prior means of the kinetic and the potential energy at N queries, summed over the kernels: (2, N) J."""
     total = torch.zeros((2, len(query)), dtype=torch.float64)
     for kernel in kernels:
-        if isinstance(kernel, ArmKernel) and (weights := kernel.prior_weights()) is not None:
+        if isinstance(kernel, RigidKernel) and (weights := kernel.prior_weights()) is not None:
             total += (kernel.energy_features(query) @ weights).T
     return total
 
@@ -114,7 +117,7 @@ def covariance(params: Params, kernels: Sequence[EnergyKernel], x: Motion, y: Mo
     """
     total = torch.zeros((2, len(x)), dtype=torch.float64)
     for kernel in kernels:
-        if isinstance(kernel, ArmKernel):
+        if isinstance(kernel, RigidKernel):
             scaled = kernel.energy_features(x) @ kernel.covariance(params)
             total += (scaled * kernel.energy_features(y)).sum(2).T
         else:
@@ -126,7 +129,7 @@ def with_anchors(posterior: Posterior, kernels: Sequence[EnergyKernel], query: M
     """Prior covariance of both energies at N queries with the M anchors of the posterior: (2, M, N) (eq. 2)."""
     total = torch.zeros((2, len(posterior.weights), len(query)), dtype=torch.float64)
     for kernel in kernels:
-        if isinstance(kernel, ArmKernel):
+        if isinstance(kernel, RigidKernel):
             scaled = kernel.energy_features(query) @ kernel.covariance(posterior.params)  # (N, 2, p)
             parts = [posterior.with_weights(kernel, scaled[:, energy].T) for energy in (KINETIC, POTENTIAL)]
         else:

@@ -5,8 +5,8 @@ geometry is learnt, too, torque is bilinear in it and in the payload,
 
     tau = Y(θ + δθ) (π + payload) ≈ Y(θ) (π + payload) + J(θ, π + payload) δθ,
 
-so that it is linearised around the means of both: with the payload in J, and the payload's own features on the mean
-geometry. The variables of the posterior are those of the arm as it was learnt, and the payload's ten.
+so that it is linearised around the means of both. The variables of the posterior are those of the arm as it was
+learnt, and the payload's ten.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from lipcore.fitting.estimators import Estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.base import TorqueKernel
 from lipcore.kernels.payload import CERTAIN, PayloadKernel
-from lipcore.model.plausible import is_plausible
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.basis import Basis
 from lipcore.posterior.compact import CompactPosterior
@@ -35,6 +34,12 @@ from lipcore.robots.urdf import PARAMETERS
 ROOM = 10.0
 """Prior variance that a payload's parameters get, in units of their own: Σ ≤ k diag Σ holds for every covariance of k
 numbers, so that the posterior is nowhere wider than its prior, as the evaluator has to assume."""
+
+
+ROUNDING = 1e-12
+"""Share of the inertia about the link's frame that may be rounding."""
+LEAST = 1e-14
+"""Smallest variance of whitened variables, of prior variance one."""
 
 
 class NoArmError(ValueError):
@@ -81,15 +86,17 @@ class Body:
 
     @classmethod
     def of(cls, parameters: Array) -> Body:
-        """The body of ten parameters; raise ValueError where none has these."""
+        """The body of ten parameters, a point where no more than rounding is its own inertia; raise ValueError where
+        none has these."""
         mass = float(parameters[0])
-        if not is_plausible(parameters):
-            raise ValueError(f"parameters are {parameters.tolist()}, which no body has")
+        if not mass > 0:
+            raise ValueError(f"parameters are {parameters.tolist()}, expected a mass above zero")
         com = parameters[1:4] / mass
         about = np.zeros((3, 3))
         about[LOWER] = parameters[4:]
         about = about + np.tril(about, -1).T
-        return cls(mass, com, about - mass * (com @ com * np.eye(3) - np.outer(com, com)))
+        own = about - mass * (com @ com * np.eye(3) - np.outer(com, com))
+        return cls(mass, com, None if np.abs(own).max() <= ROUNDING * np.abs(about).max() else own)
 
 
 LOWER = np.tril_indices(3)
@@ -100,12 +107,14 @@ LOWER = np.tril_indices(3)
 class Load:
     """What is known of a payload and, with it, of a model's whitened variables w, (M,): N(mean, covariance) of (w, π).
 
-    mean: (M + 10,); covariance: (M + 10, M + 10); room: (10,), variances that π has at most, whatever w and π are.
+    mean: (M + 10,); covariance: (M + 10, M + 10); room: (10,), variances that π has at most, whatever w and π are;
+    floor: (n,) (N·m)², below which no torque's variance lies; zero where None.
     """
 
     mean: Array
     covariance: Array
     room: Array
+    floor: Array | None = None
 
     @property
     def payload(self) -> Array:
@@ -154,7 +163,9 @@ class Carrier:
         """Covariance Σ of the whitened variables, (M, M)."""
         posterior = self.model.posterior
         learnt = (posterior.root @ posterior.basis.root).numpy()
-        return np.asarray(np.eye(len(learnt)) - learnt.T @ learnt)
+        values, vectors = np.linalg.eigh(np.eye(len(learnt)) - learnt.T @ learnt)
+        # what samples tell to rounding has a variance of either sign
+        return np.asarray((vectors * np.maximum(values, LEAST)) @ vectors.T)
 
     def step(self, mean: Array) -> Array:
         """Mean step of the geometry, (g,), of variables of this mean, (M,)."""
@@ -187,7 +198,7 @@ class Carrier:
             known(torch.from_numpy(mean), torch.from_numpy(covariance)),
             posterior.noise_variance,
             posterior.std_factor,
-            posterior.floor,
+            posterior.floor if load.floor is None else torch.maximum(posterior.floor, torch.from_numpy(load.floor)),
             posterior.misfit,
         )
         return replace(self.model, estimator=around.estimator, posterior=solved)
@@ -234,6 +245,10 @@ class Linearised:
         whitened, _ = basis.features_and_uncovered(motion)
         nonlinear = whitened[: len(basis.outputs)].reshape(-1, *motion.q.shape)
         return np.concatenate([nonlinear.numpy(), own]), mean
+
+    def bend(self, motion: Motion) -> Array:
+        """What the payload's torque is more than linear in the geometry's mean step, at N instants: (N, n) N·m."""
+        return self._payload.bend(motion.arrays())
 
     @cached_property
     def _arm(self) -> ArmKernel:

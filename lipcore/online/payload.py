@@ -13,10 +13,11 @@ are linearised anew around it until it stays.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.linalg import solve_triangular
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
@@ -115,7 +116,8 @@ def estimate(
     everything = rows if before is None or not len(before) else Rows.concatenate([before, rows])
     free = len(everything) - len(rows)
     roots = correlation_roots(carrier, everything)
-    mean, covariance, size = carrier.mean, carrier.covariance, len(carrier.mean)
+    mean, size = carrier.mean, len(carrier.mean)
+    root = np.linalg.cholesky(carrier.covariance)
     empty = carrier.known(np.zeros(PARAMETERS))
     unloaded = _Rows.of(carrier, empty, everything.take(slice(0, free)), mean) if free else None
     if unloaded is not None:
@@ -127,8 +129,9 @@ def estimate(
         features, residual = _whitened(roots, loaded if unloaded is None else unloaded.then(loaded))
         information, score = features @ features.T, features @ residual
         arm, cross = information[:size, :size], information[:size, size:]
-        open_ = np.linalg.solve(np.eye(size) + covariance @ arm, covariance)
-        open_ = 0.5 * (open_ + open_.T)
+        inner = np.linalg.cholesky(np.eye(size) + root.T @ arm @ root)
+        half = solve_triangular(inner, root.T, lower=True, check_finite=False)
+        open_ = half.T @ half  # (Σ⁻¹ + Fᵀ R⁻¹ F)⁻¹
         told = information[size:, size:] - cross.T @ open_ @ cross
         pull = score[size:] - cross.T @ open_ @ score[:size]
         last = eta
@@ -143,10 +146,14 @@ def estimate(
         joint[size:, size:] = of_payload
         room = PARAMETERS * np.diagonal(slope @ np.linalg.inv(prior.precision) @ slope.T)
         w = mean + open_ @ score[:size] + back @ payload
+        left = residual - features.T @ np.concatenate([w - mean, payload])
         load = Load(np.concatenate([w, payload]), joint, room)
         if np.sqrt(np.max((eta - last) ** 2 / np.diagonal(spread))) < STILL:
             break
-    return Estimate(eta, spread, load, gain)
+    # what an arm that is linear in its geometry gets wrong, its posterior does not say
+    bent = Linearised(carrier, load).bend(rows.motion())
+    load = replace(load, floor=(bent**2).mean(axis=0))
+    return Estimate(eta, max(1.0, float((left**2).mean())) * spread, load, gain)
 
 
 @dataclass(frozen=True)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.table import Table
 
 from lipcore.vocabulary import COMPONENTS
 from service.cli.connecting import connected, dataset_of
-from service.cli.consoles import out, print_json, print_warnings
+from service.cli.consoles import CommandError, out, print_json, print_warnings
 from service.cli.options import Alias, Data, Json, Model, Url, Version, alone, group, names, numbers
 from service.foundation.settings import DEFAULT_URL
 
@@ -32,6 +32,16 @@ def predict(
         ),
     ] = None,
     tau: Annotated[str | None, typer.Option("--tau", help="Torques, N·m, for forward_dynamics.")] = None,
+    payload: Annotated[
+        str | None,
+        typer.Option(
+            help="What the arm carries: kg, and x,y,z of its centre of mass in the frame of the last link, m."
+        ),
+    ] = None,
+    payload_inertia: Annotated[
+        str | None,
+        typer.Option(help="Its inertia xx,xy,xz,yy,yz,zz about that centre, kg·m²; that of a point by default."),
+    ] = None,
     version: Version = None,
     alias: Alias = None,
     min_revision: Annotated[
@@ -50,6 +60,7 @@ def predict(
     velocity = zeros if dq is None else numbers("--dq", dq)
     acceleration = zeros if ddq is None else numbers("--ddq", ddq)
     torque = None if tau is None else numbers("--tau", tau)
+    body = _body(payload, payload_inertia)
     with connected(url) as client:
         answer = client.predict(
             model,
@@ -61,6 +72,7 @@ def predict(
             components=names(components) or [],
             tau=torque,
             min_revision=min_revision,
+            payload=body,
         )
     if as_json:
         print_json(answer)
@@ -69,6 +81,27 @@ def predict(
 
     for table in prediction_tables(answer):
         out.print(table)
+
+
+def _body(payload: str | None, inertia: str | None) -> dict[str, Any] | None:
+    """A payload of the numbers that options give; raise CommandError where they are not as many as they should be."""
+    if payload is None:
+        if inertia is not None:
+            raise CommandError("--payload-inertia is given, expected --payload beside it")
+        return None
+    mass, *com = _as_many("--payload", payload, "mass,x,y,z")
+    body: dict[str, Any] = {"mass": mass, "com": com}
+    if inertia is not None:
+        xx, xy, xz, yy, yz, zz = _as_many("--payload-inertia", inertia, "xx,xy,xz,yy,yz,zz")
+        body["inertia"] = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
+    return body
+
+
+def _as_many(option: str, text: str, expected: str) -> list[float]:
+    given = numbers(option, text)
+    if len(given) != len(expected.split(",")):
+        raise CommandError(f"{option} is {text!r}, expected {expected}")
+    return given
 
 
 evaluate_app = alone()

@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 from lipcore.data.motion import Motion
 from lipcore.model import dynamics
 from lipcore.model.functionals import Estimate
+from lipcore.model.payload import NoArmError
 from lipcore.model.torque_model import TorqueModel
 from lipcore.vocabulary import ComponentName, TorqueConvention
 from service.foundation.errors import invalid_request
+from service.inference.payload import Payload
 from service.inference.schema import PredictRequest
 from service.models.loaded import LoadedModels, Served
 from service.models.schema import ALIAS
@@ -114,6 +116,22 @@ def check_components(model: TorqueModel, request: PredictRequest, limit: int) ->
         raise invalid_request("tau", "given", "no tau, or forward_dynamics among the components")
 
 
+def carrying(served: Served, payload: Payload | None) -> TorqueModel:
+    """What answers for a version: with this payload, or where None with what its arm carries. Raise InvalidRequestError
+    where it knows no arm that could carry one, or where no body is like that."""
+    if payload is None:
+        return served.asked
+    try:
+        return served.declared.model(payload.numbers)
+    except NoArmError:
+        rigid = "knows no rigid bodies to add it to, one of rigid-body or rigid-body+lip-chain does"
+        expected = f"no payload: a model with the estimator {served.model.estimator.name} {rigid}"
+        raise invalid_request("payload", "given", expected) from None
+    except ValueError as error:  # names a field of the payload first, and last what was expected
+        name, text = str(error).partition(" ")[0], str(error).rpartition("expected ")[2]
+        raise invalid_request(f"payload.{name}", payload.model_dump(mode="json")[name], text) from error
+
+
 _ALIAS = ALIAS.replace("$", r"\Z")  # Python's own expressions let a line end follow
 Numbers = list[float | list[float]]
 """One query or a batch; that it is one of the two, and not some of each, is left to be checked."""
@@ -131,6 +149,7 @@ class PredictBody(Struct, forbid_unknown_fields=True):
     components: list[ComponentName] = []
     tau: Numbers | None = None
     min_revision: Annotated[int, Meta(ge=0, lt=2**31)] | None = None
+    payload: Payload | None = None
 
     def single(self) -> Array | None:
         """Return the motion (3, n) where this is one query for a torque and no more."""
@@ -170,8 +189,8 @@ class Prediction(Struct, omit_defaults=True):
     components: dict[ComponentName, dict[str, Any]] | None = None
 
 
-_decoder = msgspec.json.Decoder(PredictBody)
-_FIELDS = tuple(name.encode() for name in PredictBody.__struct_fields__)
+_decoder = msgspec.json.Decoder(PredictBody, dec_hook=lambda _, value: Payload.model_validate(value))
+_FIELDS = tuple(name.encode() for name in (*PredictBody.__struct_fields__, *Payload.model_fields))
 _encoder = msgspec.json.Encoder()
 
 
@@ -199,11 +218,13 @@ def to_array(values: Sequence[Any]) -> Array:
     return np.array(values, np.float64)
 
 
-def at_once(served: Served, motion: Array, max_position: float) -> Prediction | None:
-    """Torque at one motion (3, n), for the event loop; None where the motion or the answer is not as it should be."""
-    if motion.shape[1] != served.model.n_joints or abs(motion[0]).max() > max_position:
+def at_once(served: Served, motion: Array, max_position: float, payload: Payload | None = None) -> Prediction | None:
+    """Torque at one motion (3, n), for the event loop; None where the motion or the answer is not as it should be, or
+    what answers with a payload has to be made first."""
+    model = served.asked if payload is None else served.declared.known(payload.numbers)
+    if model is None or motion.shape[1] != model.n_joints or abs(motion[0]).max() > max_position:
         return None
-    mean, deviation = served.asked.answer(motion)
+    mean, deviation = model.answer(motion)
     assert deviation is not None  # it is, unless declined
     tau, tau_std = mean.tolist(), deviation.tolist()
     if not isfinite(sum(tau) + sum(tau_std)):
@@ -225,8 +246,9 @@ def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: S
         raise invalid_request("q", f"{count} queries", f"at most {settings.max_batch} in one request")
     query.check(settings.max_position)
 
+    known = carrying(served, request.payload)
     q, dq, ddq, *_ = query.values
-    answer = served.asked.predict(q, dq, ddq, request.covariance)
+    answer = known.predict(q, dq, ddq, request.covariance)
     arrays = {"tau": answer.tau, "tau_std": answer.tau_std}
     if answer.covariance is not None:
         arrays["covariance"] = answer.covariance

@@ -82,7 +82,7 @@ async def _answer(scope: Scope, body: bytes) -> Reply | None:
     if query.min_revision is not None:
         served = await reached(loaded, model, query.version, query.alias, query.min_revision)
     if served is not None and motion is not None:
-        at_once = predicting.at_once(served, motion, loaded.storage.settings.max_position)
+        at_once = predicting.at_once(served, motion, loaded.storage.settings.max_position, query.payload)
         if at_once is not None:
             return Reply(encode(at_once))
     request = query.request()

@@ -19,6 +19,7 @@ from pydantic import (
 from lipcore.vocabulary import COMPONENTS, ComponentName, TorqueConvention
 from service.foundation.errors import invalid_request
 from service.foundation.fields import each_once, rows_of_numbers
+from service.inference.payload import Payload
 from service.models.schema import AliasName, VersionNumber
 
 _NUMBERS: dict[str, Any] = {"type": "array", "items": {"type": "number"}}
@@ -102,6 +103,12 @@ class PredictRequest(VersionChoice):
     )
     tau: Vectors | None = Field(None, description="Torque that `forward_dynamics` is asked for, N·m (prismatic: N)")
     min_revision: MinRevision = None
+    payload: Payload | None = Field(
+        None,
+        description="Answer for the arm with this on its last link, and nothing else that it did not have in training. "
+        "For models with `rigid-body` or `rigid-body+lip-chain`. It is taken as exact: `tau_std` is what the model "
+        "does not know of the arm with it. A model of gravity-compensated torques leaves out its weight, too",
+    )
 
 
 class ComponentValues(BaseModel):

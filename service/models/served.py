@@ -16,6 +16,7 @@ from anyio import to_thread
 from lipcore.model.payload import Carrier
 from lipcore.model.torque_model import TorqueModel
 from service.foundation.errors import RevisionNotReachedError, problem
+from service.models.declared import Declared
 from service.models.loads import Carried, Loads
 from service.models.scales import Factor, Scales
 
@@ -64,6 +65,11 @@ class Served:
     def carrier(self) -> Carrier | None:
         """The model as what may carry a payload; None where it knows no arm."""
         return None if self.model.arm is None else Carrier(self.model)
+
+    @cached_property
+    def declared(self) -> Declared:
+        """What answers with payloads that queries declare, instead of what its streams carry."""
+        return Declared(self.model)
 
     @cached_property
     def noise_std(self) -> list[float]:

@@ -31,16 +31,21 @@ def predict(
     tau: ArrayLike | None = None,
     alias: str | None = None,
     min_revision: int | None = None,
+    payload: Mapping[str, ArrayLike] | None = None,
 ) -> Call[Prediction]:
     """Torque for arrays of shape (n,) or (N, n), and components by name; tau is for `forward_dynamics` only.
 
     The version that serves answers, unless one is named by its number or an alias. min_revision: of an acknowledgement,
     so that the answer contains what was taught, whichever service took it; refused with 503 where it takes too long.
+    payload: what the arm carries, `mass` in kg, `com` (3,) m and, unless it is a point, `inertia` (3, 3) kg·m², both in
+    the frame of the last link, the latter about the centre of mass.
     """
     body: dict[str, Any] = {"covariance": covariance, "components": list(components)}
     for name, values in (("q", q), ("dq", dq), ("ddq", ddq), ("tau", tau)):
         if values is not None:
             body[name] = np.asarray(values, dtype=np.float64).tolist()
+    if payload is not None:
+        body["payload"] = {name: np.asarray(value).tolist() for name, value in payload.items()}
     body |= given(version=version, alias=alias, min_revision=min_revision)
     return at(read_prediction, names={"model": model}, json=body)
 

@@ -59,6 +59,15 @@ def option(name: str, *values: Any) -> list[Bad]:
     return [body(JOBS, JOB | {"options": {name: value}}, f"options.{name}") for value in values]
 
 
+def carried(name: str, *values: Any, named: str | None = None) -> list[Bad]:
+    """Payloads with one wrong value at a time."""
+    right = {"mass": 1.0, "com": [0.0, 0.0, 0.1]}
+    return wrong(
+        PREDICT, QUERY, "payload", *(right | {name: value} for value in values), named=named or f"payload.{name}"
+    )
+
+
+DIAGONAL = [[1, 0, 0], [0, 1, 0]]
 NO_OBJECTS = [
     *(body(PREDICT, text, "body") for text in TEXTS),
     *(body(path, text, "body") for path in ROUTES for text in (b"", b"[]", b"[" * 100_000)),
@@ -85,6 +94,17 @@ PREDICTING = [
     *wrong(PREDICT, QUERY, "alias", "A", *ODD),
     *missing(PREDICT, QUERY, "alias", "nobody"),
     body(PREDICT, QUERY | {"alias": "serving", "version": 1}, "alias"),
+    *wrong(PREDICT, QUERY, "payload", 5, [], "2"),
+    *wrong(PREDICT, QUERY, "payload", {}, {"com": [0, 0, 0]}, named="payload.mass"),
+    *carried("mass", 0, -1, "2", True, None, NAN, INF, 1e7, 10**400),
+    *carried("com", None, 0.1, "0,0,0", {}, [0, 0], [0, 0, 0, 0]),
+    *carried("com", [0, NAN, 0], [0, "0", 0], [0, [0], 0], named="payload.com[1]"),
+    *carried("inertia", 1, [1, 1, 1, 0, 0, 0], [[1, 0, 0], [0, 1, 0]]),
+    *carried("inertia", [[1, 0, 0], [0, 1, 0], [0, 0, 2.1]], [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]),
+    *carried("inertia", [[1, 1, 0], [0, 1, 0], [0, 0, 1]]),
+    *carried("inertia", [*DIAGONAL, [0, 0]], named="payload.inertia[2]"),
+    *carried("inertia", [*DIAGONAL, [0, 0, NAN]], named="payload.inertia[2][2]"),
+    *carried("colour", "red"),
 ]
 TRAINING = [
     *wrong(JOBS, JOB, "model", "A", *ODD, None, 5),

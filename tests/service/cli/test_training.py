@@ -57,6 +57,19 @@ def test_components_are_printed_beside_the_torque(asked, refused, server):
     assert "tau is given, expected no tau" in refused(*command, "--tau", "0,0,0,0,0,0,0")
 
 
+def test_a_payload_is_declared_in_two_options(asked, refused, server):
+    inertia = [[0.02, 0.001, 0.002], [0.001, 0.03, 0.003], [0.002, 0.003, 0.04]]
+    payload = {"mass": 2.0, "com": [0.0, 0.01, 0.1], "inertia": inertia}
+    query = {"q": [0.1] * 7, "dq": [0.0] * 7, "ddq": [1.0] * 7, "payload": payload}
+    expected = server.client.post("/v1/models/panda-sim/predict", json=query).json()
+    motion = ("--q", ",".join(["0.1"] * 7), "--ddq", ",".join(["1"] * 7))
+    command = ("predict", "panda-sim", *motion, "--payload", "2,0,0.01,0.1")
+    assert asked(*command, "--payload-inertia", "0.02,0.001,0.002,0.03,0.003,0.04", "--json") == expected
+    assert asked(*command, "--json")["tau"] != expected["tau"]
+    text = refused(*command, "--payload-inertia", "1,0,0,1,0,3")
+    assert "expected no principal moment above the sum of the other two" in text
+
+
 def test_refusals_of_the_service_are_passed_on(refused, recording, tmp_path):
     message, hint = refused("predict", "nobody", "--q", "1").splitlines()
     assert message == "error: no model 'nobody' (not_found, 404)"

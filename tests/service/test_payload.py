@@ -1,0 +1,230 @@
+"""A payload declared in a query: the service answers as lipcore's model with it, whoever else asks for whichever."""
+
+import asyncio
+import gc
+import io
+import json
+import tarfile
+import threading
+import weakref
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+import lipcore
+from lipcore.data.motion import Motion
+from lipcore.model import dynamics
+from lipcore.model.payload import Body, Carrier, NoArmError
+from service.client import AsyncClient
+from service.inference import predicting
+from service.models import declared
+from service.models.declared import Declared
+from tests.service.data import error, service_of
+
+PREDICT = "/v1/models/panda-sim/predict"
+INERTIA = [[0.02, 0.003, 0.001], [0.003, 0.015, -0.002], [0.001, -0.002, 0.01]]
+PAYLOAD = {"mass": 2, "com": [0.05, -0.03, 0.12], "inertia": INERTIA}
+POINT = {"mass": 0.5, "com": [0, 0.0, 0.2]}
+EXACT = {"rtol": 1e-9, "atol": 1e-12}
+
+
+@pytest.fixture(scope="module")
+def panda():
+    """The shipped model, as lipcore reads it."""
+    return lipcore.load(Path(__file__).parents[2] / "models" / "panda-sim")
+
+
+@pytest.fixture(scope="module")
+def motion(panda):
+    """Four instants of seven joints: (3, 4, 7)."""
+    low, high = (np.array(panda.training_range["q"][end]) for end in ("min", "max"))
+    draw = np.random.default_rng(4)
+    return np.stack([draw.uniform(low, high, (4, 7)), *draw.uniform(-1, 1, (2, 4, 7))])
+
+
+def carrying(model, payload):
+    """The library's model with a payload."""
+    inertia = payload.get("inertia")
+    body = Body(payload["mass"], np.array(payload["com"]), None if inertia is None else np.array(inertia))
+    carrier = Carrier(model)
+    return carrier.carrying(carrier.known(body.parameters))
+
+
+def body(motion, **more):
+    return dict(zip(("q", "dq", "ddq"), motion.tolist(), strict=True)) | more
+
+
+def ask(api, motion, media_type="application/json", **more):
+    content = json.dumps(body(motion, **more))
+    answer = api.post(PREDICT, content=content, headers={"content-type": media_type})
+    assert answer.status_code == 200, answer.text
+    return answer.json()
+
+
+@pytest.mark.parametrize("payload", [PAYLOAD, POINT, PAYLOAD | {"inertia": None}])
+def test_an_answer_is_that_of_the_library(api, panda, motion, payload):
+    model = carrying(panda, payload)
+    expected = model.predict(*motion, covariance=True)
+    tau = expected.tau + 0.1
+    names = list(dynamics.COMPONENTS)
+    answer = ask(api, motion, payload=payload, covariance=True, components=names, tau=tau.tolist())
+    assert np.abs(expected.tau - panda.predict(*motion).tau).max() > 1
+    for name in ("tau", "tau_std", "covariance"):
+        assert_allclose(answer[name], getattr(expected, name), **EXACT)
+    parts = dynamics.components(model, Motion.from_arrays(*motion), names, torch.from_numpy(tau))
+    for name, part in parts.items():
+        size = float(part.mean.abs().max())
+        assert_allclose(answer["components"][name]["mean"], part.mean, rtol=1e-6, atol=1e-9 * size)
+        assert_allclose(answer["components"][name]["std"], part.std, rtol=1e-4, atol=1e-6 * size)
+
+
+def test_one_motion_is_answered_on_the_event_loop_once_its_payload_is_known(api, panda, motion, monkeypatch):
+    expected = carrying(panda, POINT).predict(*motion)
+    computed, predict = [], predicting.predict
+    monkeypatch.setattr(predicting, "predict", lambda *given: computed.append(1) or predict(*given))
+    service_of(api).loaded.get("panda-sim", None).declared._kept.clear()
+    for row in range(4):
+        for payload in (POINT, {**POINT, "com": [0, 0, 0.2], "mass": 5e-1}, {**POINT, "inertia": None}):
+            answer = ask(api, motion[:, row], payload=payload)
+            assert_allclose(answer["tau"], expected.tau[row], **EXACT)
+            assert_allclose(answer["tau_std"], expected.tau_std[row], rtol=1e-6)
+    assert len(computed) == 1
+    elsewhere = ask(api, motion[:, 0], "application/x+json", payload=POINT)  # the way of what pydantic reads
+    assert len(computed) == 2
+    assert_allclose(elsewhere["tau"], expected.tau[0], **EXACT)
+    assert ask(api, motion[:, 0], payload=None) == ask(api, motion[:, 0])
+    assert_allclose(ask(api, motion)["tau"], panda.predict(*motion).tau, **EXACT)
+
+
+@pytest.mark.parametrize("rows", [1, 4])
+def test_a_model_without_an_arm_carries_nothing(api, trained, rows):
+    zeros = np.zeros((3, 2) if rows == 1 else (3, rows, 2))
+    answer = api.post(f"/v1/models/{trained.name}/predict", json=body(zeros, payload=POINT))
+    (problem,) = error(answer, 422, "invalid_request")["detail"]
+    assert (problem["field"], problem["value"]) == ("payload", "given")
+    assert problem["expected"].startswith("no payload: a model with the estimator lip-chain knows no rigid bodies")
+    assert api.post(f"/v1/models/{trained.name}/predict", json=body(zeros, payload=None)).status_code == 200
+
+
+def test_impossible_bodies_are_refused_with_what_was_expected(api, motion):
+    def refused(**more):
+        answer = api.post(PREDICT, json=body(motion, payload=PAYLOAD | more))
+        (problem,) = error(answer, 422, "invalid_request")["detail"]
+        return problem["field"], problem["expected"]
+
+    sum_of = "no principal moment above the sum of the other two"
+    assert refused(inertia=[[1, 0, 0], [0, 1, 0], [0, 0, 3]]) == ("payload.inertia", sum_of)
+    assert refused(inertia=[[1, 1, 0], [0, 1, 0], [0, 0, 1]]) == ("payload.inertia", "a symmetric matrix")
+    assert refused(mass=0) == ("payload.mass", "greater than 0")
+    assert refused(com=[0, 1]) == ("payload.com", "a list of three")
+
+
+def test_clients_ask_with_a_payload(server, panda, motion):
+    expected = carrying(panda, PAYLOAD).predict(*motion)
+
+    async def asked():
+        async with AsyncClient(server.url) as client:
+            given = {name: np.array(value) for name, value in PAYLOAD.items()}
+            return await client.predict("panda-sim", *motion, payload=given)
+
+    assert_allclose(asyncio.run(asked()).tau, expected.tau, **EXACT)
+
+
+def test_what_is_stored_and_served_is_not_changed(api, motion):
+    def tensors():
+        with tarfile.open(fileobj=io.BytesIO(api.get("/v1/models/panda-sim/export").content)) as archive:
+            return archive.extractfile("model.safetensors").read()
+
+    version = "/v1/models/panda-sim/versions/1"
+    before = api.get(version).json(), ask(api, motion), tensors()
+    ask(api, motion, payload=PAYLOAD)
+    assert (api.get(version).json(), ask(api, motion), tensors()) == before
+
+
+PAYLOADS = [(mass, (0.0, 0.01 * place, 0.1), None) for place, mass in enumerate((0.5, 1.0, 2.0, 4.0))]
+
+
+@pytest.fixture(scope="module")
+def revisions(panda):
+    """Two revisions, and what each answers with each payload at one motion."""
+    weights = panda.posterior.weights * 1.01
+    models = panda, replace(panda, posterior=replace(panda.posterior, weights=weights))
+    at = np.full((3, 7), 0.3)
+    answers = {}
+    for revision, model in enumerate(models):
+        for mass, com, _ in PAYLOADS:
+            tau, _ = carrying(model, {"mass": mass, "com": com}).answer(at)
+            answers[revision, mass] = tau
+    return models, at, answers
+
+
+@settings(max_examples=10, deadline=None)
+@given(
+    asked=st.lists(
+        st.lists(st.tuples(st.sampled_from([0, 1]), st.sampled_from(PAYLOADS)), min_size=1, max_size=6),
+        min_size=2,
+        max_size=4,
+    )
+)
+def test_threads_never_get_the_answer_to_another_question(revisions, asked):
+    models, at, answers = revisions
+    kept = [Declared(model) for model in models]
+    wrong = []
+
+    def work(questions):
+        for revision, payload in questions:
+            model = kept[revision].known(payload) or kept[revision].model(payload)
+            if not np.allclose(model.answer(at)[0], answers[revision, payload[0]], rtol=1e-9):
+                wrong.append((revision, payload))
+            if len(kept[revision]._kept) > 2:
+                wrong.append("more are kept than may be")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(declared, "KEPT", 2)
+        threads = [threading.Thread(target=work, args=(questions,)) for questions in asked]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert not wrong
+
+
+def test_what_is_asked_for_again_is_kept_and_what_was_not_is_dropped(panda, monkeypatch):
+    monkeypatch.setattr(declared, "KEPT", 2)
+    kept = Declared(panda)
+    one, two, three, _ = PAYLOADS
+    first, second = kept.model(one), kept.model(two)
+    assert kept.model(one) is first
+    kept.model(three)
+    assert kept.known(one) is first
+    assert kept.known(two) is None
+    assert kept.model(two) is not second
+
+
+def test_refusals_leave_nothing_behind(panda, trained):
+    kept = Declared(panda)
+    with pytest.raises(ValueError, match="mass"):
+        kept.model((0.0, (0.0, 0.0, 0.0), None))
+    assert not kept._kept
+    with pytest.raises(NoArmError):
+        Declared(trained.model).model(PAYLOADS[0])
+
+
+def test_a_revision_has_payloads_of_its_own_which_go_with_it(api):
+    served = replace(service_of(api).loaded.get("panda-sim", None))
+    model = weakref.ref(served.declared.model(PAYLOADS[0]))
+    later = replace(served, revision=served.revision + 1)
+    assert later.declared is not served.declared
+    assert later.declared.known(PAYLOADS[0]) is None
+    gc.disable()  # what is kept is in no cycle: loaded versions are not looked through, see `LoadedModels`
+    try:
+        del served
+        assert model() is None
+    finally:
+        gc.enable()
