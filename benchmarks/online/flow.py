@@ -70,8 +70,8 @@ def live(bed: Bed, model: str, samples: Samples, motions: Array, websocket: bool
     return asked, _flow(acks, start, learnt, share, lags(acks, asked.revisions))
 
 
-def burst(bed: Bed, model: str, samples: Samples, motions: Array) -> Flow:
-    """Teach as fast as the service acknowledges, while the control loop asks."""
+def burst(bed: Bed, model: str, samples: Samples, motions: Array) -> tuple[Asked, Flow]:
+    """Ask while a stream is taught as fast as the service acknowledges."""
     requests = batch_requests(model, STREAM, samples, _COMPRESSED)
     with Asker(bed.tcp, model, motions) as asker, HttpClient(bed.tcp) as client:
         began, used = time.monotonic(), processor.seconds_below(bed.pid)
@@ -79,7 +79,7 @@ def burst(bed: Bed, model: str, samples: Samples, motions: Array) -> Flow:
         learnt = bed.wait_learnt(model, motions[0], max(ack.revision for ack in acks))
         share = (processor.seconds_below(bed.pid) - used) / (time.monotonic() - began)
         asked = asker.finish()
-    return _flow(acks, acks[0].sent, learnt, share, lags(acks, asked.revisions))
+    return asked, _flow(acks, acks[0].sent, learnt, share, lags(acks, asked.revisions))
 
 
 def lags(acks: Sequence[Ack], revisions: Sequence[tuple[int, int]]) -> list[float]:

@@ -41,13 +41,14 @@ ROBOTS, FLEET_SAMPLES = 10, 300
 class Options:
     """How much is measured.
 
-    fit: of all models; history_s, history_rate: of the motion that the model is trained on, s and Hz; idle_s: length of
+    estimator, fit: of all models; history_s, history_rate: of the motion that the model is trained on, s and Hz; idle_s: length of
     the loop before anything is learnt, burst_s: of the stream that is sent as fast as it is acknowledged; after:
     seconds after the change at which predictions are judged; sizes: samples seen at which an update is timed;
     refit_every, refit_window: s; websocket: the live stream comes in frames; only: parts, all where empty.
     """
 
     scene: Scene = field(default_factory=Scene)
+    estimator: str = "rigid-body"
     fit: Mapping[str, Any] = field(default_factory=lambda: dict(FIT))
     history_s: float = 80.0
     history_rate: float = 10.0
@@ -89,7 +90,7 @@ def run(options: Options, console: Console) -> Results:
         home = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lipserve-bench-")))
         history = scene.history(options.history_s, options.history_rate)
         console.print(f"training on {len(history)} samples of {scene.robot}", highlight=False)
-        base, seconds = train(history, scene.arm.joint_types, options.fit)
+        base, seconds = train(history, scene.arm.joint_types, options.fit, options.estimator)
         manifest = lipcore.save(base, home / "model")
         said = f"trained here in {seconds:.0f} s on {options.history_s:g} s at {options.history_rate:g} Hz"
         results = Results(machine, facts.model(manifest, f"{said}, speed {scene.speed:g}"), joints=base.joint_names)
@@ -129,7 +130,7 @@ def _flow(bed: Bed, samples: Samples, options: Options, results: Results, consol
     console.print(f"the same while {options.scene.seconds:g} s are learnt in real time", highlight=False)
     results.learning, results.live = flow.live(bed, LIVE, samples, motions, options.websocket)
     console.print(f"the same while {options.burst_s:g} s are learnt as fast as they are acknowledged", highlight=False)
-    results.burst = flow.burst(bed, BURST, options.scene.more(options.burst_s), motions)
+    results.pushed, results.burst = flow.burst(bed, BURST, options.scene.more(options.burst_s), motions)
     for name, found in (("in real time", results.live), ("as fast as acknowledged", results.burst)):
         kept_out = ", ".join(f"{count} {code}" for code, count in found.rejected.items()) or "none"
         results.notes.append(f"{name}: the learner had {found.learner:.0%} of one core; rows kept out: {kept_out}")
@@ -158,7 +159,9 @@ def _baselines(
     scene, moments = options.scene, options.moments
     console.print("the other ways to learn, in this process", highlight=False)
     untaught = quality.untaught(base, scene, moments)
-    refitted = quality.refitted(scene, samples, moments, options.fit, options.refit_every, options.refit_window)
+    refitted = quality.refitted(
+        scene, samples, moments, options.estimator, options.fit, options.refit_every, options.refit_window
+    )
     fitted = lipcore.train(history, scene.arm.joint_types, "se", lipcore.FitOptions(**options.fit))
     fourier = quality.fourier(scene, history, samples, moments, fitted, options.forgetting_s)
     ordered: list[Method] = [untaught, *results.methods.values(), refitted, fourier]
