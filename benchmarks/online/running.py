@@ -33,7 +33,8 @@ PARTS = ("flow", "cost", "quality", "fleet")
 LIVE, BURST = "live", "burst"
 """Models that are taught under load; each part teaches copies of its own."""
 FIT: Mapping[str, Any] = {"posterior_samples": 500, "max_inducing_outputs": 500}
-"""Of the model and of its refits: small enough that a core learns 1000 samples a second with some to spare."""
+"""Of the model and of its refits. An estimator with inducing outputs has so few of them that a core learns 1000 samples
+a second with some to spare."""
 ROBOTS, FLEET_SAMPLES = 10, 300
 
 
@@ -41,10 +42,11 @@ ROBOTS, FLEET_SAMPLES = 10, 300
 class Options:
     """How much is measured.
 
-    estimator, fit: of all models; history_s, history_rate: of the motion that the model is trained on, s and Hz; idle_s: length of
-    the loop before anything is learnt, burst_s: of the stream that is sent as fast as it is acknowledged; after:
-    seconds after the change at which predictions are judged; sizes: samples seen at which an update is timed;
-    refit_every, refit_window: s; websocket: the live stream comes in frames; only: parts, all where empty.
+    estimator, fit: of all models, the learnt arm by default, which `auto` takes for an arm; history_s, history_rate: of
+    the motion that the model is trained on, s and Hz; idle_s: length of the loop before anything is learnt, burst_s: of
+    the stream that is sent as fast as it is acknowledged; after: seconds after the change at which predictions are
+    judged; sizes: samples seen at which an update is timed; refit_every, refit_window: s; websocket: the live stream
+    comes in frames; only: parts, all where empty.
     """
 
     scene: Scene = field(default_factory=Scene)
@@ -136,9 +138,10 @@ def _flow(bed: Bed, samples: Samples, options: Options, results: Results, consol
         results.notes.append(f"{name}: the learner had {found.learner:.0%} of one core; rows kept out: {kept_out}")
     how = "in frames over a WebSocket, one a row" if options.websocket else f"in batches of {BATCH_ROWS} rows over HTTP"
     results.notes.append(
-        f"the live stream comes {how}; its payload of {options.scene.payload:g} kg comes at "
-        f"{options.scene.change_at:g} s, and rows are kept out as contacts until it is taken for a change; "
-        "the learner process starts with the first batch of all, and what it has to catch up with then counts"
+        f"the live stream comes {how}, what is pushed in batches of {flow.PUSHED_ROWS}; the payload of "
+        f"{options.scene.payload:g} kg comes at {options.scene.change_at:g} s of the live stream, and rows are kept "
+        "out as contacts until it is taken for a change; the learner process starts with the first batch of all, and "
+        "what it has to catch up with then counts"
     )
 
 

@@ -33,9 +33,7 @@ ARRAYS = tuple(field.name for field in fields(Rows))
 """Of the safetensors archive that an event's rows are kept as."""
 
 
-_OF_STREAM = select(EventRow).where(
-    EventRow.model == bindparam("model"), EventRow.stream_id == bindparam("stream_id")
-)
+_OF_STREAM = select(EventRow).where(EventRow.model == bindparam("model"), EventRow.stream_id == bindparam("stream_id"))
 _BEFORE = _OF_STREAM.where(EventRow.sequence < bindparam("sequence")).order_by(EventRow.sequence.desc()).limit(1)
 _AFTER = _OF_STREAM.where(EventRow.sequence > bindparam("sequence")).order_by(EventRow.sequence).limit(1)
 _NEWEST = select(EventRow.number).where(EventRow.model == bindparam("model")).order_by(EventRow.number.desc()).limit(1)

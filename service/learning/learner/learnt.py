@@ -25,6 +25,8 @@ SECONDS = 2.0
 FEWEST_ROWS = 200
 MOST_EVENTS = 500
 """Batches that are looked at, at most."""
+READ_EVENTS = 20
+"""Batches that are read together: few are needed as a rule."""
 
 
 def floor(database: Database, model: str, version: int, through: int, n_joints: int) -> Array:
@@ -36,15 +38,18 @@ def floor(database: Database, model: str, version: int, through: int, n_joints: 
     of_version = (EventRow.kind == "batch", EventRow.version == version)
     upto = (EventRow.model == model, EventRow.number <= through)
     query = select(EventRow.received, EventRow.record).where(*upto, *of_version).order_by(EventRow.number.desc())
+    total, newest = Record.empty(n_joints), None
     with database.session() as session:
         counts = EventRow.void.is_(False) | EventRow.number.in_(_undone_later(session, model, through))
-        rows = session.execute(query.where(counts).limit(MOST_EVENTS))
-        records = [(received, record) for received, record in rows if record is not None]
-    total = Record.empty(n_joints)
-    for received, record in records:
-        if total.rows >= FEWEST_ROWS and received < records[0][0] - SECONDS:
-            break
-        total += Record.from_json(record)
+        rows = session.execute(query.where(counts).limit(MOST_EVENTS).execution_options(yield_per=READ_EVENTS))
+        for received, record in rows:
+            if record is None:
+                continue
+            newest = received if newest is None else newest
+            if total.rows >= FEWEST_ROWS and received < newest - SECONDS:
+                break
+            total += Record.from_json(record)
+        rows.close()
     return error_floor(total)
 
 
