@@ -18,8 +18,9 @@ class Results:
     """Everything that is printed; None or empty is what was not measured.
 
     facts: machine and packages; model: what was taught; live: the stream in real time, burst: the one that came as fast
-    as it was acknowledged, and learning and pushed: who asked meanwhile; moments: names in order; robots, merged: how many robots' statistics were put together, and
-    how far the outcome lies from training on all of their samples at once, relative.
+    as it was acknowledged; learning, pushed: who asked during each; moments: names in order; robots, merged: how many
+    robots' statistics were put together, and how far the outcome lies from training on all of their samples at once,
+    relative.
     """
 
     facts: dict[str, str]
