@@ -19,7 +19,7 @@ from lipcore.data.samples import Array, Samples
 from service.client.stream import StreamClient
 
 STREAM = "bench"
-PUSHED_ROWS = 200
+PUSHED_ROWS = 500
 """Rows of a batch of a stream that is pushed."""
 _COMPRESSED = 0.1
 """Of the time of a stream that is sent faster than it ran: otherwise its rows would come from the future."""

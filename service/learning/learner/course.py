@@ -17,7 +17,8 @@ from service.journal import log
 from service.storage.database import EventRow, fetch
 
 PAGE_ROWS = 500
-"""Rows that are learnt in one step, unless a single batch has more: about 0.4 s for a robot of seven joints."""
+"""Rows that are learnt in one step, unless a single batch has more: for a robot of seven joints about 15 ms with the
+learnt arm, and up to 0.4 s with an estimator of many inducing outputs."""
 PAGE_EVENTS = 200
 
 _PART = (

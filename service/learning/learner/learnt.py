@@ -41,7 +41,8 @@ def floor(database: Database, model: str, version: int, through: int, n_joints: 
     of_version = (EventRow.kind == "batch", EventRow.version == version)
     upto = (EventRow.model == model, EventRow.number <= through)
     query = select(EventRow.received, EventRow.record).where(*upto, *of_version).order_by(EventRow.number.desc())
-    records, newest, rows = list[dict[str, Any]](), None, 0
+    records, rows = list[dict[str, Any]](), 0
+    newest: float | None = None
     with database.session() as session:
         counts = EventRow.void.is_(False) | EventRow.number.in_(_undone_later(session, model, through))
         found = session.execute(query.where(counts).limit(MOST_EVENTS).execution_options(yield_per=READ_EVENTS))
