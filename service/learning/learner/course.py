@@ -144,7 +144,8 @@ def batch_of(event: EventRow) -> int:
 def _rollbacks(session: Session, model: str, start: int, number: int, last: int) -> list[tuple[int, int, int]]:
     """Rollbacks after an event: where each leads on the log that is left by then, its own number, the one it names."""
     rollbacks: list[tuple[int, int, int]] = []
-    for own, detail in fetch(session, _ROLLBACKS, model=model, after=number, through=last):
+    for row in fetch(session, _ROLLBACKS, model=model, after=number, through=last):
+        own, detail = row.number, row.detail
         to = max(detail["to"], start)
         for before, until, _ in rollbacks:
             to = before if before < to < until else to
@@ -194,7 +195,7 @@ def _is_reweighed(session: Session, model: str, number: int, through: int) -> bo
 def _undone(session: Session, model: str, number: int, through: int) -> list[range]:
     """The events that rollbacks between two events have undone."""
     rollbacks = fetch(session, _ROLLBACKS, model=model, after=number, through=through)
-    return [range(detail["to"] + 1, own) for own, detail in rollbacks]
+    return [range(each.detail["to"] + 1, each.number) for each in rollbacks]
 
 
 def _span(model: str, after: int, through: int) -> tuple[ColumnElement[bool], ...]:

@@ -95,7 +95,7 @@ def _configure(connection: Any, _: object) -> None:
     cursor.close()
 
 
-def fetch(session: Session, statement: Select[Any], **parameters: object) -> CursorResult[tuple[Any, ...]]:
+def fetch(session: Session, statement: Select[Any], **parameters: object) -> CursorResult[Any]:
     """Rows of a statement that is made once, with parameters (`bindparam`); what the session has changed is in them.
 
     For columns that are read for every batch: to make a statement each time, and an object of each row, takes six times
