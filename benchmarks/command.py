@@ -116,8 +116,9 @@ def online(
     payload: Annotated[float, typer.Option(min=0, help="kg, attached in the middle of the stream.")] = 1.5,
     drift: Annotated[float, typer.Option(min=0, help="Share by which friction grows over the stream.")] = 0.3,
     forgetting: Annotated[float, typer.Option(min=1, help="Time constant of forgetting, s.")] = 30.0,
+    estimator: Annotated[str, typer.Option(help="Of the model: by default the learnt arm.")] = "rigid-body",
     inducing: Annotated[
-        int, typer.Option(min=1, help="Most inducing outputs of the model: what a sample costs to learn.")
+        int, typer.Option(min=1, help="Most inducing outputs of an estimator that has some: what a sample costs.")
     ] = 500,
     websocket: Annotated[bool, typer.Option("--websocket", help="Stream in frames, not in batches over HTTP.")] = False,
     only: Annotated[str | None, typer.Option(help=f"Names separated by commas: {', '.join(PARTS)}.")] = None,
@@ -131,6 +132,7 @@ def online(
     seconds, change = (12.0, 6.0) if quick else (60.0, 30.0)
     options = online_running.Options(
         scene=Scene(robot, seconds, change, speed=speed, payload=payload, drift=drift, seed=seed),
+        estimator=estimator,
         fit={**online_running.FIT, **(QUICK_FIT if quick else {}), "max_inducing_outputs": inducing},
         forgetting_s=forgetting,
         websocket=websocket,

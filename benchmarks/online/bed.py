@@ -87,10 +87,12 @@ def serving(home: Path, settings: Mapping[str, Any] | None = None) -> Iterator[B
         service.stop()
 
 
-def train(samples: Samples, joint_types: tuple[str, ...], fit: Mapping[str, Any]) -> tuple[TorqueModel, float]:
+def train(
+    samples: Samples, joint_types: tuple[str, ...], fit: Mapping[str, Any], estimator: str = "lip-chain"
+) -> tuple[TorqueModel, float]:
     """Train a model in this process; also return how long it took, s."""
     began = time.monotonic()
-    model = lipcore.train(samples, joint_types, "lip-chain", lipcore.FitOptions(**fit))
+    model = lipcore.train(samples, joint_types, estimator, lipcore.FitOptions(**fit))
     return model, time.monotonic() - began
 
 

@@ -19,6 +19,8 @@ from lipcore.data.samples import Array, Samples
 from service.client.stream import StreamClient
 
 STREAM = "bench"
+PUSHED_ROWS = 500
+"""Rows of a batch of a stream that is pushed."""
 _COMPRESSED = 0.1
 """Of the time of a stream that is sent faster than it ran: otherwise its rows would come from the future."""
 
@@ -70,16 +72,16 @@ def live(bed: Bed, model: str, samples: Samples, motions: Array, websocket: bool
     return asked, _flow(acks, start, learnt, share, lags(acks, asked.revisions))
 
 
-def burst(bed: Bed, model: str, samples: Samples, motions: Array) -> Flow:
-    """Teach as fast as the service acknowledges, while the control loop asks."""
-    requests = batch_requests(model, STREAM, samples, _COMPRESSED)
+def burst(bed: Bed, model: str, samples: Samples, motions: Array) -> tuple[Asked, Flow]:
+    """Ask while a stream is taught as fast as the service acknowledges."""
+    requests = batch_requests(model, STREAM, samples, _COMPRESSED, PUSHED_ROWS)
     with Asker(bed.tcp, model, motions) as asker, HttpClient(bed.tcp) as client:
         began, used = time.monotonic(), processor.seconds_below(bed.pid)
         acks = send_all(client, requests)
         learnt = bed.wait_learnt(model, motions[0], max(ack.revision for ack in acks))
         share = (processor.seconds_below(bed.pid) - used) / (time.monotonic() - began)
         asked = asker.finish()
-    return _flow(acks, acks[0].sent, learnt, share, lags(acks, asked.revisions))
+    return asked, _flow(acks, acks[0].sent, learnt, share, lags(acks, asked.revisions))
 
 
 def lags(acks: Sequence[Ack], revisions: Sequence[tuple[int, int]]) -> list[float]:

@@ -91,7 +91,13 @@ def untaught(base: TorqueModel, scene: Scene, moments: Sequence[Moment]) -> Meth
 
 
 def refitted(
-    scene: Scene, samples: Samples, moments: Sequence[Moment], fit: Mapping[str, Any], every: float, window: float
+    scene: Scene,
+    samples: Samples,
+    moments: Sequence[Moment],
+    estimator: str,
+    fit: Mapping[str, Any],
+    every: float,
+    window: float,
 ) -> Method:
     """A model trained anew every so many seconds, on the rows of the last `window` seconds or since the change.
 
@@ -106,7 +112,7 @@ def refitted(
             start = max(at - window, scene.change_at if at > scene.change_at else 0.0)
             chosen = samples.rows((samples.t >= start) & (samples.t < at))
             thinned = chosen.rows(slice(None, None, -(-len(chosen) // REFIT_ROWS)))
-            models[at], seconds = train(thinned, scene.arm.joint_types, fit)
+            models[at], seconds = train(thinned, scene.arm.joint_types, fit, estimator)
             method.seconds.append(seconds)
         method.found[moment.name] = _judged(scene, models[at], moment.at)
     return method

@@ -18,14 +18,16 @@ class Results:
     """Everything that is printed; None or empty is what was not measured.
 
     facts: machine and packages; model: what was taught; live: the stream in real time, burst: the one that came as fast
-    as it was acknowledged; moments: names in order; robots, merged: how many robots' statistics were put together, and
-    how far the outcome lies from training on all of their samples at once, relative.
+    as it was acknowledged; learning, pushed: who asked during each; moments: names in order; robots, merged: how many
+    robots' statistics were put together, and how far the outcome lies from training on all of their samples at once,
+    relative.
     """
 
     facts: dict[str, str]
     model: dict[str, str]
     idle: Asked | None = None
     learning: Asked | None = None
+    pushed: Asked | None = None
     live: Flow | None = None
     burst: Flow | None = None
     costs: list[Cost] = field(default_factory=list)

@@ -33,7 +33,8 @@ PARTS = ("flow", "cost", "quality", "fleet")
 LIVE, BURST = "live", "burst"
 """Models that are taught under load; each part teaches copies of its own."""
 FIT: Mapping[str, Any] = {"posterior_samples": 500, "max_inducing_outputs": 500}
-"""Of the model and of its refits: small enough that a core learns 1000 samples a second with some to spare."""
+"""Of the model and of its refits. An estimator with inducing outputs has so few of them that a core learns 1000 samples
+a second with some to spare."""
 ROBOTS, FLEET_SAMPLES = 10, 300
 
 
@@ -41,13 +42,15 @@ ROBOTS, FLEET_SAMPLES = 10, 300
 class Options:
     """How much is measured.
 
-    fit: of all models; history_s, history_rate: of the motion that the model is trained on, s and Hz; idle_s: length of
-    the loop before anything is learnt, burst_s: of the stream that is sent as fast as it is acknowledged; after:
-    seconds after the change at which predictions are judged; sizes: samples seen at which an update is timed;
-    refit_every, refit_window: s; websocket: the live stream comes in frames; only: parts, all where empty.
+    estimator, fit: of all models, the learnt arm by default, which `auto` takes for an arm; history_s, history_rate: of
+    the motion that the model is trained on, s and Hz; idle_s: length of the loop before anything is learnt, burst_s: of
+    the stream that is sent as fast as it is acknowledged; after: seconds after the change at which predictions are
+    judged; sizes: samples seen at which an update is timed; refit_every, refit_window: s; websocket: the live stream
+    comes in frames; only: parts, all where empty.
     """
 
     scene: Scene = field(default_factory=Scene)
+    estimator: str = "rigid-body"
     fit: Mapping[str, Any] = field(default_factory=lambda: dict(FIT))
     history_s: float = 80.0
     history_rate: float = 10.0
@@ -89,7 +92,7 @@ def run(options: Options, console: Console) -> Results:
         home = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lipserve-bench-")))
         history = scene.history(options.history_s, options.history_rate)
         console.print(f"training on {len(history)} samples of {scene.robot}", highlight=False)
-        base, seconds = train(history, scene.arm.joint_types, options.fit)
+        base, seconds = train(history, scene.arm.joint_types, options.fit, options.estimator)
         manifest = lipcore.save(base, home / "model")
         said = f"trained here in {seconds:.0f} s on {options.history_s:g} s at {options.history_rate:g} Hz"
         results = Results(machine, facts.model(manifest, f"{said}, speed {scene.speed:g}"), joints=base.joint_names)
@@ -129,15 +132,16 @@ def _flow(bed: Bed, samples: Samples, options: Options, results: Results, consol
     console.print(f"the same while {options.scene.seconds:g} s are learnt in real time", highlight=False)
     results.learning, results.live = flow.live(bed, LIVE, samples, motions, options.websocket)
     console.print(f"the same while {options.burst_s:g} s are learnt as fast as they are acknowledged", highlight=False)
-    results.burst = flow.burst(bed, BURST, options.scene.more(options.burst_s), motions)
+    results.pushed, results.burst = flow.burst(bed, BURST, options.scene.more(options.burst_s), motions)
     for name, found in (("in real time", results.live), ("as fast as acknowledged", results.burst)):
         kept_out = ", ".join(f"{count} {code}" for code, count in found.rejected.items()) or "none"
         results.notes.append(f"{name}: the learner had {found.learner:.0%} of one core; rows kept out: {kept_out}")
     how = "in frames over a WebSocket, one a row" if options.websocket else f"in batches of {BATCH_ROWS} rows over HTTP"
     results.notes.append(
-        f"the live stream comes {how}; its payload of {options.scene.payload:g} kg comes at "
-        f"{options.scene.change_at:g} s, and rows are kept out as contacts until it is taken for a change; "
-        "the learner process starts with the first batch of all, and what it has to catch up with then counts"
+        f"the live stream comes {how}, what is pushed in batches of {flow.PUSHED_ROWS}; the payload of "
+        f"{options.scene.payload:g} kg comes at {options.scene.change_at:g} s of the live stream, and rows are kept "
+        "out as contacts until it is taken for a change; the learner process starts with the first batch of all, and "
+        "what it has to catch up with then counts"
     )
 
 
@@ -158,7 +162,9 @@ def _baselines(
     scene, moments = options.scene, options.moments
     console.print("the other ways to learn, in this process", highlight=False)
     untaught = quality.untaught(base, scene, moments)
-    refitted = quality.refitted(scene, samples, moments, options.fit, options.refit_every, options.refit_window)
+    refitted = quality.refitted(
+        scene, samples, moments, options.estimator, options.fit, options.refit_every, options.refit_window
+    )
     fitted = lipcore.train(history, scene.arm.joint_types, "se", lipcore.FitOptions(**options.fit))
     fourier = quality.fourier(scene, history, samples, moments, fitted, options.forgetting_s)
     ordered: list[Method] = [untaught, *results.methods.values(), refitted, fourier]

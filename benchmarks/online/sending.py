@@ -58,10 +58,12 @@ def batch_request(model: str, stream_id: str, sequence: int, samples: Samples, t
     return post(f"/v1/models/{model}/observations", msgspec.json.encode(body))
 
 
-def batch_requests(model: str, stream_id: str, samples: Samples, time_scale: float = 1.0) -> list[bytes]:
-    """Requests of BATCH_ROWS samples each, sequences from 0 on."""
-    starts = range(0, len(samples), BATCH_ROWS)
-    parts = (samples.rows(slice(start, start + BATCH_ROWS)) for start in starts)
+def batch_requests(
+    model: str, stream_id: str, samples: Samples, time_scale: float = 1.0, rows: int | None = None
+) -> list[bytes]:
+    """Requests of so many samples each, BATCH_ROWS where None, sequences from 0 on."""
+    rows = rows or BATCH_ROWS
+    parts = (samples.rows(slice(start, start + rows)) for start in range(0, len(samples), rows))
     return [batch_request(model, stream_id, number, part, time_scale) for number, part in enumerate(parts)]
 
 

@@ -29,20 +29,22 @@ def grids(results: Results) -> list[Grid]:
 def latencies(results: Results) -> Grid:
     """Percentiles of answers, idle and while the model learns."""
     rows = []
-    for state, asked in (("idle", results.idle), ("learning", results.learning)):
+    states = {"idle": results.idle, "learning": results.learning, "pushed": results.pushed}
+    for state, asked in states.items():
         if asked is not None:
             rows += [
                 _timing(f"answer, {state}", asked.answers),
                 _timing(f"from the tick, {state}", asked.ticks),
                 _timing(f"echo, {state}", asked.echo),
             ]
-    if results.idle is not None and results.learning is not None:
-        rows += [
-            _ratios("answer, learning / idle", results.learning.answers, results.idle.answers),
-            _ratios("echo, learning / idle", results.learning.echo, results.idle.echo),
-        ]
+    for state, asked in states.items():
+        if asked is not None and results.idle is not None and asked is not results.idle:
+            rows += [
+                _ratios(f"answer, {state} / idle", asked.answers, results.idle.answers),
+                _ratios(f"echo, {state} / idle", asked.echo, results.idle.echo),
+            ]
     columns = ("500 Hz WebSocket loop, µs", "answers", "p50", "p90", "p99", "p99.9", "largest")
-    return Grid("prediction while the model learns 1000 rows a second", columns, rows)
+    return Grid("prediction while the model learns: 1000 rows a second, and pushed", columns, rows)
 
 
 def flows(results: Results) -> Grid:

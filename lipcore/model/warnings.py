@@ -51,10 +51,9 @@ def linearisation_error(model: TorqueModel) -> Array | None:
     step = known.mean - centre
     weights = centre + step - known.covariance @ (step / known.scale**2) / posterior.std_factor**2
     linear = term.features(motion).numpy()[:, :, :used] @ weights[:used]
-    answer = posterior.predict(motion)
-    stated = answer.covariance.diagonal(dim1=1, dim2=2).clamp_min(0.0) + posterior.noise_variance
+    std = model.evaluator.many(motion.q.numpy(), motion.dq.numpy(), motion.ddq.numpy())[1]
     error = term.torque(weights, motion) - linear
-    return np.asarray(np.sqrt(np.mean(error**2 / stated.numpy(), axis=0)))
+    return np.asarray(np.sqrt(np.mean(error**2 / (std**2 + model.noise_std**2), axis=0)))
 
 
 def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:

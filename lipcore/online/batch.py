@@ -48,7 +48,8 @@ class Rows:
     @property
     def learnt(self) -> Rows:
         """The rows that teach."""
-        return self.take(self.code == LEARNT)
+        teaches = self.code == LEARNT
+        return self if teaches.all() else self.take(teaches)
 
     def motion(self) -> Motion:
         """Position, velocity and acceleration as tensors; raise ValueError where one is not finite."""

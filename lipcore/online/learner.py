@@ -161,8 +161,9 @@ class OnlineModel:
         if not len(rows):
             return self
         model = self if own else self.detached()
-        for first in range(0, len(rows), CHUNK):
-            model = model._add_chunk(rows.take(slice(first, first + CHUNK)), sign, novel)
+        parts = [rows] if len(rows) <= CHUNK else [rows.take(slice(i, i + CHUNK)) for i in range(0, len(rows), CHUNK)]
+        for part in parts:
+            model = model._add_chunk(part, sign, novel)
         return model if own else model.symmetrised()
 
     def _add_chunk(self, rows: Rows, sign: float, novel: Novel | None) -> OnlineModel:
@@ -171,7 +172,8 @@ class OnlineModel:
         current = rows.time >= model.now.begins
         now, before = model.now, model.before
         if current.any():
-            now = replace(now, statistics=model._summed(now.statistics, rows.take(current), sign, novel))
+            taken = rows if current.all() else rows.take(current)
+            now = replace(now, statistics=model._summed(now.statistics, taken, sign, novel))
         if before is not None and (late := ~current & (rows.time >= before.begins)).any():
             before = replace(before, statistics=model._summed(before.statistics, rows.take(late), sign, novel))
             now = replace(now, centre=before.solve().mean)

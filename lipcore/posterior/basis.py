@@ -66,18 +66,10 @@ class Basis:
             start += size
         raise ValueError("the linear term is none of this basis")
 
-    def covariance(self, query: Motion) -> Tensor:
-        """cov(u, f(x)) for the torques of N queries, before whitening: (M, N n)."""
-        parts = []
-        if self.term is not None:
-            parts.append(self.term.gram(self.params, self.inducing, query)[self.outputs])
-        parts += [each.covariance(self.params) @ _rows(each, query).T for each in self.linear]
-        return torch.cat(parts)
-
     def features(self, query: Motion) -> Tensor:
         """φ(x) = B⁻¹ cov(u, f(x)) for the torques of N queries (eq. 24 of docs/method.md): (M, N n)."""
-        solved: Tensor = torch.linalg.solve_triangular(self.root, self.covariance(query), upper=False)
-        return solved
+        gram = None if self.term is None else self.term.gram(self.params, self.inducing, query)[self.outputs]
+        return self._whitened(gram, query)
 
     def uncovered(self, query: Motion, features: Tensor) -> Tensor:
         """Variance k(x, x) − φᵀφ that the basis leaves open at N queries, (N, n). features: φ(x), (M, N n)."""
@@ -95,13 +87,34 @@ class Basis:
         motions = np.stack([query.q.numpy(), query.dq.numpy(), query.ddq.numpy()], axis=1)
         self._cross.fill_many(motions, blocks.numpy())
         gram = blocks[:, :size].permute(1, 2, 0, 3).reshape(size * n, len(query) * n)[self.outputs]
-        parts = [gram, *(each.covariance(self.params) @ _rows(each, query).T for each in self.linear)]
-        features = torch.linalg.solve_triangular(self.root, torch.cat(parts), upper=False)
+        features = self._whitened(gram, query)
         return features, self._open(blocks[:, size].diagonal(dim1=1, dim2=2), features)
 
     @cached_property
     def _cross(self) -> Cross | None:
         return None if self.term is None else self.term.cross(self.params, self.inducing)
+
+    def _whitened(self, gram: Tensor | None, query: Motion) -> Tensor:
+        """φ of N queries, (M, N n). gram: covariance of the chosen torques with theirs, (m, N n)."""
+        out = torch.empty((len(self), len(query) * query.n_joints), dtype=torch.float64, device=self.root.device)
+        first = len(self.outputs)
+        if gram is not None:
+            out[:first] = torch.linalg.solve_triangular(self.root[:first, :first], gram, upper=False)
+        for each in self.linear:
+            rows = _rows(each, query).T
+            last = first + len(rows)
+            torch.mul(rows, self._scales[first:last, None], out=out[first:last])
+            first = last
+        return out
+
+    @cached_property
+    def _scales(self) -> Tensor:
+        """What B⁻¹ Λ makes of each linear weight's features, as both are diagonal there: (M,), 0 for the torques."""
+        scales = torch.zeros(len(self), dtype=torch.float64, device=self.root.device)
+        for each in self.linear:
+            rows, covariance = self.rows(each), each.covariance(self.params).detach()
+            scales[rows] = covariance.diagonal() / self.root.diagonal()[rows]
+        return scales
 
     def _open(self, prior: Tensor, features: Tensor) -> Tensor:
         # the linear terms' own features leave nothing open

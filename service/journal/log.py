@@ -13,13 +13,13 @@ from typing import Any, Literal
 import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
-from sqlalchemy import Select, delete, func, select, update
+from sqlalchemy import Select, bindparam, delete, func, select, update
 from sqlalchemy.orm import Session, undefer
 
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.errors import BusyError, ConflictError
-from service.storage.database import EventRow, LearnerRow, LearningRow, SnapshotRow, StreamRow, now
+from service.storage.database import EventRow, LearnerRow, LearningRow, SnapshotRow, StreamRow, fetch, now
 from service.web.rows import Page
 from service.web.rows import newest as newest_rows
 
@@ -31,6 +31,15 @@ MOST_RANGES = 1000
 """Ranges that are remembered; the lowest are given up first, being the least likely to be filled."""
 ARRAYS = tuple(field.name for field in fields(Rows))
 """Of the safetensors archive that an event's rows are kept as."""
+
+
+_OF_STREAM = select(EventRow).where(EventRow.model == bindparam("model"), EventRow.stream_id == bindparam("stream_id"))
+_BEFORE = _OF_STREAM.where(EventRow.sequence < bindparam("sequence")).order_by(EventRow.sequence.desc()).limit(1)
+_AFTER = _OF_STREAM.where(EventRow.sequence > bindparam("sequence")).order_by(EventRow.sequence).limit(1)
+_NEWEST = select(EventRow.number).where(EventRow.model == bindparam("model")).order_by(EventRow.number.desc()).limit(1)
+_START = select(LearnerRow.start).where(
+    LearnerRow.model == bindparam("model"), LearnerRow.version == bindparam("version")
+)
 
 
 @dataclass(frozen=True)
@@ -88,7 +97,7 @@ class NewBatch:
 
 
 def append_batch(session: Session, model: str, batch: NewBatch, most_streams: int | None = None) -> EventRow:
-    """Log a batch and what its stream still misses; return its event.
+    """Log a batch and what its stream still misses; return its event, which is written with the session's next flush.
 
     Raise ConflictError where the stream is of another kind, where frames do not go on after the last, or where the
     batch may have been learnt before and is no longer kept; BusyError beyond `most_streams` streams of the model. That
@@ -104,8 +113,9 @@ def append(
     session: Session, model: str, kind: EventKind, detail: dict[str, Any], received: float, rows: Rows | None = None
 ) -> EventRow:
     """Log an event of another kind than a batch; return it."""
-    event = EventRow(number=newest(session, model) + 1, detail=detail)
-    return _append(session, event, model, kind, received, rows)
+    event = _append(session, EventRow(number=newest(session, model) + 1, detail=detail), model, kind, received, rows)
+    session.flush()
+    return event
 
 
 def find_batch(session: Session, model: str, stream_id: str, sequence: int) -> EventRow | None:
@@ -122,10 +132,12 @@ def covering(session: Session, model: str, stream_id: str, sequence: int) -> Eve
 
 def neighbours(session: Session, model: str, stream_id: str, sequence: int) -> tuple[EventRow | None, EventRow | None]:
     """The batches that are kept next below and next above a sequence, with a gap in between or without."""
-    query = _of_stream(model, stream_id)
-    before = query.where(EventRow.sequence < sequence).order_by(EventRow.sequence.desc()).limit(1)
-    after = query.where(EventRow.sequence > sequence).order_by(EventRow.sequence).limit(1)
-    return session.scalar(before), session.scalar(after)
+    source = stream(session, model, stream_id)
+    if source is None:
+        return None, None
+    place = {"model": model, "stream_id": stream_id, "sequence": sequence}
+    # most batches are the last of their stream
+    return session.scalar(_BEFORE, place), session.scalar(_AFTER, place) if sequence < source.last else None
 
 
 def stream(session: Session, model: str, stream_id: str) -> StreamRow | None:
@@ -141,8 +153,7 @@ def is_forgotten(source: StreamRow, sequence: int) -> bool:
 
 def newest(session: Session, model: str) -> int:
     """Number of the newest event, 0 where there is none."""
-    query = select(EventRow.number).where(EventRow.model == model).order_by(EventRow.number.desc()).limit(1)
-    return session.scalar(query) or 0
+    return fetch(session, _NEWEST, model=model).scalar() or 0
 
 
 def events(session: Session, model: str, after: int, limit: int, void: bool = False) -> list[EventRow]:
@@ -220,8 +231,7 @@ def forgetting(session: Session, model: str, number: int) -> float | None:
 
 def start_of(session: Session, model: str, version: int) -> int:
     """Number of the last event that a version contains by training."""
-    row = session.get(LearnerRow, (model, version))
-    return 0 if row is None else row.start
+    return fetch(session, _START, model=model, version=version).scalar() or 0
 
 
 def encode(rows: Rows) -> bytes:
@@ -254,7 +264,6 @@ def _append(
         if len(times):
             event.first, event.last = float(times.min()), float(times.max())
     session.add(event)
-    session.flush()
     return event
 
 

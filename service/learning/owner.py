@@ -4,21 +4,22 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from sqlalchemy import select
+from sqlalchemy import bindparam, select
 from sqlalchemy.orm import Session
 
 from service.foundation.errors import invalid_request, not_found
 from service.journal import log
 from service.learning.schema import CONTACT_THRESHOLD, FORGETTING_S, TORQUE_LIMIT, LearningOptions
-from service.storage.database import AlarmRow, Database, LearningRow, ModelRow, now
+from service.storage.database import AlarmRow, Database, LearningRow, ModelRow, fetch, now
 from service.web.rows import Page, newest
 
 AlarmKind = Literal["change", "payload", "novelty", "linearisation", "refresh", "promotion"]
+_SET = select(LearningRow.options, LearningRow.held).where(LearningRow.model == bindparam("model"))
 
 
 def options(session: Session, model: str) -> LearningOptions:
     """What is set for a model, the defaults where nothing is."""
-    row = session.get(LearningRow, model)
+    row = fetch(session, _SET, model=model).first()
     return LearningOptions() if row is None else LearningOptions(**within_bounds(row.options))
 
 
@@ -67,7 +68,7 @@ def release(session: Session, model: str) -> None:
 
 def held(session: Session, model: str) -> dict[str, Any] | None:
     """Why a model holds still; None where it learns."""
-    row = session.get(LearningRow, model)
+    row = fetch(session, _SET, model=model).first()
     return None if row is None else row.held
 
 

@@ -7,7 +7,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sqlalchemy import func, select, update
+from sqlalchemy import bindparam, func, select, update
 from sqlalchemy.orm import Session
 
 import lipcore
@@ -25,6 +25,7 @@ from service.storage.database import (
     ModelRow,
     ServingRow,
     VersionRow,
+    fetch,
     now,
 )
 from service.storage.files import Files, new_id
@@ -35,6 +36,11 @@ logger = logging.getLogger(__name__)
 SHIPPED = "panda-sim"
 SERVING = "serving"
 """The alias that every model has: the version that answers where none is named."""
+
+
+_VERSION = select(VersionRow.version).where(
+    VersionRow.model == bindparam("model"), VersionRow.version == bindparam("version")
+)
 
 
 class Serving(NamedTuple):
@@ -119,8 +125,7 @@ def missing(session: Session, model: str, version: int | None) -> NotFoundError:
 
 def exists(session: Session, model: str, version: int) -> bool:
     """Whether there is such a version."""
-    query = select(VersionRow.version).where(VersionRow.model == model, VersionRow.version == version)
-    return session.scalar(query) is not None
+    return fetch(session, _VERSION, model=model, version=version).scalar() is not None
 
 
 def serve(session: Session, model: str, version: int, takes_back: int | None = None) -> int:

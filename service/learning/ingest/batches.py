@@ -60,7 +60,9 @@ def _take(
     with intake.database.session() as session:
         options, source = enabled(session, model), log.stream(session, model, stream_id)
         check_kind(source, "batches")
-        answer = acknowledged(session, *key, content)
+        # beyond the last of its stream it is new
+        known = source is not None and sequence <= source.last
+        answer = acknowledged(session, *key, content) if known else None
         if answer is not None:
             monitor.counts["duplicates"] += 1
             return answer

@@ -132,6 +132,7 @@ class Intake:
                     adaptive["scale"] = scale.to_json()
             record = None if verdict.record is None else verdict.record.to_json()
             judged = replace(batch, rows=verdict.rows, record=record)
+            start = log.start_of(session, model, served.version)
             event = log.append_batch(session, model, judged, self.settings.max_observation_streams)
             event.rows = rows  # without those that had waited, which other batches count
             source = log.stream(session, model, batch.stream_id)
@@ -146,7 +147,7 @@ class Intake:
             report = details | {
                 "model": model,
                 "version": served.version,
-                "revision": event.number - log.start_of(session, model, served.version),
+                "revision": event.number - start,
                 "stream_id": batch.stream_id,
                 "sequence": batch.sequence,
                 "rows": rows,

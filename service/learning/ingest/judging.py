@@ -158,7 +158,6 @@ def judge(
     gate = watch.gate if held else watch.gate.step(rows.time, contact)
     passing = held or watch.gate.open or gate.exhausted
     counted = np.ones(len(rows), np.bool_) if passing else ~contact
-    everything = Record.of(rows.tau, batch.mean, batch.std, batch.noise_std)
     detector, change, record, surprise = watch.detector, None, None, None
     departure, departed = watch.departure, None
     if counted.any():
@@ -171,10 +170,10 @@ def judge(
     if held or watch.gate.open:
         change = None  # the consequence of a change that is known
     elif change is None and gate.exhausted:
-        change = _lasting(gate, everything, usual(), rows)
+        change = _lasting(gate, _everything(batch, rows), usual(), rows)
     elif change is None and departure is not None and departure.joints:
         departed = departure
-        change = Change(departure.began, departure.joints, usual(), everything, "departure")
+        change = Change(departure.began, departure.joints, usual(), _everything(batch, rows), "departure")
     if change is not None and options.on_change == "hold":
         held = True
     elif change is not None and departed is None:
@@ -191,6 +190,11 @@ def judge(
     judged = replace(batch.rows, code=codes)
     following = Watch(gate, detector, watch.innovations.then(rows, batch.mean), departure)
     return Verdict(judged, record, surprise, following, change, held, departed)
+
+
+def _everything(batch: Screened, rows: Rows) -> Record:
+    """Record of the rows that were predicted, contacts too: what a change is shown with."""
+    return Record.of(rows.tau, batch.mean, batch.std, batch.noise_std)
 
 
 def _followed(

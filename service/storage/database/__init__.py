@@ -1,6 +1,6 @@
 """The database: tables, sessions, and migrations of what earlier releases stored."""
 
-from service.storage.database.engine import Database
+from service.storage.database.engine import Database, fetch
 from service.storage.database.tables import (
     AlarmRow,
     AliasMoveRow,
@@ -43,5 +43,6 @@ __all__ = [
     "SnapshotRow",
     "StreamRow",
     "VersionRow",
+    "fetch",
     "now",
 ]
