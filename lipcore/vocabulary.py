@@ -31,7 +31,8 @@ AUTO = "auto"
 DEFAULT_ESTIMATOR = AUTO
 CHOICES = (AUTO, "lip", "lip-chain", "se", "gip", "lse", "rigid-body", "rigid-body+lip-chain")
 """What may be asked for: `auto`, and the estimators of `lipcore.fitting.estimators`."""
-ROBOT_ESTIMATORS = ("rigid-body", "rigid-body+lip-chain")
+CHAINED_ARM = "rigid-body+lip-chain"
+ROBOT_ESTIMATORS = ("rigid-body", CHAINED_ARM)
 """Estimators with the term `rigid_body`, which take a robot."""
 
 GeometryMode = Literal["learn", "calibrate", "fixed"]

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from lipcore.fitting.options import MOST_SECONDS, FitOptions, GeometryOption, Standing
 from lipcore.vocabulary import AUTO, CHOICES, DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS, JointType
 from service.foundation.states import JobState
-from service.models.schema import Holdout, ModelName
+from service.models.schema import VERSION, Holdout, ModelName
 
 _DEFAULTS = FitOptions()
 PromotionOption = Literal["ask", "always"]
@@ -87,6 +87,13 @@ class JobRequest(BaseModel):
         max_length=40,
         description=f"For {', '.join(ROBOT_ESTIMATORS)} and {AUTO}: a profile such as panda, or the id of a URDF",
     )
+    base: str | None = Field(
+        None,
+        pattern=VERSION,
+        description="Version of another unit of the same robot to start from: `model:3`, `model@alias`, or `model` for "
+        f"the one that serves. For {', '.join(ROBOT_ESTIMATORS)} and {AUTO}; its arm is expected, friction is not. It "
+        "may be deleted after the job",
+    )
     options: Options = Field(default_factory=Options)
     holdout: Holdout | None = Field(
         None,
@@ -153,6 +160,7 @@ class Job(BaseModel):
     model: str
     estimator: str
     robot: str | None = Field(description="Profile or id of an uploaded URDF, of estimators with rigid bodies")
+    base: str | None = Field(None, description="The version that it starts from, as `model:3`")
     datasets: list[str]
     holdout: Holdout | None = Field(
         None, description="What it holds out of the data sets; a refresh holds out what its version held out"
