@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from lipcore.arm.posing import make_problem, mode_of, surroundings, with_samples, with_stribeck
-from lipcore.arm.problem import Point, Problem, root_of
+from lipcore.arm.problem import UNIT_WIDTH, Point, Problem, root_of
 from lipcore.arm.scales import rescale
 from lipcore.arm.search import Pool, SearchResult, search
 from lipcore.data.samples import Array, Samples
@@ -85,6 +85,8 @@ def learn(
         rows = spread_out(samples.motion(), options.posterior_samples).numpy()
         chosen = samples.rows(rows)
         problem = make_problem(chosen, task.joint_types, order, task.gravity, around, samples)
+        if task.sibling is not None:
+            problem = replace(problem, scale_width=UNIT_WIDTH)
         result: SearchResult | None = None
         if mode == "learn" and not begin:
             result = _search(task, problem, order, chosen, known, seed, watch)

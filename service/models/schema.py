@@ -99,7 +99,8 @@ class Version(BaseModel):
     )
     lineage: dict[str, Any] = Field(
         description="Data sets with their hashes, when and with which `software` it was trained, and how well it fits "
-        "them (`training_metrics`); of an imported version also where it comes from (`imported`)"
+        "them (`training_metrics`); also the version of another unit that it started from (`base`), and of an imported "
+        "version where it comes from (`imported`)"
     )
     promotion: Promotion | None = Field(
         None, description="Whether it answers by itself; null for one that was refreshed, imported or shipped"
