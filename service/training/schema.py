@@ -37,7 +37,7 @@ class Options(BaseModel):
     geometry: GeometryOption = Field(
         _DEFAULTS.geometry,
         description="Of rigid bodies, where the joint axes lie: `learn` from torque alone, `calibrate` around the "
-        "robot's URDF, `fixed` as it has it; `auto`: calibrate where there is a robot, else learn",
+        "robot's URDF or the base, `fixed` as that has it; `auto`: calibrate where there is one, else learn",
     )
     search_seconds: float = Field(
         _DEFAULTS.search_seconds, gt=0, le=MOST_SECONDS, description="Time limit of the search for a geometry, s"
