@@ -77,4 +77,4 @@ def _sizes(squares: Array, n: int) -> Array:
     bodies, rotors = squares[: PARAMETERS * n].reshape(n, PARAMETERS), squares[PARAMETERS * n : (PARAMETERS + 1) * n]
     kinds = np.array(KINDS)
     means = np.stack([bodies[:, kinds == kind].mean(axis=1) for kind in range(SCALES - 1)], axis=1)
-    return np.sqrt(np.concatenate([means[:, kinds].reshape(-1), rotors]))
+    return np.asarray(np.sqrt(np.concatenate([means[:, kinds].reshape(-1), rotors])))
