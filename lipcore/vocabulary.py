@@ -37,7 +37,8 @@ ROBOT_ESTIMATORS = ("rigid-body", CHAINED_ARM)
 
 GeometryMode = Literal["learn", "calibrate", "fixed"]
 GEOMETRY_MODES: tuple[GeometryMode, ...] = get_args(GeometryMode)
-"""Where the joint axes of rigid bodies lie: learnt from torque alone, learnt around a URDF, or as the URDF says."""
+"""Where the joint axes of rigid bodies lie: learnt from torque alone, learnt around a URDF or another unit's arm, or as
+that has them."""
 
 Prior = Literal["urdf", "zero"]
 PRIORS: tuple[Prior, ...] = get_args(Prior)

@@ -8,13 +8,14 @@ import pytest
 
 from lipcore import FitOptions, Samples, TorqueModel, load, save, train
 from lipcore.data.metrics import evaluate
+from lipcore.data.motion import Motion
 from lipcore.fitting.base import BaseMismatchError, Kind, check_base
 from lipcore.kernels.arm import ArmKernel
 from lipcore.model.sibling import arm_as_expected, arm_of_sibling
 from lipcore.robots.library import Robot, another_unit
 from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
 from tests.choosing import slow
-from tests.lipcore.arm_oracles import arm, followed
+from tests.lipcore.arm_oracles import arm, followed, motions, pendulum_from_its_tip
 
 OPTIONS = FitOptions(device="cpu", statistics="chosen", hyperparameter_samples=30, max_iterations=10)
 FEW, LONG, NOISE = 25, 150, 1.0
@@ -74,6 +75,14 @@ def test_what_is_expected_is_the_other_unit(base: TorqueModel, unseen: Samples) 
     std = np.sqrt(np.square(features) @ variance.diagonal().numpy())
     assert (np.sqrt(np.mean(std**2, axis=0)) < 0.5 * true.std(axis=0)).all()
     assert (np.mean(np.abs(second - true - off) < 2 * std, axis=0) > 0.9).all()
+
+
+def test_joints_in_another_order_stay_what_they_are() -> None:
+    base = pendulum_from_its_tip("calibrate", OPTIONS)
+    expected, asked = arm_of_sibling(base), Motion.from_arrays(*motions(2, 3).transpose(1, 0, 2))
+    term = base.estimator.terms["rigid_body"]
+    torque = base.posterior.predict(asked, term).mean.numpy()
+    np.testing.assert_allclose(ArmKernel(expected).mean(asked).numpy(), torque, atol=0.02 * np.abs(torque).max())
 
 
 def test_a_transferred_version_keeps_what_was_expected(base: TorqueModel, few: Samples, tmp_path: Path) -> None:
