@@ -53,7 +53,13 @@ def train(
         of_data = Kind(samples.joint_names, types, torque_convention)
         order = None if base.arm is None else base.arm.order.tolist()
         check_base(
-            f"a model of {base.estimator.name}", of_base, order, of_data, estimator, options, None if robot is None else robot.name
+            f"a model of {base.estimator.name}",
+            of_base,
+            order,
+            of_data,
+            estimator,
+            options,
+            None if robot is None else robot.name,
         )
         robot, sibling = base.robot, arm_of_sibling(base)
     task = Task(

@@ -5,15 +5,15 @@ import pytest
 
 from service.models import registry
 from tests.service.archives.packing import exported, send
-from tests.service.data import QUICK, ended, error, job, queue, service_of, stream, train, upload
+from tests.service.data import ended, error, job, queue, service_of, stream, train, upload
 
-FIRST, TEN = "unit-1", {**QUICK, "posterior_samples": 100}
+FIRST = "unit-1"
 
 
 @pytest.fixture(scope="module")
 def second(api):
     """A data set of a second Panda, with friction of its own."""
-    return upload(api, stream("panda", 100, seed=7, viscous=0.5), name="second")
+    return upload(api, stream("panda", 60, seed=7, viscous=0.5), name="second")
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def first(api):
 
 
 def test_a_unit_starts_from_another_which_may_go(api, first, second):
-    seen = train(api, "unit-2", second["id"], estimator="rigid-body", base=f"{FIRST}@old", options=TEN)
+    seen = train(api, "unit-2", second["id"], estimator="rigid-body", base=f"{FIRST}@old")
     assert seen["base"] == f"{FIRST}:{first}"
     version = api.get("/v1/models/unit-2/versions/1").json()
     tensors = registry.find(service_of(api).database, FIRST, first).manifest["tensors"]
