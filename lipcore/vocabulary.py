@@ -31,12 +31,14 @@ AUTO = "auto"
 DEFAULT_ESTIMATOR = AUTO
 CHOICES = (AUTO, "lip", "lip-chain", "se", "gip", "lse", "rigid-body", "rigid-body+lip-chain")
 """What may be asked for: `auto`, and the estimators of `lipcore.fitting.estimators`."""
-ROBOT_ESTIMATORS = ("rigid-body", "rigid-body+lip-chain")
+CHAINED_ARM = "rigid-body+lip-chain"
+ROBOT_ESTIMATORS = ("rigid-body", CHAINED_ARM)
 """Estimators with the term `rigid_body`, which take a robot."""
 
 GeometryMode = Literal["learn", "calibrate", "fixed"]
 GEOMETRY_MODES: tuple[GeometryMode, ...] = get_args(GeometryMode)
-"""Where the joint axes of rigid bodies lie: learnt from torque alone, learnt around a URDF, or as the URDF says."""
+"""Where the joint axes of rigid bodies lie: learnt from torque alone, learnt around a URDF or another unit's arm, or as
+that has them."""
 
 Prior = Literal["urdf", "zero"]
 PRIORS: tuple[Prior, ...] = get_args(Prior)

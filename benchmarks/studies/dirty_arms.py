@@ -34,15 +34,21 @@ def recording(seconds: float, dirt: Dirt) -> Stream:
     return Stream(round(seconds * RATE), RATE, speed=SPEED, noise=0.0, dirt=dirt)
 
 
-def unseen(robot: Robot, seconds: float, dirt: Dirt, case: str, seed: int) -> Samples:
-    """Recordings of an arm, trained on so many seconds, in motion of another kind: one of CASES."""
-    stream, least = recording(seconds, dirt), LEAST_S
+def unseen(robot: Robot, stream: Stream, case: str, seed: int) -> Samples:
+    """Recordings of an arm, trained on such a stream, in motion of another kind: one of CASES."""
+    least = LEAST_S
     if case == "three times faster":
         stream = replace(stream, n_samples=round(stream.n_samples / 3), speed=3 * SPEED)
     elif case == "rests":
         stream = replace(stream, n_samples=round(RESTS_S * RATE), course="rests", speed=0.5)
     count = int(np.ceil(least / (stream.n_samples / RATE)))
-    return Samples.concatenate([prepared(simulate(robot, stream, 200 + 1000 * k + seed)) for k in range(count)])
+    return Samples.concatenate([recorded(robot, stream, 200 + 1000 * k + seed) for k in range(count)])
+
+
+def recorded(robot: Robot, stream: Stream, seed: int) -> Samples:
+    """A recording: prepared, or where there is no dirt, as simulated, of the same rate."""
+    samples = simulate(robot, stream, seed)
+    return samples.rows(slice(None, None, KEEP)) if stream.dirt is None else prepared(samples)
 
 
 def prepared(samples: Samples) -> Samples:
@@ -63,10 +69,10 @@ def main() -> None:
             cells: dict[str, list[np.ndarray]] = {case: [] for case in CASES}
             for seed in range(seeds):
                 dirt = Dirt(seed=seed)  # of one arm
-                known = prepared(simulate(robot, recording(seconds, dirt), 100 + seed))
+                known = recorded(robot, recording(seconds, dirt), 100 + seed)
                 model = lipcore.train(known, robot.joint_types, estimator)
                 for case in CASES:
-                    held = unseen(robot, seconds, dirt, case, seed)
+                    held = unseen(robot, recording(seconds, dirt), case, seed)
                     answer = model.predict(held.q, held.dq, held.ddq)
                     metrics = evaluate(held.tau, *answer.interval)
                     oracle = 2 * quantile(LEVEL) * (held.tau - answer.tau).std(0)

@@ -3,15 +3,19 @@
     learnt_arm.py rows [SEEDS]                accuracy and coverage of Panda, UR10, xArm7, Z1, TIAGo's arm
     learnt_arm.py search [FIRST LAST SEEDS]   random arms: evidence against that of the true geometry
     learnt_arm.py answer                      one query of the shipped model, beside Pinocchio's RNEA
+    learnt_arm.py transfer FIRST LAST [ROBOT...]  10 s of a second unit, from a sibling's posterior and from nothing
 
 Training motions are those of the paper's experiment (50 sinusoids), tests have twice the bandwidth (100). Training
 seeds are 5001, 5002, …; test seeds a hundred more. What is reported are arms 1 to 20 of `search` and `rows`, with five
-training seeds each; nothing was tuned on them, but on arms above 1000.
+training seeds each; nothing was tuned on them, but on arms above 1000. `transfer` moves as `dirty_arms.py` does; what
+is reported are seeds 0 to 2, tuned was on 50 and 51.
 The geometries of installed URDFs are not looked at (`known=()`), so that nothing but torque is used.
 """
 
 import sys
 import time
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +23,7 @@ import torch
 from threadpoolctl import threadpool_limits
 
 import lipcore
+from benchmarks.studies.dirty_arms import CASES, RATE, recorded, recording, unseen
 from lipcore import FitOptions
 from lipcore.arm.learning import POLISHING
 from lipcore.arm.posing import make_problem
@@ -27,8 +32,9 @@ from lipcore.data.motion import motion_arrays
 from lipcore.data.samples import Samples
 from lipcore.kernels.geometry import Geometry
 from lipcore.posterior.selection import spread_out
-from lipcore.robots.library import Robot, load_robot, pinocchio, random_arm
-from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
+from lipcore.robots.dirt import SPREAD, Dirt
+from lipcore.robots.library import Robot, another_unit, load_robot, pinocchio, random_arm
+from lipcore.robots.simulation import Stream, inverse_dynamics, simulate, usual_torque
 from lipcore.training import auto, fit
 
 ROWS = (
@@ -43,6 +49,9 @@ ROWS = (
 )
 FRICTION, NOISE = 0.3, 0.05
 """N·m·s/rad and N·m; N·m: of random arms."""
+MASSES = 0.1
+"""Share by which masses of a second unit differ."""
+LONG_S, SHORT_S = 60.0, 10.0
 FOUND = 1.0
 """nats, by which the evidence found may be worse than that at the true geometry."""
 
@@ -62,7 +71,8 @@ def true_geometry(robot: Robot) -> Geometry:
 def best_known(robot: Robot, samples: Samples, options: FitOptions) -> float:
     """Evidence that the true geometry leads to, nats, on the rows that a training looks at."""
     rows = spread_out(samples.motion(), options.posterior_samples).numpy()
-    problem, _ = make_problem(samples.rows(rows), robot.joint_types, options, True, None, samples)
+    order = np.arange(robot.n_joints)
+    problem = make_problem(samples.rows(rows), robot.joint_types, order, True, every=samples)
     sigma = np.full(robot.n_joints, NOISE)
     return problem.descend(true_geometry(robot), sigma, POLISHING).value
 
@@ -117,6 +127,66 @@ def search(first: int, last: int, seeds: int) -> None:
     print(f"best geometry found in {wins} of {total}; lowest coverage of a joint {100 * np.min(covers):.0f} %")
 
 
+def units(robot: Robot, seed: int, dirty: bool) -> list[tuple[Robot, Stream]]:
+    """Two units of a robot and how long streams of them are recorded: their friction differs, all masses by up to
+    MASSES. What is not dirty has viscous friction and white noise."""
+    out = []
+    for number, unit in enumerate((robot, another_unit(robot, MASSES, seed))):
+        dirt = Dirt(seed=2 * seed + number)
+        stream, spread = (
+            recording(LONG_S, dirt),
+            np.random.default_rng(dirt.seed).uniform(-SPREAD, SPREAD, unit.n_joints),
+        )
+        if not dirty:
+            viscous = usual_torque(robot) * dirt.viscous * (1 + spread)
+            stream = replace(stream, dirt=None, noise=NOISE, viscous=tuple(viscous))
+        out.append((unit, stream))
+    return out
+
+
+def silent(stream: Stream) -> Stream:
+    """The same without noise."""
+    return replace(stream, noise=0.0, dirt=None if stream.dirt is None else replace(stream.dirt, noise=0.0))
+
+
+def transfer(first: int, last: int, names: list[str]) -> None:
+    """Print, for each arm, simulator, unseen motion and way to train, nMSE (mean over joints and seeds), its ratio to
+    that of 60 s from nothing, this of torque without noise, and coverage (of each joint, mean over seeds; lowest of a
+    joint and seed)."""
+    print(
+        "| arm | simulator | unseen motion | trained on | nMSE | ratio | less noise | coverage by joint, % | lowest |"
+    )
+    print("|" + " --- |" * 9)
+    for name in names:
+        robot, types = load_robot(name), load_robot(name).joint_types
+        for dirty in (False, True):
+            figures: dict[tuple[str, str], list[np.ndarray]] = {}
+            for seed in range(first, last + 1):
+                (old, of_old), (new, of_new) = units(robot, seed, dirty)
+                short = replace(of_new, n_samples=round(SHORT_S * RATE))
+                base = lipcore.train(recorded(old, of_old, 100 + seed), types, "rigid-body")
+                few, many = (recorded(new, stream, 300 + seed) for stream in (short, of_new))
+                models = {
+                    "60 s": lipcore.train(many, types, "rigid-body"),
+                    "10 s": lipcore.train(few, types, "rigid-body"),
+                    "10 s and a base": lipcore.train(few, types, "rigid-body", base=base),
+                    "the base alone": base,
+                }
+                for case, (way, model) in product(CASES, models.items()):
+                    held, quiet = (unseen(new, each, case, seed) for each in (of_new, silent(of_new)))
+                    found = model.predict(held.q, held.dq, held.ddq).interval
+                    judged = evaluate(held.tau, *found)
+                    cell = judged.nmse, evaluate(quiet.tau, *found).nmse, judged.coverage
+                    figures.setdefault((case, way), []).append(np.array(cell))
+            for (case, way), cells in figures.items():
+                cover = np.array(cells)[:, 2]
+                nmse, long = (np.array(each)[:, :2].mean(axis=(0, 2)) for each in (cells, figures[case, "60 s"]))
+                ratios = " | ".join(f"{each:.2f}" for each in nmse / long)
+                joints = " ".join(f"{100 * each:.0f}" for each in cover.mean(0))
+                shown = f"{nmse[0]:.1e} | {ratios} | {joints} | {100 * cover.min():.0f}"
+                print(f"| {name} | {'dirty' if dirty else 'clean'} | {case} | {way} | {shown} |", flush=True)
+
+
 def answer() -> None:
     """Print the median time of an answer in process, µs, and that of Pinocchio's RNEA."""
     robot, shipped = load_robot("panda"), lipcore.load(Path(__file__).parents[2] / "models/panda-sim")
@@ -140,12 +210,14 @@ def main() -> None:
     """Run what is asked for."""
     torch.set_num_threads(1)
     fit.known_geometries = auto.known_geometries = lambda types, gravity: ()  # type: ignore[assignment]
-    what, numbers = sys.argv[1], [int(each) for each in sys.argv[2:]]
+    what, numbers = sys.argv[1], [int(each) for each in sys.argv[2:] if each.isdigit()]
     with threadpool_limits(1):
         if what == "answer":
             answer()
         elif what == "rows":
             rows(*(numbers or [5]))
+        elif what == "transfer":
+            transfer(*numbers, [each for each in sys.argv[2:] if not each.isdigit()] or ["panda", "ur10"])
         else:
             search(*(numbers or [1, 20, 5]))
 

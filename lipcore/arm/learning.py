@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from lipcore.arm.posing import make_problem, mode_of, with_samples, with_stribeck
-from lipcore.arm.problem import Point, Problem, root_of
+from lipcore.arm.posing import make_problem, mode_of, surroundings, with_samples, with_stribeck
+from lipcore.arm.problem import UNIT_WIDTH, Point, Problem, root_of
 from lipcore.arm.scales import rescale
 from lipcore.arm.search import Pool, SearchResult, search
 from lipcore.data.samples import Array, Samples
@@ -21,7 +21,7 @@ from lipcore.data.signals import noise_level
 from lipcore.fitting import noise
 from lipcore.fitting.hyperparameters import FitCancelledError, FitProgress
 from lipcore.fitting.task import Task
-from lipcore.kernels.arm_prior import Alternative, Arm
+from lipcore.kernels.arm_prior import Alternative, Arm, chain
 from lipcore.kernels.compiled.arm import PARAMETERS
 from lipcore.kernels.friction import FRICTION_TERMS
 from lipcore.kernels.geometry import Geometry
@@ -70,27 +70,30 @@ def learn(
 ) -> Learnt:
     """Learn the arm that moved as the samples of a task say.
 
-    task.robot: a URDF's bodies, which geometry and masses are expected around, as `options.geometry` and
-    `options.prior` say; known: geometries that a search looks at, too, where no URDF is given; begin: geometries from
-    base to tip that other samples of the same arm have led to, which are followed from there, without a search; seed:
-    of the search.
+    task.robot, task.sibling: a URDF's bodies, or the arm of another unit, which geometry and masses are expected
+    around, as `options.geometry` and `options.prior` say; known: geometries that a search looks at, too, where neither
+    is given; begin: geometries from base to tip that other samples of the same arm have led to, which are followed from
+    there, without a search; seed: of the search.
 
     Raise FitCancelledError when `task.cancelled` answers true, ValueError for samples that no arm can be learnt from.
     """
     with threadpool_limits(1):  # matrices are small: more threads would take longer
         samples, options = task.samples, task.options
         watch = _Watch(task, time.monotonic())
-        mode = mode_of(options, task.robot)
+        mode, around = mode_of(task), surroundings(task)
+        order = chain(task.robot, samples.n_joints) if around is None else around.order
         rows = spread_out(samples.motion(), options.posterior_samples).numpy()
         chosen = samples.rows(rows)
-        problem, order = make_problem(chosen, task.joint_types, options, task.gravity, task.robot, samples)
+        problem = make_problem(chosen, task.joint_types, order, task.gravity, around, samples)
+        if task.sibling is not None:
+            problem = replace(problem, scale_width=UNIT_WIDTH)
         result: SearchResult | None = None
         if mode == "learn" and not begin:
             result = _search(task, problem, order, chosen, known, seed, watch)
             starts = [(each.geometry, each.sigma) for each in result.points[:POLISHED]]
         else:
-            if task.robot is not None and (mode == "fixed" or not begin):
-                begin = [Geometry.from_robot(task.robot, task.gravity)]
+            if around is not None and (mode == "fixed" or not begin):
+                begin = [around.geometry]
             starts = [(each, noise.start(samples)[order]) for each in begin]
         polished = Pool(problem.recombined(CHECKS))
         for geometry, sigma in starts:
@@ -224,6 +227,7 @@ def _arm(
         problem.parameters(best),
         problem.centre[: PARAMETERS * n].reshape(n, PARAMETERS),
         unit,
+        problem.centre[PARAMETERS * n : first][place],
         np.zeros(0) if expected is None else expected.step(best.geometry),
         np.zeros(0) if expected is None else expected.widths,
         problem.friction_terms > len(FRICTION_TERMS),

@@ -12,43 +12,57 @@ from numpy.typing import NDArray
 from lipcore.arm.problem import Expected, Problem
 from lipcore.data.samples import Array, Samples
 from lipcore.fitting import noise
-from lipcore.fitting.options import FitOptions
-from lipcore.kernels.arm_prior import arm_of_robot, chain, in_chain, unit_anywhere, widths_of
+from lipcore.fitting.task import Task
+from lipcore.kernels.arm_prior import Arm, arm_of_robot, in_chain, unit_anywhere
 from lipcore.kernels.compiled.arm import PARAMETERS
 from lipcore.kernels.friction import FRICTION_TERMS, friction_features
 from lipcore.kernels.geometry import Geometry
-from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import GeometryMode, JointType
 
 
-def mode_of(options: FitOptions, robot: RigidBody | None) -> GeometryMode:
-    """How a geometry is obtained: learnt, calibrated around a URDF or fixed to it.
+def mode_of(task: Task) -> GeometryMode:
+    """How a task's geometry is obtained: learnt, calibrated around that of a URDF or of a sibling, or fixed to it.
 
-    robot: the URDF's bodies, if any. Raise ValueError where `options.geometry` needs a robot and there is none.
+    Raise ValueError where `options.geometry` needs one of them and there is none.
     """
-    if options.geometry == "auto":
-        return "learn" if robot is None else "calibrate"
-    if robot is None and options.geometry != "learn":
-        raise ValueError(f"geometry is {options.geometry!r}, which needs a robot: a profile such as panda, or a URDF")
-    return options.geometry
+    asked, around = task.options.geometry, task.robot is not None or task.sibling is not None
+    if asked == "auto":
+        return "calibrate" if around else "learn"
+    if not around and asked != "learn":
+        raise ValueError(f"geometry is {asked!r}, which needs a robot: a profile such as panda, or a URDF")
+    return asked
+
+
+def surroundings(task: Task) -> Arm | None:
+    """The arm that a task's geometry and masses are expected around, as `options.geometry` and `options.prior` say:
+    that of the sibling, or of the URDF; None where it is learnt from nothing. Raise ValueError as `mode_of` does, or
+    for a URDF without masses whose prior is "urdf"."""
+    mode = mode_of(task)
+    if mode == "learn":
+        return None
+    if task.sibling is None:
+        assert task.robot is not None  # `mode_of` has seen to it
+        return arm_of_robot(task.robot, task.gravity, task.options.prior, mode)
+    if mode == "calibrate":
+        return task.sibling
+    return replace(task.sibling, mode=mode, expected=np.zeros(0), widths=np.zeros(0))
 
 
 def make_problem(
     samples: Samples,
     joint_types: Sequence[JointType],
-    options: FitOptions,
+    order: NDArray[np.int64],
     gravity: bool,
-    robot: RigidBody | None = None,
+    around: Arm | None = None,
     every: Samples | None = None,
-) -> tuple[Problem, NDArray[np.int64]]:
-    """What N samples ask of an arm, base to tip, and the data's joint at each place of the chain, (n,).
+) -> Problem:
+    """What N samples ask of an arm, base to tip.
 
-    joint_types: (n,), in the order of the data; gravity: whether torques contain it; robot: a URDF's bodies, which the
-    geometry and the masses are expected around; every: all samples, which tell how large torques and noise are;
-    `samples` where None. Raise ValueError where `options.geometry` needs a robot and there is none.
+    joint_types: (n,), in the order of the data; order: (n,), the data's joint at each place of the chain; gravity:
+    whether torques contain it; around: the arm that geometry and masses are expected around; every: all samples, which
+    tell how large torques and noise are; `samples` where None.
     """
-    mode, n, every = mode_of(options, robot), samples.n_joints, samples if every is None else every
-    order = chain(robot, n)
+    n, every = samples.n_joints, samples if every is None else every
     motions, tau = _in_chain(samples, order)
     usual = np.sqrt(np.mean(every.tau**2, axis=0))[order]
     floor, start = noise.floor(every)[order], noise.start(every)[order]
@@ -56,25 +70,22 @@ def make_problem(
     # friction's weights of a joint, as large as its torque
     friction = np.stack([usual / speed, usual, usual], axis=1).reshape(-1) + floor.repeat(len(FRICTION_TERMS))
     anywhere = unit_anywhere(float(usual.max()), n)
-    body, centre = anywhere, np.zeros((n, PARAMETERS))
-    if robot is not None and mode != "learn":
-        arm = arm_of_robot(robot, gravity, options.prior)
-        masses, rotors = arm.unit[: PARAMETERS * n].reshape(n, -1), arm.unit[PARAMETERS * n :]
-        body, centre = np.concatenate([masses[order].reshape(-1), rotors[order]]), arm.centre
+    body, centre = anywhere, np.zeros((PARAMETERS + 1) * n)
+    if around is not None:
+        masses, rotors = around.unit[: PARAMETERS * n].reshape(n, -1), around.unit[PARAMETERS * n :]
+        body = np.concatenate([masses[order].reshape(-1), rotors[order]])
+        centre = np.concatenate([around.centre.reshape(-1), around.rotor[order]])
     types = tuple(joint_types[joint] for joint in order)
-    return (
-        Problem(
-            motions,
-            tau,
-            np.ones(tau.shape),
-            joint_friction(motions[:, 1]),
-            np.concatenate([centre.reshape(-1), np.zeros(n + len(friction))]),
-            np.concatenate([body, friction]),
-            start,
-            floor,
-            _expected(types, gravity, robot, mode),
-        ),
-        order,
+    return Problem(
+        motions,
+        tau,
+        np.ones(tau.shape),
+        joint_friction(motions[:, 1]),
+        np.concatenate([centre, np.zeros(len(friction))]),
+        np.concatenate([body, friction]),
+        start,
+        floor,
+        _expected(types, gravity, around),
     )
 
 
@@ -91,14 +102,9 @@ def _in_chain(samples: Samples, order: NDArray[np.int64]) -> tuple[Array, Array]
     return np.ascontiguousarray(np.stack(parts, axis=1)), in_chain(samples.tau, order)
 
 
-def _expected(
-    types: tuple[JointType, ...], gravity: bool, robot: RigidBody | None, mode: GeometryMode
-) -> Expected | None:
-    if mode == "fixed":
-        return None
-    if mode == "calibrate" and robot is not None:
-        around = Geometry.from_robot(robot, gravity)
-        return Expected(widths_of(around), around)
+def _expected(types: tuple[JointType, ...], gravity: bool, around: Arm | None) -> Expected | None:
+    if around is not None:
+        return Expected(around.widths, around.geometry.moved(around.expected)) if around.steps else None
     n = len(types)
     any_arm = Geometry(
         types,

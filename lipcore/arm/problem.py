@@ -28,6 +28,9 @@ CONVERGED = 1e-2
 """nats."""
 NOISE_WIDTH = 3.0
 """Prior width of log σ."""
+SCALE_WIDTH, UNIT_WIDTH = 2.0, 0.3
+"""Prior widths of the parts that a logarithm of s is the sum of (`arm.scales`): a factor of seven either way within one
+deviation; and of those of masses and rotor inertias around another unit's, which differ about as much as expected."""
 MOST_LEVERAGE = 0.9
 
 
@@ -75,7 +78,8 @@ class Problem:
 
     motions: (N, 3, n), q, dq and ddq from base to tip; tau: (N, n); counts: (N, n), independent measurements that a
     torque stands for; friction: (N, n, f n), its features; centre, scale: (k,), μ and s of w; noise: (n,), where its
-    prior lies; floor: (n,), the smallest admitted; expected: prior of the geometry, None where it is fixed.
+    prior lies; floor: (n,), the smallest admitted; expected: prior of the geometry, None where it is fixed;
+    scale_width: prior width of what the logarithms of s are made of, but for friction's.
     """
 
     motions: Array
@@ -87,6 +91,7 @@ class Problem:
     noise: Array
     floor: Array
     expected: Expected | None
+    scale_width: float = SCALE_WIDTH
 
     @property
     def n_joints(self) -> int:

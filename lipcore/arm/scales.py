@@ -17,13 +17,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from lipcore.arm.problem import NOISE_WIDTH, Point, Problem, root_of
+from lipcore.arm.problem import NOISE_WIDTH, SCALE_WIDTH, Point, Problem, root_of
 from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import KINDS
 from lipcore.kernels.compiled.arm import PARAMETERS
 
-WIDTH = 2.0
-"""Prior width of each logarithm's parts: a factor of seven either way within one deviation."""
 FARTHEST = 8.0
 ITERATIONS = 60
 BODY_KINDS = 3
@@ -49,13 +47,15 @@ def rescale(problem: Problem, point: Point) -> Scaled:
     evidence = _Evidence.around(problem, point)
     parts = _parts(n, k)
     noise, floor = np.log(problem.noise), np.log(problem.floor)
+    width = np.full(parts.shape[1], SCALE_WIDTH)
+    width[: BODY_KINDS + n + 1] = problem.scale_width
 
     def negative(flat: Array) -> tuple[float, Array]:
         log_noise, shares = flat[:n], flat[n:]
         value, by_noise, by_scale = evidence(log_noise, parts @ shares)
         off = (log_noise - noise) / NOISE_WIDTH
-        value += 0.5 * float(off @ off + shares @ shares / WIDTH**2)
-        return value, np.concatenate([by_noise + off / NOISE_WIDTH, parts.T @ by_scale + shares / WIDTH**2])
+        value += 0.5 * float(off @ off + np.sum((shares / width) ** 2))
+        return value, np.concatenate([by_noise + off / NOISE_WIDTH, parts.T @ by_scale + shares / width**2])
 
     start = np.concatenate([np.log(point.sigma), np.zeros(parts.shape[1])])
     bounds = [(low, None) for low in floor.tolist()] + [(-FARTHEST, FARTHEST)] * parts.shape[1]

@@ -34,6 +34,7 @@ _TENSORS = {
         *_GEOMETRY_TENSORS,
         *_ARM_TENSORS,
         "order",
+        "rotor",
         "stribeck",
         *(f"other/{name}" for name in _ALTERNATIVE_TENSORS),
     )
@@ -134,6 +135,8 @@ def arm_tensors(arm: Arm) -> dict[str, Tensor]:
         name: getattr(arm, name) for name in _ARM_TENSORS
     }
     parts["order"] = arm.order.astype(np.float64)
+    if arm.rotor.any():
+        parts["rotor"] = arm.rotor
     if arm.stribeck:
         parts["stribeck"] = np.ones(1)
     if each := arm.alternatives:
@@ -170,6 +173,8 @@ def read_arm(tensors: Mapping[str, Tensor], joint_types: Sequence[JointType], mo
         raise ValueError(f"tensor 'arm/order' is {order.tolist()}, expected each joint once")
     types = tuple(joint_types[joint] for joint in order)
     geometry = Geometry(types, *(parts.pop(name) for name in _GEOMETRY_TENSORS))
+    rotor = tensors.get(f"{PREFIX}rotor")  # nothing is stored where none is expected
+    parts["rotor"] = np.zeros(len(types)) if rotor is None else rotor.numpy()
     stribeck = _stribeck(tensors)
     alternatives = _alternatives(tensors, geometry, len(friction_terms(stribeck)))
     return Arm(geometry, order, mode, stribeck=stribeck, alternatives=alternatives, **parts)

@@ -10,6 +10,7 @@ from lipcore.data.motion import check_finite, check_joint_types
 from lipcore.data.samples import Samples
 from lipcore.fitting.hyperparameters import Cancelled, Progress
 from lipcore.fitting.options import FitOptions
+from lipcore.kernels.arm_prior import Arm
 from lipcore.robots.urdf import JointMismatchError, RigidBody
 from lipcore.vocabulary import TORQUE_CONVENTIONS, JointType, TorqueConvention
 
@@ -26,7 +27,8 @@ class Task:
     samples: of n joints, thinned where all are too many for memory; joint_types: (n,); torque_convention: what
     `samples.tau` holds; robot: rigid bodies, built for the joints of the samples; stretches: contiguous samples of the
     same recordings, which tell the white noise of signals, the samples themselves where None; on_progress: called after
-    every step; cancelled: asked at every evaluation, and ends the training with FitCancelledError.
+    every step; cancelled: asked at every evaluation, and ends the training with FitCancelledError; sibling: the
+    arm of another unit of the same robot, which is expected beforehand in the place of `robot`.
 
     Raise ValueError for samples that are too few, not finite or of other joints, JointMismatchError for a robot of
     other joints.
@@ -40,6 +42,7 @@ class Task:
     stretches: Samples | None = None
     on_progress: Progress | None = None
     cancelled: Cancelled | None = None
+    sibling: Arm | None = None
 
     def __post_init__(self) -> None:
         samples, convention = self.samples, self.torque_convention

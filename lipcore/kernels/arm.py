@@ -42,7 +42,7 @@ class ArmKernel(LinearKernel):
         shares = _shares(arm)
         mixed = np.linalg.solve(_mixing(shares), shares)
         self._rest = torch.from_numpy(np.concatenate([arm.widths, np.ones(len(shares))]))
-        self._mean = torch.from_numpy(np.concatenate([_in_data(arm), np.zeros(self.n_joints), arm.expected, mixed]))
+        self._mean = torch.from_numpy(np.concatenate([_in_data(arm), arm.rotor, arm.expected, mixed]))
         self._recent: tuple[tuple[Motion, Tensor], ...] = ()
 
     @property

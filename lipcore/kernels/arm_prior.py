@@ -46,8 +46,9 @@ class Arm:
 
     geometry: base to tip; order: (n,), the data's joint at each place of the chain; mode: where the geometry is from;
     parameters: (n, 10), base to tip, at which ∂(Y π)/∂θ is taken; centre: (n, 10), prior mean of π, base to tip; unit:
-    (11 n,), prior standard deviations of π and of the rotor inertias, in the order of the data's joints; expected:
-    (g,), the step from the geometry to its prior mean; widths: (g,), its prior standard deviations, rad and m.
+    (11 n,), prior standard deviations of π and of the rotor inertias, in the order of the data's joints; rotor: (n,),
+    prior mean of the latter, likewise; expected: (g,), the step from the geometry to its prior mean; widths: (g,), its
+    prior standard deviations, rad and m.
     stribeck: whether friction has its fourth term; alternatives: the arm itself first, then the others; empty where
     there is no other.
     """
@@ -58,6 +59,7 @@ class Arm:
     parameters: Array
     centre: Array
     unit: Array
+    rotor: Array
     expected: Array
     widths: Array
     stribeck: bool = False
@@ -69,6 +71,7 @@ class Arm:
             ("parameters", (n, PARAMETERS)),
             ("centre", (n, PARAMETERS)),
             ("unit", ((PARAMETERS + 1) * n,)),
+            ("rotor", (n,)),
             ("expected", (steps,)),
             ("widths", (steps,)),
         ):
@@ -121,6 +124,7 @@ def arm_of_robot(robot: RigidBody, gravity: bool = True, prior: Prior = "urdf", 
         bodies,
         bodies if prior == "urdf" else np.zeros_like(bodies),
         unit,
+        np.zeros(robot.n_joints),
         np.zeros(steps),
         widths_of(geometry)[:steps],
     )

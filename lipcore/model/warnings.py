@@ -86,7 +86,7 @@ def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
     if count > ALWAYS_OPEN:
         listed = "; ".join([f"{joint}: {', '.join(each)}" for joint, each in names.items()][:LISTED])
         listed += "; …" if len(names) > LISTED else ""
-        stand = "are the URDF's" if arm.mode == "calibrate" else "are only a guess"
+        stand = "are those of the URDF or the base" if arm.mode == "calibrate" else "are only a guess"
         out.append(f"The recording does not tell {count} numbers of the geometry, which {stand} ({listed}).")
     if (count > ALWAYS_OPEN or arm.alternatives) and moved < TOGETHER * model.n_joints:
         out.append(together)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import site
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -177,6 +177,17 @@ def _robots_folder() -> Path:
         if folder.is_dir():
             return folder
     raise SimulationUnavailableError("robots by name need example-robot-data: pip install 'lipserve[sim]'")
+
+
+def another_unit(robot: Robot, share: float, seed: int) -> Robot:
+    """Another unit of a robot: the same geometry, the mass of each body, and so its inertia, up to `share` off."""
+    model, rng = robot.model.copy(), np.random.default_rng(seed)
+    for joint in range(1, model.njoints):
+        parameters = model.inertias[joint].toDynamicParameters()
+        model.inertias[joint] = pinocchio().Inertia.FromDynamicParameters(
+            parameters * rng.uniform(1 - share, 1 + share)
+        )
+    return replace(robot, model=model)
 
 
 JOINTS = (3, 8)

@@ -140,7 +140,7 @@ class Work:
         too, or, without `search`, what replaces one."""
         task = replace(self.task.on(samples), on_progress=self.overall.of(RIGID, place))
         shapes = () if before is None else before.arm.geometries
-        if before is None and task.robot is None:
+        if before is None and task.robot is None and task.sibling is None:
             shapes = known_geometries(task.joint_types, task.gravity)
         known, begin, seed = (shapes, (), int(before is not None)) if search else ((), shapes, 0)
         return learn(task, known, begin, seed)
@@ -150,8 +150,9 @@ class Work:
 
         samples: of the task's recordings; name: of the estimator; place: one of PLACES.
         """
-        robot = self.task.robot if name in ROBOT_ESTIMATORS else None
-        task = replace(self.task, samples=samples, robot=robot, on_progress=self.overall.of(name, place))
+        task = replace(self.task, samples=samples, on_progress=self.overall.of(name, place))
+        if name not in ROBOT_ESTIMATORS:
+            task = replace(task, robot=None, sibling=None)
         return fit_estimator(task, name, learnt)
 
 
@@ -185,7 +186,7 @@ class Contest:
         self.entries[RIGID], self.learnt = self._rigid(RIGID)
         self.entries[BOTH] = self._enter(BOTH, BOTH, self.learnt) if self.learnt else self.entries[RIGID]
         self.entries[CHAIN] = self._enter(CHAIN, CHAIN, self.learnt)
-        if self.learnt and mode_of(self.work.task.options, self.work.task.robot) == "learn" and self._chain_leads():
+        if self.learnt and mode_of(self.work.task) == "learn" and self._chain_leads():
             entry, learnt = self._rigid(AGAIN, self.learnt)
             if learnt and entry.density > self.entries[RIGID].density:
                 self.entries[RIGID], self.learnt = entry, learnt

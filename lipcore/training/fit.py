@@ -44,9 +44,11 @@ def fit_estimator(
     Raise ValueError as `check_estimator` does, FitCancelledError, or NotPositiveDefiniteError.
     """
     samples, types, options = task.samples, task.joint_types, task.options
-    check_estimator(name, types, task.robot, options)
+    if task.sibling is None:
+        check_estimator(name, types, task.robot, options)
     if learnt is None and name in ROBOT_ESTIMATORS:
-        installed = () if task.robot is not None else known_geometries(types, task.gravity)
+        anything = task.robot is None and task.sibling is None
+        installed = known_geometries(types, task.gravity) if anything else ()
         learnt = learn(task, (*geometries, *installed))
     misfit = None if learnt is None else learnt.misfit
     learnt = learnt if name in ROBOT_ESTIMATORS else None

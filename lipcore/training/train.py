@@ -9,11 +9,13 @@ from lipcore.data import outliers
 from lipcore.data.independence import recording_weights
 from lipcore.data.motion import check_joint_types
 from lipcore.data.samples import Samples
+from lipcore.fitting.base import Kind, check_base
 from lipcore.fitting.estimators import check_estimator
 from lipcore.fitting.hyperparameters import Cancelled, Progress
 from lipcore.fitting.options import FitOptions
 from lipcore.fitting.task import Task
 from lipcore.kernels.geometry import Geometry
+from lipcore.model.sibling import arm_of_sibling
 from lipcore.model.torque_model import TorqueModel
 from lipcore.robots.urdf import RigidBody
 from lipcore.training import conditioning
@@ -31,25 +33,44 @@ def train(
     on_progress: Progress | None = None,
     cancelled: Cancelled | None = None,
     robot: RigidBody | None = None,
+    base: TorqueModel | None = None,
 ) -> TorqueModel:
     """Train a model on samples of n joints.
 
     joint_types: (n,), `revolute` or `prismatic`; estimator: one of `lipcore.fitting.estimators.ESTIMATORS`, or `auto`,
     which chooses (`lipcore.training.auto`); torque_convention: what `samples.tau` holds; on_progress, cancelled: see
-    `lipcore.fitting.hyperparameters.fit`; robot: for estimators of rigid bodies, built for the joints of the samples.
+    `lipcore.fitting.hyperparameters.fit`; robot: for estimators of rigid bodies, built for the joints of the samples;
+    base: for them, too, a model of another unit of the same robot, whose arm is expected (`lipcore.model.sibling`).
     Corrupt rows are left out before anything sees them, and the fit's report names them (`lipcore.data.outliers`).
-    Raise ValueError for bad arguments, CorruptError, FitCancelledError, or NotPositiveDefiniteError.
+    Raise ValueError for bad arguments, BaseMismatchError, CorruptError, FitCancelledError, or NotPositiveDefiniteError.
     """
     found = outliers.of_samples(samples)
     samples = samples.rows(~found.rows) if found.count else samples
+    types, options = check_joint_types(joint_types), options or FitOptions()
+    sibling = None
+    if base is not None:
+        of_base = Kind(base.joint_names, base.joint_types, base.torque_convention)
+        of_data = Kind(samples.joint_names, types, torque_convention)
+        order = None if base.arm is None else base.arm.order.tolist()
+        check_base(
+            f"a model of {base.estimator.name}",
+            of_base,
+            order,
+            of_data,
+            estimator,
+            options,
+            None if robot is None else robot.name,
+        )
+        robot, sibling = base.robot, arm_of_sibling(base)
     task = Task(
         samples,
-        check_joint_types(joint_types),
-        options or FitOptions(),
+        types,
+        options,
         torque_convention,
         robot,
         on_progress=on_progress,
         cancelled=cancelled,
+        sibling=sibling,
     )
     model = fit_model(task, estimator)
     model = replace(model, fit={**model.fit, **found.in_fit()})
@@ -65,5 +86,6 @@ def fit_model(task: Task, estimator: str = DEFAULT_ESTIMATOR, geometries: Sequen
     estimator: as in `train`; geometries: base to tip, that a search for one looks at first, as of an earlier version;
     `auto` begins anew. Raise as `train` does.
     """
-    check_estimator(estimator, task.joint_types, task.robot, task.options)
+    if task.sibling is None:
+        check_estimator(estimator, task.joint_types, task.robot, task.options)
     return choose(task) if estimator == AUTO else fit_estimator(task, estimator, geometries=geometries)

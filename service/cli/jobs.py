@@ -123,6 +123,14 @@ def train(
     robot: Annotated[
         str | None, typer.Option(help="Of rigid bodies: a profile such as panda, the id of a URDF, or a .urdf file.")
     ] = None,
+    base: Annotated[
+        str | None,
+        typer.Option(
+            help="Of rigid bodies: a version of another unit of the same robot to start from, as MODEL:3, MODEL@ALIAS "
+            "or MODEL.",
+            autocompletion=connecting.models,
+        ),
+    ] = None,
     prior: Annotated[
         str | None,
         typer.Option(help="Of rigid bodies: around the parameters of the `urdf` (default) or around `zero`."),
@@ -174,6 +182,7 @@ def train(
             options or None,
             robot=robot,
             holdout=asked or None,
+            base=base,
             promotion=promotion,  # type: ignore[arg-type]  # the service checks it
             idempotency_key=new_key(),
         )

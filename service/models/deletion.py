@@ -40,7 +40,7 @@ def delete_version(loaded: LoadedModels, model: str, version: int) -> None:
     """Delete a version for good; its number is not given again. Not for the event loop.
 
     Raise NotFoundError; ConflictError, naming the reason, while an alias points to it, it serves, it is compared with
-    the one that serves, or a job trains it anew.
+    the one that serves, or a job trains it anew or starts from it.
     """
     with loaded.moving:
         with loaded.database.transaction() as session:
@@ -63,15 +63,18 @@ def delete_model(loaded: LoadedModels, model: str) -> None:
     """Delete a model with its versions, aliases, log, streams, snapshots and alarms. Not for the event loop.
 
     A model that is trained later under the same name goes on with the numbers of versions. Raise NotFoundError, or
-    ConflictError while a job of the model waits or runs.
+    ConflictError while a job of the model, or one that starts from a version of it, waits or runs.
     """
     with loaded.moving:
         with loaded.database.transaction() as session:
             row = session.scalar(select(ModelRow).where(ModelRow.name == model))
             if row is None:
                 raise not_found("model", model)
-            for job in _active_jobs(session, model):
-                raise ConflictError(f"{job.id} of model {model!r} is {job.state}: cancel it or wait for its end")
+            for job in _active_jobs(session):
+                if job.model == model:
+                    raise ConflictError(f"{job.id} of model {model!r} is {job.state}: cancel it or wait for its end")
+                if (job.request.get("base") or "").partition(":")[0] == model:
+                    raise ConflictError(f"{job.id} starts from model {model!r}: cancel it or wait for its end")
             versions = list(session.scalars(select(VersionRow).where(VersionRow.model == model)))
             snapshots = list(session.scalars(select(SnapshotRow.id).where(SnapshotRow.model == model)))
             _note_deletion(session, row, [each.version for each in versions])
@@ -96,13 +99,15 @@ def _check_unused(session: Session, model: str, version: int) -> None:
     learner = session.get(LearnerRow, (model, version))
     if learner is not None and learner.role == "candidate":
         raise ConflictError(f"{name} is compared with the version that serves: wait until that is decided")
-    for job in _active_jobs(session, model):
-        if (job.request.get("refresh") or {}).get("version") == version:
+    for job in _active_jobs(session):
+        if job.model == model and (job.request.get("refresh") or {}).get("version") == version:
             raise ConflictError(f"{job.id} trains {name} anew: cancel it or wait for its end")
+        if job.request.get("base") == f"{model}:{version}":
+            raise ConflictError(f"{job.id} starts from {name}: cancel it or wait for its end")
 
 
-def _active_jobs(session: Session, model: str) -> list[JobRow]:
-    return list(session.scalars(select(JobRow).where(JobRow.model == model, JobRow.state.in_(ACTIVE))))
+def _active_jobs(session: Session) -> list[JobRow]:
+    return list(session.scalars(select(JobRow).where(JobRow.state.in_(ACTIVE))))
 
 
 def _note_deletion(session: Session, row: ModelRow, versions: Collection[int]) -> None:

@@ -239,6 +239,19 @@ def find(database: Database, model: str, version: int | None) -> VersionRow:
     return row
 
 
+def named(database: Database, text: str) -> VersionRow:
+    """The version that a text of the pattern `schema.VERSION` names; raise NotFoundError."""
+    name, _, alias = text.partition("@")
+    model, _, number = name.partition(":")
+    if alias in ("", SERVING):
+        return find(database, model, int(number) if number else None)
+    version = pointers(database, [model]).get((model, alias))
+    if version is None:
+        find(database, model, None)  # that there is no such model is said first
+        raise not_found("alias", alias)
+    return find(database, model, version)
+
+
 def recent(database: Database, count: int) -> list[str]:
     """Return the names of the models that changed last, at most `count`."""
     changed = func.max(VersionRow.created_at)

@@ -13,6 +13,8 @@ ModelName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._-]{0,63
 """Lower-case letters, digits, dots, underscores and hyphens: safe in URLs and never a path."""
 VersionNumber = Annotated[int, Field(ge=1, lt=2**31)]
 ALIAS = r"^[a-z][a-z0-9._-]{0,63}$"
+VERSION = r"^[a-z0-9][a-z0-9._-]{0,63}(:[1-9][0-9]{0,8}|@[a-z][a-z0-9._-]{0,63})?$"
+"""A version as one text: `model:3`, `model@alias`, or `model` for the one that serves."""
 AliasName = Annotated[str, StringConstraints(pattern=ALIAS)]
 """Lower-case letters, digits, dots, underscores and hyphens after a letter: never taken for a version's number."""
 
@@ -97,7 +99,8 @@ class Version(BaseModel):
     )
     lineage: dict[str, Any] = Field(
         description="Data sets with their hashes, when and with which `software` it was trained, and how well it fits "
-        "them (`training_metrics`); of an imported version also where it comes from (`imported`)"
+        "them (`training_metrics`); also the version of another unit that it started from (`base`), and of an imported "
+        "version where it comes from (`imported`)"
     )
     promotion: Promotion | None = Field(
         None, description="Whether it answers by itself; null for one that was refreshed, imported or shipped"

@@ -9,6 +9,7 @@ from typing import Any, Literal
 from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session
 
+from lipcore.fitting.base import BaseMismatchError, Kind, check_base
 from lipcore.fitting.estimators import UnknownEstimatorError, check_estimator
 from lipcore.fitting.options import FitOptions
 from lipcore.robots.library import ROBOTS, SimulationUnavailableError
@@ -53,11 +54,20 @@ def create(queue: JobQueue, request: JobRequest, retry_of: str | None = None, na
     if request.holdout is not None:
         holding_out.check(rows, request.holdout, queue.settings.min_samples)
     queue.storage.disk.require()  # for the version that will be made
-    _check_estimator(queue.database, request, rows[0].joint_names, joint_types)
+    base = None
+    if request.base is None:
+        _check_estimator(queue.database, request, rows[0].joint_names, joint_types)
+    else:
+        base = registry.named(queue.database, request.base)
+        _check_base(base, request, rows[0], joint_types)
     with queue.database.transaction() as session:
         if (row := done(session, JobRow, named)) is not None:  # the same request was faster on another connection
             return represent(row)
         content = {**request.model_dump(mode="json"), "joint_types": joint_types}
+        if base is not None:
+            content["base"] = f"{base.model}:{base.version}"
+            if not registry.exists(session, base.model, base.version):  # deleted since it was checked
+                raise not_found("version", base.version)
         job = add(session, queue.settings, request.model, content, retry_of, named)
         present = set(session.scalars(select(DatasetRow.id).where(DatasetRow.id.in_(request.datasets))))
         for dataset in request.datasets:
@@ -191,6 +201,19 @@ def _check_estimator(database: Database, request: JobRequest, joint_names: list[
     except (ValueError, SimulationUnavailableError) as error:
         detail = problem("robot", request.robot, "a profile or the id of an uploaded URDF, with the joints of the data")
         raise InvalidRequestError(str(error), [detail]) from None
+
+
+def _check_base(base: VersionRow, request: JobRequest, data: DatasetRow, joint_types: list[str]) -> None:
+    """Check that the training can start from a version."""
+    manifest = base.manifest
+    of_base = Kind(tuple(manifest["joint_names"]), tuple(manifest["joint_types"]), manifest["torque_convention"])
+    of_data = Kind(tuple(data.joint_names), tuple(joint_types), data.torque_convention)
+    order = manifest["parameters"].get("geometry", {}).get("order")
+    options, name = FitOptions(**request.options.model_dump()), f"{base.model}:{base.version}"
+    try:
+        check_base(name, of_base, order, of_data, request.estimator, options, request.robot)
+    except BaseMismatchError as error:
+        raise invalid_request(error.field, error.value, error.expected) from None
 
 
 def _check_options(options: Options, settings: Settings) -> None:

@@ -13,11 +13,14 @@ from lipcore.data import independence, outliers
 from lipcore.data.outliers import Corrupt, CorruptError
 from lipcore.data.samples import Array, Samples
 from lipcore.data.splits import Mask
+from lipcore.kernels.arm_prior import Arm
 from lipcore.kernels.geometry import Geometry
+from lipcore.model.sibling import arm_as_expected, arm_of_sibling
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import TorqueConvention
 from service.foundation.settings import Settings
 from service.journal import log
+from service.models import registry
 from service.models.lineage import named
 from service.models.schema import Holdout, HoldoutLineage
 from service.robots import store as robots
@@ -59,7 +62,7 @@ class Material:
     how many both are; lineage: where they come from; seen: number of the newest
     event of the model's log when it was read; held_out: samples that the version is evaluated on and does not learn
     from, and how many they stand for; None where that is nothing; geometries: of an arm, as an earlier version has
-    learnt them.
+    learnt them; sibling: the arm of another unit, which is expected of this one.
     """
 
     samples: Samples
@@ -72,6 +75,7 @@ class Material:
     seen: int = 0
     held_out: tuple[Samples, int] | None = None
     geometries: tuple[Geometry, ...] = ()
+    sibling: Arm | None = None
 
     @property
     def rows(self) -> int:
@@ -93,14 +97,24 @@ def recorded(settings: Settings, database: Database, files: Files, request: dict
         divided = holding_out.hold_out(rows, clocks, how, lambda place: unrepeated(parts[place], types, how))
     found = [sound(part) for part in parts]
     table = _learnt(parts, divided, found)
-    names, robot = rows[0].joint_names, request.get("robot")
+    names, robot = rows[0].joint_names, None
+    if (asked_robot := request.get("robot")) is not None:
+        robot = robots.resolve(database, asked_robot, names, request["joint_types"])
+    sibling, base_lineage = None, {}
+    if (base := request.get("base")) is not None:
+        version = registry.named(database, base)
+        unit = files.load_version(version.folder, version.checksums)
+        robot, sibling = unit.robot, arm_of_sibling(unit)
+        tensors = version.manifest["tensors"]["sha256"]
+        base_lineage = {"base": {"model": version.model, "version": version.version, "sha256": tensors}}
     return Material(
         *_candidates(table, None),
         table,
         rows[0].torque_convention,  # type: ignore[arg-type]  # checked when it was stored
-        None if robot is None else robots.resolve(database, robot, names, request["joint_types"]),
-        {"datasets": named(rows), **_holdout(divided.lineage), **_corrupt(rows, found)},
+        robot,
+        {"datasets": named(rows), **base_lineage, **_holdout(divided.lineage), **_corrupt(rows, found)},
         held_out=_held_out(settings, parts, divided, found),
+        sibling=sibling,
     )
 
 
@@ -117,7 +131,7 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
         within = refresh_data.scope_of(session, model, refresh["through"])
         rows, left_out = refresh_data.split_datasets(session, within, version.manifest["lineage"])
     rows = [row for row in rows if row.id in request["datasets"]]  # what may be deleted meanwhile was not promised
-    base = files.load_version(version.folder, version.checksums)
+    base, lineage = files.load_version(version.folder, version.checksums), version.manifest["lineage"]
     logged = refresh_data.read_log(
         database, model, base.joint_names, within, settings.max_refresh_samples, settings.max_time_gap_s
     )
@@ -142,6 +156,7 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
         base.robot,
         {
             "datasets": named(rows),
+            **({"base": lineage["base"]} if "base" in lineage else {}),
             **_holdout(divided.lineage),
             **_corrupt(rows, found),
             "refresh": {**refresh, "left_out": left_out},
@@ -150,7 +165,8 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
         weighted,
         seen,
         _held_out(settings, parts, divided, found),
-        () if base.arm is None else (base.arm.geometry, *(each.geometry for each in base.arm.alternatives[1:])),
+        () if base.arm is None else base.arm.geometries,
+        arm_as_expected(base.arm) if base.arm is not None and "base" in lineage else None,
     )
 
 

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from lipcore.fitting.options import MOST_SECONDS, FitOptions, GeometryOption, Standing
 from lipcore.vocabulary import AUTO, CHOICES, DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS, JointType
 from service.foundation.states import JobState
-from service.models.schema import Holdout, ModelName
+from service.models.schema import VERSION, Holdout, ModelName
 
 _DEFAULTS = FitOptions()
 PromotionOption = Literal["ask", "always"]
@@ -37,7 +37,7 @@ class Options(BaseModel):
     geometry: GeometryOption = Field(
         _DEFAULTS.geometry,
         description="Of rigid bodies, where the joint axes lie: `learn` from torque alone, `calibrate` around the "
-        "robot's URDF, `fixed` as it has it; `auto`: calibrate where there is a robot, else learn",
+        "robot's URDF or the base, `fixed` as that has it; `auto`: calibrate where there is one, else learn",
     )
     search_seconds: float = Field(
         _DEFAULTS.search_seconds, gt=0, le=MOST_SECONDS, description="Time limit of the search for a geometry, s"
@@ -86,6 +86,13 @@ class JobRequest(BaseModel):
         None,
         max_length=40,
         description=f"For {', '.join(ROBOT_ESTIMATORS)} and {AUTO}: a profile such as panda, or the id of a URDF",
+    )
+    base: str | None = Field(
+        None,
+        pattern=VERSION,
+        description="Version of another unit of the same robot to start from: `model:3`, `model@alias`, or `model` for "
+        f"the one that serves. For {', '.join(ROBOT_ESTIMATORS)} and {AUTO}; its arm is expected, friction is not. It "
+        "may be deleted after the job",
     )
     options: Options = Field(default_factory=Options)
     holdout: Holdout | None = Field(
@@ -153,6 +160,7 @@ class Job(BaseModel):
     model: str
     estimator: str
     robot: str | None = Field(description="Profile or id of an uploaded URDF, of estimators with rigid bodies")
+    base: str | None = Field(None, description="The version that it starts from, as `model:3`")
     datasets: list[str]
     holdout: Holdout | None = Field(
         None, description="What it holds out of the data sets; a refresh holds out what its version held out"

@@ -151,6 +151,7 @@ def _fit(settings: Settings, claim: Claim, material: Material, pulse: Pulse) -> 
         material.stretches,
         pulse.progress,
         pulse.cancelled,
+        material.sibling,
     )
     trained = fit_model(task, request["estimator"], material.geometries)
     corrupt = sum(each["rows"] for each in material.lineage.get("corrupt", ()))

@@ -1,6 +1,7 @@
 """What an arm does, computed another way: by Pinocchio, and from its energies by automatic differentiation."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -8,14 +9,15 @@ import torch
 from torch import Tensor
 from torch.func import grad, jvp
 
-from lipcore import FitOptions, TorqueModel
+from lipcore import FitOptions, TorqueModel, train
 from lipcore.arm.learning import learn
 from lipcore.data.samples import Samples
 from lipcore.fitting.task import Task
 from lipcore.kernels.geometry import Geometry
 from lipcore.online.batch import Rows
-from lipcore.robots.library import Robot
+from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.urdf import RigidBody
 from lipcore.training.fit import fit_estimator
 from tests.lipcore.arms import random_bodies, random_geometry
 
@@ -53,6 +55,16 @@ def followed(geometry: Geometry, robot: Robot, samples: Samples, options: FitOpt
 def recorded(robot: Robot, seed: int, size: int = 120, noise: float = 0.01, viscous: float = 0.2) -> Samples:
     """Samples of a robot that moves over most of its range."""
     return simulate(robot, Stream(size, speed=10, noise=noise, viscous=viscous, motion="full"), seed)
+
+
+def pendulum_from_its_tip(mode: str, options: FitOptions) -> TorqueModel:
+    """A model around a URDF, of a pendulum whose data have the joints from tip to base. mode: of its geometry."""
+    robot = load_robot("double-pendulum")
+    data = simulate(robot, Stream(80, speed=10, noise=0.002, viscous=0.02), 1)
+    turned = {name: getattr(data, name)[:, ::-1].copy() for name in ("q", "dq", "ddq", "tau")}
+    data = replace(data, joint_names=data.joint_names[::-1], **turned)
+    body = RigidBody.from_profile(robot.name, data.joint_names, ("revolute",) * 2)
+    return train(data, ("revolute",) * 2, "rigid-body", replace(options, geometry=mode), robot=body)
 
 
 def energies(geometry: Geometry, bodies: np.ndarray, step: Tensor, q: Tensor, dq: Tensor) -> tuple[Tensor, Tensor]:

@@ -14,7 +14,7 @@ import torch
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
-from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, load, save, train
+from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, load, save
 from lipcore.data.metrics import evaluate
 from lipcore.data.motion import Motion
 from lipcore.files import persistence
@@ -27,10 +27,7 @@ from lipcore.kernels.friction import friction_features
 from lipcore.model.parameters import inertial_parameters, report
 from lipcore.online.learner import OnlineModel
 from lipcore.posterior.compression import linear
-from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, simulate
-from lipcore.robots.urdf import RigidBody
-from tests.lipcore.arm_oracles import arm, as_robot, as_rows, followed, motions, recorded
+from tests.lipcore.arm_oracles import arm, as_robot, as_rows, followed, motions, pendulum_from_its_tip, recorded
 from tests.lipcore.arms import parameters, random_bodies, random_geometry
 
 OPTIONS = FitOptions(device="cpu", statistics="chosen")
@@ -46,16 +43,6 @@ def samples() -> Samples:
 @pytest.fixture(scope="module")
 def learnt(samples: Samples) -> TorqueModel:
     return followed(GEOMETRY, ROBOT, samples, OPTIONS)
-
-
-def of_robot(mode: str) -> TorqueModel:
-    """A pendulum whose data have the joints from tip to base."""
-    robot = load_robot("double-pendulum")
-    data = simulate(robot, Stream(80, speed=10, noise=0.002, viscous=0.02), 1)
-    turned = {name: getattr(data, name)[:, ::-1].copy() for name in ("q", "dq", "ddq", "tau")}
-    data = replace(data, joint_names=data.joint_names[::-1], **turned)
-    body = RigidBody.from_profile(robot.name, data.joint_names, ("revolute",) * 2)
-    return train(data, ("revolute",) * 2, "rigid-body", replace(OPTIONS, geometry=mode), robot=body)
 
 
 def with_alternatives(model: TorqueModel, samples: Samples, count: int = 1) -> TorqueModel:
@@ -89,7 +76,9 @@ def test_a_saved_arm_comes_back(kind: str, learnt: TorqueModel, samples: Samples
     if kind == "learn":
         model = learnt
     else:
-        model = with_alternatives(learnt, samples, 2) if kind == "alternatives" else of_robot(kind)
+        model = (
+            with_alternatives(learnt, samples, 2) if kind == "alternatives" else pendulum_from_its_tip(kind, OPTIONS)
+        )
     manifest = save(model, tmp_path / "model")
     again = load(tmp_path / "model")
     asked = motions(model.n_joints, 3).transpose(1, 0, 2)
@@ -115,6 +104,7 @@ WRONG: dict[str, tuple[Edit, str]] = {
     "order": (lambda t: t["arm/order"].zero_(), "expected each joint once"),
     "widths": (lambda t: t["arm/widths"].zero_(), "not above zero"),
     "parameters": (lambda t: t.update({"arm/parameters": t["arm/parameters"][:2].clone()}), "parameters has shape"),
+    "rotor": (lambda t: t.update({"arm/rotor": t["arm/rotation"][0, 0, :2].clone()}), "rotor has shape"),
     "steps": (lambda t: t.update({"arm/expected": t["arm/expected"][:1].clone()}), "expected has shape"),
     "not finite": (lambda t: t["arm/translation"].fill_(np.nan), "finite"),
     "coefficients": (

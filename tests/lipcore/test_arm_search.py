@@ -21,6 +21,7 @@ from lipcore.data.metrics import evaluate
 from lipcore.data.signals import noise_level
 from lipcore.fitting.hyperparameters import FitCancelledError, FitProgress
 from lipcore.fitting.task import Task
+from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.geometry import Geometry
 from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.robots.library import Robot, load_robot
@@ -52,7 +53,8 @@ def case(kinds: str, gravity: bool = True) -> Case:
 
 def rows(given: Case, size: int = 80) -> Problem:
     few = given.samples.rows(np.arange(len(given.samples)) % 2 == 0).rows(slice(0, size))
-    return make_problem(few, given.robot.joint_types, OPTIONS, bool(given.geometry.gravity.any()))[0]
+    types = given.robot.joint_types
+    return make_problem(few, types, np.arange(len(types)), bool(given.geometry.gravity.any()))
 
 
 def found_in(problem: Problem, given: Case, seconds: float = 5.0, known: tuple[Geometry, ...] = ()) -> SearchResult:
@@ -217,7 +219,7 @@ def learnt() -> tuple[Problem, Point]:
     """Few samples of an arm of which nothing is known, near its true geometry."""
     geometry, _, robot = arm(ARM, 21)
     samples = recorded(robot, 1, size=12, noise=0.05)
-    problem, _ = make_problem(samples, robot.joint_types, FitOptions(device="cpu"), True)
+    problem = make_problem(samples, robot.joint_types, np.arange(3), True)
     rng = np.random.default_rng(0)
     near = geometry.canonical().moved(rng.normal(0, 0.02, geometry.size)).canonical()
     return problem, problem.at(near, np.array([0.4, 0.3, 0.2]))
@@ -229,7 +231,7 @@ def calibrated() -> tuple[Problem, Point]:
     robot = load_robot("double-pendulum")
     body = RigidBody.from_profile(robot.name, robot.joint_names, robot.joint_types)
     samples = recorded(robot, 2, size=12, noise=0.01, viscous=0.02)
-    problem, _ = make_problem(samples, robot.joint_types, FitOptions(device="cpu"), True, body)
+    problem = make_problem(samples, robot.joint_types, np.arange(2), True, arm_of_robot(body, mode="calibrate"))
     geometry = Geometry.from_robot(body)
     geometry = geometry.moved(np.random.default_rng(1).normal(0, 0.01, geometry.size))
     return problem, problem.at(geometry, np.array([0.02, 0.03]))

@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from lipcore.robots.library import ROBOTS, Robot, load_robot
+from lipcore.robots.library import ROBOTS, Robot, another_unit, load_robot
 from lipcore.robots.simulation import Payload, Stream, simulate
 
 
@@ -78,6 +78,19 @@ def test_friction_and_noise_are_added_as_stated(panda: Robot) -> None:
     noisy = simulate(panda, replace(plain, noise=0.2), seed=5)
     assert np.array_equal(noisy.q, clean.q)
     assert np.std(noisy.tau - clean.tau) == pytest.approx(0.2, rel=0.05)
+
+
+def test_another_unit_has_the_same_joints_and_other_masses(panda: Robot) -> None:
+    unit, again = (another_unit(panda, 0.1, seed=3) for _ in range(2))
+    for joint in range(1, panda.model.njoints):
+        old, new = (each.model.inertias[joint] for each in (panda, unit))
+        share = new.mass / old.mass
+        assert 0.9 <= share <= 1.1
+        assert share != 1
+        np.testing.assert_allclose(new.lever, old.lever)
+        np.testing.assert_allclose(new.inertia, share * old.inertia)
+        assert again.model.inertias[joint].mass == new.mass
+        assert unit.model.jointPlacements[joint] == panda.model.jointPlacements[joint]
 
 
 def test_payload_is_the_weight_it_says(panda: Robot) -> None:

@@ -213,6 +213,10 @@ def test_command_line_and_client(server, lipserve, tmp_path):  # noqa: F811 - th
     assert code == 0, wrong
     code, _, wrong = lipserve(*common, "--robot", tmp_path / "missing.urdf")
     assert (code, "missing.urdf" in wrong) == (1, True)
+    code, _, wrong = lipserve(*common, "--base", "panda-sim")
+    assert (code, "base is panda-sim:1, expected a version with the joint_names of the data" in wrong) == (1, True), (
+        wrong
+    )
     with Client(server.url) as client:
         assert client.version("by-cli", 1).robot["name"] == "2dof_planar"
         with pytest.raises(ApiError, match="not well-formed"):

@@ -23,6 +23,7 @@ def train(
     robot: str | None = None,
     holdout: Mapping[str, Any] | None = None,
     promotion: PromotionOption | None = None,
+    base: str | None = None,
     *,
     idempotency_key: str | None = None,
 ) -> Call[Job]:
@@ -30,7 +31,8 @@ def train(
 
     robot: for rigid bodies, a profile such as panda or the id of an uploaded URDF; holdout: what to hold out of the
     data sets and evaluate the version on, such as {"share": 0.3}; promotion: `ask` (default) lets the version answer if
-    it does well there, `always` in any case; idempotency_key: the same request under the same key queues one job, also
+    it does well there, `always` in any case; base: a version of another unit of the same robot to start from, as
+    `model:3` or `model@alias`; idempotency_key: the same request under the same key queues one job, also
     from another client.
     """
     body: dict[str, Any] = {"model": model, "datasets": list(datasets), "options": dict(options or {})}
@@ -40,6 +42,7 @@ def train(
         robot=robot,
         holdout=None if holdout is None else dict(holdout),
         promotion=promotion,
+        base=base,
     )
     return at(record(Job), names={}, json=body, headers={KEY_HEADER: idempotency_key or new_key()})
 

@@ -37,6 +37,7 @@ function origin(version) {
     ["Noise of the measurement, N·m", version.noise_std.map((each) => number(each, 2)).join(", ")],
   ];
   if (version.robot?.name) found.push(["Robot", version.robot.name]);
+  if (from.base) found.push(["Transferred from", `${from.base.model} version ${from.base.version}`]);
   if (from.refresh) found.push(["Refresh of", `version ${from.refresh.version}`]);
   if (from.log) found.push(["Rows learnt from the log", `${count(from.log.rows)} of ${count(from.log.found)}`]);
   if (from.made_by) found.push(["Made with", from.made_by]);

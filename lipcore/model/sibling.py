@@ -1,0 +1,80 @@
+"""What a model says of another unit of its robot before that one has moved.
+
+Units of one type have the same geometry but for machining, nearly the same masses, and friction of their own. So of a
+parameter, known as N(m, V), another unit's is expected within
+
+    N(m, V + (UNIT_SHARE · size)²),    size² = mean of m² + V over the entries of its kind and body,
+
+and of the geometry likewise with what machining leaves. V is the variance given all other parameters, 1 / Λ_ii of the
+posterior precision Λ: among independent Gaussians those are nearest to the posterior (in KL(q | p)). What torque tells
+only in sums stays as tight as the sums are, instead of as loose as their parts. Nothing is kept of friction or noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from lipcore.data.samples import Array
+from lipcore.kernels.arm import SCALES, ArmKernel
+from lipcore.kernels.arm_prior import KINDS, Arm
+from lipcore.kernels.compiled.arm_recursion import PARAMETERS
+from lipcore.model.parameters import precision, weight_posterior
+from lipcore.model.torque_model import TorqueModel
+
+UNIT_SHARE = 0.1
+"""Relative deviation of masses and rotor inertias between units of one type, that a fit starts from."""
+MACHINED_TURN, MACHINED_SHIFT = 0.005, 0.003
+"""How far axes of two units of one type lie from each other, standard deviations in rad and m. Machining leaves less;
+but what V leaves out of what is known only together wants room, too. This and `UNIT_WIDTH` of `arm.problem` were chosen
+on arms 50 and 51 of `learnt_arm.py transfer` (benchmarks/studies), where a fifth of it ended at times in a poor optimum
+that takes part of the torque for noise."""
+MOUNTED_TURN = 0.02
+"""How far their bases lean from each other, rad."""
+
+
+def arm_of_sibling(base: TorqueModel) -> Arm:
+    """The arm of another unit of a model's robot, before any samples of it; its geometry may be calibrated.
+
+    Raise ValueError for a model without an arm.
+    """
+    term = base.estimator.terms.get("rigid_body")
+    if not isinstance(term, ArmKernel):
+        raise ValueError(f"estimator {base.estimator.name!r} has no arm")
+    arm, n = term.arm, term.n_joints
+    weights = weight_posterior(base.posterior, term)
+    variance = weights.scale**2 / precision(base.posterior, term).diagonal()
+    bodies, rotors = slice(0, PARAMETERS * n), slice(PARAMETERS * n, (PARAMETERS + 1) * n)
+    size = _sizes(weights.mean**2 + weights.std**2, n)
+    unit = np.sqrt(variance[: rotors.stop] + (UNIT_SHARE * size) ** 2)
+    geometry = term.geometry(weights.mean)
+    machined = np.where(geometry.turns, MACHINED_TURN, MACHINED_SHIFT)
+    machined[: geometry.screws[0]] = MOUNTED_TURN
+    steps = variance[term.steps] if arm.steps else np.zeros(geometry.size)
+    means = weights.mean[bodies].reshape(n, PARAMETERS)[arm.order]
+    return Arm(
+        geometry,
+        arm.order,
+        "calibrate",
+        means,
+        means,
+        unit,
+        weights.mean[rotors],
+        np.zeros(geometry.size),
+        np.sqrt(steps + machined**2),
+    )
+
+
+def arm_as_expected(arm: Arm) -> Arm:
+    """What an arm that was transferred was expected to be, for another training of the same unit."""
+    geometry = arm.geometry.moved(arm.expected) if arm.steps else arm.geometry
+    return replace(arm, geometry=geometry, expected=np.zeros(arm.steps), stribeck=False, alternatives=())
+
+
+def _sizes(squares: Array, n: int) -> Array:
+    """Root mean square of each kind of parameter of a body, (11 n,). squares: of the weights, (p,)."""
+    bodies, rotors = squares[: PARAMETERS * n].reshape(n, PARAMETERS), squares[PARAMETERS * n : (PARAMETERS + 1) * n]
+    kinds = np.array(KINDS)
+    means = np.stack([bodies[:, kinds == kind].mean(axis=1) for kind in range(SCALES - 1)], axis=1)
+    return np.asarray(np.sqrt(np.concatenate([means[:, kinds].reshape(-1), rotors])))
