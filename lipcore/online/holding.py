@@ -19,10 +19,10 @@ State = Literal["none", "payload", "contact", "friction"]
 SURE, BETTER = 20.0, 5.0
 """Nats by which a payload explains the last cells better than nothing, and than a contact, to be taken for one at once.
 In 60 s each of slow and of fast motion of the dirty Panda of seed 50 there were up to 28 and at most 2 at a time."""
-CERTAIN, ALIKE = 60.0, 0.9
+CERTAIN, ALIKE = 60.0, 0.99
 """What is so certain is taken for a payload where that explains so large a share of what a contact does: the torques of
 a contact are any, and those of a payload as good as the arm's geometry."""
-LASTING, NEARLY = 6, 0.5
+LASTING, NEARLY = 6, 0.8
 """What lasts for so many cells, 0.3 s, is no knock any more, and needs a smaller share."""
 LIKELY = 10.0
 """Nats from which on a contact is named. Cells that are as far off as SURE teach nothing of the payload."""
@@ -37,6 +37,9 @@ MOST_ROWS, BEFORE_ROWS, GROWTH = 160, 10, 1.15
 to grow until it is estimated again."""
 TOGETHER = 3
 """Cells of one batch that are judged together: an instant within the last AFTER is seen all the same."""
+STRANGE = 4.0
+"""Standard deviations of what is known of any payload beyond which a body is none: heavier than 120 kg, or with its
+centre of mass further than 0.6 m from the last link's frame. A push looks like such a one."""
 GAP_S = 0.5
 """A longer time between two rows: what came before is not compared with what comes after."""
 DECLARED, WRONG = np.array([0.02, *[0.005] * 3, *[0.3] * 3, *[0.005] * 3]), 4.0
@@ -202,6 +205,8 @@ class Watch:
             before = Rows.concatenate(self.recent[:-after])
             before = before.take(slice(None, None, -(-len(before) // BEFORE_ROWS)))
         found = estimate(carrier, rows, before)
+        if np.abs((found.eta - ANY.centre) / np.sqrt(1 / np.diagonal(ANY.precision))).max() > STRANGE:
+            return replace(self, state="contact")
         since = float(rows.time[0])
         held = Held(since, False, rows, before, 1, len(rows), GROWTH * len(rows), ANY, found)
         watch = replace(self, state="payload", since=since, held=held, recent=self.recent[-after:])
@@ -213,7 +218,8 @@ class Watch:
         if max(best.values()) > LIKELY:
             down, after = self._without(carrier, window, gains)
             # nothing is free about an arm without a payload: what explains as much with ten numbers explains less
-            if down >= SURE and down >= NEARLY * max(gains[after].values()):
+            share = NEARLY if after >= LASTING else ALIKE
+            if down >= SURE and down >= share * max(gains[after].values()):
                 since = float(self.recent[-after].time[0])
                 fresh = Watch(self.n, "none", {"none": 1.0}, since, None, self.waiting, self.recent[-after:])
                 return fresh._around(carrier)

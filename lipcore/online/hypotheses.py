@@ -34,7 +34,7 @@ LIKE, REST_S = (1.0, 0.5), 0.3
 """Of errors that change with motion, see `payload.likeness`, and of what holds a joint at rest, s. Chosen on the dirty
 Panda of seed 50: with those of `payload` 0.5 kg are not seen, with twice as much fast motion looks like a payload."""
 BEFORE, LEAST_BEFORE = 6, 4
-AFTER = (1, 2, 4, 6)
+AFTER = (1, 2, 3, 4, 5, 6)
 """Cells that are compared: before the instant, at most and at least; and after it."""
 MASSES = (0.5, 1.5, 5.0)
 """Scales of a payload's mass, kg; first moment and inertia as of a body about LEVER and RADIUS away."""

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchem
 from lipcore.online.record import LEVEL
 from lipcore.vocabulary import CODES, LEARNT, JointType
 from service.foundation.errors import invalid_request
+from service.learning.owner import AlarmKind
 from service.learning.schema import MOST_SEQUENCE, LearningOptions, State
 from service.models.schema import VersionNumber
 
@@ -271,7 +272,7 @@ class Alarm(BaseModel):
     """Something about a learning model that its owner should know."""
 
     id: int
-    kind: Literal["change", "novelty", "linearisation", "refresh", "promotion"]
+    kind: AlarmKind
     at: str
     message: str
     evidence: dict[str, Any]
