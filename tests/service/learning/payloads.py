@@ -1,0 +1,40 @@
+"""A simulated Panda that takes up a payload, and what teaches a model with it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Payload, Stream, simulate
+
+MASS = 1.5
+"""Of the payload, kg."""
+RATE, ROWS, BATCH = 100.0, 150, 50
+TAKEN = 0.6
+"""Seconds after which it is taken up."""
+PUSHED = 30
+"""Rows at the end of a recording in which something pushes."""
+
+
+def lifting(stream_id: str, push: float = 0.0) -> list[dict[str, Any]]:
+    """Batches of a Panda like the shipped model's that takes up MASS after TAKEN; push: N·m on its second and fourth
+    joint at the end, to and fro, as no payload does."""
+    load = Payload(MASS, at=TAKEN)
+    seen = simulate(load_robot("panda"), Stream(n_samples=ROWS, rate=RATE, noise=0.05, speed=5.0, payload=load), seed=3)
+    tau = seen.tau.copy()
+    tau[-PUSHED:, [1, 3]] += push * np.sin(np.linspace(0.0, np.pi, PUSHED))[:, None]
+    parts = [slice(at, at + BATCH) for at in range(0, ROWS, BATCH)]
+    values = {"t": seen.t, "q": seen.q, "dq": seen.dq, "ddq": seen.ddq, "tau": tau}
+    return [
+        {"stream_id": stream_id, "sequence": number, **{name: each[part].tolist() for name, each in values.items()}}
+        for number, part in enumerate(parts)
+    ]
+
+
+def lift(client: Any, model: str, stream_id: str, push: float = 0.0) -> None:
+    """Have a stream take up the payload."""
+    for body in lifting(stream_id, push):
+        answer = client.post(f"/v1/models/{model}/observations", json=body)
+        assert answer.status_code == 200, answer.text
