@@ -13,13 +13,13 @@ MOST_MASS, MOST_DISTANCE = 1000.0, 10.0
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Metres = Annotated[float, Field(ge=-MOST_DISTANCE, le=MOST_DISTANCE, allow_inf_nan=False)]
 Row = Annotated[list[Finite], Field(min_length=3, max_length=3)]
-EXAMPLE: dict[str, Any] = {"mass": 1.5, "com": [0.0, 0.0, 0.12]}
+PAYLOAD_EXAMPLE: dict[str, Any] = {"mass": 1.5, "com": [0.0, 0.0, 0.12]}
 
 
 class PayloadRequest(BaseModel):
     """A payload that the arm carries, as robot controllers take it: in the frame of the last link."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [EXAMPLE]})
+    model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [PAYLOAD_EXAMPLE]})
 
     mass: float = Field(gt=0, le=MOST_MASS, allow_inf_nan=False, description="kg")
     com: Annotated[list[Metres], Field(min_length=3, max_length=3)] = Field(description="Centre of mass, m")

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Payload, Stream, simulate
 
@@ -20,12 +18,12 @@ PUSHED = 20
 
 
 def lifting(stream_id: str, mass: float = MASS, push: float = 0.0) -> list[dict[str, Any]]:
-    """Batches of a Panda like the shipped model's that takes up a mass, kg, after TAKEN; push: N·m on its second and
-    fourth joint at the end, to and fro, as no payload does."""
+    """Batches of a Panda like the shipped model's that takes up a mass, kg, after TAKEN; push: N·m on its first and
+    last joint at the end, as no payload does."""
     load = Payload(mass, TAKEN, OFFSET) if mass else None
     seen = simulate(load_robot("panda"), Stream(n_samples=ROWS, rate=RATE, noise=0.05, speed=5.0, payload=load), seed=3)
     tau = seen.tau.copy()
-    tau[-PUSHED:, [1, 3]] += push * np.sin(np.linspace(0.0, 2 * np.pi, PUSHED))[:, None]
+    tau[-PUSHED:, [0, 6]] += push
     parts = [slice(at, at + BATCH) for at in range(0, ROWS, BATCH)]
     values = {"t": seen.t, "q": seen.q, "dq": seen.dq, "ddq": seen.ddq, "tau": tau}
     return [
