@@ -11,7 +11,7 @@ import numpy as np
 from lipcore.data.samples import Array
 from lipcore.model.payload import Body
 from lipcore.online.holding import Watch
-from lipcore.online.payload import BELOW, DIAGONAL, Estimate, body
+from lipcore.online.payload import BELOW, DIAGONAL, Estimate
 from lipcore.robots.urdf import RigidBody
 from service.foundation.errors import ConflictError, invalid_request
 from service.journal import log
@@ -145,15 +145,14 @@ def _shown(stream_id: str, watch: Watch, tip: Tip | None) -> StreamPayload:
 
 def _of(found: Estimate, tip: Tip | None) -> PayloadBody:
     """Mean and deviation of a payload's figures. Those of its inertia by draws from its parameters, seeded."""
-    best = Body.of(body(found.eta)[0])
     mass, std = found.mass
-    spread = found.covariance[1:4, 1:4]
+    com, spread = found.eta[1:4], found.covariance[1:4, 1:4]
     drawn = np.random.default_rng(0).multivariate_normal(found.eta, found.covariance, DRAWS)
     return PayloadBody(
         mass=Scalar(mean=mass, std=std),
-        com=_vector(best.com, spread),
-        com_tip=None if tip is None else _vector(tip[1].T @ (best.com - tip[2]), tip[1].T @ spread @ tip[1]),
-        inertia=Tensor(mean=best.inertia.tolist(), std=_inertias(drawn).std(axis=0).tolist()),
+        com=_vector(com, spread),
+        com_tip=None if tip is None else _vector(tip[1].T @ (com - tip[2]), tip[1].T @ spread @ tip[1]),
+        inertia=Tensor(mean=_inertias(found.eta[None])[0].tolist(), std=_inertias(drawn).std(axis=0).tolist()),
     )
 
 

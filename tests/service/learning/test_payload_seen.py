@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families as parse
 
+from lipcore.model.payload import Body
+from lipcore.online.payload import CENTRE, WIDTH
+from lipcore.online.payload import body as parameters_of
 from service.client import ApiError, AsyncClient, Client
+from service.learning.control import payload
 from tests.service.learning.following import following
 from tests.service.learning.payloads import MASS, OFFSET, lift
 from tests.service.models.versions import publish_arm_at
@@ -85,6 +89,12 @@ def test_the_asynchronous_client_does_the_same(server):
             assert (caught.value.status, caught.value.code) == (422, "invalid_request")
 
     asyncio.run(work())
+
+
+def test_inertias_of_draws_are_those_of_bodies():
+    drawn = np.random.default_rng(4).multivariate_normal(CENTRE, np.diag(WIDTH**2), 20)
+    expected = [Body.of(parameters_of(eta)[0]).inertia for eta in drawn]
+    np.testing.assert_allclose(payload._inertias(drawn), expected, rtol=1e-6, atol=1e-9)
 
 
 def test_a_model_without_an_arm_has_none(school, streaming):
