@@ -37,9 +37,9 @@ MOST_ROWS, BEFORE_ROWS, GROWTH = 160, 10, 1.15
 to grow until it is estimated again."""
 TOGETHER = 3
 """Cells of one batch that are judged together: an instant within the last AFTER is seen all the same."""
-STRANGE = 4.0
-"""Standard deviations of what is known of any payload beyond which a body is none: heavier than 120 kg, or with its
-centre of mass further than 0.6 m from the last link's frame. A push looks like such a one."""
+STRANGE = 2.5
+"""Standard deviations of what is known of any payload beyond which a body is none: heavier than 20 kg, or with its
+centre of mass further than 0.37 m from the last link's frame. A push looks like such a one."""
 GAP_S = 0.5
 """A longer time between two rows: what came before is not compared with what comes after."""
 DECLARED, WRONG = np.array([0.02, *[0.005] * 3, *[0.3] * 3, *[0.005] * 3]), 4.0

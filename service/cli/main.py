@@ -105,6 +105,7 @@ class Commands(LazyGroup):
             "service.cli.answers", "Compare a model with a recording, joint by joint.", ANSWERS, "evaluate_app"
         ),
         "stream": Entry("service.cli.stream", "Play a motion to a model in real time, and teach it.", ANSWERS),
+        "payload": Entry("service.cli.payload", "Show what the arm carries, declare it, or that it is gone.", ROBOT),
         "simulate": Entry("service.cli.simulate", "Simulate a robot's stream and write it as a recording.", ROBOT),
         "excite": Entry("service.cli.excite", "Plan the motion that tells most of what is not known.", ROBOT),
         "bench": Entry("service.cli.answers", "Time the answers of a service on this machine.", CHECK, "bench_app"),

@@ -133,6 +133,9 @@ class Calls:
     learning = One(calls.learning.learning)
     put_learning = One(calls.learning.put_learning)
     decide = One(calls.learning.decide)
+    payload = One(calls.learning.payload)
+    declare_payload = One(calls.learning.declare_payload)
+    remove_payload = One(calls.learning.remove_payload)
     alarms = Listed(calls.learning.alarms)
     live = Followed(calls.learning.live)
 

@@ -45,6 +45,10 @@ class Loads:
         known = self._default if stream_id is None else self._streams.get(stream_id, self._default)
         return None if known is None else known.mass
 
+    def masses(self) -> dict[str, tuple[float, float] | None]:
+        """Mass that each stream carries, as `mass` has it, of all streams that are known."""
+        return {name: each.mass for name, each in self._streams.items()}
+
     def take(self, streams: Mapping[str, Carried]) -> None:
         """Answer with these from now on; the default is that of an empty name."""
         self._default = streams.get("")

@@ -14,6 +14,8 @@ from tests.browser.robot import playing
 from tests.browser.visitor import PHONE, Visitor
 from tests.choosing import slow
 from tests.service.data import stream
+from tests.service.learning.payloads import lift
+from tests.service.models.versions import publish_arm_at
 
 if TYPE_CHECKING:
     from playwright.sync_api import ElementHandle, Locator, Route
@@ -155,6 +157,25 @@ def test_a_change_is_decided_and_old_rows_are_said_to_be_old(
         expect(page.get_by_text("that had been kept out")).to_be_visible()
         expect(decision).to_have_count(0)
     expect(page.get_by_text("no new rows: what is shown is old")).to_be_visible()
+
+
+@pytest.mark.slow
+def test_what_arms_carry_is_told_in_kilograms_and_a_contact_is_said(visitor: Visitor, dashboard: Dashboard) -> None:
+    publish_arm_at(dashboard.server.home, "carrier")
+    lift(dashboard.client, "carrier", "cell-1")
+    lift(dashboard.client, "carrier", "cell-2", mass=0.0, push=30.0)
+    page = visitor.open("#/live/carrier")
+    carried = page.get_by_role("region", name="Payload", exact=True)
+    lifted, touched = (carried.get_by_role("row").filter(has_text=name) for name in ("cell-1", "cell-2"))
+    expect(lifted).to_contain_text(re.compile(r"1\.[45]\d ± 0\.\d\d\skg"))
+    expect(lifted).to_contain_text(re.compile(r"payload.*\d{4}"))
+    expect(touched).to_contain_text("nothing")
+    expect(carried).to_contain_text("a contact is seen on cell-2")
+    expect(page.get_by_role("region", name="Learning", exact=True)).to_contain_text("with a payload")
+    assert audit(page) == []
+    visitor.open(f"#/live/{dashboard.model}")
+    expect(page.get_by_role("region", name="Learning", exact=True)).to_be_visible()
+    expect(carried).to_have_count(0)
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from service.client.call import Call, Page, Route, given, page, record, route
 from service.client.results.series import Live, read_live
+from service.learning.control.payload_schema import Payloads
 from service.learning.control.schema import (
     Alarm,
     Decided,
@@ -25,6 +26,7 @@ from service.learning.schema import ObservationResponse
 from service.training.schema import Job
 
 BATCH = "/v1/models/{model}/observations/{stream_id}/{sequence}"
+PAYLOAD = "/v1/models/{model}/payload"
 
 
 @route("POST", "/v1/models/{model}/observations", repeatable=True)
@@ -118,6 +120,34 @@ def put_learning(at: Route, model: str, options: Mapping[str, Any]) -> Call[Lear
 def decide(at: Route, model: str, decision: Literal["adapt", "ignore"], replay: bool = False) -> Call[Decided]:
     """End a hold: `adapt` to the changed robot, or `ignore`. replay: learn the rows that were kept out since."""
     return at(record(Decided), names={"model": model}, json={"decision": decision, "replay": replay})
+
+
+@route("GET", PAYLOAD)
+def payload(at: Route, model: str) -> Call[Payloads]:
+    """What the arms of a model's streams carry, with what is not known of it."""
+    return at(record(Payloads), names={"model": model})
+
+
+@route("PUT", PAYLOAD)
+def declare_payload(
+    at: Route,
+    model: str,
+    mass: float,
+    com: ArrayLike,
+    inertia: ArrayLike | None = None,
+    stream_id: str | None = None,
+) -> Call[Payloads]:
+    """Answer with a payload from now on: mass, kg, and com, (3) m, in the frame of the last link; inertia, (3, 3)
+    kg·m², about com, that of a point where None. stream_id: which robot carries it, all of the model where None."""
+    shape = None if inertia is None else np.asarray(inertia, np.float64).tolist()
+    body = {"mass": float(mass), "com": np.asarray(com, np.float64).tolist()}
+    return at(record(Payloads), names={"model": model}, json=body | given(inertia=shape, stream_id=stream_id))
+
+
+@route("DELETE", PAYLOAD)
+def remove_payload(at: Route, model: str, stream_id: str | None = None) -> Call[Payloads]:
+    """Answer without a payload from now on, a stream or all of them."""
+    return at(record(Payloads), names={"model": model}, params={"stream_id": stream_id})
 
 
 @route("GET", "/v1/models/{model}/alarms")

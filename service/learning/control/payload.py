@@ -4,112 +4,48 @@ from __future__ import annotations
 
 import time
 from datetime import UTC, datetime
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 
 from lipcore.data.samples import Array
 from lipcore.model.payload import Body
-from lipcore.online.holding import State, Watch
-from lipcore.online.payload import body
+from lipcore.online.holding import Watch
+from lipcore.online.payload import BELOW, DIAGONAL, Estimate
 from lipcore.robots.urdf import RigidBody
 from service.foundation.errors import ConflictError, invalid_request
 from service.journal import log
 from service.learning import owner
+from service.learning.control.payload_schema import (
+    LivePayload,
+    PayloadBody,
+    PayloadRequest,
+    Payloads,
+    Scalar,
+    StreamPayload,
+    Tensor,
+    Vector,
+)
+from service.learning.ingest.monitor import Monitor
 from service.learning.learners import Learners
-from service.learning.schema import StreamId
+from service.models.served import Served
 
 DRAWS = 500
-"""Of a payload's parameters, for the spread of its figures."""
-MOST_MASS, MOST_DISTANCE = 1000.0, 10.0
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Metres = Annotated[float, Field(ge=-MOST_DISTANCE, le=MOST_DISTANCE, allow_inf_nan=False)]
-Row = Annotated[list[Finite], Field(min_length=3, max_length=3)]
-EXAMPLE: dict[str, Any] = {"mass": 1.5, "com": [0.0, 0.0, 0.12]}
-
-
-class PayloadRequest(BaseModel):
-    """A payload that the arm carries, as robot controllers take it: in the frame of the last link."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [EXAMPLE]})
-
-    mass: float = Field(gt=0, le=MOST_MASS, allow_inf_nan=False, description="kg")
-    com: Annotated[list[Metres], Field(min_length=3, max_length=3)] = Field(description="Centre of mass, m")
-    inertia: Annotated[list[Row], Field(min_length=3, max_length=3)] | None = Field(
-        None, description="3 × 3 about the centre of mass, along the axes of the link, kg·m²; null: that of a point"
-    )
-    stream_id: StreamId | None = Field(None, description="The robot that carries it; null: all of the model")
-
-
-class Scalar(BaseModel):
-    """A number and its standard deviation."""
-
-    mean: float
-    std: float
-
-
-class Vector(BaseModel):
-    """Three numbers and their standard deviations."""
-
-    mean: list[float]
-    std: list[float]
-
-
-class Tensor(BaseModel):
-    """A matrix of 3 × 3 and its standard deviations."""
-
-    mean: list[list[float]]
-    std: list[list[float]]
-
-
-class PayloadBody(BaseModel):
-    """A body on the last link, as far as its stream tells."""
-
-    mass: Scalar = Field(description="kg")
-    com: Vector = Field(description="Centre of mass in the frame of the last link, m")
-    com_tip: Vector | None = Field(description="The same in the frame of the URDF's tip, m; null without a URDF")
-    inertia: Tensor = Field(description="About the centre of mass, along the axes of the last link, kg·m²")
-
-
-class StreamPayload(BaseModel):
-    """What one robot carries."""
-
-    stream_id: str
-    state: State = Field(
-        description="What its last rows show: `payload`, `contact`, `friction` (it has changed), or `none` of these"
-    )
-    declared: bool = Field(description="Whether the payload was declared, and not only seen")
-    since: str | None = Field(description="Since when it carries what it carries, or nothing")
-    rows: int = Field(description="Rows that the payload was seen on")
-    probabilities: dict[str, float] = Field(description="Of what may have begun within the last 0.3 s")
-    payload: PayloadBody | None = Field(description="null: it carries nothing that the model was not trained with")
-
-
-class Payloads(BaseModel):
-    """What the robots of a model carry."""
-
-    model: str
-    version: int
-    link: str | None = Field(description="The joint that moves the last link")
-    frame: Literal["learnt", "urdf"] | None = Field(
-        description="Whose frame of that link centres of mass are in. `learnt`: the arm was learnt from torque alone; "
-        "its origin lies on the last joint's axis, and lengths, and with them masses, are as good as the geometry"
-    )
-    tip: str | None = Field(description="The frame of the URDF that counts as its tip")
-    reason: str | None = Field(description="Why nothing is watched; null where payloads are")
-    streams: list[StreamPayload]
+"""Of a payload's parameters, for the spread of its inertia."""
+Tip = tuple[str, Array, Array]
 
 
 def show(learners: Learners, model: str) -> Payloads:
     """What the arm carries, stream by stream; raise NotFoundError."""
     monitor = learners.monitor(model)
     served = learners.loaded.get(model, None)
-    streams, carrier = [], served.carrier
+    streams, default, carrier = [], None, served.carrier
     tip = None if served.model.robot is None else _tip(served.model.robot)
     if carrier is not None:
         for stream_id, (watch, _) in sorted(monitor.payloads.all(carrier, served.version).items()):
             streams.append(_shown(stream_id, watch, tip))
+        held = monitor.payloads.watch("", carrier, served.version).held  # no stream has this name
+        default = None if held is None else _of(held.estimate, tip)
     with learners.database.session() as session:
         watched = owner.options(session, model).payloads
     reason = None
@@ -125,7 +61,16 @@ def show(learners: Learners, model: str) -> Payloads:
         tip=None if tip is None else tip[0],
         reason=reason,
         streams=streams,
+        default=default,
     )
+
+
+def brief(monitor: Monitor, served: Served) -> list[LivePayload] | None:
+    """What each stream's robot carries, as a version sees it; None where it knows no arm."""
+    if served.carrier is None:
+        return None
+    watches = sorted(monitor.payloads.all(served.carrier, served.version).items())
+    return [LivePayload(**_carrying(name, watch), mass=_mass(watch)) for name, (watch, _) in watches]
 
 
 def declare(learners: Learners, model: str, request: PayloadRequest) -> Payloads:
@@ -161,7 +106,7 @@ def _say(learners: Learners, model: str, stream_id: str | None, known: dict[str,
     return show(learners, model)
 
 
-def _tip(robot: RigidBody) -> tuple[str, Array, Array] | None:
+def _tip(robot: RigidBody) -> Tip | None:
     """Name, rotation and place of the last frame of a URDF in that of its last movable joint."""
     model = robot.model
     own = [each for each in model.frames if each.parentJoint == model.njoints - 1]
@@ -170,38 +115,55 @@ def _tip(robot: RigidBody) -> tuple[str, Array, Array] | None:
     return own[-1].name, np.array(own[-1].placement.rotation), np.array(own[-1].placement.translation)
 
 
-def _shown(stream_id: str, watch: Watch, tip: tuple[str, Array, Array] | None) -> StreamPayload:
+def _carrying(stream_id: str, watch: Watch) -> dict[str, Any]:
+    """The fields of `Carrying`."""
+    held, since = watch.held, watch.since
+    return {
+        "stream_id": stream_id,
+        "state": watch.state,
+        "declared": held is not None and held.declared,
+        "since": None if since is None else datetime.fromtimestamp(since, UTC).isoformat(timespec="milliseconds"),
+        "rows": 0 if held is None else held.count,
+    }
+
+
+def _mass(watch: Watch) -> Scalar | None:
+    if watch.held is None:
+        return None
+    mean, std = watch.held.estimate.mass
+    return Scalar(mean=mean, std=std)
+
+
+def _shown(stream_id: str, watch: Watch, tip: Tip | None) -> StreamPayload:
     """One stream's payload for JSON."""
-    held = watch.held
     return StreamPayload(
-        stream_id=stream_id,
-        state=watch.state,
-        declared=held is not None and held.declared,
-        since=None
-        if watch.since is None
-        else datetime.fromtimestamp(watch.since, UTC).isoformat(timespec="milliseconds"),
-        rows=0 if held is None else held.count,
+        **_carrying(stream_id, watch),
         probabilities=dict(watch.probabilities or {"none": 1.0}),
-        payload=None if held is None else _of(held.estimate.eta, held.estimate.covariance, tip),
+        payload=None if watch.held is None else _of(watch.held.estimate, tip),
     )
 
 
-def _of(eta: Array, covariance: Array, tip: tuple[str, Array, Array] | None) -> PayloadBody:
-    """Mean and deviation of a payload's figures: of its parameters' distribution, by draws from it, seeded."""
-    draws = np.random.default_rng(0).multivariate_normal(eta, covariance, DRAWS)
-    every = [Body.of(body(each)[0]) for each in draws]
-    best = Body.of(body(eta)[0])
-
-    def figure(mean: Any, values: list[Any]) -> dict[str, Any]:
-        return {"mean": np.asarray(mean).tolist(), "std": np.std(values, axis=0).tolist()}
-
-    at_tip = None
-    if tip is not None:
-        _, turn, place = tip
-        at_tip = Vector(**figure(turn.T @ (best.com - place), [turn.T @ (each.com - place) for each in every]))
+def _of(found: Estimate, tip: Tip | None) -> PayloadBody:
+    """Mean and deviation of a payload's figures. Those of its inertia by draws from its parameters, seeded."""
+    mass, std = found.mass
+    com, spread = found.eta[1:4], found.covariance[1:4, 1:4]
+    drawn = np.random.default_rng(0).multivariate_normal(found.eta, found.covariance, DRAWS)
     return PayloadBody(
-        mass=Scalar(**figure(best.mass, [each.mass for each in every])),
-        com=Vector(**figure(best.com, [each.com for each in every])),
-        com_tip=at_tip,
-        inertia=Tensor(**figure(best.inertia, [each.inertia for each in every])),
+        mass=Scalar(mean=mass, std=std),
+        com=_vector(com, spread),
+        com_tip=None if tip is None else _vector(tip[1].T @ (com - tip[2]), tip[1].T @ spread @ tip[1]),
+        inertia=Tensor(mean=_inertias(found.eta[None])[0].tolist(), std=_inertias(drawn).std(axis=0).tolist()),
     )
+
+
+def _vector(mean: Array, covariance: Array) -> Vector:
+    return Vector(mean=mean.tolist(), std=np.sqrt(np.diag(covariance)).tolist())
+
+
+def _inertias(eta: Array) -> Array:
+    """Inertias about the centre of mass, (N, 3, 3), of η, (N, 10)."""
+    root = np.zeros((len(eta), 3, 3))
+    root[:, *DIAGONAL], root[:, *BELOW] = np.exp(eta[:, 4:7]), eta[:, 7:]
+    second = np.exp(eta[:, 0])[:, None, None] * (root @ root.transpose(0, 2, 1))
+    inertias: Array = np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3) - second
+    return inertias

@@ -17,6 +17,7 @@ from service.foundation.errors import (
     responses,
 )
 from service.learning.control import decisions, payload, schema, status
+from service.learning.control.payload_schema import PAYLOAD_EXAMPLE, PayloadRequest, Payloads
 from service.learning.learners import LearnersDep
 from service.learning.schema import MOST_SEQUENCE, LearningOptions, StreamId
 from service.training import jobs
@@ -131,7 +132,7 @@ def decide(learners: LearnersDep, model: str, request: schema.ChangeRequest) -> 
 
 
 @router.get("/{model}/payload", summary="What the arm carries")
-def show_payload(learners: LearnersDep, model: str) -> payload.Payloads:
+def show_payload(learners: LearnersDep, model: str) -> Payloads:
     """Mass, centre of mass and inertia of what each stream's robot carries, with what is not known of them.
 
     A payload is noticed, estimated and answered with by itself, from the rows that streams bring. No safety function.
@@ -143,9 +144,9 @@ def show_payload(learners: LearnersDep, model: str) -> payload.Payloads:
     "/{model}/payload",
     summary="Declare what the arm carries",
     responses=responses(ConflictError, TooLargeError),
-    openapi_extra={"requestBody": {"content": {"application/json": {"example": payload.EXAMPLE}}}},
+    openapi_extra={"requestBody": {"content": {"application/json": {"example": PAYLOAD_EXAMPLE}}}},
 )
-def declare_payload(learners: LearnersDep, model: str, request: payload.PayloadRequest) -> payload.Payloads:
+def declare_payload(learners: LearnersDep, model: str, request: PayloadRequest) -> Payloads:
     """Answer with a payload from now on, as robot controllers are told theirs. Rows that say otherwise overrule it."""
     return payload.declare(learners, model, request)
 
@@ -157,7 +158,7 @@ def remove_payload(
     stream_id: Annotated[
         StreamId | None, Query(description="The robot that has put it down; all where left out")
     ] = None,
-) -> payload.Payloads:
+) -> Payloads:
     """Answer without any payload from now on."""
     return payload.remove(learners, model, stream_id)
 

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchem
 from lipcore.online.record import LEVEL
 from lipcore.vocabulary import CODES, LEARNT, JointType
 from service.foundation.errors import invalid_request
+from service.learning.control.payload_schema import LivePayload
 from service.learning.owner import AlarmKind
 from service.learning.schema import MOST_SEQUENCE, LearningOptions, State
 from service.models.schema import VersionNumber
@@ -370,6 +371,7 @@ class LiveStatus(BaseModel):
     level: float = Field(LEVEL, description="Probability of the interval whose coverage is told")
     windows: list[QualityWindow] = Field(description="How well it predicted, over sliding windows")
     scale: list[float] = Field(description="Per joint, factor on the half width that questions are answered with now")
+    payloads: list[LivePayload] | None = Field(description="What each stream's arm carries; null: no arm is known")
     answers: LiveAnswers | None = Field(description="null at first, and where there are too many models to tell apart")
     alarms: list[Alarm] = Field(description="The newest ones, newest first")
 

@@ -14,7 +14,7 @@ from lipcore.vocabulary import CODES
 from service.foundation.errors import BusyError, InvalidRequestError, NotFoundError, responses
 from service.journal import log
 from service.learning import owner
-from service.learning.control import decisions, status
+from service.learning.control import decisions, payload, status
 from service.learning.control.schema import LiveAnswers, LiveNovelty, LiveStatus
 from service.learning.learners import Learners, LearnersDep
 from service.web.observability.meters import OTHER, Meters, MetersDep, StreamMeter
@@ -60,6 +60,7 @@ class LiveLook:
             counts={name: monitor.counts[name] for name in COUNTS},
             windows=[status.window(each, now) for each in monitor.windows],
             scale=served.scales.asked,
+            payloads=payload.brief(monitor, served),
             answers=self._answers.since(passed),
             alarms=decisions.alarms(learners, model, Page(after=None, limit=MOST_ALARMS)).items,
         )

@@ -5,6 +5,7 @@ import { h, refresh, replace } from "../dom.js";
 import { count, counted } from "../format.js";
 import { empty, heading, link, offer, select } from "../ui.js";
 import { alarms } from "./live/alarms.js";
+import { carriedCard } from "./live/carried.js";
 import { follow } from "./live/connection.js";
 import { innovation } from "./live/innovation.js";
 import { moving } from "./live/moving.js";
@@ -71,6 +72,7 @@ async function followed(view, name, models, signal) {
   const tell = () => {
     said(page, seen, name);
     if (!seen.status) return;
+    refresh(page.carried, carriedCard(seen.status));
     refresh(page.standing, learningCard(seen.status), qualityCard(seen.status), answersCard(seen.status));
     alarms(page, seen.status, name, signal);
     const names = seen.rows.streams();
@@ -114,7 +116,7 @@ async function followed(view, name, models, signal) {
 
 /** The places of the page. */
 function parts(name, models) {
-  const page = Object.fromEntries(["state", "about", "quiet", "held", "standing", "alarms", "torque", "arm", "innovation"].map((each) => [each, h("div")]));
+  const page = Object.fromEntries(["state", "about", "quiet", "held", "carried", "standing", "alarms", "torque", "arm", "innovation"].map((each) => [each, h("div")]));
   page.state = h("p", { role: "status", class: "actions" });
   page.about.className = "hint";
   page.standing.className = "grid";
@@ -130,6 +132,7 @@ function parts(name, models) {
     page.about,
     page.held,
     page.quiet,
+    page.carried,
     page.plots,
     page.standing,
     page.alarms,

@@ -43,6 +43,6 @@ function list(items) {
     "section",
     { class: "card", "aria-label": "Alarms" },
     h("h2", {}, "Newest alarms"),
-    h("ul", {}, items.map((alarm) => h("li", {}, badge(alarm.kind, alarm.kind === "promotion" ? "good" : "warn"), ` ${when(alarm.at)}: ${alarm.message}`))),
+    h("ul", {}, items.map((alarm) => h("li", {}, badge(alarm.kind, { promotion: "good", payload: "plain" }[alarm.kind] ?? "warn"), ` ${when(alarm.at)}: ${alarm.message}`))),
   );
 }

@@ -4,6 +4,7 @@ export const CODES = {
   learnt: { words: "learnt" },
   contact: { words: "contact", why: "torque far outside the interval, as in a collision", symbol: "x", colour: "contact" },
   change: { words: "waits for a decision", why: "the robot seems to have changed", symbol: "star", colour: "contact" },
+  payload: { words: "with a payload", why: "teaches what the arm carries, and not the arm", symbol: "square", colour: "payload" },
   saturation: { words: "saturated", why: "torque at its actuator’s limit", symbol: "square-open", colour: "novel" },
   stationary: { words: "at rest", why: "stiction hides the torque", symbol: "circle-open", colour: "muted" },
   limit: { words: "beyond a limit", why: "position, speed, acceleration or torque", symbol: "triangle-up-open", colour: "contact" },
