@@ -19,7 +19,8 @@ AFTER = (0.1, 0.5, 1.0, 3.0)
 """s after the payload is taken up at which the service is judged."""
 
 
-class Figure(msgspec.Struct):
+@dataclass(frozen=True)
+class Figure:
     """A number and its standard deviation."""
 
     mean: float
@@ -30,16 +31,19 @@ class Figure(msgspec.Struct):
         return abs(self.mean - truth) <= quantile(0.95) * self.std
 
 
-class _Body(msgspec.Struct):
+@dataclass(frozen=True)
+class _Body:
     mass: Figure
 
 
-class _Stream(msgspec.Struct):
+@dataclass(frozen=True)
+class _Stream:
     state: str
     payload: _Body | None
 
 
-class _Payloads(msgspec.Struct):
+@dataclass(frozen=True)
+class _Payloads:
     streams: list[_Stream]
 
 
@@ -82,7 +86,7 @@ class Outcome:
     masses: dict[float, Figure | None] = field(default_factory=dict)
     answers: dict[float, Answers] = field(default_factory=dict)
     first: Answers | None = None
-    states: set[str] = field(default_factory=set)
+    states: list[str] = field(default_factory=list)
     acks: list[float] = field(default_factory=list)
 
 
@@ -132,7 +136,8 @@ def carried(bed: Bed, model: str, arm: Arm, case: Case) -> Outcome:
                 continue
             if out is None:
                 out = Outcome(case, asked(bed, model, loaded), asked(bed, model, free), early=early)
-            out.states.add(state)
+            if state not in out.states:
+                out.states.append(state)
             if up < now <= down and mass is not None and out.detected is None:
                 out.detected = (now - up) / RATE
             if now > down and mass is None and out.released is None:

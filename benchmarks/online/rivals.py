@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -78,16 +77,13 @@ def _adapting(model: TorqueModel, samples: Samples, unseen: Unseen) -> dict[floa
 
 def _refitted(arm: Arm, since: Samples, unseen: Unseen) -> Answers | str:
     """A model trained on nothing but these rows, ready at once."""
-    began = time.monotonic()
     try:
         model = lipcore.train(since, arm.robot.joint_types, "rigid-body")
     except (ValueError, ArithmeticError, RuntimeError) as error:
         return f"refused: {error}"
     exact, measured = unseen
     answer = model.predict(exact.q, exact.dq, exact.ddq)
-    found = judged(exact, measured, *answer.interval)
-    print(f"refit on {len(since)} rows: {time.monotonic() - began:.0f} s")
-    return found
+    return judged(exact, measured, *answer.interval)
 
 
 def _least_squares(robot: Robot, since: Samples, unseen: Unseen) -> Answers:
