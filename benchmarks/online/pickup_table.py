@@ -56,7 +56,11 @@ def grids(found: Carrying) -> list[Grid]:
         Grid("payloads, case by case", columns, [case_row(out) for out in found.outcomes]),
         Grid("payloads: median, and worst", ("", "cases", *_SUMMARY), summary(found.outcomes)),
         Grid("beside it", ("", *(f"{after:g} s" for after in AFTER)), _rivals(found)),
-        Grid("carrying nothing", ("", "minutes", "noticed", "contacts", "taken for one", "longest s"), _quiet(found)),
+        Grid(
+            "carrying nothing",
+            ("", "minutes", "noticed", "contacts", "taken for one", "longest s", "failures"),
+            _quiet(found),
+        ),
     ]
     return [grid for grid in every if grid.rows]
 
@@ -148,7 +152,12 @@ def _rivals(found: Carrying) -> list[tuple[str, ...]]:
 def _quiet(found: Carrying) -> list[tuple[str, ...]]:
     rows = []
     for each in found.quiet:
-        figures = (f"{each.minutes:g}", *map(str, (each.noticed, each.contacts, each.taken)), f"{each.held_s:.1f}")
+        figures = (
+            f"{each.minutes:g}",
+            *map(str, (each.noticed, each.contacts, each.taken)),
+            f"{each.held_s:.1f}",
+            str(each.failures),
+        )
         rows.append((f"{each.robot} {each.kind} {each.speed}", *figures))
     return rows
 

@@ -31,57 +31,65 @@ TAKEN_S = 1.0
 _PART = 700
 
 
-@dataclass(frozen=True)
+@dataclass
 class Quiet:
     """Of one arm in one kind of motion: minutes of it, payloads noticed in them; contacts, and those that were taken
-    for a payload; held_s: for how long the longest of these was believed."""
+    for a payload; held_s: for how long the longest of these was believed; failures: of the watch's numerics."""
 
     robot: str
     kind: str
     speed: str
     minutes: float
-    noticed: int
-    contacts: int
-    taken: int
-    held_s: float
+    noticed: int = 0
+    contacts: int = 0
+    taken: int = 0
+    held_s: float = 0.0
+    failures: int = 0
 
 
 def watched(arm: Arm, model: TorqueModel, minutes: float, console: Console) -> list[Quiet]:
     """Watch so many minutes of slow and of fast motion, once left alone and once with contacts."""
     found, carrier = [], Carrier(model)
     for speed in SPEEDS:
-        noticed, contacts, taken, held = 0, 0, 0, 0.0
-        seconds, at, block = 60 * minutes, 0.0, 0
-        while at < seconds:
-            samples = _block(arm, min(BLOCK_S, seconds - at), SPEEDS[speed], block)
-            noticed += len(payloads(carrier, samples))
+        total, at, block = Quiet(arm.name, arm.kind, speed, minutes), 0.0, 0
+        while at < 60 * minutes:
+            samples = _block(arm, min(BLOCK_S, 60 * minutes - at), SPEEDS[speed], block)
+            alone, failures = payloads(carrier, samples)
+            total.noticed += len(alone)
             starts = np.arange(EVERY_S, samples.t[-1] - EVERY_S, EVERY_S)
             rng = np.random.default_rng([arm.seed, block])
             touched = replace(samples, tau=samples.tau + touches(arm.robot, samples, starts, rng))
-            longest = [sum(took) for took in _by_contact(payloads(carrier, touched), starts)]
-            contacts, taken, held = (
-                contacts + len(starts),
-                taken + sum(each > 0 for each in longest),
-                max([held, *longest]),
-            )
+            seen, failures_touched = payloads(carrier, touched)
+            taken = [held for held in (_believed(seen, start) for start in starts) if held > 0]
+            total.contacts += len(starts)
+            total.taken += len(taken)
+            total.held_s = max([total.held_s, *taken])
+            total.failures += failures + failures_touched
             at, block = at + BLOCK_S, block + 1
-        found.append(Quiet(arm.name, arm.kind, speed, minutes, noticed, contacts, taken, held))
+        found.append(total)
         console.print(found[-1], highlight=False, soft_wrap=True)
     return found
 
 
-def payloads(carrier: Carrier, samples: Samples) -> list[tuple[float, float]]:
-    """When a payload was noticed on a stream, s, and for how long it was believed, s."""
+def payloads(carrier: Carrier, samples: Samples) -> tuple[list[tuple[float, float]], int]:
+    """When a payload was noticed on a stream, s, and for how long it was believed, s; how often the watch failed."""
+    failed = 0
     watch, rows, found, since = Watch(carrier.model.n_joints), rows_of(samples), list[tuple[float, float]](), None
     for start in range(0, len(rows), BATCH):
         batch = rows.take(slice(start, start + BATCH))
-        watch, now = watch.step(carrier, batch), float(batch.time[-1])
+        now = float(batch.time[-1])
+        try:
+            watch = watch.step(carrier, batch)
+        except np.linalg.LinAlgError:  # as the service does, which then begins anew
+            watch, failed = Watch(carrier.model.n_joints), failed + 1
         if watch.held is not None and since is None:
             since = now
         elif watch.held is None and since is not None:
             found.append((since, now - since))
             since = None
-    return found if since is None else [*found, (since, float(rows.time[-1]) - since + 1 / RATE)]
+    if since is not None:
+        found.append((since, float(rows.time[-1]) - since + 1 / RATE))
+    return found, failed
 
 
 def touches(robot: Robot, samples: Samples, starts: Array, rng: np.random.Generator) -> Array:
@@ -101,9 +109,9 @@ def touches(robot: Robot, samples: Samples, starts: Array, rng: np.random.Genera
     return out
 
 
-def _by_contact(found: list[tuple[float, float]], starts: Array) -> list[list[float]]:
-    """For each contact, how long each payload was believed that was noticed because of it."""
-    return [[held for at, held in found if 0 <= at - start < TAKEN_S] for start in starts]
+def _believed(found: list[tuple[float, float]], start: float) -> float:
+    """For how long payloads were believed, s, that were noticed because of the contact that began then."""
+    return sum(held for at, held in found if 0 <= at - start < TAKEN_S)
 
 
 def _block(arm: Arm, seconds: float, speed: float, block: int) -> Samples:
