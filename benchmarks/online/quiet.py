@@ -100,7 +100,7 @@ def touches(robot: Robot, samples: Samples, starts: Array, rng: np.random.Genera
         link, force = int(rng.integers(1, robot.model.njoints)), rng.standard_normal(3)
         force *= rng.uniform(*FORCES) / np.linalg.norm(force)
         point = rng.uniform(-REACH, REACH, 3)
-        for row in np.flatnonzero((samples.t >= start) & (samples.t < start + CONTACT_S)):
+        for row in np.flatnonzero((samples.t >= start) & (samples.t < start + CONTACT_S - 0.5 / RATE)):
             pin.computeJointJacobians(robot.model, data, robot.configuration(samples.q[row]))
             jacobian = pin.getJointJacobian(robot.model, data, link, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
             arm = data.oMi[link].rotation @ point
