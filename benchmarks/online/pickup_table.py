@@ -98,6 +98,7 @@ _SUMMARY = (
     "free",
     "before",
     *(f"nMSE {after:g} s" for after in AFTER),
+    *(f"pooled {after:g} s" for after in AFTER),
     *(f"lowest % {after:g} s" for after in AFTER),
     "after/before",
 )
@@ -124,9 +125,11 @@ def _summed(outcomes: Sequence[Outcome]) -> list[str]:
         figures = [(out.masses.get(after), out.case.mass) for out in outcomes]
         cells.append(_both([abs(each.mean / mass - 1) for each, mass in figures if each is not None], "{:.0%}"))
     cells.append(f"{sum(held)}/{len(held)}")
-    cells += [_both([each(out).mean for out in outcomes], "{:.1e}") for each in (lambda o: o.free, lambda o: o.before)]
+    for found in ([out.free for out in outcomes], [out.before for out in outcomes]):
+        cells += [_both([each.mean for each in found], "{:.1e}")]
     answers = [[out.answers[after] for out in outcomes] for after in AFTER]
     cells += [_both([each.mean for each in found], "{:.1e}") for found in answers]
+    cells += [_both([each.pooled for each in found], "{:.1e}") for found in answers]
     cells += [_both([-each.lowest for each in found], "{:.0%}").replace("-", "") for found in answers]
     return [*cells, _both([out.first.mean / out.free.mean for out in outcomes if out.first is not None], "{:.2f}")]
 
