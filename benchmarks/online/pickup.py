@@ -15,7 +15,7 @@ from benchmarks.online import quiet
 from benchmarks.online.arms import KINDS, Arm, Case, cases
 from benchmarks.online.bed import install, serving
 from benchmarks.online.carried import Outcome, carried
-from benchmarks.online.pickup_table import Carrying, case_row
+from benchmarks.online.pickup_table import Carrying, case_row, rival_row
 from benchmarks.online.rivals import rivals
 from lipcore.model.torque_model import TorqueModel
 from service.learning.schema import LearningOptions
@@ -55,7 +55,9 @@ def run(options: Options, console: Console) -> Carrying:
                 found.outcomes += _carried(arm, model, cases(robot, kind), console)
             if "rivals" in options.parts and (robot, kind) == (ROBOTS[0], KINDS[0]):
                 case = next(each for each in cases(robot, kind) if (each.mass, each.place, each.speed) == RIVAL)
-                found.rivals = rivals(arm, model, case, console)
+                found.rivals = rivals(arm, model, case)
+                for each in found.rivals:
+                    console.print("; ".join(rival_row(each)), highlight=False, soft_wrap=True)
             if "quiet" in options.parts:
                 found.quiet += quiet.watched(arm, model, options.minutes, console)
     return found

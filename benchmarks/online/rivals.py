@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 
 import lipcore
 from benchmarks.clients import HttpClient
@@ -35,17 +34,14 @@ class Rival:
     answers: dict[float, Answers | str] = field(default_factory=dict)
 
 
-def rivals(arm: Arm, model: TorqueModel, case: Case, console: Console) -> list[Rival]:
+def rivals(arm: Arm, model: TorqueModel, case: Case) -> list[Rival]:
     """All of them on the stream of one case, judged on the same unseen motion with the payload."""
     samples, unseen = arm.live(case), arm.unseen(case, True)
-    found = [
+    return [
         Rival("adapts (payloads=false, on_change=adapt)", dict(_adapting(model, samples, unseen))),
         Rival("full refit on the rows since", _each(samples, lambda since: _refitted(arm, since, unseen))),
         Rival("least squares around the URDF", _each(samples, lambda since: _least_squares(arm.robot, since, unseen))),
     ]
-    for each in found:
-        console.print(each.label, each.answers, highlight=False, soft_wrap=True)
-    return found
 
 
 def _each(samples: Samples, answer: Callable[[Samples], Answers | str]) -> dict[float, Answers | str]:
