@@ -55,7 +55,7 @@ def grids(found: Carrying) -> list[Grid]:
     every = [
         Grid("payloads, case by case", columns, [case_row(out) for out in found.outcomes]),
         Grid("payloads: median, and worst", ("", "cases", *_SUMMARY), summary(found.outcomes)),
-        Grid("beside it", ("", *(f"{after:g} s" for after in AFTER)), _rivals(found)),
+        Grid("beside it", ("", *(f"{after:g} s" for after in AFTER)), [rival_row(each) for each in found.rivals]),
         Grid(
             "carrying nothing",
             ("", "minutes", "noticed", "contacts", "taken for one", "longest s", "failures"),
@@ -144,24 +144,17 @@ def _both(values: Sequence[float], form: str) -> str:
     return f"{form.format(np.median(values))} | {form.format(max(values))}" if values else NOTHING
 
 
-def _rivals(found: Carrying) -> list[tuple[str, ...]]:
-    rows = []
-    for rival in found.rivals:
-        cells = [rival.answers.get(after) for after in AFTER]
-        rows.append((rival.label, *(each if isinstance(each, str) else answers_text(each) for each in cells)))
-    return rows
+def rival_row(rival: Rival) -> tuple[str, ...]:
+    """Another way, and its answers; or why there are none."""
+    cells = [rival.answers.get(after) for after in AFTER]
+    return rival.label, *(each if isinstance(each, str) else answers_text(each) for each in cells)
 
 
 def _quiet(found: Carrying) -> list[tuple[str, ...]]:
     rows = []
     for each in found.quiet:
-        figures = (
-            f"{each.minutes:g}",
-            *map(str, (each.noticed, each.contacts, each.taken)),
-            f"{each.held_s:.1f}",
-            str(each.failures),
-        )
-        rows.append((f"{each.robot} {each.kind} {each.speed}", *figures))
+        counts = each.minutes, each.noticed, each.contacts, each.taken, each.held_s, each.failures
+        rows.append((f"{each.robot} {each.kind} {each.speed}", *(f"{count:g}" for count in counts)))
     return rows
 
 
