@@ -1,5 +1,7 @@
 """`python -m benchmarks online --only payload,rivals,quiet`: its parts against independent references."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -18,13 +20,13 @@ GOOD, BAD = Answers((0.1, 0.3), (0.9, 0.95), 0.2), Answers((1.0, 3.0), (0.1, 0.2
 
 
 def test_a_stream_carries_its_payload_between_pick_up_and_putting_down():
-    samples = ARM.live(CASE)
-    motion, load = (samples.q, samples.dq, samples.ddq), Payload(0.3, 0.0, PLACES["centred"])
+    samples = ARM.live(replace(CASE, mass=2.0))
+    motion, load = (samples.q, samples.dq, samples.ddq), Payload(2.0, 0.0, PLACES["centred"])
     free = inverse_dynamics(ARM.robot, *motion)
     full = inverse_dynamics(ARM.robot, *motion, np.ones(1000), load)
     expected = np.concatenate([free[:300], full[300:700], free[700:]])
     assert np.abs(samples.tau - expected).max() < 6 * 0.05
-    assert np.abs(full - free).max() > 6 * 0.05
+    assert np.abs(full - free).max() > 1.0
 
 
 def test_contacts_are_the_slope_of_the_work_that_their_force_does():
