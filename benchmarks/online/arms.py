@@ -29,6 +29,8 @@ SECONDS, UP, DOWN = 10.0, 3.0, 7.0
 """Of a stream; when its payload is taken up, and put down."""
 SIMULATED = 30.0
 """s of motion, of which the last are taken: a short motion is stretched over the joints' whole range, and violent."""
+EDGE_S = 1.0
+"""s that are left out at the end, and of quiet motion at the beginning: filters without delay see nothing beyond it."""
 UNSEEN_S, UNSEEN_EVERY = 20.0, 10
 """s of the motion that is asked for, and of how many of its rows one is."""
 TRAINED_S = 60.0
@@ -87,11 +89,12 @@ class Arm:
 
     def moving(self, seconds: float, speed: float, part: int, payload: Payload | None, noise: float = NOISE) -> Samples:
         """The last so many seconds of a motion, at RATE, from time 0 on. payload: carried all the time."""
-        count = round(max(SIMULATED, seconds) * RATE)
+        end = round(max(SIMULATED, seconds) * RATE)
         dirt = self.dirt
-        stream = Stream(count, RATE, speed=speed, noise=noise if dirt is None else 0.0, payload=payload, dirt=dirt)
+        count, noise = end + round(EDGE_S * RATE), noise if dirt is None else 0.0
+        stream = Stream(count, RATE, speed=speed, noise=noise, payload=payload, dirt=dirt)
         samples = simulate(self.robot, stream, _SEEDS * self.seed + part)
-        last = samples.rows(slice(count - round(seconds * RATE), None))
+        last = samples.rows(slice(end - round(seconds * RATE), end))
         return replace(last, t=last.t - last.t[0])
 
     def live(self, case: Case) -> Samples:

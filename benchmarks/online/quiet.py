@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from rich.console import Console
 
-from benchmarks.online.arms import NOISE, RATE, SPEEDS, Arm
+from benchmarks.online.arms import EDGE_S, NOISE, RATE, SPEEDS, Arm
 from benchmarks.online.carried import BATCH
 from benchmarks.online.scene import rows_of
 from lipcore.data.samples import Array, Samples
@@ -116,6 +116,8 @@ def _believed(found: list[tuple[float, float]], start: float) -> float:
 
 def _block(arm: Arm, seconds: float, speed: float, block: int) -> Samples:
     """Motion without payload, whose friction is that of a cold arm at first."""
-    dirt = arm.dirt
-    stream = Stream(round(seconds * RATE), RATE, speed=speed, noise=NOISE if dirt is None else 0.0, dirt=dirt)
-    return simulate(arm.robot, stream, 1000 * arm.seed + _PART + block)
+    dirt, edge = arm.dirt, round(EDGE_S * RATE)
+    count = round(seconds * RATE) + 2 * edge
+    stream = Stream(count, RATE, speed=speed, noise=NOISE if dirt is None else 0.0, dirt=dirt)
+    samples = simulate(arm.robot, stream, 1000 * arm.seed + _PART + block).rows(slice(edge, count - edge))
+    return replace(samples, t=samples.t - samples.t[0])
