@@ -140,7 +140,7 @@ def carried(bed: Bed, model: str, arm: Arm, case: Case) -> Outcome:
                 out.states.append(state)
             if up < now <= down and mass is not None and out.detected is None:
                 out.detected = (now - up) / RATE
-            if now > down and mass is None and out.released is None:
+            if now > down and mass is None and out.released is None and out.detected is not None:
                 out.released = (now - down) / RATE
             if now in moments:
                 out.masses[moments[now]] = mass
