@@ -46,6 +46,11 @@ def post(path: str, body: bytes, media_type: str = "application/json", headers: 
     return "\r\n".join(lines).encode() + _END + body
 
 
+def get(path: str) -> bytes:
+    """Return the bytes of a GET request."""
+    return f"GET {path} HTTP/1.1\r\nhost: localhost\r\n\r\n".encode()
+
+
 class GoneError(BadAnswerError):
     """The service closed the connection."""
 

@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from benchmarks import facts
 from benchmarks.clients import BadAnswerError
 from benchmarks.ingest import running as ingest_running
 from benchmarks.ingest.recording import FORMATS
@@ -21,8 +22,10 @@ from benchmarks.latency import table
 from benchmarks.latency.running import KEYS, Options, run
 from benchmarks.latency.targets import Target, targets
 from benchmarks.online import durability as durable
+from benchmarks.online import pickup, pickup_table
 from benchmarks.online import running as online_running
 from benchmarks.online import table as online_table
+from benchmarks.online.arms import KINDS
 from benchmarks.online.promises import targets as online_targets
 from benchmarks.online.running import PARTS
 from benchmarks.online.scene import Scene
@@ -121,13 +124,23 @@ def online(
         int, typer.Option(min=1, help="Most inducing outputs of an estimator that has some: what a sample costs.")
     ] = 500,
     websocket: Annotated[bool, typer.Option("--websocket", help="Stream in frames, not in batches over HTTP.")] = False,
-    only: Annotated[str | None, typer.Option(help=f"Names separated by commas: {', '.join(PARTS)}.")] = None,
+    only: Annotated[
+        str | None,
+        typer.Option(help=f"Names separated by commas: {', '.join(PARTS)}; or {', '.join(pickup.PARTS)}: hours."),
+    ] = None,
+    arms: Annotated[str, typer.Option(help="Robots that take something up, with commas.")] = ",".join(pickup.ROBOTS),
+    kinds: Annotated[str, typer.Option(help="What these are, and how they are learnt.")] = ",".join(KINDS),
+    minutes: Annotated[float, typer.Option(min=0.1, help="Of quiet motion of each of these.")] = 3.0,
     quick: Annotated[bool, typer.Option("--quick", help="A first look in about two minutes.")] = False,
     json_file: JsonFile = None,
     markdown: Markdown = None,
     strict: Strict = False,
 ) -> None:
     """Teach a served model in real time while it answers: throughput, latency, cost, and quality over a change."""
+    if only is not None and set(_names(only)) & set(pickup.PARTS):
+        carrying = pickup.Options(_names(only), _names(arms), _names(kinds), minutes, seed)
+        _carrying(carrying, json_file, markdown, strict)
+        return
     short = QUICK_ONLINE if quick else {}
     seconds, change = (12.0, 6.0) if quick else (60.0, 30.0)
     options = online_running.Options(
@@ -145,6 +158,17 @@ def online(
     if json_file is not None:
         results.write(json_file, _judged(found))
     _tell(online_table.grids(results), results.notes, found, console, markdown, strict)
+
+
+def _carrying(options: pickup.Options, json_file: Path | None, markdown: Path | None, strict: bool) -> None:
+    """Measure what arms carry; print and write it."""
+    console = _begin()
+    with facts.one_thread():
+        found = pickup.run(options, console)
+    promised = pickup_table.targets(found)
+    if json_file is not None:
+        found.write(json_file, _judged(promised))
+    _tell(pickup_table.grids(found), pickup_table.NOTES, promised, console, markdown, strict)
 
 
 @app.command()

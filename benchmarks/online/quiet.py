@@ -1,0 +1,123 @@
+"""Streams of arms that carry nothing: how often a payload is noticed all the same, by itself and in contacts.
+
+The library's `Watch` is driven in this process, by the model as trained: what a service learns on the way is not in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from rich.console import Console
+
+from benchmarks.online.arms import EDGE_S, NOISE, RATE, SPEEDS, Arm
+from benchmarks.online.carried import BATCH
+from benchmarks.online.scene import rows_of
+from lipcore.data.samples import Array, Samples
+from lipcore.model.payload import Carrier
+from lipcore.model.torque_model import TorqueModel
+from lipcore.online.holding import Watch
+from lipcore.robots.library import Robot, pinocchio
+from lipcore.robots.simulation import Stream, simulate
+
+BLOCK_S = 300.0
+"""The longest motion that is simulated at once: every block is of another motion, begins cold and is watched anew."""
+EVERY_S, CONTACT_S = 2.0, 0.2
+"""A contact comes once in so long, and lasts so long."""
+FORCES, REACH = (10.0, 40.0), 0.1
+"""N, least and most; m, how far from a link's joint it may touch the link, along each axis."""
+TAKEN_S = 1.0
+"""After a contact's beginning; a payload noticed within is noticed because of it."""
+_PART = 700
+
+
+@dataclass
+class Quiet:
+    """Of one arm in one kind of motion: minutes of it, payloads noticed in them; contacts, and those that were taken
+    for a payload; held_s: for how long the longest of these was believed; failures: of the watch's numerics."""
+
+    robot: str
+    kind: str
+    speed: str
+    minutes: float
+    noticed: int = 0
+    contacts: int = 0
+    taken: int = 0
+    held_s: float = 0.0
+    failures: int = 0
+
+
+def watched(arm: Arm, model: TorqueModel, minutes: float, console: Console) -> list[Quiet]:
+    """Watch so many minutes of slow and of fast motion, once left alone and once with contacts."""
+    found, carrier = [], Carrier(model)
+    for speed in SPEEDS:
+        total, at, block = Quiet(arm.name, arm.kind, speed, minutes), 0.0, 0
+        while at < 60 * minutes:
+            samples = _block(arm, min(BLOCK_S, 60 * minutes - at), SPEEDS[speed], block)
+            alone, failures = payloads(carrier, samples)
+            total.noticed += len(alone)
+            starts = np.arange(EVERY_S, samples.t[-1] - EVERY_S, EVERY_S)
+            rng = np.random.default_rng([arm.seed, block])
+            touched = replace(samples, tau=samples.tau + touches(arm.robot, samples, starts, rng))
+            seen, failures_touched = payloads(carrier, touched)
+            taken = [held for held in (_believed(seen, start) for start in starts) if held > 0]
+            total.contacts += len(starts)
+            total.taken += len(taken)
+            total.held_s = max([total.held_s, *taken])
+            total.failures += failures + failures_touched
+            at, block = at + BLOCK_S, block + 1
+        found.append(total)
+        console.print(found[-1], highlight=False, soft_wrap=True)
+    return found
+
+
+def payloads(carrier: Carrier, samples: Samples) -> tuple[list[tuple[float, float]], int]:
+    """When a payload was noticed on a stream, s, and for how long it was believed, s; how often the watch failed."""
+    failed = 0
+    watch, rows, found, since = Watch(carrier.model.n_joints), rows_of(samples), list[tuple[float, float]](), None
+    for start in range(0, len(rows), BATCH):
+        batch = rows.take(slice(start, start + BATCH))
+        now = float(batch.time[-1])
+        try:
+            watch = watch.step(carrier, batch)
+        except np.linalg.LinAlgError:  # as the service does, which then begins anew
+            watch, failed = Watch(carrier.model.n_joints), failed + 1
+        if watch.held is not None and since is None:
+            since = now
+        elif watch.held is None and since is not None:
+            found.append((since, now - since))
+            since = None
+    if since is not None:
+        found.append((since, float(rows.time[-1]) - since + 1 / RATE))
+    return found, failed
+
+
+def touches(robot: Robot, samples: Samples, starts: Array, rng: np.random.Generator) -> Array:
+    """Torque Jᵀ f of contacts that begin at `starts`, s: each a force of constant size and direction in the world, on a
+    point of a random link, for CONTACT_S; (N, n) N·m."""
+    pin, data, out = pinocchio(), robot.model.createData(), np.zeros_like(samples.tau)
+    for start in starts:
+        link, force = int(rng.integers(1, robot.model.njoints)), rng.standard_normal(3)
+        force *= rng.uniform(*FORCES) / np.linalg.norm(force)
+        point = rng.uniform(-REACH, REACH, 3)
+        for row in np.flatnonzero((samples.t >= start) & (samples.t < start + CONTACT_S - 0.5 / RATE)):
+            pin.computeJointJacobians(robot.model, data, robot.configuration(samples.q[row]))
+            jacobian = pin.getJointJacobian(robot.model, data, link, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+            arm = data.oMi[link].rotation @ point
+            # of the point: its velocity is v + ω × arm
+            out[row] = jacobian[:3].T @ force + jacobian[3:].T @ np.cross(arm, force)
+    return out
+
+
+def _believed(found: list[tuple[float, float]], start: float) -> float:
+    """For how long payloads were believed, s, that were noticed because of the contact that began then."""
+    return sum(held for at, held in found if 0 <= at - start < TAKEN_S)
+
+
+def _block(arm: Arm, seconds: float, speed: float, block: int) -> Samples:
+    """Motion without payload, whose friction is that of a cold arm at first."""
+    dirt, edge = arm.dirt, round(EDGE_S * RATE)
+    count = round(seconds * RATE) + 2 * edge
+    stream = Stream(count, RATE, speed=speed, noise=NOISE if dirt is None else 0.0, dirt=dirt)
+    samples = simulate(arm.robot, stream, 1000 * arm.seed + _PART + block).rows(slice(edge, count - edge))
+    return replace(samples, t=samples.t - samples.t[0])
