@@ -121,7 +121,7 @@ def run(options: Options, console: Console) -> Results:
 def _models(options: Options) -> dict[str, LearningOptions]:
     """Copies of the model by name. Nothing is trained beside the measurements."""
     learning = LearningOptions(on_change="learn", auto_refresh=False, auto_promote=False)
-    adapting = learning.model_copy(update={"forgetting_s": options.forgetting_s, "on_change": "adapt"})
+    adapting = learning.model_copy(update={"forgetting_s": options.forgetting_s, "on_change": "adapt", "payloads": False})
     return {LIVE: adapting, BURST: adapting, LEARNING: learning, ADAPTING: adapting}
 
 

@@ -122,7 +122,7 @@ def test_features_are_those_of_a_body_of_pinocchio(kinds: str) -> None:
     n = len(kinds)
     geometry, bodies, robot = arm(kinds, 5)
     order = np.roll(np.arange(n), 1)
-    fixed = Arm(geometry, order, "fixed", bodies, bodies, np.ones(11 * n), np.zeros(0), np.zeros(0))
+    fixed = Arm(geometry, order, "fixed", bodies, bodies, np.ones(11 * n), np.zeros(n), np.zeros(0), np.zeros(0))
     heavy, asked = loaded(robot, BODY).model, motions(n, 3)
     kernel = PayloadKernel(fixed, np.zeros(0), np.zeros(10), np.ones(10))
     motion = Motion.from_arrays(*asked[:, :, order.argsort()].swapaxes(0, 1))
