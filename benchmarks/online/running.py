@@ -121,8 +121,9 @@ def run(options: Options, console: Console) -> Results:
 def _models(options: Options) -> dict[str, LearningOptions]:
     """Copies of the model by name. Nothing is trained beside the measurements."""
     learning = LearningOptions(on_change="learn", auto_refresh=False, auto_promote=False)
-    adapting = learning.model_copy(update={"forgetting_s": options.forgetting_s, "on_change": "adapt", "payloads": False})
-    return {LIVE: adapting, BURST: adapting, LEARNING: learning, ADAPTING: adapting}
+    adapting = learning.model_copy(update={"forgetting_s": options.forgetting_s, "on_change": "adapt"})
+    opened = adapting.model_copy(update={"payloads": False})
+    return {LIVE: adapting, BURST: adapting, LEARNING: learning, ADAPTING: opened}
 
 
 def _flow(bed: Bed, samples: Samples, options: Options, results: Results, console: Console) -> None:
