@@ -274,9 +274,9 @@ class LoadedModels:
         with self._lock:
             return {version: scales for (name, version), scales in self._scales.items() if name == model}
 
-    def loads(self, model: str) -> dict[int, tuple[Loads, Served]]:
-        """What the arm carries, of a model's versions that are in memory."""
-        return {version: (each.loads, each) for (name, version), each in self._snapshot.served.items() if name == model}
+    def served(self, model: str) -> dict[int, Served]:
+        """A model's versions that are in memory."""
+        return {version: each for (name, version), each in self._snapshot.served.items() if name == model}
 
     def preload(self) -> int:
         """Load the versions that serve of the models that changed last, as many as fit; return how many."""

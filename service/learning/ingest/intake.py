@@ -92,9 +92,14 @@ class Intake:
 
     def _follow(self, monitor: Monitor, model: str) -> None:
         if self.database.shared:
+            known = monitor.number
             with self.database.session() as session:
                 monitor.follow(session, model)
                 kept = owner.options(session, model).adaptive_intervals
+            if monitor.number != known:
+                for version, served in self.loaded.served(model).items():
+                    if served.carrier is not None:
+                        served.loads.take(monitor.payloads.carried(served.carrier, version))
             for version, scales in self.loaded.scales(model).items():
                 scales.take(monitor.factors(version) if kept else {})
 
