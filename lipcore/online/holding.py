@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
 from lipcore.model.payload import Body, Carrier, Linearised, Load
@@ -35,8 +36,11 @@ friction all at once in days."""
 MOST_ROWS, BEFORE_ROWS, GROWTH = 160, 10, 1.15
 """Rows that a payload is estimated from, evenly spread over the time since; rows before it; by how many times they have
 to grow until it is estimated again."""
-TOGETHER = 3
-"""Cells of one batch that are judged together: an instant within the last AFTER is seen all the same."""
+TOGETHER, IN_BULK = 3, 6
+"""Cells of one batch that are judged together, and of one that brings many: an instant within the last AFTER is seen
+all the same."""
+CELL_ROWS = 5
+"""Rows of a cell that are looked at, evenly spread: a robot moves little within one, however often it is measured."""
 STRANGE = 2.5
 """Standard deviations of what is known of any payload beyond which a body is none: heavier than 20 kg, or with its
 centre of mass further than 0.37 m from the last link's frame. A push looks like such a one."""
@@ -167,10 +171,11 @@ class Watch:
                 break
             ends.append((first, last))
             first = last
-        parts = [rows.take(slice(*each)) for each in ends]
+        parts = [rows.take(_evenly(*each)) for each in ends]
         watch = replace(self, waiting=rows.take(slice(first, None)) if first < len(rows) else None)
-        for at in range(0, len(parts), TOGETHER):
-            watch = watch._take(carrier, parts[at : at + TOGETHER])
+        together = TOGETHER if len(parts) <= IN_BULK else IN_BULK
+        for at in range(0, len(parts), together):
+            watch = watch._take(carrier, parts[at : at + together])
         return watch
 
     def _take(self, carrier: Carrier, parts: Sequence[Rows]) -> Watch:
@@ -297,6 +302,11 @@ def _taken(window: Window, gains: Gains, held: Held | None = None) -> int | None
             return None
     carried = np.zeros(PARAMETERS) if held is None else held.estimate.load.payload
     return after if shows(window.of_body(after, carried)) else None
+
+
+def _evenly(first: int, last: int) -> NDArray[np.int64]:
+    """Places from `first` to before `last`, CELL_ROWS of them at most, both ends among them."""
+    return np.unique(np.linspace(first, last - 1, min(CELL_ROWS, last - first)).round().astype(np.int64))
 
 
 def _unloaded(features: Array) -> Array:
