@@ -44,6 +44,9 @@ Prior = Literal["urdf", "zero"]
 PRIORS: tuple[Prior, ...] = get_args(Prior)
 """What inertial parameters are expected to be before the data speak: those of the URDF, or none."""
 
+PayloadState = Literal["none", "payload", "contact", "friction"]
+"""What the last rows of a stream show: something carried, a contact, other friction, or none of these."""
+
 CODES = (
     *("learnt", "non_finite", "limit", "time_jump", "saturation", "stationary"),
     *("contact", "change", "edge", "payload"),

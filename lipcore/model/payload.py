@@ -11,7 +11,6 @@ learnt, and the payload's ten.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -23,7 +22,6 @@ from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.fitting.estimators import Estimator
 from lipcore.kernels.arm import ArmKernel
-from lipcore.kernels.base import TorqueKernel
 from lipcore.kernels.payload import CERTAIN, PayloadKernel
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.basis import Basis
@@ -34,7 +32,6 @@ from lipcore.robots.urdf import PARAMETERS
 ROOM = 10.0
 """Prior variance that a payload's parameters get, in units of their own: Σ ≤ k diag Σ holds for every covariance of k
 numbers, so that the posterior is nowhere wider than its prior, as the evaluator has to assume."""
-
 
 ROUNDING = 1e-12
 """Share of the inertia about the link's frame that may be rounding."""
@@ -120,11 +117,6 @@ class Load:
     def payload(self) -> Array:
         """Mean of the payload's parameters, (10,)."""
         return self.mean[-PARAMETERS:]
-
-    @property
-    def spread(self) -> Array:
-        """Covariance of the payload's parameters, (10, 10)."""
-        return self.covariance[-PARAMETERS:, -PARAMETERS:]
 
 
 @dataclass(frozen=True)
@@ -214,10 +206,9 @@ class Linearised:
     @cached_property
     def estimator(self) -> Estimator:
         """The model's terms, the arm's with the payload in its parameters, and the payload's."""
-        return replace(
-            self.carrier.model.estimator,
-            terms={**self._replaced(self.carrier.model.estimator.terms), "payload": self._payload},
-        )
+        estimator, arm = self.carrier.model.estimator, self.carrier.term
+        terms = {name: self._arm if each is arm else each for name, each in estimator.terms.items()}
+        return replace(estimator, terms={**terms, "payload": self._payload})
 
     @cached_property
     def basis(self) -> Basis:
@@ -261,6 +252,3 @@ class Linearised:
     def _payload(self) -> PayloadKernel:
         step = self.carrier.step(self.load.mean[:-PARAMETERS])
         return PayloadKernel(self.carrier.term.arm, step, self.load.payload, self.load.room)
-
-    def _replaced(self, terms: Mapping[str, TorqueKernel]) -> dict[str, TorqueKernel]:
-        return {name: self._arm if each is self.carrier.term else each for name, each in terms.items()}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,8 @@ from lipcore.online.batch import Rows
 from lipcore.online.hypotheses import AFTER, BEFORE, CELL_S, LEAST_BEFORE, Cell, Kind, Window, cells_of
 from lipcore.online.payload import ANY, Estimate, Known, estimate, eta_of, known
 from lipcore.robots.urdf import PARAMETERS
+from lipcore.vocabulary import PayloadState
 
-State = Literal["none", "payload", "contact", "friction"]
 SURE, BETTER = 20.0, 5.0
 """Nats by which a payload explains the last cells better than nothing, and than a contact, to be taken for one at once.
 In 60 s each of slow and of fast motion of the dirty Panda of seed 50 there were up to 28 and at most 2 at a time."""
@@ -95,7 +95,7 @@ class Watch:
     """
 
     n: int
-    state: State = "none"
+    state: PayloadState = "none"
     probabilities: Mapping[str, float] | None = None
     since: float | None = None
     held: Held | None = None
@@ -314,7 +314,7 @@ def _unloaded(features: Array) -> Array:
     return np.concatenate([features[:-PARAMETERS], np.zeros_like(features[-PARAMETERS:])])
 
 
-def _state(gains: Gains) -> State:
+def _state(gains: Gains) -> PayloadState:
     best = {kind: max(each[kind] for each in gains.values()) for kind in KINDS}
     if max(best["contact"], best["friction"]) <= LIKELY:
         return "none"

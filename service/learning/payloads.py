@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ MOST_EVENTS = 3000
 """Of the log's newest, among which the last batch of a stream is looked for."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Noted:
     """What the log says of a stream: a batch's report, or a declaration. version: that predicted it, None for a
     declaration; received: Unix time, s."""
@@ -29,10 +29,18 @@ class Noted:
     values: Mapping[str, Any]
     version: int | None
     received: float
+    _seen: tuple[Carrier, int, Watch] | None = field(default=None, init=False)
 
     def watch(self, carrier: Carrier, version: int) -> Watch:
-        """The watch of the stream from there on, of a version. One whose geometry was learnt has a frame of its own, in
-        which a payload that another version has seen means nothing: it is noticed anew."""
+        """The watch of the stream from there on, of a version: the same one for as long as that is asked for, as models
+        that answer are made for it. A version whose geometry was learnt has a frame of its own, in which a payload that
+        another one has seen means nothing: it is noticed anew."""
+        seen = self._seen
+        if seen is None or seen[0] is not carrier or seen[1] != version:
+            self._seen = seen = carrier, version, self._made(carrier, version)
+        return seen[2]
+
+    def _made(self, carrier: Carrier, version: int) -> Watch:
         n = carrier.model.n_joints
         learnt = carrier.term.arm.mode == "learn"
         if learnt and self.version not in (None, version):

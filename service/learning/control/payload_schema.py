@@ -6,9 +6,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from lipcore.vocabulary import PayloadState
 from service.learning.schema import StreamId
 
-State = Literal["none", "payload", "contact", "friction"]
 MOST_MASS, MOST_DISTANCE = 1000.0, 10.0
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Metres = Annotated[float, Field(ge=-MOST_DISTANCE, le=MOST_DISTANCE, allow_inf_nan=False)]
@@ -63,7 +63,7 @@ class Carrying(BaseModel):
     """Whether one robot carries anything."""
 
     stream_id: str
-    state: State = Field(
+    state: PayloadState = Field(
         description="What its last rows show: `payload`, `contact`, `friction` (it has changed), or `none` of these"
     )
     declared: bool = Field(description="Whether the payload was declared, and not only seen")
