@@ -24,7 +24,12 @@ CERTAIN, ALIKE = 60.0, 0.99
 """What is so certain is taken for a payload where that explains so large a share of what a contact does: the torques of
 a contact are any, and those of a payload as good as the arm's geometry."""
 LASTING, NEARLY = 6, 0.8
-"""What lasts for so many cells, 0.3 s, is no knock any more, and needs a smaller share."""
+"""What lasts for so many cells, 0.3 s, is no knock any more, and needs a smaller share; twice as long, its square."""
+CELLS, SPARSE = BEFORE + AFTER[-1], (2, 4)
+"""Cells that are looked at together; and of how many there is one, where something lasts that a contact explains."""
+AT_ONCE, PRECISE = 3000.0, 0.1
+"""Nats from which on a payload is taken for one before it lasts, and the deviation of the logarithm of its mass then: a
+push that looks like a body to within some tenths of its torque is no rare chance, to within hundredths it is."""
 LIKELY = 10.0
 """Nats from which on a contact is named. Cells that are as far off as SURE teach nothing of the payload."""
 POSITIVE, ANOTHER = 1.5, 200.0
@@ -181,14 +186,14 @@ class Watch:
     def _take(self, carrier: Carrier, parts: Sequence[Rows]) -> Watch:
         """Take in cells, and judge the last ones."""
         assert self.around is not None
-        most = BEFORE + AFTER[-1]
-        cells = (*self.cells, *cells_of(self.around, parts))[-most:]
-        watch = replace(self, recent=(*self.recent, *parts)[-most:], cells=cells)
+        kept = CELLS * SPARSE[-1] if self.held is None else CELLS
+        cells = (*self.cells, *cells_of(self.around, parts))[-kept:]
+        watch = replace(self, recent=(*self.recent, *parts)[-kept:], cells=cells)
         if len(cells) <= LEAST_BEFORE:
             return watch if watch.held is None else watch._learn(carrier, parts)
-        window = Window.of(self.around, cells)
+        window = Window.of(self.around, cells[-CELLS:])
         # an arm that carries nothing as far as is known may have carried something from before the first cell on
-        gains = window.gains((*AFTER, most) if self.held is None else AFTER)
+        gains = window.gains((*AFTER, CELLS) if self.held is None else AFTER)
         watch = replace(watch, probabilities=_probabilities(gains))
         return watch._free(carrier, window, gains) if self.held is None else watch._carry(carrier, parts, window, gains)
 
@@ -201,16 +206,30 @@ class Watch:
 
     def _free(self, carrier: Carrier, window: Window, gains: Gains) -> Watch:
         """Judge cells of an arm that carries nothing as far as is known."""
-        after = _taken(window, gains)
-        return replace(self, state=_state(gains)) if after is None else self._take_up(carrier, after)
+        if (after := _taken(window, gains)) is not None:
+            return self._take_up(carrier, after)
+        state = _state(gains)
+        if state == "contact":  # it may be a payload that is heavier than the arm is known to: that lasts
+            assert self.around is not None
+            for every in SPARSE:
+                cells = self.cells[(len(self.cells) - 1) % every :: every][-CELLS:]
+                if len(cells) < LASTING + LEAST_BEFORE:
+                    break
+                window = Window.of(self.around, cells)
+                if (after := _taken(window, window.gains(), every=every)) is not None:
+                    return self._take_up(carrier, every * after, every)
+        return replace(self, state=state)
 
-    def _take_up(self, carrier: Carrier, after: int) -> Watch:
+    def _take_up(self, carrier: Carrier, after: int, every: int = 1) -> Watch:
+        """Carry what the last cells show, so many. every: of how many cells one was looked at."""
         rows, before = Rows.concatenate(self.recent[-after:]), _none(self.n)
         if self.held is None and len(self.recent) > after:  # rows with another payload tell another beginning
-            before = Rows.concatenate(self.recent[:-after])
+            before = Rows.concatenate(self.recent[:-after][-every * BEFORE :])
             before = before.take(slice(None, None, -(-len(before) // BEFORE_ROWS)))
         found = estimate(carrier, rows, before)
-        if np.abs((found.eta - ANY.centre) / np.sqrt(1 / np.diagonal(ANY.precision))).max() > STRANGE:
+        strange = np.abs((found.eta - ANY.centre) / np.sqrt(1 / np.diagonal(ANY.precision))).max() > STRANGE
+        least = PRECISE if after < LASTING else np.inf if found.gain >= AT_ONCE else 1 / POSITIVE
+        if strange or np.sqrt(found.covariance[0, 0]) > least:
             return replace(self, state="contact")
         since = float(rows.time[0])
         held = Held(since, False, rows, before, 1, len(rows), GROWTH * len(rows), ANY, found)
@@ -284,24 +303,27 @@ class Watch:
         return replace(watch, held=held)
 
 
-def _taken(window: Window, gains: Gains, held: Held | None = None) -> int | None:
-    """For how many cells something has been carried, or something else; None where that does not show."""
+def _taken(window: Window, gains: Gains, held: Held | None = None, every: int = 1) -> int | None:
+    """For how many cells something has been carried, or something else; None where that does not show. every: of how
+    many cells the window has one."""
     after = max(gains, key=lambda each: gains[each]["payload"])
     contact = gains[after]["contact"]
-    share = NEARLY if LASTING <= after < len(window.cells) else ALIKE
+    share = NEARLY**every if LASTING <= after < len(window.cells) else ALIKE
     sure, certain = (SURE, CERTAIN) if held is None else (ANOTHER, ANOTHER)
 
     def shows(payload: float) -> bool:
         return (payload >= sure and payload - contact >= BETTER) or (payload >= certain and payload >= share * contact)
 
-    if not shows(gains[after]["payload"]):
+    best = gains[after]["payload"]
+    if not shows(best) or (after < LASTING and (best < AT_ONCE or every > 1)):
         return None
     if held is None:
         mass, std = window.mass(after)
         if mass < POSITIVE * std:  # something is gone that the arm was trained with, or that was not noticed
             return None
     carried = np.zeros(PARAMETERS) if held is None else held.estimate.load.payload
-    return after if shows(window.of_body(after, carried)) else None
+    real = window.of_body(after, carried)
+    return after if shows(real) and min(best, real) - window.past_contact() >= BETTER else None
 
 
 def _evenly(first: int, last: int) -> NDArray[np.int64]:

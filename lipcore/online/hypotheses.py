@@ -131,12 +131,28 @@ class Window:
         total = pull + told @ carried
         return most_likely(told, total, ANY, ANY.centre)[3] + float(0.5 * carried @ told @ carried - total @ carried)
 
+    def past_contact(self) -> float:
+        """Nats by which a contact that began and ended within the cells explains them better than nothing does, at most."""
+        n, count = len(self.cells[0].q), len(self.cells)
+        spans = [(begin, end) for begin in range(1, count) for end in range(begin + 1, count)]
+        during = np.array([(np.arange(count) >= begin) & (np.arange(count) < end) for begin, end in spans], np.float64)
+        columns = np.einsum("sk,ij->kjsi", during, np.eye(n)).reshape(count * n, -1)
+        whitened = solve_triangular(self.root, columns, lower=True, check_finite=False)
+        blocks = whitened.reshape(-1, len(spans), n).transpose(1, 0, 2)
+        usual = self._usual()
+        return float(_mixed(blocks, self.residual, [np.full(n, each * usual) for each in CONTACTS]).max())
+
     def mass(self, after: int) -> tuple[float, float]:
         """Mean and standard deviation, kg, of the mass that is carried more for the last cells, of either sign."""
         told, pull = self._of_payload(after)
         scale = MASSES[1] * SHAPE
         spread = np.linalg.inv(np.eye(PARAMETERS) + scale[:, None] * told * scale)
         return MASSES[1] * float(spread[0] @ (scale * pull)), MASSES[1] * float(np.sqrt(spread[0, 0]))
+
+    def _usual(self) -> float:
+        """What a payload of 1.5 kg makes in the last cell of the joint where it makes most, N·m."""
+        payload = self.cells[-1].features[-PARAMETERS:] * (1.5 * SHAPE)[:, None]
+        return float(np.sqrt((payload**2).sum(axis=0).max()))
 
     def _of_payload(self, after: int) -> tuple[Array, Array]:
         """Λ (10, 10) and ξ (10,) of what the last cells say of a payload, as in `payload`."""
@@ -155,7 +171,7 @@ class Window:
         contact = np.broadcast_to(np.eye(n)[:, None], (n, count, n))
         turns = np.tanh(np.array([each.dq for each in self.cells]) / SIGN_WIDTH)
         friction = contact * turns
-        usual = float(np.sqrt(((payload[:, -1] * (1.5 * SHAPE)[:, None]) ** 2).sum(axis=0).max()))
+        usual = self._usual()
         scales: dict[Kind, list[Array]] = {
             "payload": [mass * SHAPE for mass in MASSES],
             "contact": [np.full(n, each * usual) for each in CONTACTS],
