@@ -132,7 +132,7 @@ class Window:
         return most_likely(told, total, ANY, ANY.centre)[3] + float(0.5 * carried @ told @ carried - total @ carried)
 
     def past_contact(self) -> float:
-        """Nats by which a contact that began and ended within the cells explains them better than nothing does, at most."""
+        """Nats by which a contact that began and ended within the cells explains them better than nothing, at most."""
         n, count = len(self.cells[0].q), len(self.cells)
         spans = [(begin, end) for begin in range(1, count) for end in range(begin + 1, count)]
         during = np.array([(np.arange(count) >= begin) & (np.arange(count) < end) for begin, end in spans], np.float64)
