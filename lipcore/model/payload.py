@@ -132,6 +132,13 @@ class Carrier:
                 "rigid-body or rigid-body+lip-chain"
             )
 
+    def knows_as(self, other: Carrier) -> bool:
+        """Whether another revision of the version knows the same: rows that are kept out of learning teach nothing."""
+        one, two = self.model.posterior, other.model.posterior
+        return self is other or (
+            one.basis is two.basis and torch.equal(one.weights, two.weights) and torch.equal(one.root, two.root)
+        )
+
     @property
     def term(self) -> ArmKernel:
         """The arm among the model's terms."""
@@ -158,6 +165,11 @@ class Carrier:
         values, vectors = np.linalg.eigh(np.eye(len(learnt)) - learnt.T @ learnt)
         # what samples tell to rounding has a variance of either sign
         return np.asarray((vectors * np.maximum(values, LEAST)) @ vectors.T)
+
+    @cached_property
+    def covariance_root(self) -> Array:
+        """Cholesky root of the covariance, (M, M) lower triangular."""
+        return np.asarray(np.linalg.cholesky(self.covariance))
 
     def step(self, mean: Array) -> Array:
         """Mean step of the geometry, (g,), of variables of this mean, (M,)."""

@@ -107,6 +107,8 @@ class Watch:
     def step(self, carrier: Carrier, rows: Rows) -> Watch:
         """Follow rows, in order of event time; those from before the latest are passed over."""
         watch = self._seen_by(carrier)
+        assert watch.around is not None
+        carrier = watch.around.carrier
         if watch._last is not None:
             rows = rows.take(rows.time > watch._last)
         if not len(rows):
@@ -143,7 +145,7 @@ class Watch:
 
     def _seen_by(self, carrier: Carrier) -> Watch:
         """The same as another revision of the model sees it."""
-        if self.around is not None and self.around.carrier is carrier:
+        if self.around is not None and self.around.carrier.knows_as(carrier):
             return self
         held = self.held
         if held is not None:
