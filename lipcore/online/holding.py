@@ -247,10 +247,10 @@ class Watch:
         bare = Linearised(carrier, replace(load, mean=mean))
         parts = self.recent[-AFTER[-1] :]
         seen = [replace(each, features=_unloaded(each.features)) for each in cells_of(bare, parts)]
-        found = {}
-        for after in gains:
-            cells = (*window.cells[:-after], *seen[-after:])
-            found[after] = Window.of(self.around, cells).density - window.density
+        first, count = len(window.cells), len(window.cells) + len(seen)
+        choices = [[*range(first - after), *range(count - after, count)] for after in gains]
+        loads = Window.among(self.around, [*window.cells, *seen], choices)
+        found = {after: each.density - window.density for after, each in zip(gains, loads, strict=True)}
         after = max(found, key=lambda each: found[each])
         return found[after], after
 
