@@ -17,6 +17,8 @@ from lipcore.data.samples import Samples
 from lipcore.fitting.options import FitOptions
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative, Arm
+from lipcore.kernels.payload import PayloadKernel
+from lipcore.robots.urdf import PARAMETERS
 from lipcore.training.train import train
 
 COMPILED = ("lip", "lip-chain", "rigid-body", "rigid-body+lip-chain")
@@ -62,6 +64,10 @@ def _of_arm(arm: Arm) -> None:
         kernel.energy_features(motion)
         kernel.torque(np.zeros(kernel.size), motion)
         kernel.regressor().fill(motion.arrays()[0], np.empty((kernel.size, arm.n_joints)))
+    payload = PayloadKernel(arm, arm.expected, np.zeros(PARAMETERS), np.ones(PARAMETERS))
+    payload.features(motion)
+    payload.bend(motion.arrays())
+    payload.regressor().fill(motion.arrays()[0], np.empty((PARAMETERS + 1, arm.n_joints)))
 
 
 if __name__ == "__main__":

@@ -101,32 +101,45 @@ class Geometry:
     @cached_property
     def constants(self) -> Array:
         """The geometry as `kernels.compiled.arm_recursion` reads it: (n, CONSTANTS)."""
-        out = np.zeros((self.n_joints, CONSTANTS))
-        for j, (kind, turn, axis) in enumerate(zip(self.joint_types, self.rotation, self.axis, strict=True)):
-            along = np.outer(axis, axis)
-            parts = (along, skew(axis), np.eye(3) - along)  # exp(q axis×) = these times 1, sin q and cos q
-            if kind == "prismatic":
-                parts = (np.eye(3), np.zeros((3, 3)), np.zeros((3, 3)))
-            out[j, TURN:PLACE] = np.concatenate([(turn @ part).reshape(-1) for part in parts])
-            out[j, AXIS:ACROSS] = turn @ axis
-            out[j, ACROSS:KIND] = (self.across[j] @ turn.T).reshape(-1)
-        out[:, PLACE:AXIS] = self.translation
+        return self._constants(self.rotation, self.translation)
+
+    def moved_constants(self, step: Array) -> Array:
+        """`constants` of the geometry a step away, (g,) rad and m."""
+        return self._constants(*self._moved(step))
+
+    def moved(self, step: Array) -> Geometry:
+        """The geometry a step away, (g,) rad and m."""
+        rotation, translation = self._moved(step)
+        return replace(self, rotation=rotation, translation=translation)
+
+    def _constants(self, rotation: Array, translation: Array) -> Array:
+        n = self.n_joints
+        out = np.zeros((n, CONSTANTS))
+        out[:, TURN:PLACE] = (rotation[:, None] @ self._parts).reshape(n, -1)
+        out[:, PLACE:AXIS] = translation
+        out[:, AXIS:ACROSS] = (rotation @ self.axis[..., None])[..., 0]
+        out[:, ACROSS:KIND] = (self.across @ rotation.mT).reshape(n, -1)
         out[:, KIND] = [kind == "prismatic" for kind in self.joint_types]
         out[:, SCREWS] = self.screws
         return out
 
-    def moved(self, step: Array) -> Geometry:
-        """The geometry a step away, (g,) rad and m."""
-        rotation, translation, at = self.rotation.copy(), self.translation.copy(), 0
-        for j, count in enumerate(self.screws):
-            part = step[at : at + count]
-            at += count
-            if count:
-                turn = part[:2] @ self.across[j]
-                if count == 4:
-                    translation[j] += self.rotation[j] @ (part[2:] @ self.across[j])
-                rotation[j] = self.rotation[j] @ rotation_of(turn)
-        return replace(self, rotation=rotation, translation=translation)
+    @cached_property
+    def _parts(self) -> Array:
+        """What times 1, sin q and cos q add up to exp(q axis×), to the identity of a prismatic joint: (n, 3, 3, 3)."""
+        along, one = self.axis[:, :, None] * self.axis[:, None], np.eye(3)
+        parts = np.stack([along, skew(self.axis), one - along], axis=1)
+        for j, kind in enumerate(self.joint_types):
+            if kind == "prismatic":
+                parts[j] = one, 0 * one, 0 * one
+        return parts
+
+    def _moved(self, step: Array) -> tuple[Array, Array]:
+        """Rotation and translation a step away."""
+        numbers = np.zeros((self.n_joints, 1, 4))
+        numbers[np.arange(4) < np.reshape(self.screws, (-1, 1, 1))] = step
+        turn, shift = (numbers[..., part] @ self.across for part in (slice(0, 2), slice(2, 4)))
+        translation = self.translation + (self.rotation @ shift.mT)[..., 0]
+        return self.rotation @ rotation_of(turn[:, 0]), translation
 
     def towards(self, other: Geometry) -> Array:
         """The step, (g,), that leads to another geometry of the same joints, to first order in what lies between."""
@@ -183,17 +196,18 @@ class Geometry:
 
 
 def skew(vector: Array) -> Array:
-    """The matrix of vector × …, (3, 3)."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    """The matrix of vector × …, (…, 3, 3) of (…, 3)."""
+    out = np.zeros((*vector.shape, 3))
+    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -z, y, -x
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = z, -y, x
+    return out
 
 
 def rotation_of(turn: Array) -> Array:
-    """Rotation by the vector `turn` (3,), rad: exp(turn×), Rodrigues' formula."""
-    angle = float(np.linalg.norm(turn))
-    if angle == 0.0:
-        return np.eye(3)
-    unit = skew(turn / angle)
+    """Rotation by the vector `turn`, rad: exp(turn×), (…, 3, 3) of (…, 3), Rodrigues' formula."""
+    angle = np.linalg.norm(turn, axis=-1)[..., None, None]
+    unit = skew(turn / np.where(angle[..., 0] > 0, angle[..., 0], 1.0))
     return np.asarray(np.eye(3) + np.sin(angle) * unit + (1 - np.cos(angle)) * unit @ unit)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -13,12 +13,12 @@ from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import Arm
 from lipcore.kernels.base import LinearKernel, Params, Regressor
 from lipcore.kernels.compiled.arm import arm_energies, arm_masses
-from lipcore.kernels.compiled.arm_recursion import PARAMETERS
+from lipcore.kernels.compiled.arm_recursion import PARAMETERS, WORK
+from lipcore.kernels.compiled.payload import NEAR, payload_features, payload_query, payload_size
+from lipcore.kernels.compiled.views import Memory
 
 CERTAIN = 1e-12
 """Variance of the weight that is known to be one."""
-NEAR = 1e-4
-"""Share of a step over which differences stand for the derivative along it."""
 
 
 class PayloadKernel(LinearKernel):
@@ -34,38 +34,32 @@ class PayloadKernel(LinearKernel):
     """
 
     def __init__(self, arm: Arm, step: Array, payload: Array, room: Array) -> None:
-        self.n_joints, self._payload, self._room = arm.n_joints, np.array(payload), np.array(room)
-        self._order, self._gravity = arm.order.astype(np.int64), arm.geometry.gravity
-        self._constants = arm.geometry.constants
-        self._ahead = arm.geometry.moved(step).constants if arm.steps else self._constants
-        self._beside = tuple(arm.geometry.moved(side * step).constants for side in (NEAR, -NEAR)) if arm.steps else ()
+        self.n_joints, self.payload, self._room = arm.n_joints, np.array(payload), np.array(room)
+        self.order, self.gravity = arm.order.astype(np.int64), arm.geometry.gravity
+        self._geometry, self._step = arm.geometry, step
+        beside = [arm.geometry.moved_constants(side * step) for side in (NEAR, -NEAR)] if arm.steps else []
+        self.constants = np.stack([arm.geometry.constants, *beside])
         first = PARAMETERS * int(arm.order[-1])
         self._last = slice(first, first + PARAMETERS)
 
     def rows(self, motions: Array) -> Array:
         """Φᵀ of N motions (N, 3, n): (N, 11, n)."""
-        return self._around(lambda constants: self._masses(constants, motions))
+        work = np.empty((payload_size(self.n_joints), WORK))
+        out = np.empty((len(motions), PARAMETERS + 1, self.n_joints))
+        payload_features(self.constants, self.gravity, self.payload, self.order, motions, work, out)
+        return out
 
     def bend(self, motions: Array) -> Array:
         """What b(θ + δ) π̄ is more than linear in δ, at N motions (N, 3, n): (N, n) N·m."""
-        straight = self.rows(motions)[:, :PARAMETERS]
-        return np.asarray(np.tensordot(self._masses(self._ahead, motions) - straight, self._payload, axes=(1, 0)))
-
-    def _masses(self, constants: Array, motions: Array) -> Array:
-        """∂τ/∂π of the last link: (N, 10, n)."""
         out = np.empty((len(motions), PARAMETERS * self.n_joints, self.n_joints))
-        arm_masses(constants, self._gravity, self._order, motions, out)
-        return out[:, self._last]
+        arm_masses(self._ahead, self.gravity, self.order, motions, out)
+        more = out[:, self._last] - self.rows(motions)[:, :PARAMETERS]
+        return np.asarray(np.tensordot(more, self.payload, axes=(1, 0)))
 
-    def _around(self, last: Callable[[Array], Array]) -> Array:
-        """Features (N, 11, …) from those of the last link's parameters at some constants, (N, 10, …)."""
-        here = last(self._constants)
-        if not self._beside:
-            return np.concatenate([here, np.zeros_like(here[:, :1])], axis=1)
-        ahead, behind = (last(each) for each in self._beside)
-        change = (ahead - behind) / (2 * NEAR)
-        known = np.tensordot(change, self._payload, axes=(1, 0))
-        return np.concatenate([here + change, -known[:, None]], axis=1)
+    @cached_property
+    def _ahead(self) -> Array:
+        """The constants of θ + δ."""
+        return self._geometry.moved_constants(self._step) if len(self.constants) > 1 else self.constants[0]
 
     def features(self, x: Motion) -> Tensor:
         """Φ at each sample: (N, n, 11)."""
@@ -73,14 +67,14 @@ class PayloadKernel(LinearKernel):
 
     def energy_features(self, x: Motion) -> Tensor:
         """Kinetic and potential energy per unit of each weight: (N, 2, 11) J."""
-        none = np.zeros((self.n_joints, PARAMETERS))
-
-        def last(constants: Array) -> Array:
+        none, sides = np.zeros((self.n_joints, PARAMETERS)), []
+        for constants in self.constants:
             out = np.empty((len(x), 2, (PARAMETERS + 1) * self.n_joints))
-            arm_energies(constants, self._gravity, none, self._order, x.arrays(), out)
-            return out[..., self._last].transpose(0, 2, 1)
-
-        return torch.from_numpy(np.ascontiguousarray(self._around(last).transpose(0, 2, 1)))
+            arm_energies(constants, self.gravity, none, self.order, x.arrays(), out)
+            sides.append(out[..., self._last])
+        change = (sides[1] - sides[2]) / (2 * NEAR) if len(sides) > 1 else np.zeros_like(sides[0])
+        known = -(change @ self.payload)[..., None]
+        return torch.from_numpy(np.concatenate([sides[0] + change, known], axis=2))
 
     def regressor(self) -> Regressor:
         """The same features of one query, for serving."""
@@ -100,12 +94,14 @@ class PayloadKernel(LinearKernel):
 
 
 class PayloadRegressor(Regressor):
-    """Features of `PayloadKernel`, one query at a time."""
+    """Features of `PayloadKernel`, compiled."""
 
     def __init__(self, kernel: PayloadKernel) -> None:
         self.n_joints, self.size = kernel.n_joints, PARAMETERS + 1
-        self._kernel = kernel
+        self._sides, self._order = len(kernel.constants), kernel.order
+        fixed = kernel.constants, kernel.gravity, kernel.payload
+        self._memory = Memory(fixed, payload_size(kernel.n_joints) * WORK)
 
     def fill(self, motion: Array, out: Array) -> None:
         """Write Φᵀ of the query, (11, n)."""
-        out[:] = self._kernel.rows(motion[None])[0]
+        payload_query(self._memory.flat, self._sides, self._order, motion, out)

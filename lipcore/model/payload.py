@@ -22,6 +22,7 @@ from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.fitting.estimators import Estimator
 from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.base import LinearKernel
 from lipcore.kernels.payload import CERTAIN, PayloadKernel
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.basis import Basis
@@ -132,6 +133,13 @@ class Carrier:
                 "rigid-body or rigid-body+lip-chain"
             )
 
+    def knows_as(self, other: Carrier) -> bool:
+        """Whether another revision of the version knows the same: rows that are kept out of learning teach nothing."""
+        one, two = self.model.posterior, other.model.posterior
+        return self is other or (
+            one.basis is two.basis and torch.equal(one.weights, two.weights) and torch.equal(one.root, two.root)
+        )
+
     @property
     def term(self) -> ArmKernel:
         """The arm among the model's terms."""
@@ -158,6 +166,11 @@ class Carrier:
         values, vectors = np.linalg.eigh(np.eye(len(learnt)) - learnt.T @ learnt)
         # what samples tell to rounding has a variance of either sign
         return np.asarray((vectors * np.maximum(values, LEAST)) @ vectors.T)
+
+    @cached_property
+    def covariance_root(self) -> Array:
+        """Cholesky root of the covariance, (M, M) lower triangular."""
+        return np.asarray(np.linalg.cholesky(self.covariance))
 
     def step(self, mean: Array) -> Array:
         """Mean step of the geometry, (g,), of variables of this mean, (M,)."""
@@ -214,25 +227,24 @@ class Linearised:
     def basis(self) -> Basis:
         """Its variables: w, π over the root of its room, and the weight that is known."""
         basis = self.carrier.model.posterior.basis
-        linear = tuple(self._arm if each is self.carrier.term else each for each in basis.linear)
         own = self._payload.covariance(basis.params).diagonal().sqrt().diag()
         root: Tensor = torch.block_diag(basis.root, own)  # type: ignore[no-untyped-call]
-        return replace(basis, linear=(*linear, self._payload), root=root)
+        return replace(basis, linear=self._linear, root=root)
 
     def rows(self, motion: Motion) -> tuple[Array, Array]:
         """Of N instants: features of (w, π), (M + 10, N, n), and the torque where both are zero, (N, n) N·m."""
         parts, mean = [], np.zeros(motion.q.shape)
-        for kernel in self.basis.linear:
+        for kernel in self._linear:
             features, weights = kernel.features(motion).numpy(), kernel.prior_weights()
             parts.append(features)
             if weights is not None:
                 mean += features @ weights.numpy()
         own = np.concatenate(parts, axis=2)[..., :-1].transpose(2, 0, 1)
         own = own * np.append(self.carrier.root[-(len(own) - PARAMETERS) :], np.ones(PARAMETERS))[:, None, None]
-        if self.basis.term is None:
+        basis = self.carrier.model.posterior.basis
+        if basis.term is None:
             return own, mean
         # of the nonlinear term, whose torques are whitened by a root that is not diagonal
-        basis = self.carrier.model.posterior.basis
         whitened, _ = basis.features_and_uncovered(motion)
         nonlinear = whitened[: len(basis.outputs)].reshape(-1, *motion.q.shape)
         return np.concatenate([nonlinear.numpy(), own]), mean
@@ -240,6 +252,11 @@ class Linearised:
     def bend(self, motion: Motion) -> Array:
         """What the payload's torque is more than linear in the geometry's mean step, at N instants: (N, n) N·m."""
         return self._payload.bend(motion.arrays())
+
+    @cached_property
+    def _linear(self) -> tuple[LinearKernel, ...]:
+        terms = self.carrier.model.posterior.basis.linear
+        return (*(self._arm if each is self.carrier.term else each for each in terms), self._payload)
 
     @cached_property
     def _arm(self) -> ArmKernel:

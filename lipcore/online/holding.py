@@ -112,6 +112,8 @@ class Watch:
     def step(self, carrier: Carrier, rows: Rows) -> Watch:
         """Follow rows, in order of event time; those from before the latest are passed over."""
         watch = self._seen_by(carrier)
+        assert watch.around is not None
+        carrier = watch.around.carrier
         if watch._last is not None:
             rows = rows.take(rows.time > watch._last)
         if not len(rows):
@@ -148,7 +150,7 @@ class Watch:
 
     def _seen_by(self, carrier: Carrier) -> Watch:
         """The same as another revision of the model sees it."""
-        if self.around is not None and self.around.carrier is carrier:
+        if self.around is not None and self.around.carrier.knows_as(carrier):
             return self
         held = self.held
         if held is not None:
@@ -264,10 +266,10 @@ class Watch:
         bare = Linearised(carrier, replace(load, mean=mean))
         parts = self.recent[-AFTER[-1] :]
         seen = [replace(each, features=_unloaded(each.features)) for each in cells_of(bare, parts)]
-        found = {}
-        for after in gains:
-            cells = (*window.cells[:-after], *seen[-after:])
-            found[after] = Window.of(self.around, cells).density - window.density
+        first, count = len(window.cells), len(window.cells) + len(seen)
+        choices = [[*range(first - after), *range(count - after, count)] for after in gains]
+        loads = Window.among(self.around, [*window.cells, *seen], choices)
+        found = {after: each.density - window.density for after, each in zip(gains, loads, strict=True)}
         after = max(found, key=lambda each: found[each])
         return found[after], after
 

@@ -103,6 +103,11 @@ class Window:
     @classmethod
     def of(cls, around: Linearised, cells: Sequence[Cell]) -> Window:
         """The window of cells, seen around a load, which their residuals and features belong to."""
+        return cls.among(around, cells, [range(len(cells))])[0]
+
+    @classmethod
+    def among(cls, around: Linearised, cells: Sequence[Cell], choices: Sequence[Sequence[int]]) -> list[Window]:
+        """The windows of some of the cells each, by their places, whose covariances are parts of one."""
         n, count = len(cells[0].q), len(cells)
         features = np.stack([each.features for each in cells], axis=1).reshape(len(cells[0].features), -1)
         covariance = (features.T @ around.load.covariance @ features).reshape(count, n, count, n)
@@ -115,9 +120,15 @@ class Window:
             covariance[:, j, :, j] += alike[j] * np.outer(lasting[:, j], lasting[:, j])
             covariance[:, j, :, j] += near * np.outer(rest[:, j], rest[:, j])
             covariance[places, j, places, j] += [each.new[j] for each in cells]
-        root = np.asarray(np.linalg.cholesky(covariance.reshape(count * n, count * n)), np.float64)
-        residual = np.concatenate([each.residual for each in cells])
-        return cls(tuple(cells), root, solve_triangular(root, residual, lower=True, check_finite=False))
+        windows = []
+        for choice in choices:
+            size, chosen = len(choice) * n, [cells[place] for place in choice]
+            part = covariance[choice][:, :, choice].reshape(size, size)
+            root = np.asarray(np.linalg.cholesky(part), np.float64)
+            residual = np.concatenate([each.residual for each in chosen])
+            whitened = solve_triangular(root, residual, lower=True, check_finite=False)
+            windows.append(cls(tuple(chosen), root, whitened))
+        return windows
 
     @property
     def density(self) -> float:

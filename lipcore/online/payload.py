@@ -117,7 +117,7 @@ def estimate(
     free = len(everything) - len(rows)
     roots = correlation_roots(carrier, everything)
     mean, size = carrier.mean, len(carrier.mean)
-    root = np.linalg.cholesky(carrier.covariance)
+    root = carrier.covariance_root
     empty = carrier.known(np.zeros(PARAMETERS))
     unloaded = _Rows.of(carrier, empty, everything.take(slice(0, free)), mean) if free else None
     if unloaded is not None:

@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
+from torch.func import jacrev
 
 from lipcore import FitOptions, Samples, TorqueModel, train
 from lipcore.data.metrics import evaluate
@@ -19,7 +20,8 @@ from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import Stream, simulate
 from lipcore.robots.urdf import RigidBody
 from tests.choosing import slow
-from tests.lipcore.arm_oracles import arm, as_robot, followed, motions, recorded, tensor
+from tests.lipcore.arm_oracles import arm, as_robot, followed, lagrangian_torque, motions, recorded, tensor
+from tests.lipcore.arms import random_bodies
 from tests.lipcore.test_components import truth_of
 
 INERTIA = np.array([[0.020, 0.003, 0.001], [0.003, 0.015, -0.002], [0.001, -0.002, 0.010]])
@@ -135,6 +137,35 @@ def test_features_are_those_of_a_body_of_pinocchio(kinds: str) -> None:
         for place, of in enumerate((pin.computeKineticEnergy, pin.computePotentialEnergy)):
             more = of(*with_, q, *((dq,) if place == 0 else ())) - of(*less, q, *((dq,) if place == 0 else ()))
             np.testing.assert_allclose(energy[row, place], more, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("kinds", ["R", "RPR", "PRRPRR"])
+def test_features_beside_a_learnt_geometry_are_those_of_the_lagrangian(kinds: str) -> None:
+    geometry, bodies, _ = arm(kinds, 26)
+    n, asked, rng = len(kinds), motions(len(kinds), 27, size=3), np.random.default_rng(28)
+    order = rng.permutation(n)
+    learnt = Arm(geometry, order, "learn", bodies, bodies, np.ones(11 * n), np.zeros(n), *np.ones((2, geometry.size)))
+    step, around, other = rng.normal(0, 0.1, geometry.size), *random_bodies(2, 29)
+    kernel = PayloadKernel(learnt, step, around, np.ones(10))
+    turned = np.empty_like(asked)
+    turned[:, :, order] = asked
+    rows = kernel.rows(turned)
+    out = np.empty((11, n))
+    kernel.regressor().fill(turned[0], out)
+    np.testing.assert_array_equal(out, rows[0])
+    nowhere = torch.zeros(geometry.size, dtype=torch.float64)
+
+    def tip(body: np.ndarray, step: torch.Tensor, motion: np.ndarray) -> torch.Tensor:
+        alone = np.zeros((n, 10))
+        alone[-1] = body
+        return lagrangian_torque(geometry, alone, step, motion)
+
+    for found, motion in zip(rows, asked, strict=True):
+        here = tip(other, nowhere, motion).numpy()
+        slope = jacrev(lambda moved, at=motion: tip(other - around, moved, at))(nowhere).numpy() @ step
+        expected = np.empty(n)
+        expected[order] = here + slope
+        np.testing.assert_allclose(np.append(other, 1.0) @ found, expected, atol=1e-7 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("body", [BODY, POINT, Body(1.0, np.zeros(3)), Body(0.3, np.ones(3), np.diag([0.0, 1.0, 1.0]))])

@@ -9,6 +9,7 @@ import lipcore
 from lipcore.model.payload import Body, Carrier
 from lipcore.online.batch import Rows
 from lipcore.online.holding import Watch
+from lipcore.online.learner import OnlineModel
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Payload, Stream, simulate
 
@@ -123,6 +124,14 @@ def test_what_a_report_says_of_a_payload_is_taken_up_again(carrier):
 
 def test_another_revision_of_the_model_sees_the_same_payload(carrier):
     watch = followed(carrier, stream(300, 1.0, last=21.0))[-1][1]
-    other = Carrier(carrier.model)
-    rows = stream(300, 1.0, first=21.0, last=21.1)
-    assert watch.step(other, rows).held.estimate.mass[0] == pytest.approx(watch.held.estimate.mass[0], abs=0.01)
+    online = OnlineModel.start(carrier.model).learn(stream(306, first=0.0, last=2.0))
+    other = Carrier(online.model())
+    few = stream(300, 1.0, first=21.0, last=21.03)
+    found = watch.step(other, few).held.estimate
+    assert found is not watch.held.estimate
+    assert found.mass[0] == pytest.approx(watch.held.estimate.mass[0], abs=0.01)
+    # one that knows nothing more, but for past errors, has no other opinion
+    same = Carrier(OnlineModel.start(carrier.model).model())
+    kept = watch.step(same, few)
+    floor = Carrier(OnlineModel.start(carrier.model).model(np.full(7, 0.1)))
+    assert kept.step(floor, stream(300, 1.0, first=21.03, last=21.04)).held.estimate is kept.held.estimate

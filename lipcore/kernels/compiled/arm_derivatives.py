@@ -59,27 +59,34 @@ def masses(constants: Array, order: Indices, work: Array, table: Array, out: Arr
     n = constants.shape[0]
     out[: PARAMETERS * n] = 0.0
     for j in range(n):
-        row, first = work[j], PARAMETERS * order[j]
-        _link_table(row, table)
-        for i in range(j + 1):
-            joint, screw = work[i], order[i]
-            # the screw of joint i as the frame of link j sees it
+        link_masses(order, work, j, table, out, PARAMETERS * order[j])
+
+
+@compiled
+def link_masses(order: Indices, work: Array, j: int, table: Array, out: Array, first: int) -> None:
+    """Write ∂τ/∂π of the body at place j of the chain, after `kinematics`, to the ten rows of `out` from `first` on; of
+    joints behind it nothing is written."""
+    row = work[j]
+    _link_table(row, table)
+    for i in range(j + 1):
+        joint, screw = work[i], order[i]
+        # the screw of joint i as the frame of link j sees it
+        for c in range(3):
+            table[AT_LINK + 3 + c] = joint[S + 3 + c]
+        add_cross(joint, S, row, ORIGIN, table, AT_LINK + 3)
+        for c in range(3):
+            angular = linear = 0.0
+            for k in range(3):
+                angular += row[R + 3 * k + c] * joint[S + k]
+                linear += row[R + 3 * k + c] * table[AT_LINK + 3 + k]
+            table[AT_LINK + c] = angular
+            table[AT_LINK + 6 + c] = linear
+        for p in range(PARAMETERS):
+            total = 0.0
             for c in range(3):
-                table[AT_LINK + 3 + c] = joint[S + 3 + c]
-            add_cross(joint, S, row, ORIGIN, table, AT_LINK + 3)
-            for c in range(3):
-                angular = linear = 0.0
-                for k in range(3):
-                    angular += row[R + 3 * k + c] * joint[S + k]
-                    linear += row[R + 3 * k + c] * table[AT_LINK + 3 + k]
-                table[AT_LINK + c] = angular
-                table[AT_LINK + 6 + c] = linear
-            for p in range(PARAMETERS):
-                total = 0.0
-                for c in range(3):
-                    total += table[AT_LINK + c] * table[MOMENT_OF + 10 * c + p]
-                    total += table[AT_LINK + 6 + c] * table[FORCE_OF + 10 * c + p]
-                out[first + p, screw] = total
+                total += table[AT_LINK + c] * table[MOMENT_OF + 10 * c + p]
+                total += table[AT_LINK + 6 + c] * table[FORCE_OF + 10 * c + p]
+            out[first + p, screw] = total
 
 
 @compiled
