@@ -64,10 +64,9 @@ def _of_arm(arm: Arm) -> None:
         kernel.energy_features(motion)
         kernel.torque(np.zeros(kernel.size), motion)
         kernel.regressor().fill(motion.arrays()[0], np.empty((kernel.size, arm.n_joints)))
-    payload = PayloadKernel(arm, arm.expected, np.zeros(PARAMETERS), np.ones(PARAMETERS))
+    payload = PayloadKernel(arm, np.ones(PARAMETERS))
     payload.features(motion)
-    payload.bend(motion.arrays())
-    payload.regressor().fill(motion.arrays()[0], np.empty((PARAMETERS + 1, arm.n_joints)))
+    payload.regressor().fill(motion.arrays()[0], np.empty((PARAMETERS, arm.n_joints)))
 
 
 if __name__ == "__main__":

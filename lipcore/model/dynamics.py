@@ -188,7 +188,7 @@ def _push(q: Tensor, joint: int) -> Motion:
 
 
 def _dynamics_terms(estimator: Estimator) -> list[TorqueKernel]:
-    return [term for name, term in estimator.terms.items() if name != "friction"]
+    return [term for name, term in estimator.terms.items() if name not in ("friction", "others")]
 
 
 def _energy_terms(estimator: Estimator) -> list[EnergyKernel]:

@@ -1,12 +1,12 @@
 """What an arm carries: a body beside those it was learnt with, and the model that answers with it.
 
 A payload is fixed to the last link, and torque is linear in its ten parameters as in those of that link. Where the
-geometry is learnt, too, torque is bilinear in it and in the payload,
+geometry is learnt, too, torque is linearised around the means of both,
 
     tau = Y(θ + δθ) (π + payload) ≈ Y(θ) (π + payload) + J(θ, π + payload) δθ,
 
-so that it is linearised around the means of both. The variables of the posterior are those of the arm as it was
-learnt, and the payload's ten.
+where θ is the geometry that the arm was learnt with or, far from it, that which rows with the payload show. The
+variables of the posterior are those of the arm as it was learnt, and the payload's ten.
 """
 
 from __future__ import annotations
@@ -22,8 +22,13 @@ from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.fitting.estimators import Estimator
 from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.arm_prior import Alternative
 from lipcore.kernels.base import LinearKernel
-from lipcore.kernels.payload import CERTAIN, PayloadKernel
+from lipcore.kernels.friction import FrictionKernel
+from lipcore.kernels.geometry import Geometry
+from lipcore.kernels.mixture import MixtureKernel
+from lipcore.kernels.payload import PayloadKernel
+from lipcore.model.memory import SEED, SHARE, Memory
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.basis import Basis
 from lipcore.posterior.compact import CompactPosterior
@@ -34,6 +39,8 @@ ROOM = 10.0
 """Prior variance that a payload's parameters get, in units of their own: Σ ≤ k diag Σ holds for every covariance of k
 numbers, so that the posterior is nowhere wider than its prior, as the evaluator has to assume."""
 
+CERTAIN = 1e-12
+"""Variance of a payload's parameter that is known."""
 ROUNDING = 1e-12
 """Share of the inertia about the link's frame that may be rounding."""
 LEAST = 1e-14
@@ -106,13 +113,15 @@ class Load:
     """What is known of a payload and, with it, of a model's whitened variables w, (M,): N(mean, covariance) of (w, π).
 
     mean: (M + 10,); covariance: (M + 10, M + 10); room: (10,), variances that π has at most, whatever w and π are;
-    floor: (n,) (N·m)², below which no torque's variance lies; zero where None.
+    geometry: of the arm with this mean, where torque is linearised; where it was learnt if None; others: arms with
+    their payloads that are as probable, this one first; none where the posterior is as good as linear.
     """
 
     mean: Array
     covariance: Array
     room: Array
-    floor: Array | None = None
+    geometry: Geometry | None = None
+    others: tuple[Alternative, ...] = ()
 
     @property
     def payload(self) -> Array:
@@ -168,13 +177,42 @@ class Carrier:
         return np.asarray((vectors * np.maximum(values, LEAST)) @ vectors.T)
 
     @cached_property
-    def covariance_root(self) -> Array:
-        """Cholesky root of the covariance, (M, M) lower triangular."""
-        return np.asarray(np.linalg.cholesky(self.covariance))
+    def memory(self) -> Memory:
+        """What the samples behind the posterior say of arms of another geometry."""
+        n, limits = self.model.n_joints, self.model.training_range
+        count = int(np.ceil(SHARE * self.term.size / n))
+        draw = np.random.default_rng(SEED).uniform
+        q, dq, ddq = (draw(limits[name]["min"], limits[name]["max"], (count, n)) for name in ("q", "dq", "ddq"))
+        motion, posterior = Motion.from_arrays(q, dq, ddq), self.model.posterior
+        features, base = Linearised(self, self.known(np.zeros(PARAMETERS))).rows(motion)
+        variance = (posterior.noise_variance + posterior.misfit.variance(motion)).numpy()
+        return Memory.of(motion.arrays(), base, features[:-PARAMETERS], self.rows, self.mean, self.covariance, variance)
 
-    def step(self, mean: Array) -> Array:
-        """Mean step of the geometry, (g,), of variables of this mean, (M,)."""
-        return np.asarray(self.term.geometry_step(mean[self.rows] * self.root[self.rows]))
+    @cached_property
+    def steps(self) -> slice:
+        """Places of the geometry's steps among the variables."""
+        first, steps = self.rows.start, self.term.steps
+        return slice(first + steps.start, first + steps.stop)
+
+    @property
+    def step(self) -> Array:
+        """Mean step of the geometry, (g,) rad and m."""
+        return self.weights(self.mean)[self.term.steps]
+
+    def alternative(self, mean: Array, geometry: Geometry, payload: Array, probability: float) -> Alternative:
+        """The arm of these variables, (M,), and a geometry, with a payload, (10,)."""
+        arm, n, friction = self.term.arm, self.model.n_joints, self.model.estimator.terms["friction"]
+        assert isinstance(friction, FrictionKernel)
+        weights, rows = self.weights(mean), self.model.posterior.basis.rows(friction)
+        bodies = weights[: PARAMETERS * n].reshape(n, PARAMETERS)[arm.order]
+        bodies[-1] += payload
+        rotor, rubbing = weights[PARAMETERS * n : (PARAMETERS + 1) * n], self.root[rows] * mean[rows]
+        return Alternative(geometry, bodies, rotor, rubbing.reshape(n, -1), probability)
+
+    def weights(self, mean: Array) -> Array:
+        """Weights of the arm, (p,), of variables of this mean, (M,)."""
+        centre = self.term.prior_weights()
+        return np.asarray(self.root[self.rows] * mean[self.rows] + (0.0 if centre is None else centre.numpy()))
 
     @cached_property
     def root(self) -> Array:
@@ -195,15 +233,16 @@ class Carrier:
         """The model that answers with a payload, its intervals with what is not known of it."""
         posterior, around = self.model.posterior, Linearised(self, load)
         unit = np.concatenate([np.ones(len(self.mean)), np.sqrt(load.room)])
-        mean, covariance = np.append(load.mean / unit, 0.0), np.zeros((len(unit) + 1, len(unit) + 1))
-        covariance[:-1, :-1] = load.covariance / np.outer(unit, unit)
+        size, count = len(unit), len(unit) + max(0, len(load.others) - 1)
+        mean, covariance = np.zeros(count), np.eye(count)
+        mean[:size], covariance[:size, :size] = load.mean / unit, load.covariance / np.outer(unit, unit)
         solved = CompactPosterior.solved(
             around.estimator.kernel,
             around.basis,
             known(torch.from_numpy(mean), torch.from_numpy(covariance)),
             posterior.noise_variance,
             posterior.std_factor,
-            posterior.floor if load.floor is None else torch.maximum(posterior.floor, torch.from_numpy(load.floor)),
+            posterior.floor,
             posterior.misfit,
         )
         return replace(self.model, estimator=around.estimator, posterior=solved)
@@ -218,18 +257,23 @@ class Linearised:
 
     @cached_property
     def estimator(self) -> Estimator:
-        """The model's terms, the arm's with the payload in its parameters, and the payload's."""
+        """The model's terms, the arm's with the payload in its parameters, the payload's, and that of other arms."""
         estimator, arm = self.carrier.model.estimator, self.carrier.term
         terms = {name: self._arm if each is arm else each for name, each in estimator.terms.items()}
-        return replace(estimator, terms={**terms, "payload": self._payload})
+        more = {} if self._others is None else {"others": self._others}
+        return replace(estimator, terms={**terms, "payload": self._payload, **more})
 
     @cached_property
     def basis(self) -> Basis:
-        """Its variables: w, π over the root of its room, and the weight that is known."""
+        """Its variables: w, π over the root of its room, and those of other arms."""
         basis = self.carrier.model.posterior.basis
         own = self._payload.covariance(basis.params).diagonal().sqrt().diag()
-        root: Tensor = torch.block_diag(basis.root, own)  # type: ignore[no-untyped-call]
-        return replace(basis, linear=self._linear, root=root)
+        linear, roots = list(self._linear), [basis.root, own]
+        if self._others is not None:
+            linear.append(self._others)
+            roots.append(torch.eye(self._others.size, dtype=torch.float64))
+        root: Tensor = torch.block_diag(*roots)  # type: ignore[no-untyped-call]
+        return replace(basis, linear=tuple(linear), root=root)
 
     def rows(self, motion: Motion) -> tuple[Array, Array]:
         """Of N instants: features of (w, π), (M + 10, N, n), and the torque where both are zero, (N, n) N·m."""
@@ -239,7 +283,7 @@ class Linearised:
             parts.append(features)
             if weights is not None:
                 mean += features @ weights.numpy()
-        own = np.concatenate(parts, axis=2)[..., :-1].transpose(2, 0, 1)
+        own = np.concatenate(parts, axis=2).transpose(2, 0, 1)
         own = own * np.append(self.carrier.root[-(len(own) - PARAMETERS) :], np.ones(PARAMETERS))[:, None, None]
         basis = self.carrier.model.posterior.basis
         if basis.term is None:
@@ -249,10 +293,6 @@ class Linearised:
         nonlinear = whitened[: len(basis.outputs)].reshape(-1, *motion.q.shape)
         return np.concatenate([nonlinear.numpy(), own]), mean
 
-    def bend(self, motion: Motion) -> Array:
-        """What the payload's torque is more than linear in the geometry's mean step, at N instants: (N, n) N·m."""
-        return self._payload.bend(motion.arrays())
-
     @cached_property
     def _linear(self) -> tuple[LinearKernel, ...]:
         terms = self.carrier.model.posterior.basis.linear
@@ -260,12 +300,24 @@ class Linearised:
 
     @cached_property
     def _arm(self) -> ArmKernel:
-        arm = self.carrier.term.arm
-        parameters = arm.parameters.copy()
-        parameters[-1] += self.load.payload
+        arm, load = self.carrier.term.arm, self.load
+        if load.geometry is None:
+            parameters = arm.parameters.copy()
+        else:
+            size = PARAMETERS * arm.n_joints
+            weights = self.carrier.weights(load.mean[:-PARAMETERS])
+            parameters = weights[:size].reshape(-1, PARAMETERS)[arm.order]
+            # steps count from the load's geometry on, and their mean is none
+            step = weights[self.carrier.term.steps]
+            arm = replace(arm, geometry=load.geometry, expected=arm.expected - step)
+        parameters[-1] += load.payload
         return ArmKernel(replace(arm, parameters=parameters))
 
     @cached_property
+    def _others(self) -> MixtureKernel | None:
+        arm = self.carrier.term.arm
+        return MixtureKernel(self.load.others, arm.order, arm.stribeck) if self.load.others else None
+
+    @cached_property
     def _payload(self) -> PayloadKernel:
-        step = self.carrier.step(self.load.mean[:-PARAMETERS])
-        return PayloadKernel(self.carrier.term.arm, step, self.load.payload, self.load.room)
+        return PayloadKernel(self._arm.arm, self.load.room)

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from lipcore.data.samples import Array
 from lipcore.model.payload import Body, Carrier, Linearised, Load
 from lipcore.online.batch import Rows
+from lipcore.online.bodies import ANY, Known, eta_of
 from lipcore.online.hypotheses import AFTER, BEFORE, CELL_S, LEAST_BEFORE, Cell, Kind, Window, cells_of
-from lipcore.online.payload import ANY, Estimate, Known, estimate, eta_of, known
+from lipcore.online.payload import Estimate, estimate, known
 from lipcore.robots.urdf import PARAMETERS
 from lipcore.vocabulary import PayloadState
 
@@ -38,9 +39,9 @@ explain more than the one that is carried, of which rows go on telling more. Bot
 PRIOR: Mapping[Kind, float] = {"payload": -12.0, "contact": -7.0, "friction": -16.0}
 """Logarithm of how probable each is to begin within a cell: a contact once a minute, a payload once in two hours, other
 friction all at once in days."""
-MOST_ROWS, BEFORE_ROWS, GROWTH = 160, 10, 1.15
+MOST_ROWS, BEFORE_ROWS, GROWTH, RENEWED = 160, 10, 1.15, 2.0
 """Rows that a payload is estimated from, evenly spread over the time since; rows before it; by how many times they have
-to grow until it is estimated again."""
+to grow until it is estimated again, and until it is from nothing."""
 TOGETHER, IN_BULK = 3, 6
 """Cells of one batch that are judged together, and of one that brings many: an instant within the last AFTER is seen
 all the same."""
@@ -62,7 +63,8 @@ KINDS: tuple[Kind, ...] = ("payload", "contact", "friction")
 class Held:
     """A payload that is carried. since: event time, s, from which on; declared: whether it was said and not only seen;
     rows: that it is estimated from, before: that came before it; every: of how many rows one is kept; count: rows that
-    it was seen on; due: their number at which it is estimated again; prior: what was known of it."""
+    it was seen on; due: their number at which it is estimated again; prior: what was known of it;
+    renewed: their number when it was last estimated from nothing."""
 
     since: float
     declared: bool
@@ -73,6 +75,7 @@ class Held:
     due: float
     prior: Known
     estimate: Estimate
+    renewed: int = 0
 
     def more(self, carrier: Carrier, rows: Rows) -> Held:
         """The same with more rows."""
@@ -84,10 +87,11 @@ class Held:
         held = replace(self, rows=kept, every=every, count=count)
         if count < self.due:
             return held
-        found = estimate(carrier, kept, self.before, self.prior, self.estimate.eta)
+        renew = count >= RENEWED * self.renewed
+        found = estimate(carrier, kept, self.before, self.prior, self.estimate, renew)
         if self.declared and np.abs((found.eta - self.prior.centre) / DECLARED).max() > WRONG:
             held, found = replace(held, declared=False, prior=ANY), estimate(carrier, kept, self.before)
-        return replace(held, due=GROWTH * count, estimate=found)
+        return replace(held, due=GROWTH * count, estimate=found, renewed=count if renew else self.renewed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +158,7 @@ class Watch:
             return self
         held = self.held
         if held is not None:
-            again = estimate(carrier, held.rows, held.before, held.prior, held.estimate.eta) if len(held.rows) else None
+            again = estimate(carrier, held.rows, held.before, held.prior, held.estimate) if len(held.rows) else None
             held = replace(held, estimate=again or known(carrier, _as_prior(held.estimate)))
         return replace(self, held=held)._around(carrier)
 
@@ -234,7 +238,7 @@ class Watch:
         if strange or np.sqrt(found.covariance[0, 0]) > least:
             return replace(self, state="contact")
         since = float(rows.time[0])
-        held = Held(since, False, rows, before, 1, len(rows), GROWTH * len(rows), ANY, found)
+        held = Held(since, False, rows, before, 1, len(rows), GROWTH * len(rows), ANY, found, len(rows))
         watch = replace(self, state="payload", since=since, held=held, recent=self.recent[-after:])
         return watch._around(carrier)
 

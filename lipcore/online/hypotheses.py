@@ -26,7 +26,8 @@ from lipcore.data.samples import Array
 from lipcore.kernels.friction import SIGN_WIDTH
 from lipcore.model.payload import Linearised
 from lipcore.online.batch import Rows
-from lipcore.online.payload import ANY, likeness, most_likely, noise_parts
+from lipcore.online.bodies import ANY, most_likely
+from lipcore.online.payload import likeness, noise_parts
 from lipcore.robots.urdf import PARAMETERS
 
 CELL_S = 0.05

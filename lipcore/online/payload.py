@@ -1,14 +1,13 @@
 """A payload estimated from the rows since it was taken up, together with what they tell of the arm.
 
-Given the variables w of the arm, N(ŵ, Σ), torque is linear in the payload's ten parameters π around its mean (see
-`lipcore.model.payload`). With H = [F, b] the features of rows and R their variance, w is integrated out:
+What is unknown are the arm's whitened variables w, with its geometry θ, and the payload's η (`bodies`). The most likely
+ones minimise
 
-    V = (Σ⁻¹ + Fᵀ R⁻¹ F)⁻¹,    Λ = bᵀ R⁻¹ b − bᵀ R⁻¹ F V Fᵀ R⁻¹ b,    ξ = bᵀ R⁻¹ r − bᵀ R⁻¹ F V Fᵀ R⁻¹ r,
+    E = ½ |e|² + ½ |m(w, θ)|² + ½ (η − η₀)ᵀ P (η − η₀),
 
-is all that the rows say of π. A body that can exist has a positive mass and a positive definite second moment: π is a
-function of ten free numbers η, log mass, centre of mass and the Cholesky factor of the spread about it, which have a
-Gaussian prior. The most likely η is found by Levenberg's and Marquardt's method; its covariance is Laplace's; the rows
-are linearised anew around it until it stays.
+where e is what the rows' torque is off, whitened by the covariance of their errors, and m what the arm's training says
+(`lipcore.model.memory`). Torque is linearised around each step (`lipcore.model.payload`), steps are Levenberg's and
+Marquardt's, and the covariance is that of the linear model around the last one (Laplace).
 """
 
 from __future__ import annotations
@@ -17,64 +16,32 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.linalg import solve_triangular
+from scipy.linalg import qr, solve_triangular
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
-from lipcore.model.payload import Body, Carrier, Linearised, Load
+from lipcore.kernels.arm_prior import Alternative
+from lipcore.kernels.geometry import Geometry
+from lipcore.model.payload import Carrier, Linearised, Load
 from lipcore.online.batch import Rows
+from lipcore.online.bodies import ANY, WIDTH, Known, body, inverse
 from lipcore.robots.urdf import PARAMETERS
 
-CENTRE = np.array([0.0, 0, 0, 0, *[np.log(0.04)] * 3, 0, 0, 0])
-WIDTH = np.array([1.2, 0.15, 0.15, 0.15, 0.7, 0.7, 0.7, 0.03, 0.03, 0.03])
-"""Prior of η: log kg; m; log m; m. Nineteen of twenty payloads weigh 0.1 to 10 kg, lie within 0.3 m of the last
-link's frame and spread over 1 to 16 cm."""
-ROUNDS, STILL = 6, 0.05
-"""Linearisations at most, and the change in standard deviations from which on there is no other."""
-STEPS, DAMPING = 50, 1e-3
+FIRST, ROUNDS, STILL = 30, 8, 1e-3
+"""Steps at most of an estimate from nothing, and of one that begins at another; and the least that one gains, nats."""
+DAMPING, LESS, MORE = 1e-3, 0.15, 8.0
+"""At first, as a share of the curvature; its factors after a step that gains, and after one that does not."""
+LEAST_DAMPING, WORST = 1e-9, 1e8
+"""It is not less; and from which on nothing is gained."""
+REACH = 0.5
+"""Longest step of the geometry, rad or m."""
+DRAWS, SEED, LINEAR = 6, 0, 2.0
+"""Places in the posterior by which it is judged how far it is from linear; and up to which mean square of theirs, in
+deviations of the linear one, it is as good as that."""
 LIKE = 0.3, 0.3
 """See `likeness`. Chosen on the dirty Panda of seed 50 among three pairs."""
-LEAST_EXTENT = 1e-3
-"""Of a body, m: none is a point."""
 LEAST_WHITE = 1e-3
 """Share of the noise's variance that is new in every row at least."""
-
-
-def body(eta: Array) -> tuple[Array, Array]:
-    """The ten parameters of η, (10,), and their derivative, (10, 10)."""
-    mass, com, scale = np.exp(eta[0]), eta[1:4], np.exp(eta[4:7])
-    root = np.zeros((3, 3))
-    root[DIAGONAL], root[BELOW] = scale, eta[7:]
-    inertia = INERTIA @ (root @ root.T + com[:, None] * com).reshape(-1)
-    out = np.concatenate([[1.0], com, inertia]) * mass
-    slope = np.zeros((PARAMETERS, PARAMETERS))
-    slope[:, 0] = out
-    slope[[1, 2, 3], [1, 2, 3]] = mass
-    # of C Cᵀ + E Eᵀ, twice the symmetric part of what its left factor changes by
-    slope[4:, 1:4] = 2 * mass * (INERTIA.reshape(6, 3, 3) @ com)
-    rows, columns = np.concatenate([DIAGONAL, BELOW], axis=1)
-    change = 2 * mass * (INERTIA.reshape(6, 3, 3) @ root)[:, rows, columns]
-    change[:, :3] *= scale
-    slope[4:, 4:] = change
-    return out, slope
-
-
-DIAGONAL, BELOW = (np.arange(3), np.arange(3)), (np.array([1, 2, 2]), np.array([0, 0, 1]))
-_UNITS = np.eye(9).reshape(9, 3, 3)
-INERTIA = np.array([(np.trace(unit) * np.eye(3) - 0.5 * (unit + unit.T))[np.tril_indices(3)] for unit in _UNITS]).T
-"""What makes xx, xy, yy, xz, yz, zz of a second moment, flat: tr(S) 1 − S, symmetrised, (6, 9)."""
-
-
-@dataclass(frozen=True)
-class Known:
-    """What is known of η before the rows: N(centre, precision⁻¹), (10,) and (10, 10)."""
-
-    centre: Array
-    precision: Array
-
-
-ANY = Known(CENTRE, np.diag(WIDTH**-2.0))
-"""Of a payload of which nothing is known."""
 
 
 @dataclass(frozen=True)
@@ -96,82 +63,194 @@ class Estimate:
 def known(carrier: Carrier, prior: Known) -> Estimate:
     """A payload of which no more is known than beforehand."""
     payload, slope = body(prior.centre)
-    spread = _inverse(prior.precision)
+    spread = inverse(prior.precision)
     return Estimate(prior.centre, spread, carrier.known(payload, slope @ spread @ slope.T), 0.0)
 
 
-def eta_of(carried: Body) -> Array:
-    """η of a body, (10,): one without extent has a little."""
-    inertia = np.zeros((3, 3)) if carried.inertia is None else carried.inertia
-    spread = (0.5 * np.trace(inertia) * np.eye(3) - inertia) / carried.mass
-    root = np.linalg.cholesky(spread + LEAST_EXTENT**2 * np.eye(3))
-    return np.concatenate([[np.log(carried.mass)], carried.com, np.log(root[DIAGONAL]), root[BELOW]])
-
-
 def estimate(
-    carrier: Carrier, rows: Rows, before: Rows | None = None, prior: Known = ANY, start: Array | None = None
+    carrier: Carrier,
+    rows: Rows,
+    before: Rows | None = None,
+    prior: Known = ANY,
+    start: Estimate | None = None,
+    renew: bool = True,
 ) -> Estimate:
-    """The payload that rows carry. before: rows that do not, whose errors tell those of the first that do; start: η to
-    begin at, where it is known roughly."""
-    everything = rows if before is None or not len(before) else Rows.concatenate([before, rows])
-    free = len(everything) - len(rows)
-    roots = correlation_roots(carrier, everything)
-    mean, size = carrier.mean, len(carrier.mean)
-    root = carrier.covariance_root
-    empty = carrier.known(np.zeros(PARAMETERS))
-    unloaded = _Rows.of(carrier, empty, everything.take(slice(0, free)), mean) if free else None
-    if unloaded is not None:
-        unloaded.features[size:] = 0.0
-    eta = prior.centre if start is None else start
-    load = empty if start is None else carrier.known(body(eta)[0])
-    for _ in range(ROUNDS):
-        loaded = _Rows.of(carrier, load, rows, mean)
-        features, residual = _whitened(roots, loaded if unloaded is None else unloaded.then(loaded))
-        information, score = features @ features.T, features @ residual
-        arm, cross = information[:size, :size], information[:size, size:]
-        inner = np.linalg.cholesky(np.eye(size) + root.T @ arm @ root)
-        half = solve_triangular(inner, root.T, lower=True, check_finite=False)
-        open_ = half.T @ half  # (Σ⁻¹ + Fᵀ R⁻¹ F)⁻¹
-        told = information[size:, size:] - cross.T @ open_ @ cross
-        pull = score[size:] - cross.T @ open_ @ score[:size]
-        last = eta
-        eta, spread, slope, gain = most_likely(told, pull, prior, eta)
-        payload = body(eta)[0]
-        of_payload = slope @ spread @ slope.T
-        back = -open_ @ cross
-        joint = np.empty((size + PARAMETERS,) * 2)
-        joint[:size, :size] = open_ + back @ of_payload @ back.T
-        joint[:size, size:] = back @ of_payload
-        joint[size:, :size] = joint[:size, size:].T
-        joint[size:, size:] = of_payload
-        room = PARAMETERS * np.diagonal(slope @ np.linalg.inv(prior.precision) @ slope.T)
-        w = mean + open_ @ score[:size] + back @ payload
-        left = residual - features.T @ np.concatenate([w - mean, payload])
-        load = Load(np.concatenate([w, payload]), joint, room)
-        if np.sqrt(np.max((eta - last) ** 2 / np.diagonal(spread))) < STILL:
+    """The payload that rows carry. before: rows that do not, whose errors tell those of the first that do; start:
+    another estimate by the same carrier, or by another revision of its version, to begin at; renew: whether to begin
+    from nothing, too, and to see how far from linear the posterior is, which else is as of the start."""
+    problem = _Problem.of(carrier, rows, before, prior)
+    renew = renew or start is None or start.load.geometry is None
+    found = [] if start is None else [_minimum(problem, problem.start(start), ROUNDS)]
+    if renew:
+        found.append(_minimum(problem, problem.start(None), FIRST))
+    at = min(found, key=lambda each: each.energy)
+    size = len(carrier.mean)
+    # not from the curvature, of whose condition the root is enough: a covariance above the prior's is none
+    root = solve_triangular(qr(at.derivative, mode="r")[0][: size + PARAMETERS], np.eye(size + PARAMETERS))
+    payload, slope = body(at.eta)
+    outward = np.zeros((size + PARAMETERS, size + PARAMETERS))
+    outward[:size, :size], outward[size:, size:] = carrier.memory.root, slope
+    outward = outward @ root
+    room = PARAMETERS * np.diagonal(slope @ inverse(prior.precision) @ slope.T)
+    load = Load(np.concatenate([at.w, payload]), outward @ outward.T, room, at.geometry)
+    if at.geometry is not None:
+        load = replace(load, others=_others(problem, at, root) if renew or start is None else start.load.others)
+    of_eta = max(1.0, at.misfit) * root[size:] @ root[size:].T
+    return Estimate(at.eta, of_eta, load, problem.gain(at))
+
+
+def _minimum(problem: _Problem, at: _Point, rounds: int, shift: Array | float = 0.0) -> _Point:
+    """Where the energy is least, or what is reached in so many steps; shift: what the residuals should be."""
+    damping, carrier = DAMPING, problem.carrier
+    for _ in range(rounds):
+        off = at.residual - shift
+        energy = 0.5 * float(off @ off)
+        curvature, gradient = at.derivative.T @ at.derivative, at.derivative.T @ off
+        while damping < WORST:
+            step = np.asarray(np.linalg.solve(curvature + damping * np.diag(np.diagonal(curvature)), -gradient))
+            trial = problem.at(*at.moved(carrier, step))
+            left = trial.residual - shift
+            gained = energy - 0.5 * float(left @ left)
+            if gained >= 0:
+                break
+            damping *= MORE
+        else:
             break
-    # what an arm that is linear in its geometry gets wrong, its posterior does not say
-    bent = Linearised(carrier, load).bend(rows.motion())
-    load = replace(load, floor=(bent**2).mean(axis=0))
-    return Estimate(eta, max(1.0, float((left**2).mean())) * spread, load, gain)
+        at, damping = trial, max(LESS * damping, LEAST_DAMPING)
+        if gained < STILL:
+            break
+    return at
 
 
-@dataclass(frozen=True)
-class _Rows:
-    """Features of rows around a load, (M + 10, N, n), and what the mean of the arm leaves of their torque, (N, n)."""
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """An arm and its payload. w: (M,); geometry: of the arm; eta: (10,); residual, derivative: of the energy, by the
+    arm's whitened steps and η; misfit: mean square of the rows' part."""
 
-    features: Array
+    w: Array
+    geometry: Geometry | None
+    eta: Array
     residual: Array
+    derivative: Array
+    misfit: float
+
+    @property
+    def energy(self) -> float:
+        return 0.5 * float(self.residual @ self.residual)
+
+    def moved(self, carrier: Carrier, step: Array) -> tuple[Array, Geometry | None, Array]:
+        """w, geometry and η a step away, or as far in its direction as they go at once."""
+        size, steps = len(self.w), carrier.steps
+        by, eta = carrier.memory.root @ step[:size], step[size:]
+        longest = np.abs(eta / WIDTH).max() / 2
+        if steps.stop > steps.start:
+            longest = max(longest, np.abs(carrier.root[steps] * by[steps]).max() / REACH)
+        by, eta = by / max(1.0, longest), eta / max(1.0, longest)
+        w, arm, geometry = self.w + by, carrier.term.arm, self.geometry
+        if geometry is not None:
+            geometry = geometry.moved(carrier.root[steps] * by[steps])
+            w[steps] = (arm.geometry.towards(geometry) - arm.expected) / carrier.root[steps]
+        return w, geometry, self.eta + eta
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """What is minimised. roots: see `correlation_roots`, of both kinds of rows."""
+
+    carrier: Carrier
+    rows: Rows
+    before: Rows | None
+    prior: Known
+    roots: Array
 
     @classmethod
-    def of(cls, carrier: Carrier, load: Load, rows: Rows, mean: Array) -> _Rows:
-        features, base = Linearised(carrier, load).rows(rows.motion())
-        return cls(features, rows.tau - base - np.tensordot(mean, features[: len(mean)], axes=1))
+    def of(cls, carrier: Carrier, rows: Rows, before: Rows | None, prior: Known) -> _Problem:
+        before = before if before is not None and len(before) else None
+        roots = correlation_roots(carrier, rows if before is None else Rows.concatenate([before, rows]))
+        return cls(carrier, rows, before, prior, roots)
 
-    def then(self, other: _Rows) -> _Rows:
-        return _Rows(
-            np.concatenate([self.features, other.features], axis=1), np.concatenate([self.residual, other.residual])
+    def start(self, start: Estimate | None) -> _Point:
+        """Where to begin."""
+        carrier = self.carrier
+        if start is None or start.load.geometry is None or len(start.load.mean) != len(carrier.mean) + PARAMETERS:
+            geometry = carrier.term.arm.geometry.moved(carrier.step) if carrier.term.arm.steps else None
+            return self.at(carrier.mean, geometry, self.prior.centre if start is None else start.eta)
+        return self.at(start.load.mean[:-PARAMETERS], start.load.geometry, start.eta)
+
+    def at(self, w: Array, geometry: Geometry | None, eta: Array) -> _Point:
+        """The energy of an arm and its payload."""
+        carrier, memory = self.carrier, self.carrier.memory
+        payload, slope = body(eta)
+        loaded, free = (_around(carrier, w, geometry, carried) for carried in (payload, np.zeros(PARAMETERS)))
+        features, torque = _rows(loaded, self.rows.motion())
+        off = torque - self.rows.tau
+        if self.before is not None:
+            others, torque = _rows(free, self.before.motion())
+            others[-PARAMETERS:] = 0.0
+            features, off = np.concatenate([others, features], axis=1), np.concatenate([torque - self.before.tau, off])
+        features, off = _whitened(self.roots, features, off)
+        remembered, torque = _rows(free, Motion.from_arrays(*memory.motions.swapaxes(0, 1)))
+        root, size = np.linalg.cholesky(self.prior.precision).T, len(w)
+        by_arm = np.concatenate([memory.derivative(remembered[:size]), features[:size].T @ memory.root])
+        derivative = np.zeros((len(by_arm) + len(eta), size + len(eta)))
+        derivative[: len(by_arm), :size] = by_arm
+        derivative[len(by_arm) - len(off) : len(by_arm), size:] = features[size:].T @ slope
+        derivative[len(by_arm) :, size:] = root
+        residual = np.concatenate([memory.residual(w, torque), off, root @ (eta - self.prior.centre)])
+        return _Point(w, geometry, eta, residual, derivative, float((off**2).mean()))
+
+    def gain(self, at: _Point) -> float:
+        """Nats by which a payload explains the rows better than the arm does without one, that is linear then."""
+        carrier, memory = self.carrier, self.carrier.memory
+        free = Linearised(carrier, carrier.known(np.zeros(PARAMETERS)))
+        parts = [_rows(free, each.motion()) for each in (self.before, self.rows) if each is not None]
+        features, torque = (np.concatenate(each, axis=-2) for each in zip(*parts, strict=True))
+        tau = np.concatenate([each.tau for each in (self.before, self.rows) if each is not None])
+        features, off = _whitened(self.roots, features, torque - tau)
+        along = features[: len(at.w)].T @ memory.root
+        curvature = np.eye(len(at.w)) + along.T @ along
+        explained = along.T @ off
+        alone = memory.residual(carrier.mean, memory.base + np.tensordot(carrier.mean, memory.features, axes=1))
+        free_energy = 0.5 * float(alone @ alone + off @ off - explained @ np.linalg.solve(curvature, explained))
+        volume = np.linalg.slogdet(at.derivative.T @ at.derivative)[1] - np.linalg.slogdet(self.prior.precision)[1]
+        return free_energy - at.energy + 0.5 * float(np.linalg.slogdet(curvature)[1] - volume)
+
+
+def _around(carrier: Carrier, w: Array, geometry: Geometry | None, payload: Array) -> Linearised:
+    nothing = np.zeros((0, 0))
+    return Linearised(carrier, Load(np.concatenate([w, payload]), nothing, np.ones(PARAMETERS), geometry))
+
+
+def _rows(around: Linearised, motion: Motion) -> tuple[Array, Array]:
+    """Features of (w, π) at N instants, (M + 10, N, n), and the torque of the load's mean, (N, n) N·m."""
+    features, base = around.rows(motion)
+    return features, base + np.tensordot(around.load.mean, features, axes=1)
+
+
+def _others(problem: _Problem, at: _Point, root: Array) -> tuple[Alternative, ...]:
+    """Places in the posterior where it is far from linear, with the most likely one; none where it is not.
+
+    Few rows leave a curved valley open, along which a centre of mass and the geometry make up for each other, and the
+    linear posterior is tangent to it at one place. Others are the minima for other noise (randomised maximum
+    likelihood, Kitanidis 1995, Oliver et al. 1996). root: of the covariance of whitened steps.
+    """
+    carrier, draw = problem.carrier, np.random.default_rng(SEED)
+    off, found = [], [at]
+    for _ in range(DRAWS):
+        begin = problem.at(*at.moved(carrier, root @ draw.standard_normal(len(root))))
+        there = _minimum(problem, begin, ROUNDS, draw.standard_normal(len(at.residual)))
+        step = np.append(
+            solve_triangular(carrier.memory.root, there.w - at.w, lower=True, check_finite=False), there.eta - at.eta
         )
+        off.append(float((solve_triangular(root, step, check_finite=False) ** 2).mean()))
+        found.append(there)
+    if carrier.model.posterior.basis.term is not None or np.mean(off) < LINEAR:
+        return ()
+    arms = []
+    for each in found:
+        assert each.geometry is not None
+        arms.append(carrier.alternative(each.w, each.geometry, body(each.eta)[0], 1 / len(found)))
+    return tuple(arms)
 
 
 def noise_parts(carrier: Carrier, motion: Motion) -> tuple[Array, Array, Array]:
@@ -205,46 +284,11 @@ def correlation_roots(carrier: Carrier, rows: Rows) -> Array:
     return np.asarray(np.linalg.cholesky(covariance))
 
 
-def _whitened(roots: Array, rows: _Rows) -> tuple[Array, Array]:
+def _whitened(roots: Array, features: Array, residual: Array) -> tuple[Array, Array]:
     """Features (M + 10, N n) and residuals (N n,) whose errors are independent, of variance one."""
-    both = np.concatenate([rows.features, rows.residual[None]]).transpose(2, 1, 0)
+    both = np.concatenate([features, residual[None]]).transpose(2, 1, 0)
     solved = torch.linalg.solve_triangular(
         torch.from_numpy(roots), torch.from_numpy(np.ascontiguousarray(both)), upper=False
     )
     flat = solved.numpy().reshape(-1, both.shape[2]).T
     return flat[:-1], flat[-1]
-
-
-def most_likely(told: Array, pull: Array, prior: Known, start: Array) -> tuple[Array, Array, Array, float]:
-    """η that minimises ½ πᵀ Λ π − ξᵀ π + prior; its covariance, the slope there, and the evidence gained, nats."""
-
-    def cost(eta: Array) -> float:
-        payload, off = body(eta)[0], eta - prior.centre
-        return float(0.5 * payload @ told @ payload - pull @ payload + 0.5 * off @ prior.precision @ off)
-
-    eta, damping = start, DAMPING
-    value = cost(eta)
-    payload, slope = body(eta)
-    for _ in range(STEPS):
-        gradient = slope.T @ (told @ payload - pull) + prior.precision @ (eta - prior.centre)
-        curvature = slope.T @ told @ slope + prior.precision
-        step = -np.linalg.solve(curvature + damping * np.diag(np.diagonal(curvature)), gradient)
-        step = step * min(1.0, 2.0 / max(float(np.abs(step / WIDTH).max()), 1e-300))
-        trial = cost(eta + step)
-        if trial > value:
-            damping *= 10.0
-            if damping > 1e8:
-                break
-            continue
-        done = value - trial < 1e-9 * (1 + abs(value))
-        eta, value, damping = eta + step, trial, max(0.1 * damping, 1e-9)
-        payload, slope = body(eta)
-        if done:
-            break
-    curvature = slope.T @ told @ slope + prior.precision
-    volume = np.linalg.slogdet(curvature)[1] - np.linalg.slogdet(prior.precision)[1]
-    return eta, _inverse(curvature), slope, -value - 0.5 * float(volume)
-
-
-def _inverse(matrix: Array) -> Array:
-    return np.asarray(np.linalg.inv(matrix), np.float64)

@@ -9,7 +9,8 @@ import lipcore
 from lipcore.fitting.options import FitOptions
 from lipcore.model.payload import Body, Carrier, Linearised, NoArmError
 from lipcore.online.batch import Rows
-from lipcore.online.payload import ANY, body, estimate, eta_of, known
+from lipcore.online.bodies import ANY, body, eta_of
+from lipcore.online.payload import estimate, known
 from lipcore.robots.library import load_robot, pinocchio
 from lipcore.robots.simulation import Payload, Stream, inverse_dynamics, simulate
 from lipcore.robots.urdf import RigidBody

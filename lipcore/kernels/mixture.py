@@ -1,0 +1,82 @@
+"""The kernel of other arms: what those that explain samples nearly as well have more torque than the first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Array
+from lipcore.kernels.arm_prior import Alternative
+from lipcore.kernels.base import LinearKernel, Params, Regressor
+from lipcore.kernels.compiled.arm import arm_differences
+from lipcore.kernels.friction import friction_features
+
+
+class MixtureKernel(LinearKernel):
+    """tau = Σ c_k δ_k, where δ_k = τ_k − τ_0 is the torque of arm k less that of the first.
+
+    With c one of the K others or none, by their probabilities p, c has mean p and covariance C = diag p − p pᵀ = L Lᵀ,
+    so that the sum has the mean and the variance of the mixture of arms. The features are Lᵀ δ, whose weights L⁻¹ c,
+    (K,), are independent with variance one.
+
+    arms: the first one and the others, K + 1; order: (n,), the data's joint at each place of the chain; stribeck:
+    whether their friction has its fourth term.
+    """
+
+    def __init__(self, arms: Sequence[Alternative], order: NDArray[np.int64], stribeck: bool) -> None:
+        self.n_joints, self.size = len(order), len(arms) - 1
+        self._order, self._stribeck = order.astype(np.int64), stribeck
+        shares = np.array([each.probability for each in arms[1:]])
+        mixing = np.ascontiguousarray(np.linalg.cholesky(np.diag(shares) - np.outer(shares, shares)))
+        self._mean = torch.from_numpy(np.linalg.solve(mixing, shares))
+        self._arms = (
+            mixing,
+            np.stack([each.geometry.constants for each in arms]),
+            arms[0].geometry.gravity,
+            np.stack([each.parameters for each in arms]),
+            np.stack([np.concatenate([each.rotor[:, None], each.friction], axis=1) for each in arms]),
+        )
+
+    def rows(self, motions: Array) -> Array:
+        """Φᵀ of N motions (N, 3, n): (N, K, n)."""
+        friction = friction_features(torch.from_numpy(motions[:, 1]), self._stribeck).numpy()
+        linear = np.ascontiguousarray(np.concatenate([motions[:, 2, :, None], friction.transpose(1, 2, 0)], axis=2))
+        out = np.empty((len(motions), self.size, self.n_joints))
+        arm_differences(*self._arms, self._order, motions, linear, out)
+        return out
+
+    def features(self, x: Motion) -> Tensor:
+        """Φ at each sample: (N, n, K)."""
+        return torch.from_numpy(np.ascontiguousarray(self.rows(x.arrays()).transpose(0, 2, 1))).to(x.device)
+
+    def regressor(self) -> Regressor:
+        """The same features of one query, for serving."""
+        return MixtureRegressor(self)
+
+    def covariance(self, params: Params) -> Tensor:
+        """Prior variances of the weights on the diagonal: (K, K)."""
+        return torch.eye(self.size, dtype=torch.float64)
+
+    def prior_weights(self) -> Tensor | None:
+        """Prior mean of the weights, (K,)."""
+        return self._mean
+
+    def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
+        """No hyperparameters."""
+        return {}
+
+
+class MixtureRegressor(Regressor):
+    """Features of `MixtureKernel`, one query at a time."""
+
+    def __init__(self, kernel: MixtureKernel) -> None:
+        self.n_joints, self.size, self._kernel = kernel.n_joints, kernel.size, kernel
+
+    def fill(self, motion: Array, out: Array) -> None:
+        """Write Φᵀ of the query, (K, n)."""
+        out[:] = self._kernel.rows(motion[None])[0]
