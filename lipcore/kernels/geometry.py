@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lipcore.data.motion import check_joint_types
 from lipcore.data.samples import Array
@@ -136,29 +137,29 @@ class Geometry:
     def _moved(self, step: Array) -> tuple[Array, Array]:
         """Rotation and translation a step away."""
         numbers = np.zeros((self.n_joints, 1, 4))
-        numbers[np.arange(4) < np.reshape(self.screws, (-1, 1, 1))] = step
+        numbers[:, 0][self._counted] = step
         turn, shift = (numbers[..., part] @ self.across for part in (slice(0, 2), slice(2, 4)))
         translation = self.translation + (self.rotation @ shift.mT)[..., 0]
         return self.rotation @ rotation_of(turn[:, 0]), translation
 
     def towards(self, other: Geometry) -> Array:
         """The step, (g,), that leads to another geometry of the same joints, to first order in what lies between."""
-        step: list[float] = []
-        for j, count in enumerate(self.screws):
-            if count:
-                step += (self.across[j] @ turn_of(self.rotation[j].T @ other.rotation[j])).tolist()
-            if count == 4:
-                step += (self.across[j] @ (self.rotation[j].T @ (other.translation[j] - self.translation[j]))).tolist()
-        return np.array(step)
+        turn = turn_of(self.rotation.mT @ other.rotation)
+        return self._step(turn, self.rotation.mT @ (other.translation - self.translation)[..., None])
 
     def shifts(self) -> Array:
         """Where each axis lies across itself, seen from the frame before: (g,) m, zero in the place of turns."""
-        step: list[float] = []
-        for j, count in enumerate(self.screws):
-            step += [0.0] * min(count, 2)
-            if count == 4:
-                step += (self.across[j] @ (self.rotation[j].T @ self.translation[j])).tolist()
-        return np.array(step)
+        return self._step(np.zeros_like(self.translation), self.rotation.mT @ self.translation[..., None])
+
+    def _step(self, turn: Array, shift: Array) -> Array:
+        """The numbers of turns (n, 3) and shifts (n, 3, 1) of the joints' frames, seen from there."""
+        numbers = np.concatenate([self.across @ turn[..., None], self.across @ shift], axis=1)[..., 0]
+        return np.asarray(numbers[self._counted])
+
+    @cached_property
+    def _counted(self) -> NDArray[np.bool_]:
+        """Which of the four numbers of each joint there are, (n, 4)."""
+        return np.arange(4) < np.reshape(self.screws, (-1, 1))
 
     def canonical(self) -> Geometry:
         """The same arm with each frame where its axis comes closest to the frame before, and the first at the base.
@@ -212,7 +213,7 @@ def rotation_of(turn: Array) -> Array:
 
 
 def turn_of(rotation: Array) -> Array:
-    """The vector (3,) rad that `rotation_of` makes this rotation of, shorter than π."""
+    """The vector (…, 3) rad that `rotation_of` makes this rotation (…, 3, 3) of, shorter than π."""
     from scipy.spatial.transform import Rotation  # noqa: PLC0415 - serving does without it
 
     return np.asarray(Rotation.from_matrix(rotation).as_rotvec())

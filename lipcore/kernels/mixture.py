@@ -22,14 +22,16 @@ class MixtureKernel(LinearKernel):
 
     With c one of the K others or none, by their probabilities p, c has mean p and covariance C = diag p − p pᵀ = L Lᵀ,
     so that the sum has the mean and the variance of the mixture of arms. The features are Lᵀ δ, whose weights L⁻¹ c,
-    (K,), are independent with variance one.
+    (K,), are independent with variance one, or a larger one where a few arms stand for many.
 
     arms: the first one and the others, K + 1; order: (n,), the data's joint at each place of the chain; stribeck:
-    whether their friction has its fourth term.
+    whether their friction has its fourth term; variance: of the weights.
     """
 
-    def __init__(self, arms: Sequence[Alternative], order: NDArray[np.int64], stribeck: bool) -> None:
-        self.n_joints, self.size = len(order), len(arms) - 1
+    def __init__(
+        self, arms: Sequence[Alternative], order: NDArray[np.int64], stribeck: bool, variance: float = 1.0
+    ) -> None:
+        self.n_joints, self.size, self._variance = len(order), len(arms) - 1, variance
         self._order, self._stribeck = order.astype(np.int64), stribeck
         shares = np.array([each.probability for each in arms[1:]])
         mixing = np.ascontiguousarray(np.linalg.cholesky(np.diag(shares) - np.outer(shares, shares)))
@@ -60,7 +62,7 @@ class MixtureKernel(LinearKernel):
 
     def covariance(self, params: Params) -> Tensor:
         """Prior variances of the weights on the diagonal: (K, K)."""
-        return torch.eye(self.size, dtype=torch.float64)
+        return self._variance * torch.eye(self.size, dtype=torch.float64)
 
     def prior_weights(self) -> Tensor | None:
         """Prior mean of the weights, (K,)."""

@@ -18,12 +18,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lipcore.data.metrics import quantile
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.fitting.estimators import Estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative
-from lipcore.kernels.base import LinearKernel
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.kernels.geometry import Geometry
 from lipcore.kernels.mixture import MixtureKernel
@@ -219,6 +219,25 @@ class Carrier:
         """Prior standard deviations of the weights, the diagonal of the basis' root, (M,)."""
         return np.asarray(self.model.posterior.basis.root.diagonal().numpy())
 
+    def rest(self, motion: Motion) -> tuple[Array, Array]:
+        """Of N instants: features of w, (M, N, n), zero where they are the arm's; what other terms expect, (N, n)."""
+        posterior, base = self.model.posterior, np.zeros(motion.q.shape)
+        out = np.zeros((len(self.mean), *base.shape))
+        for kernel in posterior.basis.linear:
+            if kernel is self.term:
+                continue
+            features, weights = kernel.features(motion).numpy(), kernel.prior_weights()
+            places = posterior.basis.rows(kernel)
+            out[places] = features.transpose(2, 0, 1) * self.root[places][:, None, None]
+            if weights is not None:
+                base += features @ weights.numpy()
+        if posterior.basis.term is not None:
+            # of the nonlinear term, whose torques are whitened by a root that is not diagonal
+            whitened, _ = posterior.basis.features_and_uncovered(motion)
+            count = len(posterior.basis.outputs)
+            out[:count] = whitened[:count].reshape(-1, *base.shape).numpy()
+        return out, base
+
     def known(self, body: Array, spread: Array | None = None) -> Load:
         """A payload of ten parameters that is known, with a covariance of (10, 10); exactly where None."""
         size = len(self.mean)
@@ -268,35 +287,25 @@ class Linearised:
         """Its variables: w, π over the root of its room, and those of other arms."""
         basis = self.carrier.model.posterior.basis
         own = self._payload.covariance(basis.params).diagonal().sqrt().diag()
-        linear, roots = list(self._linear), [basis.root, own]
+        linear = [self._arm if each is self.carrier.term else each for each in basis.linear]
+        linear, roots = [*linear, self._payload], [basis.root, own]
         if self._others is not None:
             linear.append(self._others)
-            roots.append(torch.eye(self._others.size, dtype=torch.float64))
+            roots.append(self._others.covariance(basis.params).sqrt())
         root: Tensor = torch.block_diag(*roots)  # type: ignore[no-untyped-call]
         return replace(basis, linear=tuple(linear), root=root)
 
-    def rows(self, motion: Motion) -> tuple[Array, Array]:
-        """Of N instants: features of (w, π), (M + 10, N, n), and the torque where both are zero, (N, n) N·m."""
-        parts, mean = [], np.zeros(motion.q.shape)
-        for kernel in self._linear:
-            features, weights = kernel.features(motion).numpy(), kernel.prior_weights()
-            parts.append(features)
-            if weights is not None:
-                mean += features @ weights.numpy()
-        own = np.concatenate(parts, axis=2).transpose(2, 0, 1)
-        own = own * np.append(self.carrier.root[-(len(own) - PARAMETERS) :], np.ones(PARAMETERS))[:, None, None]
-        basis = self.carrier.model.posterior.basis
-        if basis.term is None:
-            return own, mean
-        # of the nonlinear term, whose torques are whitened by a root that is not diagonal
-        whitened, _ = basis.features_and_uncovered(motion)
-        nonlinear = whitened[: len(basis.outputs)].reshape(-1, *motion.q.shape)
-        return np.concatenate([nonlinear.numpy(), own]), mean
-
-    @cached_property
-    def _linear(self) -> tuple[LinearKernel, ...]:
-        terms = self.carrier.model.posterior.basis.linear
-        return (*(self._arm if each is self.carrier.term else each for each in terms), self._payload)
+    def rows(self, motion: Motion, rest: tuple[Array, Array] | None = None) -> tuple[Array, Array]:
+        """Of N instants: features of (w, π), (M + 10, N, n), and the torque where both are zero, (N, n) N·m. rest: what
+        `Carrier.rest` has for the same instants, where that is at hand."""
+        features, base = self.carrier.rest(motion) if rest is None else rest
+        places, centre = self.carrier.rows, self._arm.prior_weights()
+        of_arm = self._arm.features(motion).numpy()
+        out = np.empty((len(features) + PARAMETERS, *base.shape))
+        out[: places.start], out[places.stop : -PARAMETERS] = features[: places.start], features[places.stop :]
+        out[places] = of_arm.transpose(2, 0, 1) * self.carrier.root[places][:, None, None]
+        out[-PARAMETERS:] = self._payload.rows(motion.arrays()).transpose(1, 0, 2)
+        return out, base if centre is None else base + of_arm @ centre.numpy()
 
     @cached_property
     def _arm(self) -> ArmKernel:
@@ -316,8 +325,16 @@ class Linearised:
     @cached_property
     def _others(self) -> MixtureKernel | None:
         arm = self.carrier.term.arm
-        return MixtureKernel(self.load.others, arm.order, arm.stribeck) if self.load.others else None
+        others, count = self.load.others, len(self.load.others) - 1
+        return MixtureKernel(others, arm.order, arm.stribeck, _of_few(count)) if others else None
 
     @cached_property
     def _payload(self) -> PayloadKernel:
         return PayloadKernel(self._arm.arm, self.load.room)
+
+
+def _of_few(count: int) -> float:
+    """How many times their variance so many draws have to be taken for, so that 95 % intervals hold: Student's t."""
+    from scipy.stats import t  # noqa: PLC0415 - serving does without it
+
+    return float((t.ppf(0.975, count) / quantile(0.95)) ** 2)

@@ -39,7 +39,7 @@ explain more than the one that is carried, of which rows go on telling more. Bot
 PRIOR: Mapping[Kind, float] = {"payload": -12.0, "contact": -7.0, "friction": -16.0}
 """Logarithm of how probable each is to begin within a cell: a contact once a minute, a payload once in two hours, other
 friction all at once in days."""
-MOST_ROWS, BEFORE_ROWS, GROWTH, RENEWED = 160, 10, 1.15, 2.0
+MOST_ROWS, BEFORE_ROWS, GROWTH, ANEW = 100, 10, 1.25, 2.0
 """Rows that a payload is estimated from, evenly spread over the time since; rows before it; by how many times they have
 to grow until it is estimated again, and until it is from nothing."""
 TOGETHER, IN_BULK = 3, 6
@@ -64,7 +64,7 @@ class Held:
     """A payload that is carried. since: event time, s, from which on; declared: whether it was said and not only seen;
     rows: that it is estimated from, before: that came before it; every: of how many rows one is kept; count: rows that
     it was seen on; due: their number at which it is estimated again; prior: what was known of it;
-    renewed: their number when it was last estimated from nothing."""
+    begun: their number when it was last estimated from nothing."""
 
     since: float
     declared: bool
@@ -75,7 +75,7 @@ class Held:
     due: float
     prior: Known
     estimate: Estimate
-    renewed: int = 0
+    begun: int = 0
 
     def more(self, carrier: Carrier, rows: Rows) -> Held:
         """The same with more rows."""
@@ -87,11 +87,11 @@ class Held:
         held = replace(self, rows=kept, every=every, count=count)
         if count < self.due:
             return held
-        renew = count >= RENEWED * self.renewed
-        found = estimate(carrier, kept, self.before, self.prior, self.estimate, renew)
+        anew = count >= ANEW * self.begun
+        found = estimate(carrier, kept, self.before, self.prior, self.estimate, anew)
         if self.declared and np.abs((found.eta - self.prior.centre) / DECLARED).max() > WRONG:
             held, found = replace(held, declared=False, prior=ANY), estimate(carrier, kept, self.before)
-        return replace(held, due=GROWTH * count, estimate=found, renewed=count if renew else self.renewed)
+        return replace(held, due=GROWTH * count, estimate=found, begun=count if anew else self.begun)
 
 
 @dataclass(frozen=True, eq=False)

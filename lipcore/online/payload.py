@@ -35,9 +35,9 @@ LEAST_DAMPING, WORST = 1e-9, 1e8
 """It is not less; and from which on nothing is gained."""
 REACH = 0.5
 """Longest step of the geometry, rad or m."""
-DRAWS, SEED, LINEAR = 6, 0, 2.0
-"""Places in the posterior by which it is judged how far it is from linear; and up to which mean square of theirs, in
-deviations of the linear one, it is as good as that."""
+PLACES, RENEWED, SEED, LINEAR = 8, 2, 0, 2.0
+"""Places in the posterior by which it is judged how far it is from linear; how many are looked for again with more
+rows; what they are drawn by; and the mean square, in deviations of the linear posterior, up to which it is as good."""
 LIKE = 0.3, 0.3
 """See `likeness`. Chosen on the dirty Panda of seed 50 among three pairs."""
 LEAST_WHITE = 1e-3
@@ -53,6 +53,7 @@ class Estimate:
     covariance: Array
     load: Load
     gain: float
+    places: tuple[Place, ...] = ()
 
     @property
     def mass(self) -> tuple[float, float]:
@@ -73,30 +74,69 @@ def estimate(
     before: Rows | None = None,
     prior: Known = ANY,
     start: Estimate | None = None,
-    renew: bool = True,
+    anew: bool = False,
 ) -> Estimate:
     """The payload that rows carry. before: rows that do not, whose errors tell those of the first that do; start:
-    another estimate by the same carrier, or by another revision of its version, to begin at; renew: whether to begin
-    from nothing, too, and to see how far from linear the posterior is, which else is as of the start."""
+    another estimate by the same carrier, or by another revision of its version, to begin at; anew: whether to begin
+    from nothing, too."""
     problem = _Problem.of(carrier, rows, before, prior)
-    renew = renew or start is None or start.load.geometry is None
-    found = [] if start is None else [_minimum(problem, problem.start(start), ROUNDS)]
-    if renew:
-        found.append(_minimum(problem, problem.start(None), FIRST))
+    if start is not None and len(start.load.mean) != len(carrier.mean) + PARAMETERS:
+        start = None
+    found = [] if start is None else [_minimum(problem, problem.at(problem.begin(start)), ROUNDS)]
+    if anew or start is None:
+        found.append(_minimum(problem, problem.at(problem.begin(None)), FIRST))
     at = min(found, key=lambda each: each.energy)
     size = len(carrier.mean)
     # not from the curvature, of whose condition the root is enough: a covariance above the prior's is none
     root = solve_triangular(qr(at.derivative, mode="r")[0][: size + PARAMETERS], np.eye(size + PARAMETERS))
-    payload, slope = body(at.eta)
+    eta = at.place.eta
+    payload, slope = body(eta)
     outward = np.zeros((size + PARAMETERS, size + PARAMETERS))
     outward[:size, :size], outward[size:, size:] = carrier.memory.root, slope
     outward = outward @ root
     room = PARAMETERS * np.diagonal(slope @ inverse(prior.precision) @ slope.T)
-    load = Load(np.concatenate([at.w, payload]), outward @ outward.T, room, at.geometry)
-    if at.geometry is not None:
-        load = replace(load, others=_others(problem, at, root) if renew or start is None else start.load.others)
+    load = Load(np.concatenate([at.place.w, payload]), outward @ outward.T, room, at.place.geometry)
+    places = _places(problem, at, root, () if start is None else start.places)
+    load = replace(load, others=_others(carrier, at, root, places))
     of_eta = max(1.0, at.misfit) * root[size:] @ root[size:].T
-    return Estimate(at.eta, of_eta, load, problem.gain(at))
+    return Estimate(eta, of_eta, load, problem.gain(at), places)
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """An arm and its payload. w: (M,); geometry: of the arm, None where it is not learnt; eta: (10,)."""
+
+    w: Array
+    geometry: Geometry | None
+    eta: Array
+
+    def moved(self, carrier: Carrier, step: Array) -> Place:
+        """The place a whitened step away, (M + 10,), or as far in its direction as is gone at once."""
+        size, steps = len(self.w), carrier.steps
+        by, eta = carrier.memory.root @ step[:size], step[size:]
+        longest = np.abs(eta / WIDTH).max() / 2
+        if steps.stop > steps.start:
+            longest = max(longest, np.abs(carrier.root[steps] * by[steps]).max() / REACH)
+        by, eta = by / max(1.0, longest), eta / max(1.0, longest)
+        w, arm, geometry = self.w + by, carrier.term.arm, self.geometry
+        if geometry is not None:
+            geometry = geometry.moved(carrier.root[steps] * by[steps])
+            w[steps] = (arm.geometry.towards(geometry) - arm.expected) / carrier.root[steps]
+        return Place(w, geometry, self.eta + eta)
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """The energy of a place. residual, derivative: of it, by whitened steps; misfit: mean square of the rows' part."""
+
+    place: Place
+    residual: Array
+    derivative: Array
+    misfit: float
+
+    @property
+    def energy(self) -> float:
+        return 0.5 * float(self.residual @ self.residual)
 
 
 def _minimum(problem: _Problem, at: _Point, rounds: int, shift: Array | float = 0.0) -> _Point:
@@ -108,7 +148,7 @@ def _minimum(problem: _Problem, at: _Point, rounds: int, shift: Array | float = 
         curvature, gradient = at.derivative.T @ at.derivative, at.derivative.T @ off
         while damping < WORST:
             step = np.asarray(np.linalg.solve(curvature + damping * np.diag(np.diagonal(curvature)), -gradient))
-            trial = problem.at(*at.moved(carrier, step))
+            trial = problem.at(at.place.moved(carrier, step))
             left = trial.residual - shift
             gained = energy - 0.5 * float(left @ left)
             if gained >= 0:
@@ -122,93 +162,79 @@ def _minimum(problem: _Problem, at: _Point, rounds: int, shift: Array | float = 
     return at
 
 
-@dataclass(frozen=True, eq=False)
-class _Point:
-    """An arm and its payload. w: (M,); geometry: of the arm; eta: (10,); residual, derivative: of the energy, by the
-    arm's whitened steps and η; misfit: mean square of the rows' part."""
-
-    w: Array
-    geometry: Geometry | None
-    eta: Array
-    residual: Array
-    derivative: Array
-    misfit: float
-
-    @property
-    def energy(self) -> float:
-        return 0.5 * float(self.residual @ self.residual)
-
-    def moved(self, carrier: Carrier, step: Array) -> tuple[Array, Geometry | None, Array]:
-        """w, geometry and η a step away, or as far in its direction as they go at once."""
-        size, steps = len(self.w), carrier.steps
-        by, eta = carrier.memory.root @ step[:size], step[size:]
-        longest = np.abs(eta / WIDTH).max() / 2
-        if steps.stop > steps.start:
-            longest = max(longest, np.abs(carrier.root[steps] * by[steps]).max() / REACH)
-        by, eta = by / max(1.0, longest), eta / max(1.0, longest)
-        w, arm, geometry = self.w + by, carrier.term.arm, self.geometry
-        if geometry is not None:
-            geometry = geometry.moved(carrier.root[steps] * by[steps])
-            w[steps] = (arm.geometry.towards(geometry) - arm.expected) / carrier.root[steps]
-        return w, geometry, self.eta + eta
+_Seen = tuple[Motion, tuple[Array, Array]]
+"""Instants, and what terms other than the arm make there."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """What is minimised. roots: see `correlation_roots`, of both kinds of rows."""
+    """What is minimised. loaded, free: motions, with a payload and without; tau: of both, the free ones first, (N, n)
+    N·m; roots: see `correlation_roots`, of both."""
 
     carrier: Carrier
-    rows: Rows
-    before: Rows | None
+    loaded: _Seen
+    free: _Seen | None
+    virtual: _Seen
+    tau: Array
     prior: Known
     roots: Array
 
     @classmethod
     def of(cls, carrier: Carrier, rows: Rows, before: Rows | None, prior: Known) -> _Problem:
-        before = before if before is not None and len(before) else None
-        roots = correlation_roots(carrier, rows if before is None else Rows.concatenate([before, rows]))
-        return cls(carrier, rows, before, prior, roots)
+        def seen(motion: Motion) -> _Seen:
+            return motion, carrier.rest(motion)
 
-    def start(self, start: Estimate | None) -> _Point:
+        free = before is not None and len(before) > 0
+        both = Rows.concatenate([before, rows]) if before is not None else rows
+        return cls(
+            carrier,
+            seen(rows.motion()),
+            seen(before.motion()) if before is not None and free else None,
+            seen(Motion.from_arrays(*carrier.memory.motions.swapaxes(0, 1))),
+            both.tau,
+            prior,
+            correlation_roots(carrier, both),
+        )
+
+    def begin(self, start: Estimate | None) -> Place:
         """Where to begin."""
-        carrier = self.carrier
-        if start is None or start.load.geometry is None or len(start.load.mean) != len(carrier.mean) + PARAMETERS:
-            geometry = carrier.term.arm.geometry.moved(carrier.step) if carrier.term.arm.steps else None
-            return self.at(carrier.mean, geometry, self.prior.centre if start is None else start.eta)
-        return self.at(start.load.mean[:-PARAMETERS], start.load.geometry, start.eta)
+        arm, learnt = self.carrier.term.arm, None if start is None else start.load.geometry
+        if learnt is None and arm.steps:
+            learnt = arm.geometry.moved(self.carrier.step)
+        if start is None:
+            return Place(self.carrier.mean, learnt, self.prior.centre)
+        return Place(start.load.mean[:-PARAMETERS], learnt, start.eta)
 
-    def at(self, w: Array, geometry: Geometry | None, eta: Array) -> _Point:
-        """The energy of an arm and its payload."""
-        carrier, memory = self.carrier, self.carrier.memory
-        payload, slope = body(eta)
-        loaded, free = (_around(carrier, w, geometry, carried) for carried in (payload, np.zeros(PARAMETERS)))
-        features, torque = _rows(loaded, self.rows.motion())
-        off = torque - self.rows.tau
-        if self.before is not None:
-            others, torque = _rows(free, self.before.motion())
+    def at(self, place: Place) -> _Point:
+        """The energy of a place."""
+        memory, size = self.carrier.memory, len(place.w)
+        payload, slope = body(place.eta)
+        loaded, free = (_around(self.carrier, place, carried) for carried in (payload, np.zeros(PARAMETERS)))
+        features, torque = _rows(loaded, *self.loaded)
+        if self.free is not None:
+            others, torque_free = _rows(free, *self.free)
             others[-PARAMETERS:] = 0.0
-            features, off = np.concatenate([others, features], axis=1), np.concatenate([torque - self.before.tau, off])
-        features, off = _whitened(self.roots, features, off)
-        remembered, torque = _rows(free, Motion.from_arrays(*memory.motions.swapaxes(0, 1)))
-        root, size = np.linalg.cholesky(self.prior.precision).T, len(w)
+            features, torque = np.concatenate([others, features], axis=1), np.concatenate([torque_free, torque])
+        features, off = _whitened(self.roots, features, torque - self.tau)
+        remembered, torque = _rows(free, *self.virtual)
+        root = np.linalg.cholesky(self.prior.precision).T
         by_arm = np.concatenate([memory.derivative(remembered[:size]), features[:size].T @ memory.root])
-        derivative = np.zeros((len(by_arm) + len(eta), size + len(eta)))
+        derivative = np.zeros((len(by_arm) + PARAMETERS, size + PARAMETERS))
         derivative[: len(by_arm), :size] = by_arm
         derivative[len(by_arm) - len(off) : len(by_arm), size:] = features[size:].T @ slope
         derivative[len(by_arm) :, size:] = root
-        residual = np.concatenate([memory.residual(w, torque), off, root @ (eta - self.prior.centre)])
-        return _Point(w, geometry, eta, residual, derivative, float((off**2).mean()))
+        residual = np.concatenate([memory.residual(place.w, torque), off, root @ (place.eta - self.prior.centre)])
+        return _Point(place, residual, derivative, float((off**2).mean()))
 
     def gain(self, at: _Point) -> float:
         """Nats by which a payload explains the rows better than the arm does without one, that is linear then."""
         carrier, memory = self.carrier, self.carrier.memory
-        free = Linearised(carrier, carrier.known(np.zeros(PARAMETERS)))
-        parts = [_rows(free, each.motion()) for each in (self.before, self.rows) if each is not None]
+        nothing = Linearised(carrier, carrier.known(np.zeros(PARAMETERS)))
+        parts = [_rows(nothing, *each) for each in (self.free, self.loaded) if each is not None]
         features, torque = (np.concatenate(each, axis=-2) for each in zip(*parts, strict=True))
-        tau = np.concatenate([each.tau for each in (self.before, self.rows) if each is not None])
-        features, off = _whitened(self.roots, features, torque - tau)
-        along = features[: len(at.w)].T @ memory.root
-        curvature = np.eye(len(at.w)) + along.T @ along
+        features, off = _whitened(self.roots, features, torque - self.tau)
+        along = features[: len(carrier.mean)].T @ memory.root
+        curvature = np.eye(len(carrier.mean)) + along.T @ along
         explained = along.T @ off
         alone = memory.residual(carrier.mean, memory.base + np.tensordot(carrier.mean, memory.features, axes=1))
         free_energy = 0.5 * float(alone @ alone + off @ off - explained @ np.linalg.solve(curvature, explained))
@@ -216,40 +242,47 @@ class _Problem:
         return free_energy - at.energy + 0.5 * float(np.linalg.slogdet(curvature)[1] - volume)
 
 
-def _around(carrier: Carrier, w: Array, geometry: Geometry | None, payload: Array) -> Linearised:
+def _around(carrier: Carrier, place: Place, payload: Array) -> Linearised:
     nothing = np.zeros((0, 0))
-    return Linearised(carrier, Load(np.concatenate([w, payload]), nothing, np.ones(PARAMETERS), geometry))
+    return Linearised(carrier, Load(np.append(place.w, payload), nothing, np.ones(PARAMETERS), place.geometry))
 
 
-def _rows(around: Linearised, motion: Motion) -> tuple[Array, Array]:
+def _rows(around: Linearised, motion: Motion, rest: tuple[Array, Array]) -> tuple[Array, Array]:
     """Features of (w, π) at N instants, (M + 10, N, n), and the torque of the load's mean, (N, n) N·m."""
-    features, base = around.rows(motion)
+    features, base = around.rows(motion, rest)
     return features, base + np.tensordot(around.load.mean, features, axes=1)
 
 
-def _others(problem: _Problem, at: _Point, root: Array) -> tuple[Alternative, ...]:
-    """Places in the posterior where it is far from linear, with the most likely one; none where it is not.
+def _places(problem: _Problem, at: _Point, root: Array, known: tuple[Place, ...]) -> tuple[Place, ...]:
+    """Places in the posterior: minima for other noise (randomised maximum likelihood, Kitanidis 1995, Oliver et al.
+    1996). root: of the covariance of whitened steps; known: places at fewer rows, the oldest of which is renewed."""
+    if at.place.geometry is None:
+        return ()
+    draw, carrier = np.random.default_rng([SEED, len(at.residual)]), problem.carrier
+    begin = known[:RENEWED] or [at.place.moved(carrier, root @ draw.standard_normal(len(root))) for _ in range(PLACES)]
+    shifts = [draw.standard_normal(len(at.residual)) for _ in begin]
+    found = [_minimum(problem, problem.at(each), ROUNDS, by).place for each, by in zip(begin, shifts, strict=True)]
+    return (*known[RENEWED:], *found)
+
+
+def _others(carrier: Carrier, at: _Point, root: Array, places: tuple[Place, ...]) -> tuple[Alternative, ...]:
+    """Arms all over the posterior where it is far from linear, the most likely one first; none where it is not.
 
     Few rows leave a curved valley open, along which a centre of mass and the geometry make up for each other, and the
-    linear posterior is tangent to it at one place. Others are the minima for other noise (randomised maximum
-    likelihood, Kitanidis 1995, Oliver et al. 1996). root: of the covariance of whitened steps.
+    linear posterior is tangent to it at one place.
     """
-    carrier, draw = problem.carrier, np.random.default_rng(SEED)
-    off, found = [], [at]
-    for _ in range(DRAWS):
-        begin = problem.at(*at.moved(carrier, root @ draw.standard_normal(len(root))))
-        there = _minimum(problem, begin, ROUNDS, draw.standard_normal(len(at.residual)))
-        step = np.append(
-            solve_triangular(carrier.memory.root, there.w - at.w, lower=True, check_finite=False), there.eta - at.eta
-        )
-        off.append(float((solve_triangular(root, step, check_finite=False) ** 2).mean()))
-        found.append(there)
-    if carrier.model.posterior.basis.term is not None or np.mean(off) < LINEAR:
+    if not places or carrier.model.posterior.basis.term is not None:
         return ()
-    arms = []
-    for each in found:
+    off = []
+    for each in places:
+        w = solve_triangular(carrier.memory.root, each.w - at.place.w, lower=True, check_finite=False)
+        off.append(solve_triangular(root, np.append(w, each.eta - at.place.eta), check_finite=False))
+    if np.square(off).mean() < LINEAR:
+        return ()
+    share, arms = 1 / (1 + len(places)), []
+    for each in (at.place, *places):
         assert each.geometry is not None
-        arms.append(carrier.alternative(each.w, each.geometry, body(each.eta)[0], 1 / len(found)))
+        arms.append(carrier.alternative(each.w, each.geometry, body(each.eta)[0], share))
     return tuple(arms)
 
 
