@@ -67,7 +67,9 @@ def _of_arm(arm: Arm) -> None:
     payload = PayloadKernel(arm, arm.expected, np.zeros(PARAMETERS), np.ones(PARAMETERS))
     payload.features(motion)
     payload.bend(motion.arrays())
-    payload.regressor().fill(motion.arrays()[0], np.empty((PARAMETERS + 1, arm.n_joints)))
+    out = np.empty((1, PARAMETERS + 1, arm.n_joints))
+    payload.regressor().fill(motion.arrays()[0], out[0])
+    payload.regressor().fill_many(motion.arrays(), out, 0)
 
 
 if __name__ == "__main__":

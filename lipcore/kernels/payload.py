@@ -14,7 +14,7 @@ from lipcore.kernels.arm_prior import Arm
 from lipcore.kernels.base import LinearKernel, Params, Regressor
 from lipcore.kernels.compiled.arm import arm_energies, arm_masses
 from lipcore.kernels.compiled.arm_recursion import PARAMETERS, WORK
-from lipcore.kernels.compiled.payload import NEAR, payload_features, payload_query, payload_size
+from lipcore.kernels.compiled.payload import NEAR, payload_features, payload_queries, payload_query, payload_size
 from lipcore.kernels.compiled.views import Memory
 
 CERTAIN = 1e-12
@@ -105,3 +105,7 @@ class PayloadRegressor(Regressor):
     def fill(self, motion: Array, out: Array) -> None:
         """Write Φᵀ of the query, (11, n)."""
         payload_query(self._memory.flat, self._sides, self._order, motion, out)
+
+    def fill_many(self, motions: Array, out: Array, first: int) -> None:
+        """Write Φᵀ of N queries; see `Regressor.fill_many`."""
+        payload_queries(self._memory.flat, self._sides, self._order, motions, out, first)

@@ -150,9 +150,12 @@ def test_features_beside_a_learnt_geometry_are_those_of_the_lagrangian(kinds: st
     turned = np.empty_like(asked)
     turned[:, :, order] = asked
     rows = kernel.rows(turned)
-    out = np.empty((11, n))
-    kernel.regressor().fill(turned[0], out)
-    np.testing.assert_array_equal(out, rows[0])
+    out = np.full((len(turned), 14, n), np.nan)
+    kernel.regressor().fill_many(turned, out, 2)
+    np.testing.assert_array_equal(out[:, 2:13], rows)
+    assert np.isnan(out[:, [0, 1, 13]]).all()
+    kernel.regressor().fill(turned[0], out[1, 2:13])
+    np.testing.assert_array_equal(out[1, 2:13], rows[0])
     nowhere = torch.zeros(geometry.size, dtype=torch.float64)
 
     def tip(body: np.ndarray, step: torch.Tensor, motion: np.ndarray) -> torch.Tensor:

@@ -64,6 +64,13 @@ def payload_query(memory: Array, sides: int, order: Indices, motion: Array, out:
 
 
 @compiled
+def payload_queries(memory: Array, sides: int, order: Indices, motions: Array, out: Array, first: int) -> None:
+    """`payload_query` of N queries, (N, 3, n), into the rows of each of `out`, (N, …, n), from `first` on."""
+    for k in range(motions.shape[0]):
+        payload_query(memory, sides, order, motions[k], out[k, first : first + PARAMETERS + 1])
+
+
+@compiled
 def payload_features(
     constants: Array, gravity: Array, payload: Array, order: Indices, motions: Array, work: Array, out: Array
 ) -> None:
