@@ -66,7 +66,9 @@ def _of_arm(arm: Arm) -> None:
         kernel.regressor().fill(motion.arrays()[0], np.empty((kernel.size, arm.n_joints)))
     payload = PayloadKernel(arm, np.ones(PARAMETERS))
     payload.features(motion)
-    payload.regressor().fill(motion.arrays()[0], np.empty((PARAMETERS, arm.n_joints)))
+    out = np.empty((1, PARAMETERS, arm.n_joints))
+    payload.regressor().fill(motion.arrays()[0], out[0])
+    payload.regressor().fill_many(motion.arrays(), out, 0)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,14 @@ from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import KINDS, Arm
 from lipcore.kernels.base import LinearKernel, Params, Regressor
-from lipcore.kernels.compiled.arm import arm_energies, arm_features, arm_query, arm_size, arm_torques
+from lipcore.kernels.compiled.arm import (
+    arm_energies,
+    arm_features,
+    arm_queries,
+    arm_query,
+    arm_size,
+    arm_torques,
+)
 from lipcore.kernels.compiled.arm_recursion import PARAMETERS
 from lipcore.kernels.compiled.views import Memory
 from lipcore.kernels.geometry import Geometry
@@ -123,6 +130,13 @@ class ArmRegressor(Regressor):
         arm_query(self._memory.flat, self._order, motion, out[: self._first])
         if self._others is not None:
             self._others.fill(motion, out[self._first :])
+
+    def fill_many(self, motions: Array, out: Array, first: int) -> None:
+        """Write Φᵀ of N queries; see `Regressor.fill_many`."""
+        if self._others is not None:
+            super().fill_many(motions, out, first)
+        else:
+            arm_queries(self._memory.flat, self._order, motions, out, first, first + self._first)
 
 
 def _in_data(arm: Arm) -> Array:

@@ -34,6 +34,12 @@ class Regressor(ABC):
     def fill(self, motion: Array, out: Array) -> None:
         """Write Φᵀ of the query `motion`, (3, n) its q, dq and ddq, into `out`, (p, n), C-contiguous."""
 
+    def fill_many(self, motions: Array, out: Array, first: int) -> None:
+        """`fill` for N queries, (N, 3, n), into the p rows of each of `out`, (N, …, n), from `first` on; the same
+        numbers to the last bit."""
+        for motion, target in zip(motions, out, strict=True):
+            self.fill(motion, target[first : first + self.size])
+
 
 class Cross(ABC):
     """A kernel with its hyperparameters and S inducing samples fixed, ready to meet one query after the other.

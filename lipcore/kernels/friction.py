@@ -76,6 +76,10 @@ class FrictionRegressor(Regressor):
         """Write Φᵀ of the query, (f n, n)."""
         _friction_rows(motion, SIGN_WIDTH, STRIBECK_SPEED, out)
 
+    def fill_many(self, motions: Array, out: Array, first: int) -> None:
+        """Write Φᵀ of N queries; see `Regressor.fill_many`."""
+        _friction_queries(motions, SIGN_WIDTH, STRIBECK_SPEED, out, first, first + self.size)
+
 
 @compiled
 def _friction_rows(motion: Array, width: float, speed: float, out: Array) -> None:
@@ -91,3 +95,9 @@ def _friction_rows(motion: Array, width: float, speed: float, out: Array) -> Non
         out[first + 2, joint] = 1.0
         if terms == 4:
             out[first + 3, joint] = sign * np.exp(-((velocity / speed) ** 2))
+
+
+@compiled
+def _friction_queries(motions: Array, width: float, speed: float, out: Array, first: int, last: int) -> None:
+    for k in range(motions.shape[0]):
+        _friction_rows(motions[k], width, speed, out[k, first:last])

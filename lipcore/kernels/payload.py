@@ -11,9 +11,8 @@ from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import Arm
 from lipcore.kernels.base import LinearKernel, Params, Regressor
 from lipcore.kernels.compiled.arm import arm_energies
-from lipcore.kernels.compiled.arm_derivatives import TABLE
-from lipcore.kernels.compiled.arm_recursion import PARAMETERS, WORK
-from lipcore.kernels.compiled.payload import payload_features, payload_query, payload_size
+from lipcore.kernels.compiled.arm_recursion import PARAMETERS
+from lipcore.kernels.compiled.payload import payload_queries, payload_query, payload_size
 from lipcore.kernels.compiled.views import Memory
 
 
@@ -36,8 +35,7 @@ class PayloadKernel(LinearKernel):
     def rows(self, motions: Array) -> Array:
         """Φᵀ of N motions (N, 3, n): (N, 10, n)."""
         out = np.empty((len(motions), PARAMETERS, self.n_joints))
-        work, table = np.empty((self.n_joints + 1, WORK)), np.empty(TABLE)
-        payload_features(self.constants, self.gravity, self.order, motions, work, table, out)
+        self.regressor().fill_many(motions, out, 0)
         return out
 
     def features(self, x: Motion) -> Tensor:
@@ -75,3 +73,7 @@ class PayloadRegressor(Regressor):
     def fill(self, motion: Array, out: Array) -> None:
         """Write Φᵀ of the query, (10, n)."""
         payload_query(self._memory.flat, self._order, motion, out)
+
+    def fill_many(self, motions: Array, out: Array, first: int) -> None:
+        """Write Φᵀ of N queries; see `Regressor.fill_many`."""
+        payload_queries(self._memory.flat, self._order, motions, out, first)

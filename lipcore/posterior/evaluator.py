@@ -75,11 +75,12 @@ class Evaluator:
         means, variances = _linear_prior(linear, params)
         _check(self._outputs, samples * n, weights, root, len(means))
         self._fixed = _lay_out(weights, root, means, variances)
-        self._fills = []
+        self._fills, self._fills_many = [], []
         first = 0
         for kernel in linear:
             regressor = kernel.regressor()
             self._fills.append((first, first + regressor.size, regressor.fill))
+            self._fills_many.append((first, regressor.fill_many))
             first += regressor.size
         self._std_factor = float(std_factor)
         self._floor = np.zeros(n) if floor is None else np.array(floor, np.float64)
@@ -163,14 +164,14 @@ class Evaluator:
         """Compile everything that an answer takes, or load it from Numba's cache."""
         zeros = np.zeros((1, self.n_joints))
         self.many(zeros, zeros, zeros, covariance=True)
+        self.one(np.zeros((3, self.n_joints)))
 
     def _answer(self, scratch: _Scratch, count: int, what: int, tau: Array, std: Array, covariance: Array) -> None:
         motions, blocks, features = scratch.motions[:count], scratch.blocks[:count], scratch.features[:count]
         if self._cross is not None:
             self._cross.fill_many(motions, blocks)
-        for first, last, fill in self._fills:
-            for motion, target in zip(motions, features, strict=True):
-                fill(motion, target[first:last])
+        for first, fill_many in self._fills_many:
+            fill_many(motions, features, first)
         answer(
             self._fixed,
             self._outputs,

@@ -45,7 +45,7 @@ class Declared:
             return self.known(payload) or self._made(payload)
 
     def _made(self, payload: Numbers) -> TorqueModel:
-        carrier, (mass, com, inertia) = self._carrier, payload
+        carrier, (mass, com, inertia) = self.carrier, payload
         body = Body(mass, np.array(com), None if inertia is None else np.array(inertia))
         model = carrier.carrying(carrier.known(body.parameters))
         model.answer(np.zeros((3, model.n_joints)))  # brings its arrays into memory
@@ -56,5 +56,6 @@ class Declared:
         return model
 
     @cached_property
-    def _carrier(self) -> Carrier:
+    def carrier(self) -> Carrier:
+        """The revision as what may carry a payload. Raise NoArmError where it knows no rigid bodies."""
         return Carrier(self._model)

@@ -64,7 +64,7 @@ class Served:
     @cached_property
     def carrier(self) -> Carrier | None:
         """The model as what may carry a payload; None where it knows no arm."""
-        return None if self.model.arm is None else Carrier(self.model)
+        return None if self.model.arm is None else self.declared.carrier
 
     @cached_property
     def declared(self) -> Declared:

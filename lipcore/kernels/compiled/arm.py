@@ -76,6 +76,13 @@ def arm_query(memory: Array, order: Indices, motion: Array, out: Array) -> None:
 
 
 @compiled
+def arm_queries(memory: Array, order: Indices, motions: Array, out: Array, first: int, last: int) -> None:
+    """`arm_query` of N queries, (N, 3, n), into rows `first` to `last` of each of `out`, (N, …, n)."""
+    for k in range(motions.shape[0]):
+        arm_query(memory, order, motions[k], out[k, first:last])
+
+
+@compiled
 def arm_features(
     constants: Array, gravity: Array, parameters: Array, order: Indices, motions: Array, out: Array
 ) -> None:
