@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from lipcore.data.samples import Array
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online.batch import Rows
+from lipcore.online.regime import COLD, Regime, Walk
 from lipcore.posterior.compact import CompactPosterior
-from lipcore.posterior.statistics import Solution, Statistics, add_to, copied, decay, empty, mirror, solve
+from lipcore.posterior.statistics import Statistics, add_to, empty
 
 CHUNK = 500
 """Rows whose features are computed together: they take 28 MB at a thousand variables."""
@@ -28,34 +28,19 @@ class ForgottenError(ValueError):
 
 
 @dataclass(frozen=True)
-class Regime:
-    """What is known of a robot between two changes: a prior N(centre, I) and the sums of its rows since.
-
-    begins: event time, s. centre: (M,) whitened variables. The trained version is in the sums of the first regime: as
-    samples that say its mean, which is the centre.
-    """
-
-    begins: float
-    centre: Tensor
-    statistics: Statistics
-
-    def solve(self) -> Solution:
-        """Posterior of the whitened variables."""
-        return solve(self.statistics, self.centre)
-
-
-@dataclass(frozen=True)
 class OnlineModel:
     """A trained version and what it has learnt since; immutable, every method returns another one.
 
     The posterior is a function of the rows learnt, not of their order: a row of event time t counts its own weight (see
     `data.independence`), times exp(−(reference − t) / forgetting_s) where there is forgetting. What is forgotten leaves
     its mean behind, with the prior's uncertainty: the version as trained where that is forgotten. A change begins a new
-    regime, whose prior has the mean of what was known before and the variance that a robot never seen has.
+    regime, whose prior has the mean of what was known before and the variance that a robot never seen has. Friction may
+    drift besides, see `Walk`: then event time is cut into epochs, each of which has friction of its own, and answers
+    have that of the newest one. All else is common to all epochs.
 
     base: the version as trained; reference: event time, s, that weights refer to, the latest seen; since: when the
     version's own samples begin to be forgotten, the first row's time unless given; before: the regime before the last
-    change, which late rows of then still reach.
+    change, which late rows of then still reach; walk: how friction drifts, None where it stays as it is.
     """
 
     base: TorqueModel
@@ -64,13 +49,21 @@ class OnlineModel:
     reference: float
     before: Regime | None
     now: Regime
+    walk: Walk | None = None
 
     @classmethod
-    def start(cls, base: TorqueModel, forgetting_s: float | None = None, since: float | None = None) -> OnlineModel:
+    def start(
+        cls,
+        base: TorqueModel,
+        forgetting_s: float | None = None,
+        since: float | None = None,
+        friction_walk_s: float | None = None,
+    ) -> OnlineModel:
         """A version as trained, with nothing learnt yet.
 
         forgetting_s: time constant of forgetting, s, None for never; since: event time, s, from which on the version's
-        own samples are forgotten. Raise ValueError for a wrong forgetting time, or a model that has learnt already.
+        own samples are forgotten; friction_walk_s: time constant of friction that drifts, s, None where it does not.
+        Raise ValueError for a wrong time, or a model that has learnt already.
         """
         _check(forgetting_s)
         statistics = base.posterior.statistics
@@ -80,21 +73,23 @@ class OnlineModel:
         centre = base.posterior.basis.root.T @ base.posterior.weights
         sums = Statistics(statistics.a, statistics.b - centre, 0.0)
         reference = -math.inf if since is None else since
-        return cls(base, forgetting_s, since, reference, None, Regime(-math.inf, centre, sums))
+        now = Regime(-math.inf, centre, sums)
+        return cls(base, forgetting_s, since, reference, None, now).with_walk(friction_walk_s)
 
     @property
     def samples(self) -> float:
         """Sum of the weights of the rows learnt in this regime."""
-        return self.now.statistics.samples
+        return self.now.samples
 
     def begin(self, since: float) -> OnlineModel:
         """Say from when on, s of event time, the version's own samples are forgotten, where that is not known yet."""
         if self.since is not None:
             return self
-        return replace(self, since=since, reference=max(self.reference, since))
+        return replace(self, since=since, reference=max(self.reference, since), walk=_begun(self.walk, since))
 
     def learn(self, rows: Rows, own: bool = False, novel: Novel | None = None) -> OnlineModel:
-        """Learn the rows of code 0, in any order; those from before the regime before this one teach nothing more.
+        """Learn the rows of code 0, in any order; those from before the regime before this one teach nothing more, and
+        those of an epoch that is folded count in the oldest one kept.
 
         own: whether nobody else has these sums (see `detached`), so that they can be added to where they are: the model
         that this is called of is not to be used again, the last of many is to be `symmetrised`. The outcome is the same
@@ -112,15 +107,23 @@ class OnlineModel:
         return self._add(rows.learnt, -1.0, own)
 
     def check_unlearn(self, rows: Rows) -> None:
-        """Raise ForgottenError where rows cannot be taken back, being from before the regime before this one."""
-        oldest = self.now.begins if self.before is None else self.before.begins
-        if len(rows.learnt) and float(rows.learnt.time.min()) < oldest:
+        """Raise ForgottenError where rows cannot be taken back: from before the regime before this one, or folded."""
+        oldest, time = (self.now if self.before is None else self.before).begins, rows.learnt.time
+        if not len(time):
+            return
+        if float(time.min()) < oldest:
             raise ForgottenError(f"rows from before {oldest:.3f} s cannot be taken back: two changes have come since")
+        if self.walk is None:
+            return
+        numbers, current = self.walk.number(time), time >= self.now.begins
+        for regime, numbered in ((self.now, numbers[current]), (self.before, numbers[~current])):
+            if regime is not None and regime.has_folded(numbered):
+                raise ForgottenError(f"rows of epochs up to {regime.at} cannot be taken back: friction has gone on")
 
     def detached(self) -> OnlineModel:
         """The same model with sums of its own, which can be added to."""
-        before = self.before and replace(self.before, statistics=copied(self.before.statistics))
-        return replace(self, before=before, now=replace(self.now, statistics=copied(self.now.statistics)))
+        drifts = self.walk is not None
+        return replace(self, before=self.before and self.before.detached(drifts), now=self.now.detached(drifts))
 
     def change(self, at: float) -> OnlineModel:
         """Begin a new regime at an event time: the mean is kept, its uncertainty is opened.
@@ -128,7 +131,7 @@ class OnlineModel:
         It begins after the latest row learnt where that is later: a row belongs to one regime for good.
         """
         begins = max(at, math.nextafter(max(self.reference, self.now.begins), math.inf))
-        fresh = Regime(begins, self.now.solve().mean, empty(len(self.now.centre)))
+        fresh = Regime(begins, self.now.solve(self.walk).mean, empty(len(self.now.centre)))
         return replace(self, before=self.now, now=fresh)
 
     def with_forgetting(self, forgetting_s: float | None) -> OnlineModel:
@@ -136,13 +139,29 @@ class OnlineModel:
         _check(forgetting_s)
         return replace(self, forgetting_s=forgetting_s)
 
+    def with_walk(self, friction_walk_s: float | None) -> OnlineModel:
+        """Let friction drift otherwise from here on, or not any more; nothing happens where it does so already.
+
+        friction_walk_s: s, None for never; raise ValueError unless above zero.
+        """
+        if friction_walk_s == (None if self.walk is None else self.walk.time_s):
+            return self
+        # what has been learnt so far is the past of the first epoch, from one step before it
+        fresh = self.since is None or self.reference <= self.since
+        now, before = (each and each.closed(self.walk, -COLD if fresh else -1) for each in (self.now, self.before))
+        assert now is not None
+        walk = None
+        if friction_walk_s is not None:
+            walk = Walk.of(self.base, friction_walk_s, None if self.since is None else self.reference)
+        return replace(self, now=now, before=before, walk=walk)
+
     def model(self, floor: Array | None = None) -> TorqueModel:
         """Solve for the model that answers. floor: (n,) (N·m)², which its variances are never below."""
         posterior = self.base.posterior
         updated = CompactPosterior.solved(
             posterior.kernel,
             posterior.basis,
-            self.now.solve(),
+            self.now.solve(self.walk),
             posterior.noise_variance,
             posterior.std_factor,
             None if floor is None else torch.from_numpy(np.array(floor, np.float64)),
@@ -154,7 +173,7 @@ class OnlineModel:
         """Return the same model with both triangles of its sums, once it has learnt with `own`."""
         for regime in (self.now, self.before):
             if regime is not None:
-                mirror(regime.statistics)
+                regime.symmetrise()
         return self
 
     def _add(self, rows: Rows, sign: float, own: bool, novel: Novel | None = None) -> OnlineModel:
@@ -173,11 +192,23 @@ class OnlineModel:
         now, before = model.now, model.before
         if current.any():
             taken = rows if current.all() else rows.take(current)
-            now = replace(now, statistics=model._summed(now.statistics, taken, sign, novel))
+            now = model._learnt(now, taken, sign, novel)
         if before is not None and (late := ~current & (rows.time >= before.begins)).any():
-            before = replace(before, statistics=model._summed(before.statistics, rows.take(late), sign, novel))
-            now = replace(now, centre=before.solve().mean)
+            before = model._learnt(before, rows.take(late), sign, novel)
+            # folded epochs of `now` were drawn back to the centre of then: a share √(1 − s) from here, which is near 1
+            now = replace(now, centre=before.solve(model.walk).mean)
         return replace(model, now=now, before=before)
+
+    def _learnt(self, regime: Regime, rows: Rows, sign: float, novel: Novel | None) -> Regime:
+        """A regime, overwritten, with its rows added (sign 1) or taken back (−1)."""
+        if self.walk is None:
+            return replace(regime, statistics=self._summed(regime.statistics, rows, sign, novel))
+        numbers = regime.place(self.walk.number(rows.time))
+        for number in sorted(set(numbers.tolist())):
+            of_epoch = numbers == number
+            part = rows if of_epoch.all() else rows.take(of_epoch)
+            regime = regime.with_epoch(number, self._summed(regime.of_epoch(number), part, sign, novel))
+        return regime.folded(self.walk)
 
     def _summed(self, statistics: Statistics, rows: Rows, sign: float, novel: Novel | None) -> Statistics:
         """These statistics, overwritten, with the rows added (sign 1) or taken back (−1)."""
@@ -194,12 +225,12 @@ class OnlineModel:
     def _aged(self, reference: float, since: float) -> OnlineModel:
         """The same knowledge as it weighs at a later reference time; its sums are overwritten."""
         age = reference - max(self.reference, since)
+        walk = _begun(self.walk, since)
         if self.forgetting_s is None or age <= 0:
-            return replace(self, reference=reference, since=since)
+            return replace(self, reference=reference, since=since, walk=walk)
         factor = math.exp(-age / self.forgetting_s)
-        now = replace(self.now, statistics=decay(self.now.statistics, factor, own=True))
-        before = self.before and replace(self.before, statistics=decay(self.before.statistics, factor, own=True))
-        return replace(self, reference=reference, since=since, now=now, before=before)
+        now, before = self.now.decayed(factor), self.before and self.before.decayed(factor)
+        return replace(self, reference=reference, since=since, now=now, before=before, walk=walk)
 
 
 def uncovered(base: TorqueModel, rows: Rows) -> NDArray[np.bool_]:
@@ -213,3 +244,8 @@ def uncovered(base: TorqueModel, rows: Rows) -> NDArray[np.bool_]:
 def _check(forgetting_s: float | None) -> None:
     if forgetting_s is not None and not 0 < forgetting_s < math.inf:
         raise ValueError(f"forgetting_s is {forgetting_s!r}, expected a positive number of seconds, or None")
+
+
+def _begun(walk: Walk | None, since: float) -> Walk | None:
+    """The walk, whose first epoch begins then where that is not known yet."""
+    return replace(walk, since=since) if walk is not None and walk.since is None else walk

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from lipcore.data.samples import Array
 from lipcore.model.torque_model import TorqueModel
-from lipcore.online.learner import OnlineModel, Regime
+from lipcore.online.learner import OnlineModel
+from lipcore.online.regime import Epoch, Regime, Walk
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.linalg import pack_symmetric, unpack_symmetric
 from lipcore.posterior.statistics import Statistics
@@ -33,11 +34,12 @@ def consolidate(online: OnlineModel, floor: Array | None = None) -> TorqueModel:
     base, now = online.base.posterior, online.now
     trained = base.statistics
     # a change of the robot leaves nothing of the training samples but their mean
+    sums = now.sums(online.walk)
     samples = online.samples + (trained.samples if trained is not None and online.before is None else 0.0)
     posterior = CompactPosterior.build(
         base.kernel,
         base.basis,
-        Statistics(now.statistics.a, now.centre + now.statistics.b, max(samples, 0.0)),
+        Statistics(sums.a, now.centre + sums.b, max(samples, 0.0)),
         base.noise_variance,
         base.std_factor,
         base.misfit,
@@ -90,6 +92,9 @@ def dump(online: OnlineModel) -> bytes:
     """
     numbers = [ABSENT if each is None else each for each in (online.forgetting_s, online.since, online.reference)]
     tensors = {"numbers": torch.tensor(numbers, dtype=torch.float64), "base": _trained(online.base)}
+    if online.walk is not None:
+        since = ABSENT if online.walk.since is None else online.walk.since
+        tensors["walk"] = torch.tensor([online.walk.time_s, since], dtype=torch.float64)
     for name in REGIMES:
         regime = getattr(online, name)
         if regime is not None:
@@ -108,15 +113,20 @@ def load(base: TorqueModel, payload: bytes) -> OnlineModel:
         same = any(torch.equal(tensors["base"], each) for each in (_trained(base), base.posterior.weights))
         forgetting_s, since, reference = tensors["numbers"].tolist()
         regimes = {name: _regime(tensors, name) for name in REGIMES if f"{name}/numbers" in tensors}
+        walk_s, walk_since = tensors["walk"].tolist() if "walk" in tensors else (ABSENT, ABSENT)
     except (KeyError, SafetensorError, RuntimeError, TypeError) as error:
         raise ValueError(f"these bytes are no state of an online model: {error}") from error
     if not same:
         raise ValueError("the state is of another version")
     size = len(base.posterior.basis)
     for name, regime in regimes.items():
-        if regime.centre.shape != (size,) or regime.statistics.a.shape != (size, size):
+        sums = [regime.statistics, *(each.statistics for each in regime.epochs)]
+        if regime.centre.shape != (size,) or any(each.a.shape != (size, size) for each in sums):
             raise ValueError(f"{name} has {len(regime.centre)} variables, expected {size}")
-    return OnlineModel(base, _number(forgetting_s), _number(since), reference, regimes.get("before"), regimes["now"])
+    walk = None if walk_s != walk_s else Walk.of(base, walk_s, _number(walk_since))  # noqa: PLR0124
+    return OnlineModel(
+        base, _number(forgetting_s), _number(since), reference, regimes.get("before"), regimes["now"], walk
+    )
 
 
 def _trained(base: TorqueModel) -> Tensor:
@@ -126,15 +136,37 @@ def _trained(base: TorqueModel) -> Tensor:
 
 
 def _parts(regime: Regime) -> dict[str, Tensor]:
-    sums = regime.statistics
-    numbers = torch.tensor([regime.begins, sums.samples], dtype=torch.float64)
-    return {"numbers": numbers, "centre": regime.centre, "a": pack_symmetric(sums.a), "b": sums.b}
+    numbers = torch.tensor([regime.begins, regime.statistics.samples, regime.at], dtype=torch.float64)
+    parts = {"numbers": numbers, "centre": regime.centre} | _sums(regime.statistics)
+    if regime.epochs:
+        every = [[each.number, each.statistics.samples] for each in regime.epochs]
+        parts["epochs"] = torch.tensor(every, dtype=torch.float64)
+        for place, each in enumerate(regime.epochs):
+            parts |= {f"{place}/{part}": value for part, value in _sums(each.statistics).items()}
+    return parts
+
+
+def _sums(statistics: Statistics) -> dict[str, Tensor]:
+    return {"a": pack_symmetric(statistics.a), "b": statistics.b}
 
 
 def _regime(tensors: dict[str, Tensor], name: str) -> Regime:
-    begins, samples = tensors[f"{name}/numbers"].tolist()
-    statistics = Statistics(unpack_symmetric(f"{name}/a", tensors[f"{name}/a"]), tensors[f"{name}/b"], samples)
-    return Regime(begins, tensors[f"{name}/centre"], statistics)
+    begins, samples, *at = tensors[f"{name}/numbers"].tolist()
+    epochs = tensors[f"{name}/epochs"].tolist() if f"{name}/epochs" in tensors else []
+    return Regime(
+        begins,
+        tensors[f"{name}/centre"],
+        _statistics(tensors, name, samples),
+        round(at[0]) if at else -1,  # earlier releases have written none
+        tuple(
+            Epoch(round(number), _statistics(tensors, f"{name}/{place}", each))
+            for place, (number, each) in enumerate(epochs)
+        ),
+    )
+
+
+def _statistics(tensors: dict[str, Tensor], name: str, samples: float) -> Statistics:
+    return Statistics(unpack_symmetric(f"{name}/a", tensors[f"{name}/a"]), tensors[f"{name}/b"], samples)
 
 
 def _number(value: float) -> float | None:

@@ -7,7 +7,7 @@ dense and rise in the order of commits, and an event is durable once the transac
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal
 
 import numpy as np
@@ -40,6 +40,25 @@ _NEWEST = select(EventRow.number).where(EventRow.model == bindparam("model")).or
 _START = select(LearnerRow.start).where(
     LearnerRow.model == bindparam("model"), LearnerRow.version == bindparam("version")
 )
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What events of the kind `settings` set. forgetting_s: time constant of forgetting, s, None where nothing is
+    forgotten; friction_walk_s: that of friction that drifts, s, None where it does not."""
+
+    forgetting_s: float | None = None
+    friction_walk_s: float | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """As an event keeps it."""
+        walk = {} if self.friction_walk_s is None else {"friction_walk_s": self.friction_walk_s}
+        return {"forgetting_s": self.forgetting_s} | walk
+
+    @staticmethod
+    def from_json(detail: dict[str, Any]) -> Memory:
+        """Read what `to_json` wrote."""
+        return Memory(detail["forgetting_s"], detail.get("friction_walk_s"))
 
 
 @dataclass(frozen=True)
@@ -216,17 +235,17 @@ def rollback(session: Session, model: str, to: int, received: float) -> EventRow
     event = append(session, model, "rollback", {"to": to}, received)
     settings = session.get(LearningRow, model)
     if settings is not None:
-        settings.options = {**settings.options, "forgetting_s": forgetting(session, model, to)}
+        settings.options = {**settings.options, **asdict(memory(session, model, to))}
     return event
 
 
-def forgetting(session: Session, model: str, number: int) -> float | None:
-    """Time constant of forgetting, s, that is in force after event `number`; None: nothing is forgotten."""
+def memory(session: Session, model: str, number: int) -> Memory:
+    """What is set after event `number`."""
     query = select(EventRow.detail).where(
         EventRow.model == model, EventRow.number <= number, EventRow.kind == "settings", EventRow.void.is_(False)
     )
     detail = session.scalar(query.order_by(EventRow.number.desc()).limit(1))
-    return None if detail is None else detail["forgetting_s"]
+    return Memory() if detail is None else Memory.from_json(detail)
 
 
 def start_of(session: Session, model: str, version: int) -> int:

@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 
 from service.foundation.errors import invalid_request, not_found
 from service.journal import log
-from service.learning.schema import CONTACT_THRESHOLD, FORGETTING_S, TORQUE_LIMIT, LearningOptions
+from service.learning.schema import CONTACT_THRESHOLD, FORGETTING_S, FRICTION_WALK_S, TORQUE_LIMIT, LearningOptions
 from service.storage.database import AlarmRow, Database, LearningRow, ModelRow, fetch, now
 from service.web.rows import Page, newest
 
@@ -34,14 +34,15 @@ def within_bounds(stored: dict[str, Any]) -> dict[str, Any]:
         kept["contact_threshold"] = near(threshold, CONTACT_THRESHOLD)
     if (limits := stored.get("torque_limits")) is not None:
         kept["torque_limits"] = [near(each, TORQUE_LIMIT) for each in limits]
-    if (forgetting_s := stored.get("forgetting_s")) is not None:
-        kept["forgetting_s"] = near(forgetting_s, FORGETTING_S)
+    for name, bounds in (("forgetting_s", FORGETTING_S), ("friction_walk_s", FRICTION_WALK_S)):
+        if (seconds := stored.get(name)) is not None:
+            kept[name] = near(seconds, bounds)
     return kept
 
 
 def set_options(database: Database, model: str, chosen: LearningOptions, n_joints: int, received: float) -> None:
-    """Set how a model learns from now on; a new time constant of forgetting is an event of its log. Raise NotFoundError
-    for a model that does not exist, InvalidRequestError where `torque_limits` is not of its joints."""
+    """Set how a model learns from now on; a new time constant is an event of its log. Raise NotFoundError for a model
+    that does not exist, InvalidRequestError where `torque_limits` is not of its joints."""
     limits = chosen.torque_limits
     if limits is not None and len(limits) != n_joints:
         raise invalid_request(
@@ -50,8 +51,9 @@ def set_options(database: Database, model: str, chosen: LearningOptions, n_joint
     with database.turn(model), database.transaction(model) as session:
         row = _row(session, model)
         row.options = chosen.model_dump()
-        if chosen.forgetting_s != log.forgetting(session, model, log.newest(session, model)):
-            log.append(session, model, "settings", {"forgetting_s": chosen.forgetting_s}, received)
+        memory = log.Memory(chosen.forgetting_s, chosen.friction_walk_s)
+        if memory != log.memory(session, model, log.newest(session, model)):
+            log.append(session, model, "settings", memory.to_json(), received)
 
 
 def hold(session: Session, model: str, detail: dict[str, Any]) -> None:

@@ -18,6 +18,8 @@ would choose what is learnt; beyond a hundred nothing is gated: what would be le
 TORQUE_LIMIT = (1e-3, LARGEST_TORQUE)
 FORGETTING_S = (1.0, 1e9)
 """Up to thirty years: a longer memory is none that forgets."""
+FRICTION_WALK_S = (10.0, 1e9)
+"""From ten epochs of a second each."""
 TorqueLimit = Annotated[float, Field(ge=TORQUE_LIMIT[0], le=TORQUE_LIMIT[1], allow_inf_nan=False)]
 
 
@@ -33,6 +35,14 @@ class LearningOptions(BaseModel):
         le=FORGETTING_S[1],
         allow_inf_nan=False,
         description="Age in s at which a sample counts 1/e of a new one, in event time; null: nothing is forgotten",
+    )
+    friction_walk_s: float | None = Field(
+        None,
+        ge=FRICTION_WALK_S[0],
+        le=FRICTION_WALK_S[1],
+        allow_inf_nan=False,
+        description="Time in s over which friction may change by about 30 %, as that of an arm that warms up does: it "
+        "is followed, and masses and geometry are not opened. 1800 suits most arms; null: friction stays as learnt",
     )
     on_change: Literal["hold", "adapt", "learn"] = Field(
         "hold",

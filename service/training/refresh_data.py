@@ -52,7 +52,7 @@ def scope_of(session: Session, model: str, through: int) -> Scope:
     newest = session.scalar(select(func.max(EventRow.last)).where(*live, EventRow.learnt > 0))
     details = session.scalars(select(EventRow.detail).where(*live, EventRow.kind == "change"))
     changed = max((float((detail or {})["t"]) for detail in details), default=None)
-    forgetting_s = log.forgetting(session, model, through)
+    forgetting_s = log.memory(session, model, through).forgetting_s
     since = -math.inf if changed is None else changed
     if forgetting_s is not None and newest is not None:
         since = max(since, newest - MEMORY * forgetting_s)

@@ -14,6 +14,7 @@ from sqlalchemy import ColumnElement, bindparam, select
 from sqlalchemy.orm import Session, defer, undefer
 
 from service.journal import log
+from service.journal.log import Memory
 from service.storage.database import EventRow, fetch
 
 PAGE_ROWS = 500
@@ -43,8 +44,8 @@ _EVENTS = (  # what was answered and recorded of them is not learnt
 class Taking:
     """What an unlearning takes out: the batch and its replays, as far as they are learnt, in their order.
 
-    number: its event; batch: the number of the batch; reweighed: whether forgetting was set otherwise in between, so
-    that it is not known what the rows weigh by now.
+    number: its event; batch: the number of the batch; reweighed: whether a time constant was set otherwise in between,
+    so that it is not known what the rows weigh by now.
     """
 
     number: int
@@ -57,15 +58,15 @@ class Taking:
 class Stretch:
     """What follows an event: either the events that are learnt next, or a rollback that leads from it to `end`.
 
-    takings: what is unlearnt in it, by the numbers of the unlearnings. forgetting_s: what a rollback to before the
-    beginning of a version sets, in a list; None where nothing is set. complete: whether no event of it is missing.
+    takings: what is unlearnt in it, by the numbers of the unlearnings. memory: what a rollback to before the beginning
+    of a version sets; None where nothing is set. complete: whether no event of it is missing.
     """
 
     end: int
     is_rollback: bool
     events: Sequence[EventRow]
     takings: Mapping[int, Taking]
-    forgetting_s: Sequence[float | None] | None
+    memory: Memory | None
     complete: bool
 
 
@@ -91,8 +92,8 @@ def ahead(session: Session, model: str, start: int, number: int, last: int) -> S
     if here:
         end, target = max(here)
         takings = {each.number: each for each in takings_since(session, model, start, number, end)}
-        forgetting = [in_force(session, model, target)] if target < start else None
-        return Stretch(end, True, [], takings, forgetting, log.is_complete(session, model, number, end))
+        memory = in_force(session, model, target) if target < start else None
+        return Stretch(end, True, [], takings, memory, log.is_complete(session, model, number, end))
     stop = min([last, *(to for to, *_ in rollbacks)])
     part = {"model": model, "after": number, "through": stop}
     count = _count(fetch(session, _SIZES, **part).scalars())
@@ -125,15 +126,15 @@ def left_out(session: Session, model: str, start: int, batch: int, end: int) -> 
         batches |= more
 
 
-def in_force(session: Session, model: str, number: int) -> float | None:
-    """Time constant of forgetting, s, after event `number`; None: nothing is forgotten."""
+def in_force(session: Session, model: str, number: int) -> Memory:
+    """What is set after event `number`."""
     query = select(EventRow.number, EventRow.detail).where(
         EventRow.model == model, EventRow.number <= number, EventRow.kind == "settings"
     )
     settings: dict[int, Any] = {row.number: row.detail for row in session.execute(query)}
     undone = _undone(session, model, min(settings, default=number), number)
     held = [at for at in settings if not any(at in each for each in undone)]
-    return settings[max(held)]["forgetting_s"] if held else None
+    return Memory.from_json(settings[max(held)]) if held else Memory()
 
 
 def batch_of(event: EventRow) -> int:
@@ -186,7 +187,7 @@ def _taking(session: Session, unlearning: EventRow, start: int, through: int) ->
 
 
 def _is_reweighed(session: Session, model: str, number: int, through: int) -> bool:
-    """Whether forgetting was set between two events."""
+    """Whether a time constant was set between two events."""
     query = select(EventRow.number).where(*_span(model, number, through), EventRow.kind == "settings")
     undone = _undone(session, model, number, through)
     return any(not any(at in each for each in undone) for at in session.scalars(query))

@@ -5,9 +5,9 @@ snapshot and in however many steps; so services that share a log answer alike. I
 + e2) + …, in the order of their numbers:
 
 * a batch, or a replay, is learnt by itself at its place, even where it is unlearnt later;
-* unlearning subtracts it again, at the place of the unlearning. Where it cannot be subtracted, since two changes or
-  another forgetting have come in between, the log is learnt anew from the state before it, without it and without all
-  else that is unlearnt on the way (`course.left_out`);
+* unlearning subtracts it again, at the place of the unlearning. Where it cannot be subtracted, since two changes,
+  another time constant or many epochs of friction have come in between, the log is learnt anew from the state before
+  it, without it and without all else that is unlearnt on the way (`course.left_out`);
 * a rollback leads to the state after the event that it names, less what was unlearnt between that and the rollback.
   Events that it undoes are passed over where that is known before they are learnt.
 
@@ -30,7 +30,7 @@ from lipcore.online import transfer as state
 from lipcore.online.batch import Rows
 from lipcore.online.learner import ForgottenError, Novel, OnlineModel
 from service.journal import log, snapshots
-from service.journal.log import decode
+from service.journal.log import Memory, decode
 from service.learning.learner import course
 from service.learning.learner.course import RewoundError, Stretch, Taking, batch_of
 from service.storage.database import Database, EventRow
@@ -138,8 +138,7 @@ def advance(
     if part.is_rollback:
         for taking in part.takings.values():
             online = _take(database, known, online, taking, part.end)
-        for forgetting_s in part.forgetting_s or ():
-            online = online.with_forgetting(forgetting_s)
+        online = online if part.memory is None else _remembering(online, part.memory)
     else:
         rows = {each.event.number: each.rows for each in arrivals}
         online = _learn(database, known, online, part, rows, novel)
@@ -169,7 +168,7 @@ def _begin(
             except (ValueError, OSError) as error:
                 logger.error("snapshot %s of version %d of model %r cannot be used: %s", row.id, version, model, error)
                 limit, torn = row.number - 1, True
-        online = OnlineModel.start(base, course.in_force(session, model, start))
+        online = _remembering(OnlineModel.start(base), course.in_force(session, model, start))
     return Restored(model, version, start, online, start, without, torn)
 
 
@@ -192,8 +191,13 @@ def _learn(
         elif event.kind == "change":
             online = online.change((event.detail or {})["t"])
         elif event.kind == "settings":
-            online = online.with_forgetting((event.detail or {})["forgetting_s"])
+            online = _remembering(online, Memory.from_json(event.detail or {}))
     return online
+
+
+def _remembering(online: OnlineModel, memory: Memory) -> OnlineModel:
+    """What has been learnt, remembered otherwise from here on."""
+    return online.with_forgetting(memory.forgetting_s).with_walk(memory.friction_walk_s)
 
 
 def _take(database: Database, known: Restored, online: OnlineModel, taking: Taking, end: int) -> OnlineModel:
@@ -203,7 +207,7 @@ def _take(database: Database, known: Restored, online: OnlineModel, taking: Taki
         return online
     try:
         if taking.reweighed:
-            raise ForgottenError("forgetting has changed since")
+            raise ForgottenError("a time constant has changed since")
         every = [log.rows_of(each) for each in taking.events]
         for rows in every:
             online.check_unlearn(rows)

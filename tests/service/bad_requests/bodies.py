@@ -148,6 +148,7 @@ TEACHING = [
 SETTING = [
     *wrong(LEARNING, {}, "enabled", "on", None, 1, method="PUT"),
     *wrong(LEARNING, {}, "forgetting_s", 0, -1, 1e308, NAN, INF, "1 h", method="PUT"),
+    *wrong(LEARNING, {}, "friction_walk_s", 0, 9.9, 1e308, NAN, INF, "1 h", method="PUT"),
     *wrong(LEARNING, {}, "on_change", "wait", None, method="PUT"),
     *wrong(LEARNING, {}, "torque_limits", [1.0] * 6, "87", method="PUT"),
     *wrong(

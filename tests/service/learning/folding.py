@@ -29,21 +29,21 @@ class Fold:
 
     def _after(self, number: int, without: Without) -> OnlineModel:
         if number <= self.start:
-            return OnlineModel.start(self.base, self._forgetting(self.start))
+            return self._remembering(OnlineModel.start(self.base), self._settings(self.start))
         event = self.events[number]
         detail = event.detail or {}
         if event.kind == "rollback":
             to = max(detail["to"], self.start)
             online = self.after(to, without)
             taken = self._take(online, to, [self.events[each] for each in range(to + 1, number)], number, without)
-            return taken.with_forgetting(self._forgetting(detail["to"])) if detail["to"] < self.start else taken
+            return self._remembering(taken, self._settings(detail["to"])) if detail["to"] < self.start else taken
         online = self.after(number - 1, without)
         if event.kind == "unlearn":
             return self._take(online, number - 1, [event], number, without)
         if event.kind == "change":
             return online.change(detail["t"])
         if event.kind == "settings":
-            return online.with_forgetting(detail["forgetting_s"])
+            return self._remembering(online, detail)
         online = online.begin(event.received) if event.kind == "batch" else online
         batch = number if event.kind == "batch" else detail["event"]
         return online if without.get(batch, 0) >= number else online.learn(decode(event.payload))
@@ -97,9 +97,13 @@ class Fold:
             found = found | {_event(each) for each in span if each.kind == "unlearn" and _event(each) > self.start}
         return found
 
-    def _forgetting(self, number: int) -> float | None:
+    def _settings(self, number: int) -> Any:
         settings = [each for each in self._live(number) if each.kind == "settings"]
-        return settings[-1].detail["forgetting_s"] if settings else None
+        return settings[-1].detail if settings else {}
+
+    @staticmethod
+    def _remembering(online: OnlineModel, detail: Any) -> OnlineModel:
+        return online.with_forgetting(detail.get("forgetting_s")).with_walk(detail.get("friction_walk_s"))
 
 
 def _event(event: EventRow) -> int:

@@ -35,6 +35,7 @@ what = st.one_of(
     st.tuples(st.sampled_from(["replay", "unlearn", "unlearn", "rollback"]), st.integers(0, 100)),
     st.tuples(st.just("change"), st.integers(0, 30)),
     st.tuples(st.just("settings"), st.sampled_from([None, 0.5, 2.0])),
+    st.tuples(st.just("walk"), st.sampled_from([None, 2.0])),
 )
 piece = st.tuples(
     st.lists(what, min_size=1, max_size=8),  # what is logged
@@ -65,6 +66,8 @@ class Story:
             arm.event("change", t=BEGIN + value / 30)
         elif kind == "settings":
             arm.event("settings", forgetting_s=value)
+        elif kind == "walk":
+            arm.event("settings", forgetting_s=None, friction_walk_s=value)
         elif kind == "rollback":
             free = [each for each in range(len(events)) if each not in self.dead]
             if len(events) > 1:
@@ -138,6 +141,7 @@ def tell(pieces, page_rows: int, start: int) -> None:
 
 TWO_CHANGES = [("batch", 0), ("change", 3), ("batch", 5), ("change", 20), ("batch", 9)]
 TWICE = [("batch", 0), ("unlearn", 0), ("unlearn", 0), ("batch", 2), ("rollback", 3), ("batch", 3), ("rollback", 1)]
+DRIFTING = [("walk", 2.0), *(("batch", at) for at in (0, 1, 30, 8, 12, 16, 2, 20))]
 REWEIGHED = [("batch", 1), ("settings", 2.0), ("batch", 2)]
 
 
@@ -146,6 +150,7 @@ REWEIGHED = [("batch", 1), ("settings", 2.0), ("batch", 2)]
 @example([(TWO_CHANGES, 2, True), ([("unlearn", 0), ("batch", 11)], 9, False)], 3, 0)
 @example([(TWO_CHANGES, 3, True), ([("unlearn", 0), ("unlearn", 1), ("batch", 11), ("rollback", 3)], 3, True)], 3, 0)
 @example([(TWICE, 9, True)], 500, 0)
+@example([(DRIFTING, 3, True), ([("unlearn", 0), ("unlearn", 7), ("walk", None), ("rollback", 5)], 9, True)], 6, 0)
 @example([(REWEIGHED, 9, False), ([("unlearn", 0), ("rollback", 3)], 9, True)], 3, 0)
 def test_the_state_is_a_function_of_the_log_to_the_last_bit(pieces, page_rows, start):
     tell(pieces, page_rows, start)

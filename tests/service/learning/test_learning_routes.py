@@ -17,6 +17,7 @@ EQUAL = 1e-8
 DEFAULTS = {
     "enabled": True,
     "forgetting_s": None,
+    "friction_walk_s": None,
     "on_change": "hold",
     "torque_limits": None,
     "contact_threshold": 8.0,
@@ -173,7 +174,7 @@ def logged(database, model=MODEL):
     return [(event.number, event.kind, event.detail) for event in everything(database, model) if event.kind != "batch"]
 
 
-def test_only_another_forgetting_is_an_event(database):
+def test_only_another_time_constant_is_an_event(database):
     put(database, contact_threshold=5.0)
     assert logged(database) == []
     put(database, forgetting_s=60.0)
@@ -181,10 +182,12 @@ def test_only_another_forgetting_is_an_event(database):
     put(database, forgetting_s=60.0, enabled=False)
     put(database, forgetting_s=30.0)
     put(database)
+    put(database, friction_walk_s=1800.0)
     assert logged(database) == [
         (1, "settings", {"forgetting_s": 60.0}),
         (3, "settings", {"forgetting_s": 30.0}),
         (4, "settings", {"forgetting_s": None}),
+        (5, "settings", {"forgetting_s": None, "friction_walk_s": 1800.0}),
     ]
     assert everything(database)[0].received == 500.0
     with pytest.raises(NotFoundError, match="no model 'nobody'"):

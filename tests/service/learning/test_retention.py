@@ -2,7 +2,7 @@
 
 from service.foundation.settings import Settings
 from service.journal import log, snapshots
-from service.journal.log import encode
+from service.journal.log import Memory, encode
 from service.storage.database import LearnerRow, ServingRow, SnapshotRow, now
 from tests.service.learning.batches import MODEL, OTHER, batch, everything, note, rows, source, take_back, write
 
@@ -92,7 +92,7 @@ def test_other_events_go_with_the_batches_but_settings_in_force_stay(database):
     assert retain(database, batches=1) == 3  # 2, 3 and 5
     assert kept(database) == [1, 6, 7]
     with database.session() as session:
-        assert log.forgetting(session, MODEL, 7) == 60.0
+        assert log.memory(session, MODEL, 7) == Memory(60.0)
 
 
 def test_what_a_version_has_still_to_unlearn_stays(database):

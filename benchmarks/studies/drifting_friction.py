@@ -1,0 +1,187 @@
+"""Friction that drifts as an arm warms up: what a learnt arm knows after half an hour, with and without a walk.
+
+    python benchmarks/studies/drifting_friction.py SEED[,SEED...] [CASE[;CASE...]] [ROBOT]
+
+An arm is trained on 60 s at 100 Hz and then followed for 30 minutes at 100 Hz, of which every fifth row is learnt; each
+minute is a motion of its own. A row of the table is the mean over the seeds of the last five minutes: every stretch of
+EVERY_S seconds is predicted, compared, and learnt only then. nMSE of clean arms is that of the torque without noise.
+Moving: the same of the rows in which the joint is faster than MOVING; nearly all of a dirty arm's error is that of
+joints that have hardly broken away. Coverage is that of the model itself, without the factor that serving adds. Moved:
+the largest change of a mass or a step of the geometry since training, in trained standard deviations; opened: the
+largest ratio of their standard deviation to that of what is learnt as today.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+import lipcore
+from benchmarks.studies.dirty_arms import prepared
+from lipcore.data.independence import stream_weights
+from lipcore.data.metrics import evaluate
+from lipcore.data.samples import Array, Samples
+from lipcore.kernels.arm import ArmKernel
+from lipcore.model.parameters import weight_posterior
+from lipcore.model.torque_model import TorqueModel
+from lipcore.online.batch import Rows
+from lipcore.online.learner import OnlineModel
+from lipcore.robots.dirt import Dirt
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, simulate
+from lipcore.vocabulary import LEARNT
+
+RATE, KEEP, EVERY_S, MINUTES, JUDGED = 100.0, 5, 2.0, 30, 5
+NOISE = 0.05
+"""Of a clean arm, N·m; a dirty one's is in its dirt."""
+STREAM = Stream(round(60 * RATE), RATE, speed=5.0, noise=0.0)
+MOVING = 0.1
+"""rad/s."""
+VISCOUS, COULOMB = 0.5, 0.3
+"""Friction of a clean arm, N·m·s/rad and N·m."""
+NIGHT_S = 8 * 3600.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """dirt: of the arm, None of a clean one; falls: share by which a clean arm's friction falls, evenly; cold: minute
+    before which it stands still for a night, having been warm so far, None where it begins cold."""
+
+    dirt: Dirt | None = None
+    falls: float = 0.0
+    cold: int | None = None
+
+
+WARMS = Dirt(warmth=0.43, warm_s=600.0)
+CASES = {
+    "clean": Case(),
+    "clean, falls by 30 %": Case(falls=0.3),
+    "dirty": Case(Dirt(warmth=0.0)),
+    "dirty, 13 % in 5 min": Case(Dirt()),
+    "dirty, 30 % in 10 min": Case(WARMS),
+    "dirty, the next morning": Case(WARMS, cold=20),
+}
+WAYS: dict[str, dict[str, float]] = {
+    "as today": {},
+    "`forgetting_s` 300": {"forgetting_s": 300.0},
+    "`forgetting_s` 1800": {"forgetting_s": 1800.0},
+    "`friction_walk_s` 1800": {"friction_walk_s": 1800.0},
+}
+
+
+@dataclass(frozen=True)
+class Part:
+    """A minute. samples: as judged; tau: (N, n) N·m as measured, which is learnt."""
+
+    samples: Samples
+    tau: Array
+
+
+def simulated(name: str, case: Case, seed: int) -> tuple[Samples, list[Part]]:
+    """The recording that an arm is trained on, and the minutes of the stream."""
+    robot = load_robot(name)
+    rng = np.random.default_rng(seed)
+    known, parts = None, []
+    for minute in range(-1, MINUTES):
+        stream, begin = STREAM, 60.0 * minute
+        if case.dirt is None:
+            factor = 1 - case.falls * max(minute, 0) / (MINUTES - 1)
+            stream = replace(stream, viscous=factor * VISCOUS, coulomb=factor * COULOMB)
+        else:
+            since = -1 if case.cold is None else case.cold  # the minute in which it begins cold
+            warmth = case.dirt.warmth * np.exp(-60.0 * (minute - since) / case.dirt.warm_s) if minute >= since else 0.0
+            stream = replace(stream, dirt=replace(case.dirt, seed=seed, warmth=float(warmth)))
+        samples = simulate(robot, stream, 1000 * seed + minute + 1)
+        if minute < 0:
+            known = samples if case.dirt else replace(samples, tau=_noisy(samples.tau, rng))
+            known = prepared(known) if case.dirt else known.rows(slice(None, None, KEEP))
+            continue
+        samples = samples.rows(slice(None, None, KEEP))
+        pause = NIGHT_S if case.cold is not None and minute >= case.cold else 0.0
+        samples = replace(samples, t=samples.t + begin + pause)
+        parts.append(Part(samples, samples.tau if case.dirt else _noisy(samples.tau, rng)))
+    assert known is not None
+    return known, parts
+
+
+def _noisy(tau: Array, rng: np.random.Generator) -> Array:
+    return np.asarray(tau + NOISE * rng.standard_normal(tau.shape))
+
+
+def rows_of(part: Part) -> Rows:
+    """All rows, each with its weight."""
+    samples = part.samples
+    codes = np.full(len(samples), LEARNT, np.uint8)
+    return Rows(samples.t, samples.q, samples.dq, samples.ddq, part.tau, codes, stream_weights(samples.t))
+
+
+def body(model: TorqueModel) -> tuple[Array, Array]:
+    """Masses and steps of the geometry, and their standard deviations, (p,) each."""
+    term = model.estimator.terms["rigid_body"]
+    assert isinstance(term, ArmKernel)
+    weights = weight_posterior(model.posterior, term)
+    return weights.mean, weights.std
+
+
+@dataclass(frozen=True)
+class Found:
+    """Of the last minutes: nmse, that of joints in motion and coverage, (n,); of the end: masses and geometry, and
+    their deviations, (p,)."""
+
+    nmse: Array
+    moving: Array
+    coverage: Array
+    mean: Array
+    std: Array
+
+
+def followed(base: TorqueModel, parts: list[Part], way: dict[str, float]) -> Found:
+    """Learn a stream in one way, and judge its last minutes."""
+    online, model = OnlineModel.start(base, **way, since=0.0), base
+    step, answers = round(EVERY_S * RATE / KEEP), []
+    for minute, part in enumerate(parts):
+        rows = rows_of(part)
+        for first in range(0, len(rows), step):
+            chunk = rows.take(slice(first, first + step))
+            if minute >= MINUTES - JUDGED:
+                answer = model.predict(chunk.q, chunk.dq, chunk.ddq)
+                answers.append([answer.tau, answer.tau_std])
+            online = online.learn(chunk)
+            model = online.model()
+    tau, std = (np.concatenate(each) for each in zip(*answers, strict=True))
+    judged = Samples.concatenate([part.samples for part in parts[-JUDGED:]])
+    squares, moves = (judged.tau - tau) ** 2 / judged.tau.var(axis=0), np.abs(judged.dq) > MOVING
+    measured = np.concatenate([part.tau for part in parts[-JUDGED:]])
+    coverage = evaluate(measured, tau, std, base.noise_std).coverage
+    return Found(squares.mean(axis=0), (squares * moves).sum(axis=0) / moves.sum(axis=0), coverage, *body(model))
+
+
+def main() -> None:
+    """Print a Markdown table, a row for each case and way."""
+    torch.set_num_threads(1)
+    seeds = [int(each) for each in sys.argv[1].split(",")]
+    names = sys.argv[2].split(";") if len(sys.argv) > 2 and sys.argv[2] else list(CASES)
+    robot = sys.argv[3] if len(sys.argv) > 3 else "panda"
+    print("| case | way | nMSE | moving | coverage, % | lowest | moved | opened |\n|" + " --- |" * 8)
+    for name in names:
+        figures: dict[str, list[list[float]]] = {way: [] for way in WAYS}
+        for seed in seeds:
+            known, parts = simulated(robot, CASES[name], seed)
+            base = lipcore.train(known, load_robot(robot).joint_types, "rigid-body")
+            trained, trained_std = body(base)
+            every = {way: followed(base, parts, options) for way, options in WAYS.items()}
+            for way, found in every.items():
+                moved, opened = np.abs(found.mean - trained) / trained_std, found.std / every["as today"].std
+                errors = [found.nmse.mean(), found.moving.mean()]
+                figures[way].append([*errors, found.coverage.mean(), found.coverage.min(), moved.max(), opened.max()])
+        for way, rows in figures.items():
+            nmse, moving, coverage, lowest, moved, opened = np.mean(rows, axis=0)
+            shown = f"{nmse:.2e} | {moving:.2e} | {100 * coverage:.1f} | {100 * lowest:.0f}"
+            print(f"| {name} | {way} | {shown} | {moved:.1f} | {opened:.2f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
