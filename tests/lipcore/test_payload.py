@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import lipcore
+from lipcore.data.motion import Motion
 from lipcore.fitting.options import FitOptions
-from lipcore.model.payload import Body, Carrier, Linearised, NoArmError
+from lipcore.model.payload import Body, Carrier, Linearised, Load, NoArmError
 from lipcore.online.batch import Rows
 from lipcore.online.bodies import ANY, body, eta_of
 from lipcore.online.payload import estimate, known
@@ -127,6 +128,64 @@ def test_a_payload_is_known_within_a_second_and_its_intervals_hold(carrier, reco
         assert nmse < most * unaware
         assert inside > 0.85
     assert found.gain > 1e4
+
+
+@pytest.fixture(scope="module")
+def open_arm():
+    """A UR10 learnt from torque alone, whose wrist bears next to none: much of its geometry is open."""
+    robot = load_robot("ur10")
+    samples = simulate(robot, Stream(speed=5.0, noise=0.05, motion="full"), 53)
+    return samples, Carrier(lipcore.train(samples, robot.joint_types, "rigid-body"))
+
+
+def test_what_training_says_of_an_arm_of_another_geometry_is_what_its_samples_say(open_arm):
+    samples, carrier = open_arm
+    memory, model, arm = carrier.memory, carrier.model, carrier.term.arm
+    variance = model.posterior.noise_variance.numpy()
+    weight = model.posterior.statistics.samples / len(samples)
+    seen = Motion.from_arrays(samples.q, samples.dq, samples.ddq)
+    virtual = Motion.from_arrays(*memory.motions.swapaxes(0, 1))
+
+    def energies(w, geometry):
+        load = Load(np.append(w, np.zeros(10)), np.zeros((0, 0)), np.ones(10), geometry)
+        here, there = (
+            base + np.einsum("knj,k->nj", features, load.mean)
+            for features, base in (Linearised(carrier, load).rows(each) for each in (seen, virtual))
+        )
+        residual = memory.residual(w, there)
+        samples_say = weight * ((samples.tau - here) ** 2 / variance).sum() + w @ w
+        return np.array([0.5 * samples_say, 0.5 * residual @ residual])
+
+    before = arm.geometry.moved(carrier.step)
+    least, rng = energies(carrier.mean, before), np.random.default_rng(0)
+    linear, exact = [], []
+    for scale in (0.3, 1.0, 2.0):
+        for _ in range(4):
+            w = carrier.mean + memory.root @ (scale * rng.standard_normal(len(carrier.mean)))
+            moved = before.moved((w - carrier.mean)[carrier.steps] * carrier.root[carrier.steps])
+            w[carrier.steps] = (arm.geometry.towards(moved) - arm.expected) / carrier.root[carrier.steps]
+            samples_say, remembered = energies(w, moved) - least
+            assert remembered == pytest.approx(samples_say, rel=0.05, abs=3.0)
+            linear.append(0.5 * (np.linalg.solve(memory.root, w - carrier.mean) ** 2).sum())
+            exact.append(samples_say)
+    assert np.median(exact) > 5 * np.median(linear)
+
+
+def test_a_payload_shows_where_an_open_geometry_lies_and_its_intervals_hold(open_arm):
+    _, carrier = open_arm
+    robot, found = load_robot("ur10"), None
+    carried = Payload(1.0, 0.0, (0.05, 0.03, 0.08))
+    rows = as_rows(simulate(robot, Stream(300, 100.0, speed=5.0, noise=0.05, payload=carried), 54))
+    other = simulate(robot, Stream(300, 10.0, speed=5.0, noise=0.0, payload=carried, n_sinusoids=100), 55)
+    for count in (10, 30, 100, 300):
+        found = estimate(carrier, rows.take(slice(0, count, max(1, count // 100))), start=found, anew=True)
+    mass, std = found.mass
+    assert abs(mass - 1.0) < 4 * std < 0.05
+    turned = np.abs(carrier.term.arm.geometry.towards(found.load.geometry)[carrier.term.arm.geometry.turns])
+    assert turned.max() > 0.1  # further than anything is linear
+    answer = carrier.carrying(found.load).predict(other.q, other.dq, other.ddq)
+    assert ((answer.tau - other.tau) ** 2).mean(0).sum() < 3e-3 * other.tau.var(0).sum()
+    assert errors(carrier.carrying(found.load), other)[1] > 0.85
 
 
 def test_a_payload_that_is_there_no_more_leaves_the_arm_as_it_was(carrier, recorded):

@@ -82,6 +82,20 @@ def test_a_push_on_one_joint_is_a_contact_and_no_payload(carrier):
     assert "contact" in {watch.state for _, watch in watches}
 
 
+def test_a_small_payload_has_to_last_as_a_short_push_looks_like_one(carrier):
+    held = {round(at, 2): watch.held for at, watch in followed(carrier, stream(305, 0.1))}
+    taken = min(at for at, each in held.items() if each is not None)
+    assert UP + 0.2 < taken < UP + 0.45
+    mass, std = next(each for at, each in reversed(held.items()) if at < DOWN).estimate.mass
+    assert abs(mass - 0.1) < 4 * std
+    for begin in (20.0, 20.8, 21.5):  # the weight of the same mass, for a fifth of a second each
+        carried, free = stream(305, 0.1), stream(305)
+        during = ((carried.time >= begin) & (carried.time < begin + 0.2))[:, None]
+        tau = np.where(during, carried.tau, free.tau)
+        pushed = Rows(free.time, free.q, free.dq, free.ddq, tau, free.code)
+        assert all(watch.held is None for _, watch in followed(carrier, pushed))
+
+
 def test_batches_of_any_size_notice_the_same(carrier):
     rows = stream(300, 1.0, last=21.0)
     masses = [followed(carrier, rows, block)[-1][1].held.estimate.mass[0] for block in (3, 10, 77, len(rows))]
