@@ -296,16 +296,22 @@ class Watch:
         return out
 
     @staticmethod
-    def from_json(values: Mapping[str, Any], n: int, carrier: Carrier) -> Watch:
-        """What `to_json` wrote, for n joints. Of a payload only what was known of it by itself, not of the arm with it:
-        rows that follow tell."""
+    def from_json(values: Mapping[str, Any], n: int, carrier: Carrier, rows: Rows | None = None) -> Watch:
+        """What `to_json` wrote, for n joints. rows: that the payload was seen on, in order of event time. Without them
+        it is known by itself and not with the arm: rows that follow tell."""
         watch = Watch(n, values["state"], values["probabilities"], values["since"])
         if (kept := values["held"]) is None:
             return watch
-        prior = Known(np.array(kept["eta"]), np.linalg.inv(np.array(kept["covariance"])))
-        nothing, count = _none(n), int(kept["rows"])
-        since = float(values["since"])
-        held = Held(since, kept["declared"], nothing, nothing, 1, count, count + 1.0, prior, known(carrier, prior))
+        nothing, count, since, declared = _none(n), int(kept["rows"]), float(values["since"]), kept["declared"]
+        eta, covariance = np.array(kept["eta"]), np.array(kept["covariance"])
+        if rows is not None:
+            rows = rows.take(_evenly(0, len(rows), MOST_ROWS))
+            every = max(1, round(count / len(rows)))
+            found = replace(estimate(carrier, rows), eta=eta, covariance=covariance)
+            held = Held(since, declared, rows, nothing, every, count, GROWTH * count, ANY, found, count)
+        else:
+            prior = Known(eta, np.linalg.inv(covariance))
+            held = Held(since, declared, nothing, nothing, 1, count, count + 1.0, prior, known(carrier, prior))
         return replace(watch, held=held)
 
 
@@ -332,9 +338,9 @@ def _taken(window: Window, gains: Gains, held: Held | None = None, every: int = 
     return after if shows(real) and min(best, real) - window.past_contact() >= BETTER else None
 
 
-def _evenly(first: int, last: int) -> NDArray[np.int64]:
-    """Places from `first` to before `last`, CELL_ROWS of them at most, both ends among them."""
-    return np.unique(np.linspace(first, last - 1, min(CELL_ROWS, last - first)).round().astype(np.int64))
+def _evenly(first: int, last: int, most: int = CELL_ROWS) -> NDArray[np.int64]:
+    """Places from `first` to before `last`, so many at most, both ends among them."""
+    return np.unique(np.linspace(first, last - 1, min(most, last - first)).round().astype(np.int64))
 
 
 def _unloaded(features: Array) -> Array:

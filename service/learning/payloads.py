@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,23 +12,31 @@ from sqlalchemy.orm import Session
 
 from lipcore.model.payload import Body, Carrier
 from lipcore.model.torque_model import TorqueModel
+from lipcore.online.batch import Rows
 from lipcore.online.holding import Watch
 from lipcore.online.payload import Estimate
+from lipcore.vocabulary import CODES, LEARNT
+from service.journal import log
 from service.models.loads import Carried
 from service.storage.database import EventRow
 
 MOST_EVENTS = 3000
 """Of the log's newest, among which the last batch of a stream is looked for."""
+MOST_BATCHES = 40
+"""That are read again to know what a stream carries."""
+TEACHING = [LEARNT, CODES.index("payload")]
+"""Codes of rows that tell of a payload."""
 
 
 @dataclass
 class Noted:
     """What the log says of a stream: a batch's report, or a declaration. version: that predicted it, None for a
-    declaration; received: Unix time, s."""
+    declaration; received: Unix time, s; rows: that a payload was seen on, where they were looked for."""
 
     values: Mapping[str, Any]
     version: int | None
     received: float
+    rows: Rows | None = None
     _seen: tuple[Carrier, int, Watch] | None = field(default=None, init=False)
 
     def watch(self, carrier: Carrier, version: int) -> Watch:
@@ -46,7 +54,7 @@ class Noted:
         if learnt and self.version not in (None, version):
             return Watch(n)
         if "body" not in self.values:
-            return Watch.from_json(self.values, n, carrier)
+            return Watch.from_json(self.values, n, carrier, self.rows)
         body = self.values["body"]
         return (
             Watch(n).put_down(self.received) if body is None else Watch(n).declare(carrier, _body(body), self.received)
@@ -86,6 +94,11 @@ class Payloads:
         events = [*batches, *session.scalars(select(EventRow).where(*declared))]
         for event in sorted(events, key=lambda each: each.number):
             made.remember(event)
+        for stream_id, noted in made._noted.items():
+            held = noted.values.get("held")
+            if held is not None and not held["declared"]:
+                rows = _seen_on(session, model, stream_id, float(noted.values["since"]))
+                made._noted[stream_id] = replace(noted, rows=rows)
         return made
 
     def remember(self, event: EventRow) -> None:
@@ -150,6 +163,21 @@ class Payloads:
         model.answer(np.zeros((3, model.n_joints)))  # whoever asks next does not wait for it to be laid out
         self._models[stream_id] = found, carrier, model
         return model
+
+
+def _seen_on(session: Session, model: str, stream_id: str, since: float) -> Rows | None:
+    """Rows of a stream since an event time, s, of as many batches as are read, evenly spread; None without any."""
+    of_stream = EventRow.model == model, EventRow.stream_id == stream_id, EventRow.kind == "batch"
+    since_then = select(EventRow.number).where(*of_stream, EventRow.last >= since).order_by(EventRow.number)
+    numbers = list(session.scalars(since_then))
+    places = np.unique(np.linspace(0, len(numbers) - 1, min(len(numbers), MOST_BATCHES)).round().astype(int))
+    chosen = EventRow.model == model, EventRow.number.in_([numbers[place] for place in places])
+    parts = [log.rows_of(event) for event in session.scalars(select(EventRow).where(*chosen))]
+    if not parts:
+        return None
+    rows = Rows.concatenate(parts)
+    rows = rows.take(np.isin(rows.code, TEACHING) & (rows.time >= since))
+    return rows.take(np.argsort(rows.time, kind="stable")) if len(rows) else None
 
 
 def _body(values: Mapping[str, Any]) -> Body:
