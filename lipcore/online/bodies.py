@@ -6,6 +6,7 @@ numbers η, log mass, centre of mass and the Cholesky factor of the spread about
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,11 @@ link's frame and spread over 1 to 16 cm."""
 STEPS, DAMPING = 50, 1e-3
 LEAST_EXTENT = 1e-3
 """Of a body, m: none is a point."""
+
+LEVER, RADIUS = 0.13, 0.14
+SHAPE = np.array([1.0, *[LEVER] * 3, *[RADIUS**2] * 6])
+CONTACTS = (1.0, 3.0)
+"""Scales of a contact's torque, in units of what is usual."""
 
 
 def body(eta: Array) -> tuple[Array, Array]:
@@ -102,3 +108,19 @@ def most_likely(told: Array, pull: Array, prior: Known, start: Array) -> tuple[A
 def inverse(matrix: Array) -> Array:
     """Of a covariance or a precision."""
     return np.asarray(np.linalg.inv(matrix), np.float64)
+
+
+def usual(features: Array) -> float:
+    """What a payload of 1.5 kg makes of the joint where it makes most, N·m. features: of its parameters, (10, n)."""
+    return float(np.sqrt(((features * (1.5 * SHAPE)[:, None]) ** 2).sum(axis=0).max()))
+
+
+def evidence(gram: Array, pull: Array, scales: Sequence[Array]) -> Array:
+    """Evidence gained by each of K sets of features whose coefficients are N(0, diag scale²), averaged over the scales:
+    (K,) nats. gram: Fᵀ C⁻¹ F, (K, p, p); pull: Fᵀ C⁻¹ r, (K, p), with the covariance C of the residuals r."""
+    scale = np.array(scales)[:, None]  # (S, 1, p)
+    total = np.eye(gram.shape[-1]) + scale[..., None] * gram * scale[..., None, :]
+    scaled = scale * pull
+    solved = np.linalg.solve(total, scaled[..., None])[..., 0]
+    gained = 0.5 * (scaled * solved).sum(axis=-1) - 0.5 * np.linalg.slogdet(total)[1]
+    return np.asarray(np.logaddexp.reduce(gained, axis=0) - np.log(len(scales)))

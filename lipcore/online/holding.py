@@ -234,8 +234,10 @@ class Watch:
             before = before.take(slice(None, None, -(-len(before) // BEFORE_ROWS)))
         found = estimate(carrier, rows, before)
         strange = np.abs((found.eta - ANY.centre) / np.sqrt(1 / np.diagonal(ANY.precision))).max() > STRANGE
-        least = PRECISE if after < LASTING else np.inf if found.gain >= AT_ONCE else 1 / POSITIVE
-        if strange or np.sqrt(found.covariance[0, 0]) > least:
+        vague = 1 / POSITIVE if found.gain < AT_ONCE else np.inf
+        if after < LASTING:
+            vague = PRECISE if found.gain - found.contact >= BETTER else 0.0
+        if strange or np.sqrt(found.covariance[0, 0]) > vague:
             return replace(self, state="contact")
         since = float(rows.time[0])
         held = Held(since, False, rows, before, 1, len(rows), GROWTH * len(rows), ANY, found, len(rows))
@@ -320,13 +322,15 @@ def _taken(window: Window, gains: Gains, held: Held | None = None, every: int = 
     many cells the window has one."""
     after = max(gains, key=lambda each: gains[each]["payload"])
     contact = gains[after]["contact"]
-    share = NEARLY**every if LASTING <= after < len(window.cells) else ALIKE
+    best = gains[after]["payload"]
+    # at once, the rows decide with the arm's geometry as they have it; see `Watch._take_up`
+    near = after >= LASTING or (held is None and best >= AT_ONCE)
+    share = NEARLY**every if near and after < len(window.cells) else ALIKE
     sure, certain = (SURE, CERTAIN) if held is None else (ANOTHER, ANOTHER)
 
     def shows(payload: float) -> bool:
         return (payload >= sure and payload - contact >= BETTER) or (payload >= certain and payload >= share * contact)
 
-    best = gains[after]["payload"]
     if not shows(best) or (after < LASTING and (best < AT_ONCE or every > 1)):
         return None
     if held is None:

@@ -26,7 +26,7 @@ from lipcore.data.samples import Array
 from lipcore.kernels.friction import SIGN_WIDTH
 from lipcore.model.payload import Linearised
 from lipcore.online.batch import Rows
-from lipcore.online.bodies import ANY, most_likely
+from lipcore.online.bodies import ANY, CONTACTS, SHAPE, evidence, most_likely, usual
 from lipcore.online.payload import likeness, noise_parts
 from lipcore.robots.urdf import PARAMETERS
 
@@ -39,11 +39,8 @@ AFTER = (1, 2, 3, 4, 5, 6)
 """Cells that are compared: before the instant, at most and at least; and after it."""
 MASSES = (0.5, 1.5, 5.0)
 """Scales of a payload's mass, kg; first moment and inertia as of a body about LEVER and RADIUS away."""
-LEVER, RADIUS = 0.13, 0.14
-SHAPE = np.array([1.0, *[LEVER] * 3, *[RADIUS**2] * 6])
-CONTACTS, FRICTIONS = (1.0, 3.0), (0.1, 0.3)
-"""Scales of a contact's torque and of a change of friction, in units of what a payload of 1.5 kg makes on the joint
-where it is largest."""
+FRICTIONS = (0.1, 0.3)
+"""Scales of a change of friction, in units of what is usual, see `bodies.usual`."""
 Kind = Literal["payload", "contact", "friction"]
 
 
@@ -151,8 +148,8 @@ class Window:
         columns = np.einsum("sk,ij->kjsi", during, np.eye(n)).reshape(count * n, -1)
         whitened = solve_triangular(self.root, columns, lower=True, check_finite=False)
         blocks = whitened.reshape(-1, len(spans), n).transpose(1, 0, 2)
-        usual = self._usual()
-        return float(_mixed(blocks, self.residual, [np.full(n, each * usual) for each in CONTACTS]).max())
+        typical = usual(self.cells[-1].features[-PARAMETERS:])
+        return float(self._evidence(blocks, [np.full(n, each * typical) for each in CONTACTS]).max())
 
     def mass(self, after: int) -> tuple[float, float]:
         """Mean and standard deviation, kg, of the mass that is carried more for the last cells, of either sign."""
@@ -161,10 +158,10 @@ class Window:
         spread = np.linalg.inv(np.eye(PARAMETERS) + scale[:, None] * told * scale)
         return MASSES[1] * float(spread[0] @ (scale * pull)), MASSES[1] * float(np.sqrt(spread[0, 0]))
 
-    def _usual(self) -> float:
-        """What a payload of 1.5 kg makes in the last cell of the joint where it makes most, N·m."""
-        payload = self.cells[-1].features[-PARAMETERS:] * (1.5 * SHAPE)[:, None]
-        return float(np.sqrt((payload**2).sum(axis=0).max()))
+    def _evidence(self, features: Array, scales: Sequence[Array]) -> Array:
+        """Nats gained by each of K sets of whitened features, (K, N n, p), see `bodies.evidence`."""
+        gram, pull = features.transpose(0, 2, 1) @ features, np.einsum("kni,n->ki", features, self.residual)
+        return evidence(gram, pull, scales)
 
     def _of_payload(self, after: int) -> tuple[Array, Array]:
         """Λ (10, 10) and ξ (10,) of what the last cells say of a payload, as in `payload`."""
@@ -183,11 +180,11 @@ class Window:
         contact = np.broadcast_to(np.eye(n)[:, None], (n, count, n))
         turns = np.tanh(np.array([each.dq for each in self.cells]) / SIGN_WIDTH)
         friction = contact * turns
-        usual = self._usual()
+        typical = usual(self.cells[-1].features[-PARAMETERS:])
         scales: dict[Kind, list[Array]] = {
             "payload": [mass * SHAPE for mass in MASSES],
-            "contact": [np.full(n, each * usual) for each in CONTACTS],
-            "friction": [np.full(n, each * usual) for each in FRICTIONS],
+            "contact": [np.full(n, each * typical) for each in CONTACTS],
+            "friction": [np.full(n, each * typical) for each in FRICTIONS],
         }
         kinds: dict[Kind, Array] = {"payload": payload, "contact": contact, "friction": friction}
         spans = [each for each in after if count - each >= LEAST_BEFORE or count == each]
@@ -203,18 +200,6 @@ class Window:
             size, number = len(each), len(spans)
             block = whitened[:, at : at + size * number].reshape(-1, number, size).transpose(1, 0, 2)
             at += size * number
-            for span, gain in zip(spans, _mixed(block, self.residual, scales[kind]), strict=True):
+            for span, gain in zip(spans, self._evidence(block, scales[kind]), strict=True):
                 out[span][kind] = float(gain)
         return out
-
-
-def _mixed(features: Array, residual: Array, scales: list[Array]) -> Array:
-    """Evidence gained by each of K sets of whitened features, (K, N n, p), whose coefficients are N(0, diag scale²),
-    averaged over the scales: (K,) nats."""
-    gram, pull = features.transpose(0, 2, 1) @ features, np.einsum("kni,n->ki", features, residual)
-    scale = np.array(scales)[:, None]  # (S, 1, p)
-    total = np.eye(gram.shape[-1]) + scale[..., None] * gram * scale[..., None, :]
-    scaled = scale * pull
-    solved = np.linalg.solve(total, scaled[..., None])[..., 0]
-    gained = 0.5 * (scaled * solved).sum(axis=-1) - 0.5 * np.linalg.slogdet(total)[1]
-    return np.asarray(np.logaddexp.reduce(gained, axis=0) - np.log(len(scales)))

@@ -24,7 +24,7 @@ from lipcore.kernels.arm_prior import Alternative
 from lipcore.kernels.geometry import Geometry
 from lipcore.model.payload import Carrier, Linearised, Load
 from lipcore.online.batch import Rows
-from lipcore.online.bodies import ANY, WIDTH, Known, body, inverse
+from lipcore.online.bodies import ANY, CONTACTS, WIDTH, Known, body, evidence, inverse, usual
 from lipcore.robots.urdf import PARAMETERS
 
 FIRST, ROUNDS, STILL = 30, 8, 1e-3
@@ -47,12 +47,14 @@ LEAST_WHITE = 1e-3
 @dataclass(frozen=True)
 class Estimate:
     """A payload as rows have it. eta, (10,): most likely; covariance: (10, 10) of it; load: with the arm's variables;
-    gain: nats by which it explains the rows better than the arm without a payload."""
+    gain, contact: nats by which it explains the rows better than the arm without a payload, and
+    a contact does; places: see `_places`."""
 
     eta: Array
     covariance: Array
     load: Load
     gain: float
+    contact: float
     places: tuple[Place, ...] = ()
 
     @property
@@ -65,7 +67,7 @@ def known(carrier: Carrier, prior: Known) -> Estimate:
     """A payload of which no more is known than beforehand."""
     payload, slope = body(prior.centre)
     spread = inverse(prior.precision)
-    return Estimate(prior.centre, spread, carrier.known(payload, slope @ spread @ slope.T), 0.0)
+    return Estimate(prior.centre, spread, carrier.known(payload, slope @ spread @ slope.T), 0.0, 0.0)
 
 
 def estimate(
@@ -99,7 +101,7 @@ def estimate(
     places = _places(problem, at, root, () if start is None else start.places)
     load = replace(load, others=_others(carrier, at, root, places))
     of_eta = max(1.0, at.misfit) * root[size:] @ root[size:].T
-    return Estimate(eta, of_eta, load, problem.gain(at), places)
+    return Estimate(eta, of_eta, load, *problem.gains(at), places)
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,20 +228,29 @@ class _Problem:
         residual = np.concatenate([memory.residual(place.w, torque), off, root @ (place.eta - self.prior.centre)])
         return _Point(place, residual, derivative, float((off**2).mean()))
 
-    def gain(self, at: _Point) -> float:
-        """Nats by which a payload explains the rows better than the arm does without one, that is linear then."""
-        carrier, memory = self.carrier, self.carrier.memory
+    def gains(self, at: _Point) -> tuple[float, float]:
+        """Nats by which a payload, and a contact of constant torque, explain the rows better than the arm does without
+        either, which is linear then."""
+        carrier, memory, size = self.carrier, self.carrier.memory, len(at.place.w)
         nothing = Linearised(carrier, carrier.known(np.zeros(PARAMETERS)))
         parts = [_rows(nothing, *each) for each in (self.free, self.loaded) if each is not None]
         features, torque = (np.concatenate(each, axis=-2) for each in zip(*parts, strict=True))
-        features, off = _whitened(self.roots, features, torque - self.tau)
-        along = features[: len(carrier.mean)].T @ memory.root
-        curvature = np.eye(len(carrier.mean)) + along.T @ along
-        explained = along.T @ off
+        count, n = torque.shape
+        touched = np.zeros((n, count, n))
+        touched[:, count - len(self.loaded[0]) :] = np.eye(n)[:, None]
+        typical = usual(features[size:, -1])
+        features, off = _whitened(self.roots, np.concatenate([features[:size], touched]), torque - self.tau)
+        along, contact = features[:size].T @ memory.root, features[size:].T
+        curvature = np.eye(size) + along.T @ along
+        explained, shared = along.T @ off, along.T @ contact
+        within = np.linalg.solve(curvature, np.column_stack([explained, shared]))
+        gram, pull = contact.T @ contact - shared.T @ within[:, 1:], shared.T @ within[:, 0] - contact.T @ off
+        of_contact = evidence(gram[None], pull[None], [np.full(n, each * typical) for each in CONTACTS])
         alone = memory.residual(carrier.mean, memory.base + np.tensordot(carrier.mean, memory.features, axes=1))
-        free_energy = 0.5 * float(alone @ alone + off @ off - explained @ np.linalg.solve(curvature, explained))
+        free_energy = 0.5 * float(alone @ alone + off @ off - explained @ within[:, 0])
         volume = np.linalg.slogdet(at.derivative.T @ at.derivative)[1] - np.linalg.slogdet(self.prior.precision)[1]
-        return free_energy - at.energy + 0.5 * float(np.linalg.slogdet(curvature)[1] - volume)
+        of_payload = free_energy - at.energy + 0.5 * float(np.linalg.slogdet(curvature)[1] - volume)
+        return of_payload, float(of_contact[0])
 
 
 def _around(carrier: Carrier, place: Place, payload: Array) -> Linearised:
