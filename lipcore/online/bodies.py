@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lipcore.data.samples import Array
-from lipcore.model.payload import Body
+from lipcore.model.body import Body
 from lipcore.robots.urdf import PARAMETERS
 
 CENTRE = np.array([0.0, 0, 0, 0, *[np.log(0.04)] * 3, 0, 0, 0])

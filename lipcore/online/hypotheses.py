@@ -27,13 +27,13 @@ from lipcore.kernels.friction import SIGN_WIDTH
 from lipcore.model.payload import Linearised
 from lipcore.online.batch import Rows
 from lipcore.online.bodies import ANY, CONTACTS, SHAPE, evidence, most_likely, usual
-from lipcore.online.payload import likeness, noise_parts
+from lipcore.online.errors import likeness, noise_parts
 from lipcore.robots.urdf import PARAMETERS
 
 CELL_S = 0.05
 LIKE, REST_S = (1.0, 0.5), 0.3
-"""Of errors that change with motion, see `payload.likeness`, and of what holds a joint at rest, s. Chosen on the dirty
-Panda of seed 50: with those of `payload` 0.5 kg are not seen, with twice as much fast motion looks like a payload."""
+"""Of errors that change with motion, see `errors.likeness`, and of what holds a joint at rest, s. Chosen on the dirty
+Panda of seed 50: with those of `errors` 0.5 kg are not seen, with twice as much fast motion looks like a payload."""
 BEFORE, LEAST_BEFORE = 6, 4
 AFTER = (1, 2, 3, 4, 5, 6)
 """Cells that are compared: before the instant, at most and at least; and after it."""

@@ -15,7 +15,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from scipy.linalg import qr, solve_triangular
 
 from lipcore.data.motion import Motion
@@ -25,6 +24,7 @@ from lipcore.kernels.geometry import Geometry
 from lipcore.model.payload import Carrier, Linearised, Load
 from lipcore.online.batch import Rows
 from lipcore.online.bodies import ANY, CONTACTS, WIDTH, Known, body, evidence, inverse, usual
+from lipcore.online.errors import correlation_roots, whitened
 from lipcore.robots.urdf import PARAMETERS
 
 FIRST, ROUNDS, STILL = 30, 8, 1e-3
@@ -38,10 +38,6 @@ REACH = 0.5
 PLACES, RENEWED, SEED, LINEAR = 8, 2, 0, 2.0
 """Places in the posterior by which it is judged how far it is from linear; how many are looked for again with more
 rows; what they are drawn by; and the mean square, in deviations of the linear posterior, up to which it is as good."""
-LIKE = 0.3, 0.3
-"""See `likeness`. Chosen on the dirty Panda of seed 50 among three pairs."""
-LEAST_WHITE = 1e-3
-"""Share of the noise's variance that is new in every row at least."""
 
 
 @dataclass(frozen=True)
@@ -217,7 +213,7 @@ class _Problem:
             others, torque_free = _rows(free, *self.free)
             others[-PARAMETERS:] = 0.0
             features, torque = np.concatenate([others, features], axis=1), np.concatenate([torque_free, torque])
-        features, off = _whitened(self.roots, features, torque - self.tau)
+        features, off = whitened(self.roots, features, torque - self.tau)
         remembered, torque = _rows(free, *self.virtual)
         root = np.linalg.cholesky(self.prior.precision).T
         by_arm = np.concatenate([memory.derivative(remembered[:size]), features[:size].T @ memory.root])
@@ -239,7 +235,7 @@ class _Problem:
         touched = np.zeros((n, count, n))
         touched[:, count - len(self.loaded[0]) :] = np.eye(n)[:, None]
         typical = usual(features[size:, -1])
-        features, off = _whitened(self.roots, np.concatenate([features[:size], touched]), torque - self.tau)
+        features, off = whitened(self.roots, np.concatenate([features[:size], touched]), torque - self.tau)
         along, contact = features[:size].T @ memory.root, features[size:].T
         curvature = np.eye(size) + along.T @ along
         explained, shared = along.T @ off, along.T @ contact
@@ -295,44 +291,3 @@ def _others(carrier: Carrier, at: _Point, root: Array, places: tuple[Place, ...]
         assert each.geometry is not None
         arms.append(carrier.alternative(each.w, each.geometry, body(each.eta)[0], share))
     return tuple(arms)
-
-
-def noise_parts(carrier: Carrier, motion: Motion) -> tuple[Array, Array, Array]:
-    """Variance of the torques at N instants, (N·m)²: what is new in every row, (n,); what is not, as errors that last
-    are, and those of faster motion, (N, n); and that of joints at rest, (N, n), which may break away at any time."""
-    posterior = carrier.model.posterior
-    noise, misfit = posterior.noise_variance, posterior.misfit
-    white = torch.maximum(noise - misfit.lasting, LEAST_WHITE * noise)
-    rest = misfit.at_rest(motion.dq)
-    return white.numpy(), (misfit.lasting + misfit.variance(motion) - rest).numpy(), rest.numpy()
-
-
-def likeness(carrier: Carrier, q: Array, dq: Array, speed: float, pose: float) -> Array:
-    """Correlation of the errors of N instants that are not new in each, joint by joint: (n, N, N).
-
-    They are functions of motion, as friction is, and not of time: alike where a joint moves alike in a pose that is
-    alike, whether just before or long ago. q, dq: (N, n); speed, pose: differences over which they become others, of
-    the joint's velocity in units of its usual one, and of the pose, root mean square over joints, rad (m).
-    """
-    faster = np.abs(dq[:, None] - dq[None]) / carrier.model.posterior.misfit.speed.numpy()
-    apart = np.sqrt(((q[:, None] - q[None]) ** 2).mean(axis=-1, keepdims=True))
-    return np.asarray(np.exp(-faster / speed - apart / pose).transpose(2, 0, 1))
-
-
-def correlation_roots(carrier: Carrier, rows: Rows) -> Array:
-    """Cholesky roots of the covariance of the errors of N rows, joint by joint: (n, N, N) N·m."""
-    white, lasting, rest = noise_parts(carrier, rows.motion())
-    deviation = np.sqrt((lasting + rest).T)
-    covariance = deviation[:, :, None] * deviation[:, None, :] * likeness(carrier, rows.q, rows.dq, *LIKE)
-    covariance[:, np.arange(len(rows)), np.arange(len(rows))] += white[:, None]
-    return np.asarray(np.linalg.cholesky(covariance))
-
-
-def _whitened(roots: Array, features: Array, residual: Array) -> tuple[Array, Array]:
-    """Features (M + 10, N n) and residuals (N n,) whose errors are independent, of variance one."""
-    both = np.concatenate([features, residual[None]]).transpose(2, 1, 0)
-    solved = torch.linalg.solve_triangular(
-        torch.from_numpy(roots), torch.from_numpy(np.ascontiguousarray(both)), upper=False
-    )
-    flat = solved.numpy().reshape(-1, both.shape[2]).T
-    return flat[:-1], flat[-1]

@@ -10,7 +10,8 @@ import numpy as np
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from lipcore.model.payload import Body, Carrier
+from lipcore.model.body import Body
+from lipcore.model.payload import Carrier
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online.batch import Rows
 from lipcore.online.holding import Watch

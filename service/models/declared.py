@@ -8,7 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from lipcore.model.payload import Body, Carrier
+from lipcore.model.body import Body
+from lipcore.model.payload import Carrier
 from lipcore.model.torque_model import TorqueModel
 
 Numbers = tuple[float, Sequence[float], Sequence[Sequence[float]] | None]

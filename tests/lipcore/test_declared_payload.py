@@ -14,7 +14,8 @@ from lipcore.data.motion import Motion
 from lipcore.kernels.arm_prior import Arm
 from lipcore.kernels.payload import PayloadKernel
 from lipcore.model import dynamics
-from lipcore.model.payload import Body, Carrier, NoArmError
+from lipcore.model.body import Body
+from lipcore.model.payload import Carrier, NoArmError
 from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import Stream, simulate
 from lipcore.robots.urdf import RigidBody

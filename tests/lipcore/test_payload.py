@@ -8,7 +8,8 @@ import pytest
 import lipcore
 from lipcore.data.motion import Motion
 from lipcore.fitting.options import FitOptions
-from lipcore.model.payload import Body, Carrier, Linearised, Load, NoArmError
+from lipcore.model.body import Body
+from lipcore.model.payload import Carrier, Linearised, Load, NoArmError
 from lipcore.online.batch import Rows
 from lipcore.online.bodies import ANY, body, eta_of
 from lipcore.online.payload import estimate, known

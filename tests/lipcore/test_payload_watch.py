@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import lipcore
-from lipcore.model.payload import Body, Carrier
+from lipcore.model.body import Body
+from lipcore.model.payload import Carrier
 from lipcore.online.batch import Rows
 from lipcore.online.holding import Watch
 from lipcore.online.learner import OnlineModel

@@ -20,7 +20,8 @@ from numpy.testing import assert_allclose
 import lipcore
 from lipcore.data.motion import Motion
 from lipcore.model import dynamics
-from lipcore.model.payload import Body, Carrier, NoArmError
+from lipcore.model.body import Body
+from lipcore.model.payload import Carrier, NoArmError
 from service.client import AsyncClient
 from service.inference import predicting
 from service.models import declared

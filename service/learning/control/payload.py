@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lipcore.data.samples import Array
-from lipcore.model.payload import Body
+from lipcore.model.body import Body
 from lipcore.online.bodies import BELOW, DIAGONAL
 from lipcore.online.holding import Watch
 from lipcore.online.payload import Estimate

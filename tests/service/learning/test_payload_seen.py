@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families as parse
 
-from lipcore.model.payload import Body
+from lipcore.model.body import Body
 from lipcore.online.bodies import CENTRE, WIDTH
 from lipcore.online.bodies import body as parameters_of
 from service.client import ApiError, AsyncClient, Client

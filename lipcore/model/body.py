@@ -1,0 +1,69 @@
+"""A rigid body that an arm carries, as controllers are given it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lipcore.data.samples import Array
+
+ROUNDING = 1e-12
+"""Share of the inertia about the link's frame that may be rounding."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """A rigid body in the frame of an arm's last link.
+
+    mass: kg, above zero; com: (3,) m, its centre of mass; inertia: (3, 3) kg·m² about the centre of mass, along the
+    axes of the link; that of a point where None. Raise ValueError for a body that cannot exist.
+    """
+
+    mass: float
+    com: Array
+    inertia: Array | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.mass < np.inf:
+            raise ValueError(f"mass is {self.mass!r}, expected a positive number of kg")
+        if self.com.shape != (3,) or not np.isfinite(self.com).all():
+            raise ValueError(f"com is {self.com.tolist()}, expected three finite numbers, m")
+        if self.inertia is None:
+            return
+        if self.inertia.shape != (3, 3) or not np.isfinite(self.inertia).all():
+            raise ValueError(f"inertia is {self.inertia.tolist()}, expected a matrix of 3 × 3 finite numbers, kg·m²")
+        size = np.abs(self.inertia).max()
+        if not np.allclose(self.inertia, self.inertia.T, atol=1e-6 * size):
+            raise ValueError(f"inertia is {self.inertia.tolist()}, expected a symmetric matrix")
+        spread = 0.5 * np.trace(self.inertia) * np.eye(3) - self.inertia
+        if np.linalg.eigvalsh(spread)[0] < -1e-9 * size:
+            raise ValueError(
+                f"inertia is {self.inertia.tolist()}, which no body has: expected no principal moment above the sum of "
+                "the other two"
+            )
+
+    @property
+    def parameters(self) -> Array:
+        """Mass, first moment and inertia about the link's frame, xx, xy, yy, xz, yz, zz: (10,)."""
+        own = np.zeros((3, 3)) if self.inertia is None else self.inertia
+        about = own + self.mass * (self.com @ self.com * np.eye(3) - np.outer(self.com, self.com))
+        return np.concatenate([[self.mass], self.mass * self.com, about[LOWER]])
+
+    @classmethod
+    def of(cls, parameters: Array) -> Body:
+        """The body of ten parameters, a point where no more than rounding is its own inertia; raise ValueError where
+        none has these."""
+        mass = float(parameters[0])
+        if not mass > 0:
+            raise ValueError(f"parameters are {parameters.tolist()}, expected a mass above zero")
+        com = parameters[1:4] / mass
+        about = np.zeros((3, 3))
+        about[LOWER] = parameters[4:]
+        about = about + np.tril(about, -1).T
+        own = about - mass * (com @ com * np.eye(3) - np.outer(com, com))
+        return cls(mass, com, None if np.abs(own).max() <= ROUNDING * np.abs(about).max() else own)
+
+
+LOWER = np.tril_indices(3)
+"""Where xx, xy, yy, xz, yz and zz stand in a matrix."""

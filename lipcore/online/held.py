@@ -1,0 +1,115 @@
+"""A payload that is carried: estimated again as its rows grow, declared, and written down."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lipcore.data.samples import Array
+from lipcore.model.body import Body
+from lipcore.model.payload import Carrier
+from lipcore.online.batch import Rows
+from lipcore.online.bodies import ANY, Known, eta_of, inverse
+from lipcore.online.payload import Estimate, estimate, known
+
+MOST_ROWS, BEFORE_ROWS, GROWTH, ANEW = 100, 10, 1.25, 2.0
+"""Rows that a payload is estimated from, evenly spread over the time since; rows before it; by how many times they have
+to grow until it is estimated again, and until it is from nothing."""
+DECLARED, WRONG = np.array([0.02, *[0.005] * 3, *[0.3] * 3, *[0.005] * 3]), 4.0
+"""Standard deviations of η of a payload that was declared: of log mass, m, of log m, m; and how many of them it lies
+off where rows show that something else is carried."""
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """A payload that is carried. since: event time, s, from which on; declared: whether it was said and not only seen;
+    rows: that it is estimated from, before: that came before it; every: of how many rows one is kept; count: rows that
+    it was seen on; due: their number at which it is estimated again; prior: what was known of it;
+    begun: their number when it was last estimated from nothing."""
+
+    since: float
+    declared: bool
+    rows: Rows
+    before: Rows
+    every: int
+    count: int
+    due: float
+    prior: Known
+    estimate: Estimate
+    begun: int = 0
+
+    @staticmethod
+    def seen(carrier: Carrier, rows: Rows, before: Rows) -> Held:
+        """What rows show, beside those before them."""
+        before = before.take(slice(None, None, max(1, -(-len(before) // BEFORE_ROWS))))
+        found, count = estimate(carrier, rows, before), len(rows)
+        return Held(float(rows.time[0]), False, rows, before, 1, count, GROWTH * count, ANY, found, count)
+
+    @staticmethod
+    def said(carrier: Carrier, body: Body, at: float) -> Held:
+        """What is declared to be carried from event time `at`, s, on."""
+        prior, nothing = Known(eta_of(body), np.diag(DECLARED**-2.0)), no_rows(carrier.model.n_joints)
+        return Held(at, True, nothing, nothing, 1, 0, 1.0, prior, known(carrier, prior))
+
+    def seen_by(self, carrier: Carrier) -> Held:
+        """The same as another revision of the model sees it."""
+        if len(self.rows):
+            return replace(self, estimate=estimate(carrier, self.rows, self.before, self.prior, self.estimate))
+        prior = Known(self.estimate.eta, inverse(self.estimate.covariance))
+        return replace(self, estimate=known(carrier, prior))
+
+    def to_json(self) -> dict[str, Any]:
+        """What a batch's report says of it."""
+        return {
+            "declared": self.declared,
+            "rows": self.count,
+            "eta": self.estimate.eta.tolist(),
+            "covariance": self.estimate.covariance.tolist(),
+        }
+
+    @staticmethod
+    def from_json(values: Mapping[str, Any], since: float, carrier: Carrier, rows: Rows | None) -> Held:
+        """What `to_json` wrote. rows: that it was seen on, in order of event time. Without them it is known by itself
+        and not with the arm: rows that follow tell."""
+        count, nothing = int(values["rows"]), no_rows(carrier.model.n_joints)
+        eta, covariance = np.array(values["eta"]), np.array(values["covariance"])
+        if rows is None:
+            prior = Known(eta, inverse(covariance))
+            return Held(
+                since, values["declared"], nothing, nothing, 1, count, count + 1.0, prior, known(carrier, prior)
+            )
+        rows = rows.take(evenly(0, len(rows), MOST_ROWS))
+        found = replace(estimate(carrier, rows), eta=eta, covariance=covariance)
+        every = max(1, round(count / len(rows)))
+        return Held(since, values["declared"], rows, nothing, every, count, GROWTH * count, ANY, found, count)
+
+    def more(self, carrier: Carrier, rows: Rows) -> Held:
+        """The same with more rows."""
+        first = -self.count % self.every
+        kept = Rows.concatenate([self.rows, rows.take(slice(first, None, self.every))])
+        every, count = self.every, self.count + len(rows)
+        if len(kept) > MOST_ROWS:
+            kept, every = kept.take(slice(0, None, 2)), 2 * every
+        held = replace(self, rows=kept, every=every, count=count)
+        if count < self.due:
+            return held
+        anew = count >= ANEW * self.begun
+        found = estimate(carrier, kept, self.before, self.prior, self.estimate, anew)
+        if self.declared and np.abs((found.eta - self.prior.centre) / DECLARED).max() > WRONG:
+            held, found = replace(held, declared=False, prior=ANY), estimate(carrier, kept, self.before)
+        return replace(held, due=GROWTH * count, estimate=found, begun=count if anew else self.begun)
+
+
+def evenly(first: int, last: int, most: int) -> NDArray[np.int64]:
+    """Places from `first` to before `last`, so many at most, both ends among them."""
+    return np.unique(np.linspace(first, last - 1, min(most, last - first)).round().astype(np.int64))
+
+
+def no_rows(n: int) -> Rows:
+    """No rows of n joints."""
+    empty: Array = np.empty((0, n))
+    return Rows(np.empty(0), empty, empty, empty, empty, np.empty(0, np.uint8))
