@@ -42,7 +42,7 @@ class ArmKernel(LinearKernel):
         kinds = np.concatenate([np.tile(KINDS, arm.n_joints), np.full(arm.n_joints, SCALES - 1)])
         self._kinds = torch.from_numpy(kinds)
         self._unit = torch.from_numpy(arm.unit)
-        self.others = MixtureKernel(arm.alternatives, arm.order, arm.stribeck) if arm.alternatives else None
+        self.others = MixtureKernel(arm.alternatives, arm.order) if arm.alternatives else None
         mixed = None if self.others is None else self.others.prior_weights()
         others = np.zeros(0) if mixed is None else mixed.numpy()
         self._rest = torch.from_numpy(np.concatenate([arm.widths, np.ones(len(others))]))

@@ -14,7 +14,8 @@ from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import Alternative
 from lipcore.kernels.base import LinearKernel, Params, Regressor
 from lipcore.kernels.compiled.arm import arm_differences
-from lipcore.kernels.friction import friction_features
+from lipcore.kernels.compiled.compile import compiled
+from lipcore.kernels.friction import SIGN_WIDTH, STRIBECK_SPEED
 
 
 class MixtureKernel(LinearKernel):
@@ -24,15 +25,13 @@ class MixtureKernel(LinearKernel):
     so that the sum has the mean and the variance of the mixture of arms. The features are Lᵀ δ, whose weights L⁻¹ c,
     (K,), are independent with variance one, or a larger one where a few arms stand for many.
 
-    arms: the first one and the others, K + 1; order: (n,), the data's joint at each place of the chain; stribeck:
-    whether their friction has its fourth term; variance: of the weights.
+    arms: the first one and the others, K + 1; order: (n,), the data's joint at each place of the chain; variance: of
+    the weights.
     """
 
-    def __init__(
-        self, arms: Sequence[Alternative], order: NDArray[np.int64], stribeck: bool, variance: float = 1.0
-    ) -> None:
+    def __init__(self, arms: Sequence[Alternative], order: NDArray[np.int64], variance: float = 1.0) -> None:
         self.n_joints, self.size, self._variance = len(order), len(arms) - 1, variance
-        self._order, self._stribeck = order.astype(np.int64), stribeck
+        self._order = order.astype(np.int64)
         shares = np.array([each.probability for each in arms[1:]])
         mixing = np.ascontiguousarray(np.linalg.cholesky(np.diag(shares) - np.outer(shares, shares)))
         self._mean = torch.from_numpy(np.linalg.solve(mixing, shares))
@@ -46,9 +45,9 @@ class MixtureKernel(LinearKernel):
 
     def rows(self, motions: Array) -> Array:
         """Φᵀ of N motions (N, 3, n): (N, K, n)."""
-        friction = friction_features(torch.from_numpy(motions[:, 1]), self._stribeck).numpy()
-        linear = np.ascontiguousarray(np.concatenate([motions[:, 2, :, None], friction.transpose(1, 2, 0)], axis=2))
         out = np.empty((len(motions), self.size, self.n_joints))
+        linear = np.empty((len(motions), *self._arms[-1].shape[1:]))
+        _linear_features(motions, SIGN_WIDTH, STRIBECK_SPEED, linear)
         arm_differences(*self._arms, self._order, motions, linear, out)
         return out
 
@@ -82,3 +81,19 @@ class MixtureRegressor(Regressor):
     def fill(self, motion: Array, out: Array) -> None:
         """Write Φᵀ of the query, (K, n)."""
         out[:] = self._kernel.rows(motion[None])[0]
+
+    def fill_many(self, motions: Array, out: Array, first: int) -> None:
+        """Write Φᵀ of N queries; see `Regressor.fill_many`."""
+        out[:, first : first + self.size] = self._kernel.rows(motions)
+
+
+@compiled
+def _linear_features(motions: Array, width: float, speed: float, out: Array) -> None:
+    """ddq and friction's features, see `FrictionKernel`, of each joint, (N, n, 4 or 5), for motions (N, 3, n)."""
+    for k in range(motions.shape[0]):
+        for j in range(motions.shape[2]):
+            velocity = motions[k, 1, j]
+            sign = np.tanh(velocity / width)
+            out[k, j, 0], out[k, j, 1], out[k, j, 2], out[k, j, 3] = motions[k, 2, j], velocity, sign, 1.0
+            if out.shape[2] > 4:
+                out[k, j, 4] = sign * np.exp(-((velocity / speed) ** 2))

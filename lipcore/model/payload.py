@@ -267,7 +267,7 @@ class Linearised:
     def _others(self) -> MixtureKernel | None:
         arm = self.carrier.term.arm
         others, count = self.load.others, len(self.load.others) - 1
-        return MixtureKernel(others, arm.order, arm.stribeck, _of_few(count)) if others else None
+        return MixtureKernel(others, arm.order, _of_few(count)) if others else None
 
     @cached_property
     def _payload(self) -> PayloadKernel:
