@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from lipcore.kernels.compiled.arm_derivatives import TABLE, link_masses
 from lipcore.kernels.compiled.arm_recursion import CONSTANTS, PARAMETERS, WORK, Array, Indices, kinematics
-from lipcore.kernels.compiled.compile import compiled
+from lipcore.kernels.compiled.compile import brief, compiled
 from lipcore.kernels.compiled.views import numbers
 
 NEAR = 1e-4
@@ -44,7 +44,7 @@ def payload_size(n: int) -> int:
     return n + 1 - (-(TABLE + PARAMETERS * n) // WORK)
 
 
-@compiled
+@brief
 def payload_query(memory: Array, sides: int, order: Indices, motion: Array, out: Array) -> None:
     """`payload_rows` of one query, with one array for all: `Memory` of constants, gravity and payload, with
     `payload_size` rows to work in. sides: s."""
