@@ -8,7 +8,7 @@ from torch import Tensor
 
 from lipcore.data.motion import Motion
 from lipcore.kernels.base import Array, LinearKernel, Params, Regressor
-from lipcore.kernels.compiled.compile import compiled
+from lipcore.kernels.compiled.compile import brief, compiled
 
 SIGN_WIDTH = 0.02
 """Velocity over which the Coulomb sign turns over, rad/s (m/s): tanh(dq / width) avoids a jump at standstill."""
@@ -81,7 +81,7 @@ class FrictionRegressor(Regressor):
         _friction_queries(motions, SIGN_WIDTH, STRIBECK_SPEED, out, first, first + self.size)
 
 
-@compiled
+@brief
 def _friction_rows(motion: Array, width: float, speed: float, out: Array) -> None:
     """Rows f j to f j + f − 1 of `out`, (f n, n), f = 3 or 4: joint j's dq, s = tanh(dq / width), 1 and, where f = 4,
     s exp(−(dq / speed)²) in column j, else zero."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lipcore.data.motion import Motion
 from lipcore.kernels.base import LinearKernel, PairKernel, Params
-from lipcore.kernels.compiled.answer import COVARIANCE, MEAN, ROWS, STD, WIDTH, answer, pack
+from lipcore.kernels.compiled.answer import COVARIANCE, MEAN, ROWS, STD, WIDTH, answer, answer_one, pack
 from lipcore.posterior.misfit import Misfit
 
 Array = NDArray[np.float64]
@@ -47,8 +47,8 @@ class Evaluator:
     order of the anchors. weights: (M,). root: Q, (M, M) lower triangular. std_factor: calibration. floor: (n,)
     (N·m)²; misfit: (5, n), see `Misfit.packed`; none where None.
 
-    Safe from several threads, which answer at the same time: compiled code runs without the GIL and every thread has
-    memory of its own. Raises ValueError naming the argument that does not fit.
+    Safe from several threads, each of which has memory of its own. `many` computes without the GIL, at the same time as
+    others; `one` keeps it, but for a nonlinear term. Raises ValueError naming the argument that does not fit.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class Evaluator:
             fill(query[0], features[0, first:last])
         tau = np.empty((1, self.n_joints))
         deviation = np.empty((1, self.n_joints)) if std else own
-        answer(
+        answer_one(
             self._fixed,
             self._outputs,
             blocks,

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.kernels.compiled.compile import compiled, inlined
+from lipcore.kernels.compiled.compile import brief, compiled, inlined
 from lipcore.kernels.compiled.lanes import LANES, spread
 from lipcore.kernels.compiled.views import lay, numbers
 
@@ -123,6 +123,40 @@ def answer(
             more = misfit[0, j] * np.exp(-((motions[query, 1, j] / misfit[1, j]) ** 2)) + misfit[2, j] * faster
             covariance[query, j, j] = max(covariance[query, j, j] + more, floor[j])
             std[query, j] = np.sqrt(covariance[query, j, j])
+
+
+@brief
+def answer_one(
+    fixed: Array,
+    outputs: Indices,
+    blocks: Array,
+    features: Array,
+    std_factor: float,
+    floor: Array,
+    misfit: Array,
+    motions: Array,
+    what: int,
+    memory: Array,
+    tau: Array,
+    std: Array,
+    covariance: Array,
+) -> None:
+    """`answer` of one query."""
+    answer(
+        fixed,
+        outputs,
+        blocks,
+        features,
+        std_factor,
+        floor,
+        misfit,
+        motions,
+        what,
+        memory,
+        tau,
+        std,
+        covariance,
+    )
 
 
 @compiled

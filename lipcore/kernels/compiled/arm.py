@@ -22,7 +22,7 @@ from lipcore.kernels.compiled.arm_recursion import (
     torques,
 )
 from lipcore.kernels.compiled.arm_recursion import PARAMETERS as PARAMETERS  # noqa: PLC0414 - searches take it from here
-from lipcore.kernels.compiled.compile import compiled
+from lipcore.kernels.compiled.compile import brief, compiled
 from lipcore.kernels.compiled.views import numbers
 
 
@@ -55,7 +55,7 @@ def arm_size(n: int) -> int:
     return (n + 1) * WORK + TABLE
 
 
-@compiled
+@brief
 def arm_query(memory: Array, order: Indices, motion: Array, out: Array) -> None:
     """`arm_rows` of one query, with one array for all that taking over nine costs time: `Memory` of constants, gravity
     and parameters, with `arm_size` elements to work in."""

@@ -62,6 +62,12 @@ def compiled(function: _F) -> _F:
     return _compile(function)
 
 
+def brief(function: _F) -> _F:
+    """Like `compiled`, but with the GIL: who answers one query in microseconds would have to wait for it again, each
+    time, where another thread has taken it meanwhile."""
+    return _compile(function, nogil=False)
+
+
 def inlined(function: _F) -> _F:
     """Like `compiled`, and inlined where another compiled function calls it; Python itself cannot call it."""
     return _compile(function, forceinline=True, no_cpython_wrapper=True)
@@ -90,16 +96,16 @@ def _imported(path: Path) -> frozenset[Path]:
     return frozenset({path}.union(*(_imported(each) for each in direct)))
 
 
-def _compile(function: _F, keep: bool = True, **options: Any) -> _F:
+def _compile(function: _F, keep: bool = True, nogil: bool = True, **options: Any) -> _F:
     # entry points for C are never used, and take a fifth of the compile time
-    options |= {"fastmath": _FASTMATH, "error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
+    options |= {"fastmath": _FASTMATH, "error_model": "numpy", "no_cfunc_wrapper": True}
     try:
-        dispatcher = njit(cache=keep, **options)(function)
+        dispatcher = njit(cache=keep, nogil=nogil, **options)(function)
     except RuntimeError as error:
         # raised at decoration time, so without this the import itself would fail
         if "no locator available" not in str(error):
             raise
-        dispatcher = njit(cache=False, **options)(function)
+        dispatcher = njit(cache=False, nogil=nogil, **options)(function)
     # one machine code for all integers, not another one for each constant that a caller names
     resolve = dispatcher.get_call_template
     dispatcher.get_call_template = lambda given, named: resolve([types.unliteral(each) for each in given], named)  # type: ignore[no-untyped-call]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from lipcore.kernels.compiled.arm_derivatives import TABLE, link_masses
 from lipcore.kernels.compiled.arm_recursion import CONSTANTS, PARAMETERS, WORK, Array, Indices, kinematics
-from lipcore.kernels.compiled.compile import compiled
+from lipcore.kernels.compiled.compile import brief, compiled
 from lipcore.kernels.compiled.views import numbers
 
 
@@ -13,7 +13,7 @@ def payload_size(n: int) -> int:
     return (n + 1) * WORK + TABLE
 
 
-@compiled
+@brief
 def payload_query(memory: Array, order: Indices, motion: Array, out: Array) -> None:
     """Features of one query, ∂τ/∂π of the last link, (10, n), with one array for all: `Memory` of the geometry's
     constants and gravity, with `payload_size` elements to work in."""
