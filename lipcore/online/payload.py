@@ -35,9 +35,10 @@ LEAST_DAMPING, WORST = 1e-9, 1e8
 """It is not less; and from which on nothing is gained."""
 REACH = 0.5
 """Longest step of the geometry, rad or m."""
-PLACES, RENEWED, SEED, LINEAR = 8, 2, 0, 2.0
+PLACES, RENEWED, SEED, LINEAR, FAR = 8, 2, 0, 2.0, 3.0
 """Places in the posterior by which it is judged how far it is from linear; how many are looked for again with more
-rows; what they are drawn by; and the mean square, in deviations of the linear posterior, up to which it is as good."""
+rows; what they are drawn by; the mean square, in deviations of the linear posterior, up to which it is as good; and the
+energy above the least, for each number that is unknown, from which on a place has not been reached yet."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Estimate:
     load: Load
     gain: float
     contact: float
-    places: tuple[Place, ...] = ()
+    places: tuple[_Point, ...] = ()
 
     @property
     def mass(self) -> tuple[float, float]:
@@ -77,14 +78,18 @@ def estimate(
     """The payload that rows carry. before: rows that do not, whose errors tell those of the first that do; start:
     another estimate by the same carrier, or by another revision of its version, to begin at; anew: whether to begin
     from nothing, too."""
-    problem = _Problem.of(carrier, rows, before, prior)
-    if start is not None and len(start.load.mean) != len(carrier.mean) + PARAMETERS:
+    problem, size = _Problem.of(carrier, rows, before, prior), len(carrier.mean)
+    if start is not None and len(start.load.mean) != size + PARAMETERS:
         start = None
+    draw = np.random.default_rng([SEED, len(rows)])
     found = [] if start is None else [_minimum(problem, problem.at(problem.begin(start)), ROUNDS)]
     if anew or start is None:
         found.append(_minimum(problem, problem.at(problem.begin(None)), FIRST))
+        found.append(_minimum(problem, problem.at(problem.drawn(found[-1].place.eta, draw)), FIRST))
     at = min(found, key=lambda each: each.energy)
-    size = len(carrier.mean)
+    places = _places(problem, at, () if start is None else start.places, draw)
+    best = min([at, *places], key=lambda each: each.energy)
+    at = at if best is at else _minimum(problem, best, ROUNDS)
     # not from the curvature, of whose condition the root is enough: a covariance above the prior's is none
     root = solve_triangular(qr(at.derivative, mode="r")[0][: size + PARAMETERS], np.eye(size + PARAMETERS))
     eta = at.place.eta
@@ -94,7 +99,6 @@ def estimate(
     outward = outward @ root
     room = PARAMETERS * np.diagonal(slope @ inverse(prior.precision) @ slope.T)
     load = Load(np.concatenate([at.place.w, payload]), outward @ outward.T, room, at.place.geometry)
-    places = _places(problem, at, root, () if start is None else start.places)
     load = replace(load, others=_others(carrier, at, root, places))
     of_eta = max(1.0, at.misfit) * root[size:] @ root[size:].T
     return Estimate(eta, of_eta, load, *problem.gains(at), places)
@@ -203,6 +207,11 @@ class _Problem:
             return Place(self.carrier.mean, learnt, self.prior.centre)
         return Place(start.load.mean[:-PARAMETERS], learnt, start.eta)
 
+    def drawn(self, eta: Array, draw: np.random.Generator) -> Place:
+        """One of the arms that there may be, and a payload."""
+        step = np.append(draw.standard_normal(len(self.carrier.mean)), np.zeros(PARAMETERS))
+        return replace(self.begin(None).moved(self.carrier, step), eta=eta)
+
     def at(self, place: Place) -> _Point:
         """The energy of a place."""
         memory, size = self.carrier.memory, len(place.w)
@@ -260,19 +269,19 @@ def _rows(around: Linearised, motion: Motion, rest: tuple[Array, Array]) -> tupl
     return features, base + np.tensordot(around.load.mean, features, axes=1)
 
 
-def _places(problem: _Problem, at: _Point, root: Array, known: tuple[Place, ...]) -> tuple[Place, ...]:
-    """Places in the posterior: minima for other noise (randomised maximum likelihood, Kitanidis 1995, Oliver et al.
-    1996). root: of the covariance of whitened steps; known: places at fewer rows, the oldest of which is renewed."""
+def _places(problem: _Problem, at: _Point, known: tuple[_Point, ...], draw: np.random.Generator) -> tuple[_Point, ...]:
+    """Places in the posterior: minima for other noise, begun all over what the arm may be (randomised maximum
+    likelihood, Kitanidis 1995, Oliver et al. 1996). known: places at fewer rows, the oldest of which are renewed."""
     if at.place.geometry is None:
         return ()
-    draw, carrier = np.random.default_rng([SEED, len(at.residual)]), problem.carrier
-    begin = known[:RENEWED] or [at.place.moved(carrier, root @ draw.standard_normal(len(root))) for _ in range(PLACES)]
+    begin = [each.place for each in known[:RENEWED]]
+    begin = begin or [problem.drawn(at.place.eta, draw) for _ in range(PLACES)]
     shifts = [draw.standard_normal(len(at.residual)) for _ in begin]
-    found = [_minimum(problem, problem.at(each), ROUNDS, by).place for each, by in zip(begin, shifts, strict=True)]
+    found = [_minimum(problem, problem.at(each), ROUNDS, by) for each, by in zip(begin, shifts, strict=True)]
     return (*known[RENEWED:], *found)
 
 
-def _others(carrier: Carrier, at: _Point, root: Array, places: tuple[Place, ...]) -> tuple[Alternative, ...]:
+def _others(carrier: Carrier, at: _Point, root: Array, places: tuple[_Point, ...]) -> tuple[Alternative, ...]:
     """Arms all over the posterior where it is far from linear, the most likely one first; none where it is not.
 
     Few rows leave a curved valley open, along which a centre of mass and the geometry make up for each other, and the
@@ -280,14 +289,15 @@ def _others(carrier: Carrier, at: _Point, root: Array, places: tuple[Place, ...]
     """
     if not places or carrier.model.posterior.basis.term is not None:
         return ()
-    off = []
-    for each in places:
+    known = [each.place for each in places if each.energy < at.energy + FAR * len(root)]
+    off = [np.zeros(len(root))]
+    for each in known:
         w = solve_triangular(carrier.memory.root, each.w - at.place.w, lower=True, check_finite=False)
         off.append(solve_triangular(root, np.append(w, each.eta - at.place.eta), check_finite=False))
-    if np.square(off).mean() < LINEAR:
+    if not known or np.square(off[1:]).mean() < LINEAR:
         return ()
-    share, arms = 1 / (1 + len(places)), []
-    for each in (at.place, *places):
+    share, arms = 1 / (1 + len(known)), []
+    for each in (at.place, *known):
         assert each.geometry is not None
         arms.append(carrier.alternative(each.w, each.geometry, body(each.eta)[0], share))
     return tuple(arms)
