@@ -63,7 +63,7 @@ class MixtureKernel(LinearKernel):
         """Prior variances of the weights on the diagonal: (K, K)."""
         return self._variance * torch.eye(self.size, dtype=torch.float64)
 
-    def prior_weights(self) -> Tensor | None:
+    def prior_weights(self) -> Tensor:
         """Prior mean of the weights, (K,)."""
         return self._mean
 

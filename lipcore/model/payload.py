@@ -263,6 +263,30 @@ class Linearised:
         parameters[-1] += load.payload
         return ArmKernel(replace(arm, parameters=parameters))
 
+    def all_rows(self, motion: Motion) -> tuple[Array, Array]:
+        """Of N instants: features of all that is unknown, as `covariance` has it, (M + K + 10, N, n), and the mean of
+        the torque, (N, n) N·m."""
+        features, base = self.rows(motion)
+        mean = base + np.tensordot(self.load.mean, features, axes=1)
+        if self._others is None:
+            return features, mean
+        more, centre = self._others.features(motion).numpy(), self._others.prior_weights()
+        known = np.split(features, [len(features) - PARAMETERS])
+        return np.concatenate([known[0], more.transpose(2, 0, 1), known[1]]), mean + more @ centre.numpy()
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance of w, of the weights of K other arms, and of π, (M + K + 10, M + K + 10)."""
+        known = self.load.covariance
+        if self._others is None:
+            return known
+        size, count = len(known) - PARAMETERS, self._others.size
+        places = np.concatenate([np.arange(size), size + count + np.arange(PARAMETERS)])
+        out = np.zeros((len(known) + count,) * 2)
+        out[np.ix_(places, places)] = known
+        out[size : size + count, size : size + count] = self._others.covariance(self.basis.params).numpy()
+        return out
+
     @cached_property
     def _others(self) -> MixtureKernel | None:
         arm = self.carrier.term.arm

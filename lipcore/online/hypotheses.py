@@ -49,7 +49,7 @@ class Cell:
     """Means over the rows of one stretch of time. end: event time of its last row, s; q, dq, residual:
     (n,); new, lasting, rest: (n,), variances of the residual, of this cell alone, shared with cells of like motion, and
     with those before and after;
-    features: (M + 10, n), of the arm's variables and of the payload."""
+    features: (M + K + 10, n), see `Linearised.all_rows`."""
 
     end: float
     q: Array
@@ -70,9 +70,8 @@ def cells_of(around: Linearised, parts: Sequence[Rows]) -> tuple[Cell, ...]:
     def mean(values: Array) -> Array:
         return np.asarray(np.add.reduceat(values, first, axis=-2) / counts[:, None])
 
-    features, base = around.rows(rows.motion())
-    features = mean(features)
-    left = mean(rows.tau - base) - np.tensordot(around.load.mean, features, axes=1)
+    features, expected = around.all_rows(rows.motion())
+    features, left = mean(features), mean(rows.tau - expected)
     q, dq, ddq = (mean(each) for each in (rows.q, rows.dq, rows.ddq))
     white, lasting, rest = noise_parts(around.carrier, Motion.from_arrays(q, dq, ddq))
     return tuple(
@@ -108,7 +107,7 @@ class Window:
         """The windows of some of the cells each, by their places, whose covariances are parts of one."""
         n, count = len(cells[0].q), len(cells)
         features = np.stack([each.features for each in cells], axis=1).reshape(len(cells[0].features), -1)
-        covariance = (features.T @ around.load.covariance @ features).reshape(count, n, count, n)
+        covariance = (features.T @ around.covariance @ features).reshape(count, n, count, n)
         q, dq = np.array([each.q for each in cells]), np.array([each.dq for each in cells])
         alike = likeness(around.carrier, q, dq, *LIKE)
         end, places = np.array([each.end for each in cells]), np.arange(count)

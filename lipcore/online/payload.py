@@ -13,6 +13,7 @@ Marquardt's, and the covariance is that of the linear model around the last one 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import qr, solve_triangular
@@ -27,8 +28,10 @@ from lipcore.online.bodies import ANY, CONTACTS, WIDTH, Known, body, evidence, i
 from lipcore.online.errors import correlation_roots, whitened
 from lipcore.robots.urdf import PARAMETERS
 
-FIRST, ROUNDS, STILL = 30, 8, 1e-3
+FIRST, ROUNDS, STILL = 60, 8, 0.01
 """Steps at most of an estimate from nothing, and of one that begins at another; and the least that one gains, nats."""
+TRIALS, BEYOND = 3, 2.0
+"""Other beginnings that are tried where the energy lies so many standard deviations above what is expected of it."""
 DAMPING, LESS, MORE = 1e-3, 0.15, 8.0
 """At first, as a share of the curvature; its factors after a step that gains, and after one that does not."""
 LEAST_DAMPING, WORST = 1e-9, 1e8
@@ -87,8 +90,14 @@ def estimate(
         found.append(_minimum(problem, problem.at(problem.begin(None)), FIRST))
         found.append(_minimum(problem, problem.at(problem.drawn(found[-1].place.eta, draw)), FIRST))
     at = min(found, key=lambda each: each.energy)
-    places = _places(problem, at, () if start is None else start.places, draw)
-    best = min([at, *places], key=lambda each: each.energy)
+    for _ in range(TRIALS):
+        if at.energy < problem.expected():
+            break
+        other = _minimum(problem, problem.at(problem.drawn(at.place.eta, draw)), FIRST)
+        at = min([at, other], key=lambda each: each.energy)
+    known = () if start is None else start.places
+    places = _places(problem, at, known, draw)
+    best = min([at, *places[len(known) - RENEWED if known else 0 :]], key=lambda each: each.energy)
     at = at if best is at else _minimum(problem, best, ROUNDS)
     # not from the curvature, of whose condition the root is enough: a covariance above the prior's is none
     root = solve_triangular(qr(at.derivative, mode="r")[0][: size + PARAMETERS], np.eye(size + PARAMETERS))
@@ -207,6 +216,17 @@ class _Problem:
             return Place(self.carrier.mean, learnt, self.prior.centre)
         return Place(start.load.mean[:-PARAMETERS], learnt, start.eta)
 
+    @cached_property
+    def _alone(self) -> float:
+        """Energy of the arm as it was learnt, by what its training says."""
+        memory, mean = self.carrier.memory, self.carrier.mean
+        alone = memory.residual(mean, memory.base + np.tensordot(mean, memory.features, axes=1))
+        return 0.5 * float(alone @ alone)
+
+    def expected(self) -> float:
+        """What the least energy is hardly above: each of the rows' torques adds ½ χ² with one degree of freedom."""
+        return self._alone + 0.5 * self.tau.size + BEYOND * np.sqrt(0.5 * self.tau.size)
+
     def drawn(self, eta: Array, draw: np.random.Generator) -> Place:
         """One of the arms that there may be, and a payload."""
         step = np.append(draw.standard_normal(len(self.carrier.mean)), np.zeros(PARAMETERS))
@@ -251,8 +271,7 @@ class _Problem:
         within = np.linalg.solve(curvature, np.column_stack([explained, shared]))
         gram, pull = contact.T @ contact - shared.T @ within[:, 1:], shared.T @ within[:, 0] - contact.T @ off
         of_contact = evidence(gram[None], pull[None], [np.full(n, each * typical) for each in CONTACTS])
-        alone = memory.residual(carrier.mean, memory.base + np.tensordot(carrier.mean, memory.features, axes=1))
-        free_energy = 0.5 * float(alone @ alone + off @ off - explained @ within[:, 0])
+        free_energy = self._alone + 0.5 * float(off @ off - explained @ within[:, 0])
         volume = np.linalg.slogdet(at.derivative.T @ at.derivative)[1] - np.linalg.slogdet(self.prior.precision)[1]
         of_payload = free_energy - at.energy + 0.5 * float(np.linalg.slogdet(curvature)[1] - volume)
         return of_payload, float(of_contact[0])
