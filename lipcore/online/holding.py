@@ -44,6 +44,8 @@ CELL_ROWS = 5
 STRANGE = 2.5
 """Standard deviations of what is known of any payload beyond which a body is none: heavier than 20 kg, or with its
 centre of mass further than 0.37 m from the last link's frame. A push looks like such a one."""
+OFF = 12
+"""Cells one after the other that a payload does not explain, 0.6 s, after which it is estimated anew from them."""
 GAP_S = 0.5
 """A longer time between two rows: what came before is not compared with what comes after."""
 
@@ -66,6 +68,7 @@ class Watch:
     recent: tuple[Rows, ...] = ()
     cells: tuple[Cell, ...] = ()
     around: Linearised | None = None
+    off: int = 0
 
     def step(self, carrier: Carrier, rows: Rows) -> Watch:
         """Follow rows, in order of event time; those from before the latest are passed over."""
@@ -180,12 +183,12 @@ class Watch:
         held = Held.seen(carrier, rows, before)
         found = held.estimate
         vague = 1 / POSITIVE if found.gain < AT_ONCE else np.inf
-        if after < LASTING:
+        if after < LASTING or self.held is not None:
             vague = PRECISE if found.gain - found.contact >= BETTER else 0.0
         strange = np.abs((found.eta - ANY.centre) / WIDTH).max() > STRANGE
         if strange or np.sqrt(found.covariance[0, 0]) > vague:
             return replace(self, state="contact")
-        watch = replace(self, state="payload", since=held.since, held=held, recent=self.recent[-after:])
+        watch = replace(self, state="payload", since=held.since, held=held, recent=self.recent[-after:], off=0)
         return watch._around(carrier)
 
     def _carry(self, carrier: Carrier, parts: Sequence[Rows], window: Window, gains: Gains) -> Watch:
@@ -202,10 +205,15 @@ class Watch:
                 return fresh._around(carrier)
             if (changed := taken(window, gains, self.held.estimate.load.payload)) is not None:
                 return self._take_up(carrier, changed)
-        if max(best.values()) > SURE:
-            state = state_of(gains)
-            return replace(self, state="payload" if state == "none" else state)
-        return self._learn(carrier, parts)
+        if max(best.values()) <= SURE:
+            return replace(self, off=0)._learn(carrier, parts)
+        off = self.off + len(parts)
+        if off >= OFF:  # no contact lasts so long: it was estimated wrongly, or is another one
+            again = self._take_up(carrier, len(self.recent))
+            if again.held is not self.held:
+                return again
+        state = state_of(gains)
+        return replace(self, state="payload" if state == "none" else state, off=off)
 
     def _without(self, carrier: Carrier, window: Window, gains: Gains) -> tuple[float, int]:
         """Nats by which the arm without its payload explains the last cells better, and how many of them."""

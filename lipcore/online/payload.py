@@ -96,8 +96,8 @@ def estimate(
         other = _minimum(problem, problem.at(problem.drawn(at.place.eta, draw)), FIRST)
         at = min([at, other], key=lambda each: each.energy)
     known = () if start is None else start.places
-    places = _places(problem, at, known, draw)
-    best = min([at, *places[len(known) - RENEWED if known else 0 :]], key=lambda each: each.energy)
+    old, renewed = _places(problem, at, known, len(known) if anew else RENEWED, draw)
+    best = min([at, *renewed], key=lambda each: each.energy)
     at = at if best is at else _minimum(problem, best, ROUNDS)
     # not from the curvature, of whose condition the root is enough: a covariance above the prior's is none
     root = solve_triangular(qr(at.derivative, mode="r")[0][: size + PARAMETERS], np.eye(size + PARAMETERS))
@@ -108,6 +108,7 @@ def estimate(
     outward = outward @ root
     room = PARAMETERS * np.diagonal(slope @ inverse(prior.precision) @ slope.T)
     load = Load(np.concatenate([at.place.w, payload]), outward @ outward.T, room, at.place.geometry)
+    places = (*old, *renewed)
     load = replace(load, others=_others(carrier, at, root, places))
     of_eta = max(1.0, at.misfit) * root[size:] @ root[size:].T
     return Estimate(eta, of_eta, load, *problem.gains(at), places)
@@ -225,7 +226,7 @@ class _Problem:
 
     def expected(self) -> float:
         """What the least energy is hardly above: each of the rows' torques adds ½ χ² with one degree of freedom."""
-        return self._alone + 0.5 * self.tau.size + BEYOND * np.sqrt(0.5 * self.tau.size)
+        return self._alone + 0.5 * self.tau.size + BEYOND * float(np.sqrt(0.5 * self.tau.size))
 
     def drawn(self, eta: Array, draw: np.random.Generator) -> Place:
         """One of the arms that there may be, and a payload."""
@@ -288,16 +289,19 @@ def _rows(around: Linearised, motion: Motion, rest: tuple[Array, Array]) -> tupl
     return features, base + np.tensordot(around.load.mean, features, axes=1)
 
 
-def _places(problem: _Problem, at: _Point, known: tuple[_Point, ...], draw: np.random.Generator) -> tuple[_Point, ...]:
+def _places(
+    problem: _Problem, at: _Point, known: tuple[_Point, ...], count: int, draw: np.random.Generator
+) -> tuple[tuple[_Point, ...], tuple[_Point, ...]]:
     """Places in the posterior: minima for other noise, begun all over what the arm may be (randomised maximum
-    likelihood, Kitanidis 1995, Oliver et al. 1996). known: places at fewer rows, the oldest of which are renewed."""
+    likelihood, Kitanidis 1995, Oliver et al. 1996). known: places at fewer rows, the oldest of which, so many, are
+    renewed. Return those that are not, and the new ones."""
     if at.place.geometry is None:
-        return ()
-    begin = [each.place for each in known[:RENEWED]]
+        return (), ()
+    begin = [each.place for each in known[:count]]
     begin = begin or [problem.drawn(at.place.eta, draw) for _ in range(PLACES)]
     shifts = [draw.standard_normal(len(at.residual)) for _ in begin]
     found = [_minimum(problem, problem.at(each), ROUNDS, by) for each, by in zip(begin, shifts, strict=True)]
-    return (*known[RENEWED:], *found)
+    return known[count:], tuple(found)
 
 
 def _others(carrier: Carrier, at: _Point, root: Array, places: tuple[_Point, ...]) -> tuple[Alternative, ...]:
