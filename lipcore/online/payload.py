@@ -28,17 +28,18 @@ from lipcore.online.bodies import ANY, CONTACTS, WIDTH, Known, body, evidence, i
 from lipcore.online.errors import correlation_roots, whitened
 from lipcore.robots.urdf import PARAMETERS
 
-FIRST, ROUNDS, STILL = 60, 8, 0.01
-"""Steps at most of an estimate from nothing, and of one that begins at another; and the least that one gains, nats."""
-TRIALS, BEYOND = 3, 2.0
-"""Other beginnings that are tried where the energy lies so many standard deviations above what is expected of it."""
+FIRST, ROUNDS, FEW, STILL = 30, 8, 4, 0.01
+"""Steps at most of an estimate from nothing, of one that begins at another, and of a place in the posterior: an answer
+waits for them; and the least that one gains, nats."""
+BEYOND = 2.0
+"""Another beginning is tried where the energy lies so many standard deviations above what is expected of it."""
 DAMPING, LESS, MORE = 1e-3, 0.15, 8.0
 """At first, as a share of the curvature; its factors after a step that gains, and after one that does not."""
 LEAST_DAMPING, WORST = 1e-9, 1e8
 """It is not less; and from which on nothing is gained."""
 REACH = 0.5
 """Longest step of the geometry, rad or m."""
-PLACES, RENEWED, SEED, LINEAR, FAR = 8, 2, 0, 2.0, 3.0
+PLACES, RENEWED, SEED, LINEAR, FAR = 8, 3, 0, 2.0, 3.0
 """Places in the posterior by which it is judged how far it is from linear; how many are looked for again with more
 rows; what they are drawn by; the mean square, in deviations of the linear posterior, up to which it is as good; and the
 energy above the least, for each number that is unknown, from which on a place has not been reached yet."""
@@ -88,15 +89,11 @@ def estimate(
     found = [] if start is None else [_minimum(problem, problem.at(problem.begin(start)), ROUNDS)]
     if anew or start is None:
         found.append(_minimum(problem, problem.at(problem.begin(None)), FIRST))
-        found.append(_minimum(problem, problem.at(problem.drawn(found[-1].place.eta, draw)), FIRST))
     at = min(found, key=lambda each: each.energy)
-    for _ in range(TRIALS):
-        if at.energy < problem.expected():
-            break
+    if at.energy > problem.expected():
         other = _minimum(problem, problem.at(problem.drawn(at.place.eta, draw)), FIRST)
         at = min([at, other], key=lambda each: each.energy)
-    known = () if start is None else start.places
-    old, renewed = _places(problem, at, known, len(known) if anew else RENEWED, draw)
+    old, renewed = _places(problem, at, () if start is None else start.places, draw)
     best = min([at, *renewed], key=lambda each: each.energy)
     at = at if best is at else _minimum(problem, best, ROUNDS)
     # not from the curvature, of whose condition the root is enough: a covariance above the prior's is none
@@ -290,18 +287,18 @@ def _rows(around: Linearised, motion: Motion, rest: tuple[Array, Array]) -> tupl
 
 
 def _places(
-    problem: _Problem, at: _Point, known: tuple[_Point, ...], count: int, draw: np.random.Generator
+    problem: _Problem, at: _Point, known: tuple[_Point, ...], draw: np.random.Generator
 ) -> tuple[tuple[_Point, ...], tuple[_Point, ...]]:
     """Places in the posterior: minima for other noise, begun all over what the arm may be (randomised maximum
-    likelihood, Kitanidis 1995, Oliver et al. 1996). known: places at fewer rows, the oldest of which, so many, are
-    renewed. Return those that are not, and the new ones."""
+    likelihood, Kitanidis 1995, Oliver et al. 1996). known: places at fewer rows, the oldest of which are renewed.
+    Return those that are not, and the new ones."""
     if at.place.geometry is None:
         return (), ()
-    begin = [each.place for each in known[:count]]
+    begin = [each.place for each in known[:RENEWED]]
     begin = begin or [problem.drawn(at.place.eta, draw) for _ in range(PLACES)]
     shifts = [draw.standard_normal(len(at.residual)) for _ in begin]
-    found = [_minimum(problem, problem.at(each), ROUNDS, by) for each, by in zip(begin, shifts, strict=True)]
-    return known[count:], tuple(found)
+    found = [_minimum(problem, problem.at(each), FEW, by) for each, by in zip(begin, shifts, strict=True)]
+    return known[RENEWED:], tuple(found)
 
 
 def _others(carrier: Carrier, at: _Point, root: Array, places: tuple[_Point, ...]) -> tuple[Alternative, ...]:

@@ -178,8 +178,8 @@ def test_a_payload_shows_where_an_open_geometry_lies_and_its_intervals_hold(open
     carried = Payload(1.0, 0.0, (0.05, 0.03, 0.08))
     rows = as_rows(simulate(robot, Stream(300, 100.0, speed=5.0, noise=0.05, payload=carried), 54))
     other = simulate(robot, Stream(300, 10.0, speed=5.0, noise=0.0, payload=carried, n_sinusoids=100), 55)
-    for count in (10, 30, 100, 300):
-        found = estimate(carrier, rows.take(slice(0, count, max(1, count // 100))), start=found, anew=True)
+    for count in (10, 20, 30, 40, 50, 70, 90, 120, 150, 190, 240, 300):
+        found = estimate(carrier, rows.take(slice(0, count, max(1, count // 100))), start=found)
     mass, std = found.mass
     assert abs(mass - 1.0) < 4 * std < 0.05
     turned = np.abs(carrier.term.arm.geometry.towards(found.load.geometry)[carrier.term.arm.geometry.turns])
