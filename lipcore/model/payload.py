@@ -118,6 +118,17 @@ class Carrier:
         return np.asarray((vectors * np.maximum(values, LEAST)) @ vectors.T)
 
     @cached_property
+    def covariance_root(self) -> Array:
+        """Cholesky root of the covariance, (M, M) lower triangular."""
+        return np.asarray(np.linalg.cholesky(self.covariance))
+
+    @property
+    def bends(self) -> bool:
+        """Whether the arm's geometry can be followed beyond where it is linear: where it is learnt, and nothing but
+        linear terms explains torque with it, whose variables are few."""
+        return self.term.arm.steps > 0 and self.model.posterior.basis.term is None
+
+    @cached_property
     def memory(self) -> Memory:
         """What the samples behind the posterior say of arms of another geometry."""
         n, limits = self.model.n_joints, self.model.training_range

@@ -14,7 +14,8 @@ from lipcore.model.body import Body
 from lipcore.model.payload import Carrier
 from lipcore.online.batch import Rows
 from lipcore.online.bodies import ANY, Known, eta_of, inverse
-from lipcore.online.payload import Estimate, estimate, known
+from lipcore.online.estimate import Estimate, known
+from lipcore.online.payload import estimate
 
 MOST_ROWS, BEFORE_ROWS, GROWTH, ANEW = 100, 10, 1.25, 2.0
 """Rows that a payload is estimated from, evenly spread over the time since; rows before it; by how many times they have

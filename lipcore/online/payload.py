@@ -24,8 +24,10 @@ from lipcore.kernels.arm_prior import Alternative
 from lipcore.kernels.geometry import Geometry
 from lipcore.model.payload import Carrier, Linearised, Load
 from lipcore.online.batch import Rows
-from lipcore.online.bodies import ANY, CONTACTS, WIDTH, Known, body, evidence, inverse, usual
+from lipcore.online.bodies import ANY, WIDTH, Known, body, inverse
 from lipcore.online.errors import correlation_roots, whitened
+from lipcore.online.estimate import Estimate, Seen, alone, rows_of
+from lipcore.online.linear import linear
 from lipcore.robots.urdf import PARAMETERS
 
 FIRST, ROUNDS, FEW, STILL = 30, 8, 4, 0.01
@@ -45,32 +47,6 @@ rows; what they are drawn by; the mean square, in deviations of the linear poste
 energy above the least, for each number that is unknown, from which on a place has not been reached yet."""
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """A payload as rows have it. eta, (10,): most likely; covariance: (10, 10) of it; load: with the arm's variables;
-    gain, contact: nats by which it explains the rows better than the arm without a payload, and
-    a contact does; places: see `_places`."""
-
-    eta: Array
-    covariance: Array
-    load: Load
-    gain: float
-    contact: float
-    places: tuple[_Point, ...] = ()
-
-    @property
-    def mass(self) -> tuple[float, float]:
-        """Mean and standard deviation of the mass, kg."""
-        return float(np.exp(self.eta[0])), float(np.exp(self.eta[0]) * np.sqrt(self.covariance[0, 0]))
-
-
-def known(carrier: Carrier, prior: Known) -> Estimate:
-    """A payload of which no more is known than beforehand."""
-    payload, slope = body(prior.centre)
-    spread = inverse(prior.precision)
-    return Estimate(prior.centre, spread, carrier.known(payload, slope @ spread @ slope.T), 0.0, 0.0)
-
-
 def estimate(
     carrier: Carrier,
     rows: Rows,
@@ -82,6 +58,8 @@ def estimate(
     """The payload that rows carry. before: rows that do not, whose errors tell those of the first that do; start:
     another estimate by the same carrier, or by another revision of its version, to begin at; anew: whether to begin
     from nothing, too."""
+    if not carrier.bends:
+        return linear(carrier, rows, before, prior, start)
     problem, size = _Problem.of(carrier, rows, before, prior), len(carrier.mean)
     if start is not None and len(start.load.mean) != size + PARAMETERS:
         start = None
@@ -135,7 +113,7 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
-class _Point:
+class Point:
     """The energy of a place. residual, derivative: of it, by whitened steps; misfit: mean square of the rows' part."""
 
     place: Place
@@ -145,10 +123,11 @@ class _Point:
 
     @property
     def energy(self) -> float:
+        """Nats."""
         return 0.5 * float(self.residual @ self.residual)
 
 
-def _minimum(problem: _Problem, at: _Point, rounds: int, shift: Array | float = 0.0) -> _Point:
+def _minimum(problem: _Problem, at: Point, rounds: int, shift: Array | float = 0.0) -> Point:
     """Where the energy is least, or what is reached in so many steps; shift: what the residuals should be."""
     damping, carrier = DAMPING, problem.carrier
     for _ in range(rounds):
@@ -171,26 +150,22 @@ def _minimum(problem: _Problem, at: _Point, rounds: int, shift: Array | float = 
     return at
 
 
-_Seen = tuple[Motion, tuple[Array, Array]]
-"""Instants, and what terms other than the arm make there."""
-
-
 @dataclass(frozen=True, eq=False)
 class _Problem:
     """What is minimised. loaded, free: motions, with a payload and without; tau: of both, the free ones first, (N, n)
     N·m; roots: see `correlation_roots`, of both."""
 
     carrier: Carrier
-    loaded: _Seen
-    free: _Seen | None
-    virtual: _Seen
+    loaded: Seen
+    free: Seen | None
+    virtual: Seen
     tau: Array
     prior: Known
     roots: Array
 
     @classmethod
     def of(cls, carrier: Carrier, rows: Rows, before: Rows | None, prior: Known) -> _Problem:
-        def seen(motion: Motion) -> _Seen:
+        def seen(motion: Motion) -> Seen:
             return motion, carrier.rest(motion)
 
         free = before is not None and len(before) > 0
@@ -230,18 +205,18 @@ class _Problem:
         step = np.append(draw.standard_normal(len(self.carrier.mean)), np.zeros(PARAMETERS))
         return replace(self.begin(None).moved(self.carrier, step), eta=eta)
 
-    def at(self, place: Place) -> _Point:
+    def at(self, place: Place) -> Point:
         """The energy of a place."""
         memory, size = self.carrier.memory, len(place.w)
         payload, slope = body(place.eta)
         loaded, free = (_around(self.carrier, place, carried) for carried in (payload, np.zeros(PARAMETERS)))
-        features, torque = _rows(loaded, *self.loaded)
+        features, torque = rows_of(loaded, *self.loaded)
         if self.free is not None:
-            others, torque_free = _rows(free, *self.free)
+            others, torque_free = rows_of(free, *self.free)
             others[-PARAMETERS:] = 0.0
             features, torque = np.concatenate([others, features], axis=1), np.concatenate([torque_free, torque])
         features, off = whitened(self.roots, features, torque - self.tau)
-        remembered, torque = _rows(free, *self.virtual)
+        remembered, torque = rows_of(free, *self.virtual)
         root = np.linalg.cholesky(self.prior.precision).T
         by_arm = np.concatenate([memory.derivative(remembered[:size]), features[:size].T @ memory.root])
         derivative = np.zeros((len(by_arm) + PARAMETERS, size + PARAMETERS))
@@ -249,30 +224,14 @@ class _Problem:
         derivative[len(by_arm) - len(off) : len(by_arm), size:] = features[size:].T @ slope
         derivative[len(by_arm) :, size:] = root
         residual = np.concatenate([memory.residual(place.w, torque), off, root @ (place.eta - self.prior.centre)])
-        return _Point(place, residual, derivative, float((off**2).mean()))
+        return Point(place, residual, derivative, float((off**2).mean()))
 
-    def gains(self, at: _Point) -> tuple[float, float]:
+    def gains(self, at: Point) -> tuple[float, float]:
         """Nats by which a payload, and a contact of constant torque, explain the rows better than the arm does without
         either, which is linear then."""
-        carrier, memory, size = self.carrier, self.carrier.memory, len(at.place.w)
-        nothing = Linearised(carrier, carrier.known(np.zeros(PARAMETERS)))
-        parts = [_rows(nothing, *each) for each in (self.free, self.loaded) if each is not None]
-        features, torque = (np.concatenate(each, axis=-2) for each in zip(*parts, strict=True))
-        count, n = torque.shape
-        touched = np.zeros((n, count, n))
-        touched[:, count - len(self.loaded[0]) :] = np.eye(n)[:, None]
-        typical = usual(features[size:, -1])
-        features, off = whitened(self.roots, np.concatenate([features[:size], touched]), torque - self.tau)
-        along, contact = features[:size].T @ memory.root, features[size:].T
-        curvature = np.eye(size) + along.T @ along
-        explained, shared = along.T @ off, along.T @ contact
-        within = np.linalg.solve(curvature, np.column_stack([explained, shared]))
-        gram, pull = contact.T @ contact - shared.T @ within[:, 1:], shared.T @ within[:, 0] - contact.T @ off
-        of_contact = evidence(gram[None], pull[None], [np.full(n, each * typical) for each in CONTACTS])
-        free_energy = self._alone + 0.5 * float(off @ off - explained @ within[:, 0])
-        volume = np.linalg.slogdet(at.derivative.T @ at.derivative)[1] - np.linalg.slogdet(self.prior.precision)[1]
-        of_payload = free_energy - at.energy + 0.5 * float(np.linalg.slogdet(curvature)[1] - volume)
-        return of_payload, float(of_contact[0])
+        least, volume, contact = alone(self.carrier, self.free, self.loaded, self.tau, self.roots)
+        curved = np.linalg.slogdet(at.derivative.T @ at.derivative)[1] - np.linalg.slogdet(self.prior.precision)[1]
+        return self._alone + least - at.energy + 0.5 * (volume - float(curved)), contact
 
 
 def _around(carrier: Carrier, place: Place, payload: Array) -> Linearised:
@@ -280,20 +239,12 @@ def _around(carrier: Carrier, place: Place, payload: Array) -> Linearised:
     return Linearised(carrier, Load(np.append(place.w, payload), nothing, np.ones(PARAMETERS), place.geometry))
 
 
-def _rows(around: Linearised, motion: Motion, rest: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Features of (w, π) at N instants, (M + 10, N, n), and the torque of the load's mean, (N, n) N·m."""
-    features, base = around.rows(motion, rest)
-    return features, base + np.tensordot(around.load.mean, features, axes=1)
-
-
 def _places(
-    problem: _Problem, at: _Point, known: tuple[_Point, ...], draw: np.random.Generator
-) -> tuple[tuple[_Point, ...], tuple[_Point, ...]]:
+    problem: _Problem, at: Point, known: tuple[Point, ...], draw: np.random.Generator
+) -> tuple[tuple[Point, ...], tuple[Point, ...]]:
     """Places in the posterior: minima for other noise, begun all over what the arm may be (randomised maximum
     likelihood, Kitanidis 1995, Oliver et al. 1996). known: places at fewer rows, the oldest of which are renewed.
     Return those that are not, and the new ones."""
-    if at.place.geometry is None:
-        return (), ()
     begin = [each.place for each in known[:RENEWED]]
     begin = begin or [problem.drawn(at.place.eta, draw) for _ in range(PLACES)]
     shifts = [draw.standard_normal(len(at.residual)) for _ in begin]
@@ -301,14 +252,12 @@ def _places(
     return known[RENEWED:], tuple(found)
 
 
-def _others(carrier: Carrier, at: _Point, root: Array, places: tuple[_Point, ...]) -> tuple[Alternative, ...]:
+def _others(carrier: Carrier, at: Point, root: Array, places: tuple[Point, ...]) -> tuple[Alternative, ...]:
     """Arms all over the posterior where it is far from linear, the most likely one first; none where it is not.
 
     Few rows leave a curved valley open, along which a centre of mass and the geometry make up for each other, and the
     linear posterior is tangent to it at one place.
     """
-    if not places or carrier.model.posterior.basis.term is not None:
-        return ()
     known = [each.place for each in places if each.energy < at.energy + FAR * len(root)]
     off = [np.zeros(len(root))]
     for each in known:

@@ -14,8 +14,8 @@ from lipcore.model.body import Body
 from lipcore.model.payload import Carrier
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online.batch import Rows
+from lipcore.online.estimate import Estimate
 from lipcore.online.holding import Watch
-from lipcore.online.payload import Estimate
 from lipcore.vocabulary import CODES, LEARNT
 from service.journal import log
 from service.models.loads import Carried

@@ -12,7 +12,8 @@ from lipcore.model.body import Body
 from lipcore.model.payload import Carrier, Linearised, Load, NoArmError
 from lipcore.online.batch import Rows
 from lipcore.online.bodies import ANY, body, eta_of
-from lipcore.online.payload import estimate, known
+from lipcore.online.estimate import known
+from lipcore.online.payload import estimate
 from lipcore.robots.library import load_robot, pinocchio
 from lipcore.robots.simulation import Payload, Stream, inverse_dynamics, simulate
 from lipcore.robots.urdf import RigidBody

@@ -11,8 +11,8 @@ import numpy as np
 from lipcore.data.samples import Array
 from lipcore.model.body import Body
 from lipcore.online.bodies import BELOW, DIAGONAL
+from lipcore.online.estimate import Estimate
 from lipcore.online.holding import Watch
-from lipcore.online.payload import Estimate
 from lipcore.robots.urdf import RigidBody
 from service.foundation.errors import ConflictError, invalid_request
 from service.journal import log
