@@ -27,10 +27,13 @@ off where rows show that something else is carried."""
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """A payload that is carried. since: event time, s, from which on; declared: whether it was said and not only seen;
-    rows: that it is estimated from, before: that came before it; every: of how many rows one is kept; count: rows that
-    it was seen on; due: their number at which it is estimated again; prior: what was known of it;
-    begun: their number when it was last estimated from nothing."""
+    """A payload that is carried.
+
+    since: event time, s, from which on; declared: whether by its owner, and not only seen; rows: that it is estimated
+    from, before: that came before it; every: of how many rows one is kept; count: rows that it was seen on; due: their
+    number at which it is estimated again; prior: what was known of it; begun: their number when it was last estimated
+    from nothing.
+    """
 
     since: float
     declared: bool
@@ -44,14 +47,14 @@ class Held:
     begun: int = 0
 
     @staticmethod
-    def seen(carrier: Carrier, rows: Rows, before: Rows) -> Held:
+    def of_rows(carrier: Carrier, rows: Rows, before: Rows) -> Held:
         """What rows show, beside those before them."""
         before = before.take(slice(None, None, max(1, -(-len(before) // BEFORE_ROWS))))
         found, count = estimate(carrier, rows, before), len(rows)
         return Held(float(rows.time[0]), False, rows, before, 1, count, GROWTH * count, ANY, found, count)
 
     @staticmethod
-    def said(carrier: Carrier, body: Body, at: float) -> Held:
+    def of_declaration(carrier: Carrier, body: Body, at: float) -> Held:
         """What is declared to be carried from event time `at`, s, on."""
         prior, nothing = Known(eta_of(body), np.diag(DECLARED**-2.0)), no_rows(carrier.model.n_joints)
         return Held(at, True, nothing, nothing, 1, 0, 1.0, prior, known(carrier, prior))

@@ -56,7 +56,7 @@ class Watch:
 
     state: what the last cells show; probabilities: of each hypothesis; since: event time, s, of the last change of
     whether something is held; waiting: rows that are no cell yet; recent: rows of the last cells, and these as they
-    were seen with `around`.
+    were seen with `around`; off: how many of them, one after the other, a payload does not explain.
     """
 
     n: int
@@ -89,7 +89,7 @@ class Watch:
 
     def declare(self, carrier: Carrier, body: Body, at: float) -> Watch:
         """The same where a payload is known to be carried from event time `at`, s, on."""
-        return Watch(self.n, "payload", {"payload": 1.0}, at, Held.said(carrier, body, at))
+        return Watch(self.n, "payload", {"payload": 1.0}, at, Held.of_declaration(carrier, body, at))
 
     def put_down(self, at: float) -> Watch:
         """The same where it is known that nothing is carried from event time `at`, s, on."""
@@ -180,7 +180,7 @@ class Watch:
         rows, before = Rows.concatenate(self.recent[-after:]), no_rows(self.n)
         if self.held is None and len(self.recent) > after:  # rows with another payload tell another beginning
             before = Rows.concatenate(self.recent[:-after][-every * BEFORE :])
-        held = Held.seen(carrier, rows, before)
+        held = Held.of_rows(carrier, rows, before)
         found = held.estimate
         vague = 1 / POSITIVE if found.gain < AT_ONCE else np.inf
         if after < LASTING or self.held is not None:

@@ -83,7 +83,7 @@ def estimate(
     outward = outward @ root
     room = PARAMETERS * np.diagonal(slope @ inverse(prior.precision) @ slope.T)
     load = Load(np.concatenate([at.place.w, payload]), outward @ outward.T, room, at.place.geometry)
-    places = (*old, *renewed)
+    places = (*old, *(Reached(each.place, each.energy) for each in renewed))
     load = replace(load, others=_others(carrier, at, root, places))
     of_eta = max(1.0, at.misfit) * root[size:] @ root[size:].T
     return Estimate(eta, of_eta, load, *problem.gains(at), places)
@@ -91,29 +91,33 @@ def estimate(
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """An arm and its payload. w: (M,); geometry: of the arm, None where it is not learnt; eta: (10,)."""
+    """An arm and its payload. w: (M,); geometry: of the arm; eta: (10,)."""
 
     w: Array
-    geometry: Geometry | None
+    geometry: Geometry
     eta: Array
 
     def moved(self, carrier: Carrier, step: Array) -> Place:
         """The place a whitened step away, (M + 10,), or as far in its direction as is gone at once."""
         size, steps = len(self.w), carrier.steps
         by, eta = carrier.memory.root @ step[:size], step[size:]
-        longest = np.abs(eta / WIDTH).max() / 2
-        if steps.stop > steps.start:
-            longest = max(longest, np.abs(carrier.root[steps] * by[steps]).max() / REACH)
+        longest = max(np.abs(eta / WIDTH).max() / 2, np.abs(carrier.root[steps] * by[steps]).max() / REACH)
         by, eta = by / max(1.0, longest), eta / max(1.0, longest)
-        w, arm, geometry = self.w + by, carrier.term.arm, self.geometry
-        if geometry is not None:
-            geometry = geometry.moved(carrier.root[steps] * by[steps])
-            w[steps] = (arm.geometry.towards(geometry) - arm.expected) / carrier.root[steps]
+        w, arm, geometry = self.w + by, carrier.term.arm, self.geometry.moved(carrier.root[steps] * by[steps])
+        w[steps] = (arm.geometry.towards(geometry) - arm.expected) / carrier.root[steps]
         return Place(w, geometry, self.eta + eta)
 
 
 @dataclass(frozen=True, eq=False)
-class Point:
+class Reached:
+    """A place in the posterior, and its energy when it was reached, nats."""
+
+    place: Place
+    energy: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
     """The energy of a place. residual, derivative: of it, by whitened steps; misfit: mean square of the rows' part."""
 
     place: Place
@@ -127,7 +131,7 @@ class Point:
         return 0.5 * float(self.residual @ self.residual)
 
 
-def _minimum(problem: _Problem, at: Point, rounds: int, shift: Array | float = 0.0) -> Point:
+def _minimum(problem: _Problem, at: _Point, rounds: int, shift: Array | float = 0.0) -> _Point:
     """Where the energy is least, or what is reached in so many steps; shift: what the residuals should be."""
     damping, carrier = DAMPING, problem.carrier
     for _ in range(rounds):
@@ -152,8 +156,8 @@ def _minimum(problem: _Problem, at: Point, rounds: int, shift: Array | float = 0
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """What is minimised. loaded, free: motions, with a payload and without; tau: of both, the free ones first, (N, n)
-    N·m; roots: see `correlation_roots`, of both."""
+    """What is minimised. loaded, free, virtual: motions with a payload, without, and of the memory; tau: of the first
+    two, the free ones first, (N, n) N·m; roots: see `correlation_roots`, of both."""
 
     carrier: Carrier
     loaded: Seen
@@ -168,12 +172,12 @@ class _Problem:
         def seen(motion: Motion) -> Seen:
             return motion, carrier.rest(motion)
 
-        free = before is not None and len(before) > 0
-        both = Rows.concatenate([before, rows]) if before is not None else rows
+        before = before if before is not None and len(before) else None
+        both = rows if before is None else Rows.concatenate([before, rows])
         return cls(
             carrier,
             seen(rows.motion()),
-            seen(before.motion()) if before is not None and free else None,
+            None if before is None else seen(before.motion()),
             seen(Motion.from_arrays(*carrier.memory.motions.swapaxes(0, 1))),
             both.tau,
             prior,
@@ -182,12 +186,12 @@ class _Problem:
 
     def begin(self, start: Estimate | None) -> Place:
         """Where to begin."""
-        arm, learnt = self.carrier.term.arm, None if start is None else start.load.geometry
-        if learnt is None and arm.steps:
-            learnt = arm.geometry.moved(self.carrier.step)
+        geometry = None if start is None else start.load.geometry
+        if geometry is None:
+            geometry = self.carrier.term.arm.geometry.moved(self.carrier.step)
         if start is None:
-            return Place(self.carrier.mean, learnt, self.prior.centre)
-        return Place(start.load.mean[:-PARAMETERS], learnt, start.eta)
+            return Place(self.carrier.mean, geometry, self.prior.centre)
+        return Place(start.load.mean[:-PARAMETERS], geometry, start.eta)
 
     @cached_property
     def _alone(self) -> float:
@@ -205,7 +209,7 @@ class _Problem:
         step = np.append(draw.standard_normal(len(self.carrier.mean)), np.zeros(PARAMETERS))
         return replace(self.begin(None).moved(self.carrier, step), eta=eta)
 
-    def at(self, place: Place) -> Point:
+    def at(self, place: Place) -> _Point:
         """The energy of a place."""
         memory, size = self.carrier.memory, len(place.w)
         payload, slope = body(place.eta)
@@ -224,9 +228,9 @@ class _Problem:
         derivative[len(by_arm) - len(off) : len(by_arm), size:] = features[size:].T @ slope
         derivative[len(by_arm) :, size:] = root
         residual = np.concatenate([memory.residual(place.w, torque), off, root @ (place.eta - self.prior.centre)])
-        return Point(place, residual, derivative, float((off**2).mean()))
+        return _Point(place, residual, derivative, float((off**2).mean()))
 
-    def gains(self, at: Point) -> tuple[float, float]:
+    def gains(self, at: _Point) -> tuple[float, float]:
         """Nats by which a payload, and a contact of constant torque, explain the rows better than the arm does without
         either, which is linear then."""
         least, volume, contact = alone(self.carrier, self.free, self.loaded, self.tau, self.roots)
@@ -240,8 +244,8 @@ def _around(carrier: Carrier, place: Place, payload: Array) -> Linearised:
 
 
 def _places(
-    problem: _Problem, at: Point, known: tuple[Point, ...], draw: np.random.Generator
-) -> tuple[tuple[Point, ...], tuple[Point, ...]]:
+    problem: _Problem, at: _Point, known: tuple[Reached, ...], draw: np.random.Generator
+) -> tuple[tuple[Reached, ...], list[_Point]]:
     """Places in the posterior: minima for other noise, begun all over what the arm may be (randomised maximum
     likelihood, Kitanidis 1995, Oliver et al. 1996). known: places at fewer rows, the oldest of which are renewed.
     Return those that are not, and the new ones."""
@@ -249,10 +253,10 @@ def _places(
     begin = begin or [problem.drawn(at.place.eta, draw) for _ in range(PLACES)]
     shifts = [draw.standard_normal(len(at.residual)) for _ in begin]
     found = [_minimum(problem, problem.at(each), FEW, by) for each, by in zip(begin, shifts, strict=True)]
-    return known[RENEWED:], tuple(found)
+    return known[RENEWED:], found
 
 
-def _others(carrier: Carrier, at: Point, root: Array, places: tuple[Point, ...]) -> tuple[Alternative, ...]:
+def _others(carrier: Carrier, at: _Point, root: Array, places: tuple[Reached, ...]) -> tuple[Alternative, ...]:
     """Arms all over the posterior where it is far from linear, the most likely one first; none where it is not.
 
     Few rows leave a curved valley open, along which a centre of mass and the geometry make up for each other, and the
@@ -267,6 +271,5 @@ def _others(carrier: Carrier, at: Point, root: Array, places: tuple[Point, ...])
         return ()
     share, arms = 1 / (1 + len(known)), []
     for each in (at.place, *known):
-        assert each.geometry is not None
         arms.append(carrier.alternative(each.w, each.geometry, body(each.eta)[0], share))
     return tuple(arms)
