@@ -71,7 +71,10 @@ def estimate(
     if at.energy > problem.expected():
         other = _minimum(problem, problem.at(problem.drawn(at.place.eta, draw)), FIRST)
         at = min([at, other], key=lambda each: each.energy)
-    old, renewed = _places(problem, at, () if start is None else start.places, draw)
+    # with more rows, what was as good as linear stays so
+    settled = start is not None and not start.load.others and not anew
+    known = () if start is None else start.places
+    old, renewed = (known, []) if settled else _places(problem, at, known, draw)
     best = min([at, *renewed], key=lambda each: each.energy)
     at = at if best is at else _minimum(problem, best, ROUNDS)
     # not from the curvature, of whose condition the root is enough: a covariance above the prior's is none
@@ -84,7 +87,8 @@ def estimate(
     room = PARAMETERS * np.diagonal(slope @ inverse(prior.precision) @ slope.T)
     load = Load(np.concatenate([at.place.w, payload]), outward @ outward.T, room, at.place.geometry)
     places = (*old, *(Reached(each.place, each.energy) for each in renewed))
-    load = replace(load, others=_others(carrier, at, root, places))
+    if not settled:
+        load = replace(load, others=_others(carrier, at, root, places))
     of_eta = max(1.0, at.misfit) * root[size:] @ root[size:].T
     return Estimate(eta, of_eta, load, *problem.gains(at), places)
 
