@@ -133,10 +133,9 @@ class ArmRegressor(Regressor):
 
     def fill_many(self, motions: Array, out: Array, first: int) -> None:
         """Write Φᵀ of N queries; see `Regressor.fill_many`."""
+        arm_queries(self._memory.flat, self._order, motions, out, first, first + self._first)
         if self._others is not None:
-            super().fill_many(motions, out, first)
-        else:
-            arm_queries(self._memory.flat, self._order, motions, out, first, first + self._first)
+            self._others.fill_many(motions, out, first + self._first)
 
 
 def _in_data(arm: Arm) -> Array:

@@ -85,10 +85,9 @@ def estimate(
     outward[:size, :size], outward[size:, size:] = carrier.memory.root, slope
     outward = outward @ root
     room = PARAMETERS * np.diagonal(slope @ inverse(prior.precision) @ slope.T)
-    load = Load(np.concatenate([at.place.w, payload]), outward @ outward.T, room, at.place.geometry)
     places = (*old, *(Reached(each.place, each.energy) for each in renewed))
-    if not settled:
-        load = replace(load, others=_others(carrier, at, root, places))
+    others = () if settled else _others(carrier, at, root, places)
+    load = Load(np.concatenate([at.place.w, payload]), outward @ outward.T, room, at.place.geometry, others)
     of_eta = max(1.0, at.misfit) * root[size:] @ root[size:].T
     return Estimate(eta, of_eta, load, *problem.gains(at), places)
 
