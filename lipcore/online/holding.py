@@ -222,9 +222,9 @@ class Watch:
         load = self.held.estimate.load
         mean = load.mean.copy()
         mean[-PARAMETERS:] = 0.0
-        bare = Linearised(carrier, replace(load, mean=mean))
-        parts = self.recent[-AFTER[-1] :]
-        seen = [replace(each, features=_unloaded(each.features)) for each in cells_of(bare, parts)]
+        bare = Linearised(carrier, replace(load, mean=mean, others=()))  # which carry it, too
+        parts, size = self.recent[-AFTER[-1] :], len(window.cells[-1].features)
+        seen = [replace(each, features=_unloaded(each.features, size)) for each in cells_of(bare, parts)]
         first, count = len(window.cells), len(window.cells) + len(seen)
         choices = [[*range(first - after), *range(count - after, count)] for after in gains]
         loads = Window.among(self.around, [*window.cells, *seen], choices)
@@ -249,6 +249,8 @@ class Watch:
         return Watch(n, values["state"], values["probabilities"], since, carried)
 
 
-def _unloaded(features: Array) -> Array:
-    """Features of (w, π) of an arm that carries nothing."""
-    return np.concatenate([features[:-PARAMETERS], np.zeros_like(features[-PARAMETERS:])])
+def _unloaded(features: Array, size: int) -> Array:
+    """Features of all that is unknown, (size, n), of an arm that carries nothing."""
+    out = np.zeros((size, features.shape[1]))
+    out[: len(features) - PARAMETERS] = features[:-PARAMETERS]
+    return out
