@@ -15,7 +15,7 @@ from lipcore.online.errors import whitened
 from lipcore.robots.urdf import PARAMETERS
 
 if TYPE_CHECKING:
-    from lipcore.online.payload import Reached
+    from lipcore.online.payload import Place
 
 Seen = tuple[Motion, tuple[Array, Array]]
 """Instants, and what terms other than the arm make there."""
@@ -32,7 +32,7 @@ class Estimate:
     load: Load
     gain: float
     contact: float
-    places: tuple[Reached, ...] = ()
+    places: tuple[Place, ...] = ()
 
     @property
     def mass(self) -> tuple[float, float]:

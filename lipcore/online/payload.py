@@ -12,7 +12,8 @@ Marquardt's, and the covariance is that of the linear model around the last one 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -33,18 +34,19 @@ from lipcore.robots.urdf import PARAMETERS
 FIRST, ROUNDS, FEW, STILL = 30, 8, 4, 0.01
 """Steps at most of an estimate from nothing, of one that begins at another, and of a place in the posterior: an answer
 waits for them; and the least that one gains, nats."""
-BEYOND = 2.0
-"""Another beginning is tried where the energy lies so many standard deviations above what is expected of it."""
 DAMPING, LESS, MORE = 1e-3, 0.15, 8.0
 """At first, as a share of the curvature; its factors after a step that gains, and after one that does not."""
 LEAST_DAMPING, WORST = 1e-9, 1e8
 """It is not less; and from which on nothing is gained."""
 REACH = 0.5
 """Longest step of the geometry, rad or m."""
-PLACES, RENEWED, SEED, LINEAR, FAR = 8, 3, 0, 2.0, 3.0
-"""Places in the posterior by which it is judged how far it is from linear; how many are looked for again with more
-rows; what they are drawn by; the mean square, in deviations of the linear posterior, up to which it is as good; and the
-energy above the least, for each number that is unknown, from which on a place has not been reached yet."""
+PLACES, APART, RELAXED, SEED = 12, (1.0, 4.0), 30, 0
+"""Places in the posterior by which it is judged how far it is from linear, followed from estimate to estimate; how many
+deviations of the linear posterior wide they begin, from and to, since where it is bent it is wider; steps in which they
+become arms that the training allows; and what they are drawn by."""
+LINEAR, FAR = 2.0, 3.0
+"""The mean square, in deviations of the linear posterior, up to which it is as good; and the energy above the least,
+for each number that is unknown, from which on a place has not been reached yet."""
 
 
 def estimate(
@@ -56,27 +58,23 @@ def estimate(
     anew: bool = False,
 ) -> Estimate:
     """The payload that rows carry. before: rows that do not, whose errors tell those of the first that do; start:
-    another estimate by the same carrier, or by another revision of its version, to begin at; anew: whether to begin
-    from nothing, too."""
+    another estimate by the same carrier, or by another revision of its version, to begin at; anew: whether to look for
+    places in the posterior again, where there were none or where rows have ruled them out."""
     if not carrier.bends:
         return linear(carrier, rows, before, prior, start)
     problem, size = _Problem.of(carrier, rows, before, prior), len(carrier.mean)
     if start is not None and len(start.load.mean) != size + PARAMETERS:
         start = None
     draw = np.random.default_rng([SEED, len(rows)])
-    found = [] if start is None else [_minimum(problem, problem.at(problem.begin(start)), ROUNDS)]
-    if anew or start is None:
-        found.append(_minimum(problem, problem.at(problem.begin(None)), FIRST))
-    at = min(found, key=lambda each: each.energy)
-    if at.energy > problem.expected():
-        other = _minimum(problem, problem.at(problem.drawn(at.place.eta, draw)), FIRST)
-        at = min([at, other], key=lambda each: each.energy)
+    at = _minimum(problem, problem.at(problem.begin(start)), FIRST if start is None else ROUNDS)
     # with more rows, what was as good as linear stays so
-    settled = start is not None and not start.load.others and not anew
-    known = () if start is None else start.places
-    old, renewed = (known, []) if settled else _places(problem, at, known, draw)
-    best = min([at, *renewed], key=lambda each: each.energy)
-    at = at if best is at else _minimum(problem, best, ROUNDS)
+    settled = start is not None and not start.places and not anew
+    places: Sequence[_Point] = (
+        [] if settled else _places(problem, at, () if start is None else start.places, draw, anew)
+    )
+    if places:  # whose energies are with their noise
+        other = _minimum(problem, min(places, key=lambda each: each.energy), ROUNDS)
+        at = min([at, other], key=lambda each: each.energy)
     # not from the curvature, of whose condition the root is enough: a covariance above the prior's is none
     root = solve_triangular(qr(at.derivative, mode="r")[0][: size + PARAMETERS], np.eye(size + PARAMETERS))
     eta = at.place.eta
@@ -85,11 +83,10 @@ def estimate(
     outward[:size, :size], outward[size:, size:] = carrier.memory.root, slope
     outward = outward @ root
     room = PARAMETERS * np.diagonal(slope @ inverse(prior.precision) @ slope.T)
-    places = (*old, *(Reached(each.place, each.energy) for each in renewed))
-    others = () if settled else _others(carrier, at, root, places)
+    places, others = _others(carrier, at, root, places)
     load = Load(np.concatenate([at.place.w, payload]), outward @ outward.T, room, at.place.geometry, others)
     of_eta = max(1.0, at.misfit) * root[size:] @ root[size:].T
-    return Estimate(eta, of_eta, load, *problem.gains(at), places)
+    return Estimate(eta, of_eta, load, *problem.gains(at), tuple(each.place for each in places))
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,14 +109,6 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
-class Reached:
-    """A place in the posterior, and its energy when it was reached, nats."""
-
-    place: Place
-    energy: float
-
-
-@dataclass(frozen=True, eq=False)
 class _Point:
     """The energy of a place. residual, derivative: of it, by whitened steps; misfit: mean square of the rows' part."""
 
@@ -134,7 +123,7 @@ class _Point:
         return 0.5 * float(self.residual @ self.residual)
 
 
-def _minimum(problem: _Problem, at: _Point, rounds: int, shift: Array | float = 0.0) -> _Point:
+def _minimum(problem: _Training | _Problem, at: _Point, rounds: int, shift: Array | float = 0.0) -> _Point:
     """Where the energy is least, or what is reached in so many steps; shift: what the residuals should be."""
     damping, carrier = DAMPING, problem.carrier
     for _ in range(rounds):
@@ -158,14 +147,40 @@ def _minimum(problem: _Problem, at: _Point, rounds: int, shift: Array | float = 
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
-    """What is minimised. loaded, free, virtual: motions with a payload, without, and of the memory; tau: of the first
-    two, the free ones first, (N, n) N·m; roots: see `correlation_roots`, of both."""
+class _Training:
+    """What the training of an arm says. virtual: motions of its memory."""
 
     carrier: Carrier
+    virtual: Seen
+
+    def at(self, place: Place) -> _Point:
+        """The energy of a place, whose payload is left as it is."""
+        memory, size = self.carrier.memory, len(place.w)
+        features, torque = rows_of(_around(self.carrier, place, np.zeros(PARAMETERS)), *self.virtual)
+        by_arm = memory.derivative(features[:size])
+        derivative = np.zeros((len(by_arm) + PARAMETERS, size + PARAMETERS))
+        derivative[: len(by_arm), :size] = by_arm
+        derivative[len(by_arm) :, size:] = np.eye(PARAMETERS)
+        residual = np.concatenate([memory.residual(place.w, torque), np.zeros(PARAMETERS)])
+        return _Point(place, residual, derivative, 0.0)
+
+    @cached_property
+    def alone(self) -> float:
+        """Energy of the arm as it was learnt, nats."""
+        memory, mean = self.carrier.memory, self.carrier.mean
+        alone = memory.residual(mean, memory.base + np.tensordot(mean, memory.features, axes=1))
+        return 0.5 * float(alone @ alone)
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """What is minimised. loaded, free: motions with a payload, and without; tau: of both, the free ones first, (N, n)
+    N·m; roots: see `correlation_roots`, of both."""
+
+    carrier: Carrier
+    training: _Training
     loaded: Seen
     free: Seen | None
-    virtual: Seen
     tau: Array
     prior: Known
     roots: Array
@@ -179,9 +194,9 @@ class _Problem:
         both = rows if before is None else Rows.concatenate([before, rows])
         return cls(
             carrier,
+            _Training(carrier, seen(Motion.from_arrays(*carrier.memory.motions.swapaxes(0, 1)))),
             seen(rows.motion()),
             None if before is None else seen(before.motion()),
-            seen(Motion.from_arrays(*carrier.memory.motions.swapaxes(0, 1))),
             both.tau,
             prior,
             correlation_roots(carrier, both),
@@ -196,41 +211,30 @@ class _Problem:
             return Place(self.carrier.mean, geometry, self.prior.centre)
         return Place(start.load.mean[:-PARAMETERS], geometry, start.eta)
 
-    @cached_property
-    def _alone(self) -> float:
-        """Energy of the arm as it was learnt, by what its training says."""
-        memory, mean = self.carrier.memory, self.carrier.mean
-        alone = memory.residual(mean, memory.base + np.tensordot(mean, memory.features, axes=1))
-        return 0.5 * float(alone @ alone)
-
-    def expected(self) -> float:
-        """What the least energy is hardly above: each of the rows' torques adds ½ χ² with one degree of freedom."""
-        return self._alone + 0.5 * self.tau.size + BEYOND * float(np.sqrt(0.5 * self.tau.size))
-
     def drawn(self, eta: Array, draw: np.random.Generator) -> Place:
-        """One of the arms that there may be, and a payload."""
-        step = np.append(draw.standard_normal(len(self.carrier.mean)), np.zeros(PARAMETERS))
-        return replace(self.begin(None).moved(self.carrier, step), eta=eta)
+        """One of the arms that the training allows, and a payload."""
+        start, steps, root = self.begin(None), self.carrier.steps, self.carrier.root
+        by = draw.uniform(*APART) * self.carrier.memory.root @ draw.standard_normal(len(start.w))
+        w, arm, geometry = start.w + by, self.carrier.term.arm, start.geometry.moved(root[steps] * by[steps])
+        w[steps] = (arm.geometry.towards(geometry) - arm.expected) / root[steps]
+        return _minimum(self.training, self.training.at(Place(w, geometry, eta)), RELAXED).place
 
     def at(self, place: Place) -> _Point:
         """The energy of a place."""
-        memory, size = self.carrier.memory, len(place.w)
+        trained, size = self.training.at(place), len(place.w)
         payload, slope = body(place.eta)
-        loaded, free = (_around(self.carrier, place, carried) for carried in (payload, np.zeros(PARAMETERS)))
-        features, torque = rows_of(loaded, *self.loaded)
+        features, torque = rows_of(_around(self.carrier, place, payload), *self.loaded)
         if self.free is not None:
-            others, torque_free = rows_of(free, *self.free)
+            others, torque_free = rows_of(_around(self.carrier, place, np.zeros(PARAMETERS)), *self.free)
             others[-PARAMETERS:] = 0.0
             features, torque = np.concatenate([others, features], axis=1), np.concatenate([torque_free, torque])
         features, off = whitened(self.roots, features, torque - self.tau)
-        remembered, torque = rows_of(free, *self.virtual)
         root = np.linalg.cholesky(self.prior.precision).T
-        by_arm = np.concatenate([memory.derivative(remembered[:size]), features[:size].T @ memory.root])
-        derivative = np.zeros((len(by_arm) + PARAMETERS, size + PARAMETERS))
-        derivative[: len(by_arm), :size] = by_arm
-        derivative[len(by_arm) - len(off) : len(by_arm), size:] = features[size:].T @ slope
-        derivative[len(by_arm) :, size:] = root
-        residual = np.concatenate([memory.residual(place.w, torque), off, root @ (place.eta - self.prior.centre)])
+        by_rows = np.hstack([features[:size].T @ self.carrier.memory.root, features[size:].T @ slope])
+        derivative = np.concatenate([trained.derivative, by_rows])
+        derivative[len(trained.derivative) - PARAMETERS : len(trained.derivative), size:] = root
+        residual = np.concatenate([trained.residual, off])
+        residual[len(trained.residual) - PARAMETERS : len(trained.residual)] = root @ (place.eta - self.prior.centre)
         return _Point(place, residual, derivative, float((off**2).mean()))
 
     def gains(self, at: _Point) -> tuple[float, float]:
@@ -238,7 +242,7 @@ class _Problem:
         either, which is linear then."""
         least, volume, contact = alone(self.carrier, self.free, self.loaded, self.tau, self.roots)
         curved = np.linalg.slogdet(at.derivative.T @ at.derivative)[1] - np.linalg.slogdet(self.prior.precision)[1]
-        return self._alone + least - at.energy + 0.5 * (volume - float(curved)), contact
+        return self.training.alone + least - at.energy + 0.5 * (volume - float(curved)), contact
 
 
 def _around(carrier: Carrier, place: Place, payload: Array) -> Linearised:
@@ -247,20 +251,27 @@ def _around(carrier: Carrier, place: Place, payload: Array) -> Linearised:
 
 
 def _places(
-    problem: _Problem, at: _Point, known: tuple[Reached, ...], draw: np.random.Generator
-) -> tuple[tuple[Reached, ...], list[_Point]]:
+    problem: _Problem, at: _Point, known: Sequence[Place], draw: np.random.Generator, anew: bool
+) -> list[_Point]:
     """Places in the posterior: minima for other noise, begun all over what the arm may be (randomised maximum
-    likelihood, Kitanidis 1995, Oliver et al. 1996). known: places at fewer rows, the oldest of which are renewed.
-    Return those that are not, and the new ones."""
-    begin = [each.place for each in known[:RENEWED]]
-    begin = begin or [problem.drawn(at.place.eta, draw) for _ in range(PLACES)]
-    shifts = [draw.standard_normal(len(at.residual)) for _ in begin]
-    found = [_minimum(problem, problem.at(each), FEW, by) for each, by in zip(begin, shifts, strict=True)]
-    return known[RENEWED:], found
+    likelihood, Kitanidis 1995, Oliver et al. 1996), or at those that are known of fewer rows. anew: whether those that
+    rows have ruled out begin again."""
+
+    def sought(begin: Place, rounds: int = FEW) -> _Point:
+        return _minimum(problem, problem.at(begin), rounds, draw.standard_normal(len(at.residual)))
+
+    places = [sought(each) for each in known or [problem.drawn(at.place.eta, draw) for _ in range(PLACES)]]
+    if anew:
+        lost = min(each.energy for each in (at, *places)) + FAR * len(at.place.w)
+        places = [each if each.energy < lost else sought(problem.drawn(at.place.eta, draw), FIRST) for each in places]
+    return places
 
 
-def _others(carrier: Carrier, at: _Point, root: Array, places: tuple[Reached, ...]) -> tuple[Alternative, ...]:
-    """Arms all over the posterior where it is far from linear, the most likely one first; none where it is not.
+def _others(
+    carrier: Carrier, at: _Point, root: Array, places: Sequence[_Point]
+) -> tuple[Sequence[_Point], tuple[Alternative, ...]]:
+    """Places to follow, and arms all over the posterior where it is far from linear, the most likely one first; none of
+    either where it is not.
 
     Few rows leave a curved valley open, along which a centre of mass and the geometry make up for each other, and the
     linear posterior is tangent to it at one place.
@@ -270,9 +281,11 @@ def _others(carrier: Carrier, at: _Point, root: Array, places: tuple[Reached, ..
     for each in known:
         w = solve_triangular(carrier.memory.root, each.w - at.place.w, lower=True, check_finite=False)
         off.append(solve_triangular(root, np.append(w, each.eta - at.place.eta), check_finite=False))
-    if not known or np.square(off[1:]).mean() < LINEAR:
-        return ()
+    if not known:
+        return places, ()
+    if np.square(off[1:]).mean() < LINEAR:
+        return (), ()
     share, arms = 1 / (1 + len(known)), []
     for each in (at.place, *known):
         arms.append(carrier.alternative(each.w, each.geometry, body(each.eta)[0], share))
-    return tuple(arms)
+    return places, tuple(arms)
