@@ -15,7 +15,7 @@ from lipcore.online.errors import whitened
 from lipcore.robots.urdf import PARAMETERS
 
 if TYPE_CHECKING:
-    from lipcore.online.payload import Place
+    from lipcore.online.payload import Draw
 
 Seen = tuple[Motion, tuple[Array, Array]]
 """Instants, and what terms other than the arm make there."""
@@ -25,14 +25,14 @@ Seen = tuple[Motion, tuple[Array, Array]]
 class Estimate:
     """A payload as rows have it. eta, (10,): most likely; covariance: (10, 10) of it; load: with the arm's variables;
     gain, contact: nats by which it explains the rows better than the arm without a payload, and
-    a contact does; places: see `_places`."""
+    a contact does; draws: from the posterior, where it is not linear."""
 
     eta: Array
     covariance: Array
     load: Load
     gain: float
     contact: float
-    places: tuple[Place, ...] = ()
+    draws: tuple[Draw, ...] = ()
 
     @property
     def mass(self) -> tuple[float, float]:

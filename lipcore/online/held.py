@@ -19,7 +19,7 @@ from lipcore.online.payload import estimate
 
 MOST_ROWS, BEFORE_ROWS, GROWTH, ANEW = 100, 10, 1.45, 2.0
 """Rows that a payload is estimated from, evenly spread over the time since; rows before it; by how many times they have
-to grow until it is estimated again, and until places in its posterior are looked for again."""
+to grow until it is estimated again, and until its posterior is drawn from again."""
 DECLARED, WRONG = np.array([0.02, *[0.005] * 3, *[0.3] * 3, *[0.005] * 3]), 4.0
 """Standard deviations of η of a payload that was declared: of log mass, m, of log m, m; and how many of them it lies
 off where rows show that something else is carried."""
@@ -31,8 +31,8 @@ class Held:
 
     since: event time, s, from which on; declared: whether by its owner, and not only seen; rows: that it is estimated
     from, before: that came before it; every: of how many rows one is kept; count: rows that it was seen on; due: their
-    number at which it is estimated again; prior: what was known of it; begun: their number when places in
-    its posterior were last looked for.
+    number at which it is estimated again; prior: what was known of it; begun: their number when its
+    posterior was last drawn from.
     """
 
     since: float

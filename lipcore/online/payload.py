@@ -32,7 +32,7 @@ from lipcore.online.linear import linear
 from lipcore.robots.urdf import PARAMETERS
 
 FIRST, ROUNDS, FEW, STILL = 30, 8, 4, 0.01
-"""Steps at most of an estimate from nothing, of one that begins at another, and of a place in the posterior: an answer
+"""Steps at most of an estimate from nothing, of one that begins at another, and of a draw from its posterior: an answer
 waits for them; and the least that one gains, nats."""
 DAMPING, LESS, MORE = 1e-3, 0.15, 8.0
 """At first, as a share of the curvature; its factors after a step that gains, and after one that does not."""
@@ -40,13 +40,13 @@ LEAST_DAMPING, WORST = 1e-9, 1e8
 """It is not less; and from which on nothing is gained."""
 REACH = 0.5
 """Longest step of the geometry, rad or m."""
-PLACES, APART, RELAXED, SEED = 12, (1.0, 4.0), 30, 0
-"""Places in the posterior by which it is judged how far it is from linear, followed from estimate to estimate; how many
-deviations of the linear posterior wide they begin, from and to, since where it is bent it is wider; steps in which they
-become arms that the training allows; and what they are drawn by."""
-LINEAR, FAR = 2.0, 3.0
+DRAWS, WIDE, RELAXED, SEED = 12, (1.0, 6.0), 30, 0
+"""Draws from the posterior by which it is judged how far it is from linear, followed from estimate to estimate; how
+many deviations of the linear posterior wide they begin, from and to, as where it is bent it is wider; steps in which
+they become arms that the training allows; and what they are drawn by."""
+LINEAR, FAR = 2.0, 10.0
 """The mean square, in deviations of the linear posterior, up to which it is as good; and the energy above the least,
-for each number that is unknown, from which on a place has not been reached yet."""
+for each number that is unknown, from which on rows have ruled a draw out, nats."""
 
 
 def estimate(
@@ -58,8 +58,8 @@ def estimate(
     anew: bool = False,
 ) -> Estimate:
     """The payload that rows carry. before: rows that do not, whose errors tell those of the first that do; start:
-    another estimate by the same carrier, or by another revision of its version, to begin at; anew: whether to look for
-    places in the posterior again, where there were none or where rows have ruled them out."""
+    another estimate by the same carrier, or by another revision of its version, to begin at; anew: whether to draw
+    from the posterior again, where it was as good as linear or rows have ruled draws out."""
     if not carrier.bends:
         return linear(carrier, rows, before, prior, start)
     problem, size = _Problem.of(carrier, rows, before, prior), len(carrier.mean)
@@ -68,12 +68,10 @@ def estimate(
     draw = np.random.default_rng([SEED, len(rows)])
     at = _minimum(problem, problem.at(problem.begin(start)), FIRST if start is None else ROUNDS)
     # with more rows, what was as good as linear stays so
-    settled = start is not None and not start.places and not anew
-    places: Sequence[_Point] = (
-        [] if settled else _places(problem, at, () if start is None else start.places, draw, anew)
-    )
-    if places:  # whose energies are with their noise
-        other = _minimum(problem, min(places, key=lambda each: each.energy), ROUNDS)
+    settled = start is not None and not start.draws and not anew
+    drawn = [] if settled else _draws(problem, at, () if start is None else start.draws, draw, anew)
+    if drawn:  # each of which is the minimum for other noise
+        other = _minimum(problem, min([point for point, _ in drawn], key=lambda each: each.energy), ROUNDS)
         at = min([at, other], key=lambda each: each.energy)
     # not from the curvature, of whose condition the root is enough: a covariance above the prior's is none
     root = solve_triangular(qr(at.derivative, mode="r")[0][: size + PARAMETERS], np.eye(size + PARAMETERS))
@@ -83,10 +81,11 @@ def estimate(
     outward[:size, :size], outward[size:, size:] = carrier.memory.root, slope
     outward = outward @ root
     room = PARAMETERS * np.diagonal(slope @ inverse(prior.precision) @ slope.T)
-    places, others = _others(carrier, at, root, places)
+    others, bent = _others(carrier, at, root, [point for point, _ in drawn])
+    draws = tuple(Draw(point.place, noise) for point, noise in drawn) if bent else ()
     load = Load(np.concatenate([at.place.w, payload]), outward @ outward.T, room, at.place.geometry, others)
     of_eta = max(1.0, at.misfit) * root[size:] @ root[size:].T
-    return Estimate(eta, of_eta, load, *problem.gains(at), tuple(each.place for each in places))
+    return Estimate(eta, of_eta, load, *problem.gains(at), draws)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +105,14 @@ class Place:
         w, arm, geometry = self.w + by, carrier.term.arm, self.geometry.moved(carrier.root[steps] * by[steps])
         w[steps] = (arm.geometry.towards(geometry) - arm.expected) / carrier.root[steps]
         return Place(w, geometry, self.eta + eta)
+
+
+@dataclass(frozen=True, eq=False)
+class Draw:
+    """A draw from the posterior: the place of least energy for other noise. noise: of what is known beforehand."""
+
+    place: Place
+    noise: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,13 +218,16 @@ class _Problem:
             return Place(self.carrier.mean, geometry, self.prior.centre)
         return Place(start.load.mean[:-PARAMETERS], geometry, start.eta)
 
-    def drawn(self, eta: Array, draw: np.random.Generator) -> Place:
+    def drawn(self, eta: Array, draw: np.random.Generator) -> Draw:
         """One of the arms that the training allows, and a payload."""
         start, steps, root = self.begin(None), self.carrier.steps, self.carrier.root
-        by = draw.uniform(*APART) * self.carrier.memory.root @ draw.standard_normal(len(start.w))
+        by = draw.uniform(*WIDE) * self.carrier.memory.root @ draw.standard_normal(len(start.w))
         w, arm, geometry = start.w + by, self.carrier.term.arm, start.geometry.moved(root[steps] * by[steps])
         w[steps] = (arm.geometry.towards(geometry) - arm.expected) / root[steps]
-        return _minimum(self.training, self.training.at(Place(w, geometry, eta)), RELAXED).place
+        at = self.training.at(Place(w, geometry, eta))
+        noise = draw.standard_normal(len(at.residual))
+        still = np.concatenate([noise[:-PARAMETERS], np.zeros(PARAMETERS)])
+        return Draw(_minimum(self.training, at, RELAXED, still).place, noise)
 
     def at(self, place: Place) -> _Point:
         """The energy of a place."""
@@ -250,42 +260,49 @@ def _around(carrier: Carrier, place: Place, payload: Array) -> Linearised:
     return Linearised(carrier, Load(np.append(place.w, payload), nothing, np.ones(PARAMETERS), place.geometry))
 
 
-def _places(
-    problem: _Problem, at: _Point, known: Sequence[Place], draw: np.random.Generator, anew: bool
-) -> list[_Point]:
-    """Places in the posterior: minima for other noise, begun all over what the arm may be (randomised maximum
-    likelihood, Kitanidis 1995, Oliver et al. 1996), or at those that are known of fewer rows. anew: whether those that
-    rows have ruled out begin again."""
+def _draws(
+    problem: _Problem, at: _Point, known: Sequence[Draw], draw: np.random.Generator, anew: bool
+) -> list[tuple[_Point, Array]]:
+    """Draws from the posterior, with their noise: minima for other noise of the training, of what is known of payloads
+    and of the rows (randomised maximum likelihood, Kitanidis 1995, Oliver et al. 1996). known: of fewer rows; anew:
+    whether those that rows have ruled out begin again."""
 
-    def sought(begin: Place, rounds: int = FEW) -> _Point:
-        return _minimum(problem, problem.at(begin), rounds, draw.standard_normal(len(at.residual)))
+    def sought(begin: Draw, rounds: int = FEW) -> tuple[_Point, Array]:
+        noise = np.append(begin.noise, draw.standard_normal(problem.tau.size))
+        return _minimum(problem, problem.at(begin.place), rounds, noise), begin.noise
 
-    places = [sought(each) for each in known or [problem.drawn(at.place.eta, draw) for _ in range(PLACES)]]
+    # another revision of the training may know more, or less
+    known = [each for each in known if len(each.noise) == len(at.residual) - problem.tau.size]
+    found = [sought(each) for each in known or [problem.drawn(at.place.eta, draw) for _ in range(DRAWS)]]
     if anew:
-        lost = min(each.energy for each in (at, *places)) + FAR * len(at.place.w)
-        places = [each if each.energy < lost else sought(problem.drawn(at.place.eta, draw), FIRST) for each in places]
-    return places
+        out = _ruled_out(min([at, *(point for point, _ in found)], key=lambda each: each.energy))
+        found = [sought(problem.drawn(at.place.eta, draw), FIRST) if each[0].energy > out else each for each in found]
+    return found
+
+
+def _ruled_out(least: _Point) -> float:
+    """Energy from which on a draw is ruled out, nats."""
+    return least.energy + FAR * len(least.derivative.T)
 
 
 def _others(
-    carrier: Carrier, at: _Point, root: Array, places: Sequence[_Point]
-) -> tuple[Sequence[_Point], tuple[Alternative, ...]]:
-    """Places to follow, and arms all over the posterior where it is far from linear, the most likely one first; none of
-    either where it is not.
+    carrier: Carrier, at: _Point, root: Array, points: Sequence[_Point]
+) -> tuple[tuple[Alternative, ...], bool]:
+    """Arms all over the posterior where it is far from linear, the most likely one first; and whether it is.
 
     Few rows leave a curved valley open, along which a centre of mass and the geometry make up for each other, and the
     linear posterior is tangent to it at one place.
     """
-    known = [each.place for each in places if each.energy < at.energy + FAR * len(root)]
+    known = [each.place for each in points if each.energy < _ruled_out(at)]
+    if not known:
+        return (), bool(points)
     off = [np.zeros(len(root))]
     for each in known:
         w = solve_triangular(carrier.memory.root, each.w - at.place.w, lower=True, check_finite=False)
         off.append(solve_triangular(root, np.append(w, each.eta - at.place.eta), check_finite=False))
-    if not known:
-        return places, ()
     if np.square(off[1:]).mean() < LINEAR:
-        return (), ()
+        return (), False
     share, arms = 1 / (1 + len(known)), []
     for each in (at.place, *known):
         arms.append(carrier.alternative(each.w, each.geometry, body(each.eta)[0], share))
-    return places, tuple(arms)
+    return tuple(arms), True
