@@ -15,7 +15,8 @@ from lipcore.arm.problem import Point, Problem
 from lipcore.data.samples import Array
 from lipcore.kernels.geometry import STANDARD_GRAVITY, Geometry, aligned, rotation_of
 from lipcore.robots.library import ROBOTS, SimulationUnavailableError, installed_profiles
-from lipcore.robots.urdf import JointMismatchError, RigidBody, UrdfError
+from lipcore.robots.urdf import JointMismatchError, RigidBody
+from lipcore.robots.urdf_text import UrdfError
 from lipcore.vocabulary import JointType
 
 RIGHT_ANGLED = np.array([[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], np.float64)

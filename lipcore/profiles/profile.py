@@ -12,7 +12,8 @@ import numpy as np
 
 from lipcore.data.motion import Array
 from lipcore.profiles.names import Assignment, assignments, is_number, makes
-from lipcore.robots.urdf import MOVABLE, UrdfError, describe
+from lipcore.robots.urdf import describe
+from lipcore.robots.urdf_text import MOVABLE, UrdfError
 from lipcore.vocabulary import EffortMeaning, JointType
 
 FREE = (-np.inf, np.inf)

@@ -1,8 +1,4 @@
-"""Rigid bodies of a URDF, arranged as the joints of the data are.
-
-A URDF comes from strangers: it is read as text, never as a path, meshes are not opened, and what could run away while
-it is parsed (document types, deep nesting, loops, endless chains) is refused before Pinocchio sees it.
-"""
+"""Rigid bodies of a URDF, arranged as the joints of the data are."""
 
 from __future__ import annotations
 
@@ -10,45 +6,26 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
-from xml.parsers import expat
 
 import numpy as np
 
 from lipcore.data.motion import check_joint_types
 from lipcore.data.samples import Array
 from lipcore.robots.library import ROBOTS, UnknownRobotError, pinocchio, profile_urdf
+from lipcore.robots.urdf_text import MOVABLE, UrdfError, UrdfJoint, read
 from lipcore.vocabulary import JointType
 
 Matching = Literal["name", "order", "list"]
 """How the data's joints were matched with the URDF's: by name, by order (profiles only), by an explicit list."""
 
-MOVABLE: dict[str, JointType] = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 MIN_LENGTH, DEFAULT_LENGTH = 0.01, 0.3
 """Below the first, m, the placements say nothing about the links' size, and the second stands in."""
-MAX_DEPTH = 32
-MAX_LINKS = 500
-"""Links of a URDF: parsers and Pinocchio recurse from link to link, and a long enough chain would exhaust the stack."""
 PARAMETERS = 10
 """Inertial parameters of a body: mass, first moment (3), inertia (xx, xy, yy, xz, yz, zz) about its joint's frame."""
 
 
-class UrdfError(ValueError):
-    """The text is no URDF that can be used; the message says why."""
-
-
 class JointMismatchError(ValueError):
     """The joints of the URDF are not those of the data; the message names both."""
-
-
-@dataclass(frozen=True)
-class UrdfJoint:
-    """A joint as the URDF has it. kind: its `type` there; mimics: the joint that it follows."""
-
-    name: str
-    kind: str
-    parent: str
-    child: str
-    mimics: str | None = None
 
 
 @dataclass(frozen=True)
@@ -126,9 +103,10 @@ class RigidBody:
         matched: Matching,
     ) -> RigidBody:
         types, names = check_joint_types(joint_types), tuple(joint_names)
-        text_name, everything = _scan(urdf)
+        text = read(urdf)
+        everything = text.joints
         movable = {joint.name: joint for joint in everything if joint.kind in MOVABLE}
-        robot, chosen = name or text_name, set(urdf_joints)
+        robot, chosen = name or text.robot, set(urdf_joints)
         if len(urdf_joints) != len(names) or len(chosen) != len(names) or not movable.keys() >= chosen:
             listed = f"; `joints` lists {', '.join(urdf_joints)}" if matched == "list" else ""
             raise _mismatch(robot, tuple(movable), names, listed)
@@ -140,7 +118,7 @@ class RigidBody:
                     f"joint {data_name!r} is {kind} in the data, but {joint.name!r} of robot {robot!r} is {joint.kind}"
                 )
         _check_mimicry(everything, urdf_joints)
-        model = _reduce(_parse(urdf), urdf_joints)
+        model = _reduce(_parse(text.plain), urdf_joints)
         return cls(robot, urdf, names, types, urdf_joints, matched, model)
 
     @property
@@ -173,84 +151,17 @@ class RigidBody:
 
 def describe(urdf: str) -> Description:
     """Read what a URDF holds and check that Pinocchio takes it; raise UrdfError."""
-    name, everything = _scan(urdf)
-    joints = tuple(joint for joint in everything if joint.kind in MOVABLE and joint.mimics is None)
+    text = read(urdf)
+    joints = tuple(joint for joint in text.joints if joint.kind in MOVABLE and joint.mimics is None)
     if not joints:
         raise UrdfError("the URDF has no joint that moves, expected revolute, continuous or prismatic joints")
-    _parse(urdf)
-    return Description(name, joints)
+    _parse(text.plain)
+    return Description(text.robot, joints)
 
 
 def _mismatch(robot: str, movable: Sequence[str], data: Sequence[str], listed: str = "") -> JointMismatchError:
     listed_joints, given = ", ".join(movable) or "none", ", ".join(data)
     return JointMismatchError(f"robot {robot!r} has the movable joints {listed_joints}; the data have {given}{listed}")
-
-
-def _scan(urdf: str) -> tuple[str, tuple[UrdfJoint, ...]]:
-    """The robot's name and its joints, from one pass that refuses what must not reach a recursive parser."""
-    scanner = _Scanner()
-    parser = expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = scanner.start, scanner.end
-    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = scanner.refuse_declaration
-    try:
-        parser.Parse(urdf, True)
-    except expat.ExpatError as error:
-        raise UrdfError(f"the URDF is not well-formed XML: {error}") from None
-    except UnicodeEncodeError as error:
-        raise UrdfError(f"the URDF is not text: {error}") from None
-    if scanner.links > MAX_LINKS:
-        raise UrdfError(f"the URDF has {scanner.links} links, expected at most {MAX_LINKS}")
-    joints = [
-        UrdfJoint(entry["name"], entry["type"], entry["parent"], entry["child"], entry.get("mimic"))
-        for entry in ({"name": "", "type": "", "parent": "", "child": ""} | joint for joint in scanner.joints)
-    ]
-    moved: dict[str, str] = {}
-    for joint in joints:
-        if joint.child in moved:
-            raise UrdfError(
-                f"link {joint.child!r} is the child of two joints, {moved[joint.child]!r} and {joint.name!r}: a closed "
-                "loop cannot be used, expected a tree"
-            )
-        moved[joint.child] = joint.name
-    for joint in joints:
-        if joint.kind not in MOVABLE and joint.kind != "fixed":
-            raise UrdfError(
-                f"joint {joint.name!r} is of type {joint.kind!r}: expected a fixed base and joints of type "
-                f"{', '.join(MOVABLE)} or fixed"
-            )
-    return scanner.robot, tuple(joints)
-
-
-class _Scanner:
-    """Handlers of expat that collect the joints directly below the root element `robot`."""
-
-    def __init__(self) -> None:
-        self.depth = self.links = 0
-        self.robot = ""
-        self.joints: list[dict[str, str]] = []
-        self._inside = False
-
-    def start(self, tag: str, attributes: dict[str, str]) -> None:
-        self.depth += 1
-        if self.depth > MAX_DEPTH:
-            raise UrdfError(f"the URDF nests elements more than {MAX_DEPTH} deep")
-        if self.depth == 1:
-            if tag != "robot":
-                raise UrdfError(f"the root element is <{tag[:40]}>, expected <robot>")
-            self.robot = attributes.get("name", "")[:200]
-        elif self.depth == 2:
-            self._inside = tag == "joint"
-            self.links += tag == "link"
-            if self._inside:
-                self.joints.append({name: attributes.get(name, "") for name in ("name", "type")})
-        elif self.depth == 3 and self._inside and tag in ("parent", "child", "mimic"):
-            self.joints[-1][tag] = attributes.get("joint" if tag == "mimic" else "link", "")
-
-    def end(self, tag: str) -> None:
-        self.depth -= 1
-
-    def refuse_declaration(self, *_: Any) -> None:
-        raise UrdfError("the URDF declares a document type or an entity (<!DOCTYPE>, <!ENTITY>), which is not accepted")
 
 
 def _check_mimicry(joints: Sequence[UrdfJoint], free: Sequence[str]) -> None:
@@ -263,14 +174,14 @@ def _check_mimicry(joints: Sequence[UrdfJoint], free: Sequence[str]) -> None:
             )
 
 
-def _parse(urdf: str) -> Any:
+def _parse(plain: str) -> Any:
     pin = pinocchio()
     try:
-        model = pin.buildModelFromXML(urdf)
+        model = pin.buildModelFromXML(plain)
     except (ValueError, RuntimeError) as error:
         raise UrdfError(
-            f"Pinocchio cannot read the URDF: {str(error).strip()[:300]} Usual reasons: a link that a joint names is "
-            "missing, there are two roots, a name is used twice, or a revolute or prismatic joint has no <limit>"
+            f"Pinocchio cannot read the URDF: {str(error).strip()[:300]} Usual reason: a "
+            "revolute or prismatic joint has no <limit>"
         ) from None
     for name, inertia in zip(tuple(model.names), tuple(model.inertias), strict=True):
         values = inertia.toDynamicParameters()

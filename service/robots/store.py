@@ -16,7 +16,8 @@ from lipcore.profiles import Profile
 from lipcore.profiles.names import is_number
 from lipcore.profiles.profile import read_limits
 from lipcore.robots.library import ROBOTS, UnknownRobotError, profile_urdf
-from lipcore.robots.urdf import MOVABLE, RigidBody, UrdfError, describe
+from lipcore.robots.urdf import RigidBody, describe
+from lipcore.robots.urdf_text import MOVABLE, UrdfError
 from service.foundation.errors import (
     ConflictError,
     InvalidDataError,
@@ -123,7 +124,10 @@ def profile_of(database: Database, robot: str) -> Profile:
     row = _find(database, robot)
     if row is None:
         raise invalid_request("robot", robot, f"one of {', '.join(known)}, or the id of an uploaded URDF")
-    return profiles.from_urdf(row.urdf, row.name)
+    try:
+        return profiles.from_urdf(row.urdf, row.name)
+    except UrdfError as error:  # an earlier release has taken it
+        raise _invalid(f"robot {robot} cannot be used any more: {error}") from None
 
 
 def _of_profile(robot: str, joint_names: Sequence[str], joint_types: Sequence[str]) -> RigidBody:

@@ -12,7 +12,8 @@ from lipcore.profiles.arms import ARMS
 from lipcore.profiles.catalogue import SHEETS
 from lipcore.profiles.names import words
 from lipcore.robots.library import ROBOTS, UnknownRobotError, load_robot, profile_urdf
-from lipcore.robots.urdf import RigidBody, UrdfError
+from lipcore.robots.urdf import RigidBody
+from lipcore.robots.urdf_text import UrdfError
 from tests.lipcore.test_urdf import joint, link, robot
 
 ALL = tuple(SHEETS)

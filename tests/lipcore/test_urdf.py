@@ -14,7 +14,8 @@ from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.compiled.arm import arm_torques
 from lipcore.kernels.geometry import rotation_of
 from lipcore.robots.library import ROBOTS, UnknownRobotError, load_robot, profile_urdf
-from lipcore.robots.urdf import MAX_LINKS, JointMismatchError, RigidBody, UrdfError, describe
+from lipcore.robots.urdf import JointMismatchError, RigidBody, describe
+from lipcore.robots.urdf_text import MAX_LINKS, UrdfError
 from tests.lipcore.arms import parameters, random_bodies, random_geometry
 
 TWO = ("revolute", "revolute")
@@ -109,7 +110,19 @@ def test_a_list_that_does_not_fit_is_shown(listed: tuple[str, ...]) -> None:
         ("", "not well-formed XML"),
         ("<sdf/>", "root element is <sdf>, expected <robot>"),
         (robot(), "no joint that moves"),
-        (robot(link("a"), joint("j", "a", "b")), "Pinocchio cannot read"),
+        (robot(link("a"), joint("j", "a", "b")), "joint 'j' has the child 'b', expected a link"),
+        (robot(link("a"), link("b"), joint("j", "a", "b").replace("<limit", "<no")), "Pinocchio cannot read"),
+        (robot(link("a"), link("b"), link("c"), joint("j", "a", "b")), "no joint leads to the links 'a' and 'c'"),
+        (robot(link("a"), link("a")), "two links are called 'a'"),
+        (robot(link("a"), link("b"), joint("j", "b", "b")), "lead to link 'b' are a closed loop"),
+        (robot(link("a"), link("b"), joint("j", "b", "b"), joint("k", "a", "a")), "closed loop"),
+        (ARM.replace('axis xyz="0 1 0"', 'axis xyz="0 0 0"'), "axis xyz> of joint 'j1' is '0 0 0', of length 0"),
+        (ARM.replace('axis xyz="0 1 0"', 'axis xyz="1e300 0 0"'), "expected 3 numbers of at most 10000"),
+        (ARM.replace('ixx="0.1"', 'ixx="inf"'), "<inertia ixx> of link 'base' is 'inf', expected a number"),
+        (ARM.replace('ixx="0.1"', 'ixx="nan"'), "is 'nan', expected a number of at most"),
+        (ARM.replace('ixx="0.1"', 'ixx="1_0"'), "is '1_0'"),
+        (ARM.replace("0 0 0.3", "0 0.3"), "<origin xyz> of joint 'j1' is '0 0.3', expected 3 numbers"),
+        (ARM.replace('"upper"', '"up&#10;2026 ERROR forged"'), "is called 'up.n2026 ERROR forged', expected a name"),
         (
             robot(link("a"), link("b"), joint("j", "a", "b", "floating")),
             "'j' is of type 'floating': expected a fixed base",
@@ -129,6 +142,16 @@ def test_a_list_that_does_not_fit_is_shown(listed: tuple[str, ...]) -> None:
 def test_text_that_cannot_be_used_is_refused_with_the_reason(text: str, message: str) -> None:
     with pytest.raises(UrdfError, match=message):
         describe(text)
+
+
+def test_what_is_uploaded_is_never_written_to_stderr(capfd: pytest.CaptureFixture[str]) -> None:
+    forged = "2026-01-01 ERROR forged"
+    material = f'<visual><geometry><forged/></geometry><material name="{forged}&#10;{forged}"/></visual>'
+    describe(ARM.replace("<visual>", material + "<visual>"))
+    for text in (ARM.replace('"1"', f'"{forged}"'), ARM.replace('type="revolute"', f'type="{forged}"'), ARM[:-9]):
+        with pytest.raises(UrdfError):
+            describe(text)
+    assert "forged" not in "".join(capfd.readouterr())
 
 
 def test_branching_joints_are_refused() -> None:

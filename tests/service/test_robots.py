@@ -4,6 +4,7 @@ import hashlib
 
 import numpy as np
 import pytest
+from sqlalchemy import update
 
 import lipcore
 from lipcore.robots.library import ROBOTS, load_robot, profile_urdf
@@ -11,6 +12,7 @@ from service.client import ApiError, Client
 from service.foundation.errors import InvalidRequestError
 from service.models import registry
 from service.robots import store
+from service.storage.database import RobotRow
 from tests.service.cli.conftest import lipserve  # noqa: F401 - a fixture
 from tests.service.data import QUICK, columns, error, post, queue, service_of, stream, train, upload
 from tests.service.data import csv as csv_file
@@ -115,6 +117,10 @@ def test_the_profile_of_an_uploaded_urdf(empty):
         (b'<!DOCTYPE r SYSTEM "file:///etc/passwd">' + urdf(), "document type or an entity"),
         (urdf(kind="floating"), "joint 'joint1' is of type 'floating': expected a fixed base"),
         (urdf(joints=()), "no joint that moves"),
+        (urdf().replace(b"0 1 0", b"0 0 0"), "<axis xyz> of joint 'joint1' is '0 0 0'"),
+        (urdf().replace(b"0 1 0", b"1e300 0 0"), "<axis xyz> of joint 'joint1' is '1e300 0 0'"),
+        (urdf().replace(b'ixx="1"', b'ixx="inf"'), "<inertia ixx> of link 'l0' is 'inf'"),
+        (urdf().replace(b'child link="l1"', b'child link="l0"'), "expected a tree"),
     ],
 )
 def test_a_body_that_is_no_usable_urdf(empty, body, message):
@@ -122,6 +128,18 @@ def test_a_body_that_is_no_usable_urdf(empty, body, message):
     assert message in reply["message"]
     assert reply["detail"][0]["field"] == "urdf"
     assert empty.get("/v1/robots").json()["items"] == []
+
+
+def test_a_robot_of_an_earlier_release_that_is_no_usable_urdf_is_reported(empty):
+    text = urdf(joints=("joint1",))
+    robot = added(empty, text)["id"]
+    with service_of(empty).database.transaction() as session:
+        bad = text.replace(b"0 1 0", b"0 0 0").decode()
+        session.execute(update(RobotRow).where(RobotRow.id == robot).values(urdf=bad))
+    table = {name: values for name, values in columns(stream()).items() if not name.endswith("2")}
+    answer = post(empty, csv_file(table), "text/csv", robot=robot)
+    message = error(answer, 422, "invalid_data")["message"]
+    assert f"robot {robot} cannot be used any more: <axis xyz> of joint 'joint1' is '0 0 0'" in message
 
 
 def ask(api, dataset, **request):

@@ -1,0 +1,201 @@
+"""The text of a URDF, checked before Pinocchio sees it.
+
+A URDF comes from strangers: it is read as text, never as a path, and what could run away while it is parsed (document
+types, deep nesting, loops, endless chains) is refused. Pinocchio is given only what has been checked: links with their
+inertias and joints, written anew. What is left out (meshes, materials, transmissions) cannot be opened, and the parser
+below Pinocchio, which writes what it dislikes straight to stderr, has nothing to say.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+from xml.etree import ElementTree
+from xml.parsers import expat
+
+import numpy as np
+
+from lipcore.vocabulary import JointType
+
+MOVABLE: dict[str, JointType] = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+MAX_DEPTH = 32
+MAX_LINKS = 500
+"""Links of a URDF: parsers and Pinocchio recurse from link to link, and a long enough chain would exhaust the stack."""
+LARGEST = {"mass": 1e6, "inertia": 1e9, "limit": 1e18}
+FARTHEST = 1e4
+"""Largest numbers of a URDF by element, kg, kg·m² and of any unit, and of every other, m and rad: what is computed with
+them stays a number."""
+DIRECTION = 1e-3, 1e3
+"""Shortest and longest axis of a joint: a direction, whose length says nothing."""
+NUMBERS = {
+    "origin": {"xyz": 3, "rpy": 3},
+    "mass": {"value": 1},
+    "inertia": dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), 1),
+    "axis": {"xyz": 3},
+    "limit": dict.fromkeys(("lower", "upper", "effort", "velocity"), 1),
+    "mimic": {"multiplier": 1, "offset": 1},
+}
+"""Attributes that are numbers, and how many, of the elements that are read."""
+NAMES = {"parent": ("link",), "child": ("link",), "mimic": ("joint",)}
+TREE = {
+    "robot": ("link", "joint"),
+    "link": ("inertial",),
+    "inertial": ("origin", "mass", "inertia"),
+    "joint": ("origin", "parent", "child", "axis", "limit", "mimic"),
+    **dict.fromkeys((*NUMBERS, *NAMES), ()),
+}
+"""Elements that are read, by the one that they are in."""
+
+
+class UrdfError(ValueError):
+    """The text is no URDF that can be used; the message says why."""
+
+
+@dataclass(frozen=True)
+class UrdfJoint:
+    """A joint as the URDF has it. kind: its `type` there; mimics: the joint that it follows."""
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    mimics: str | None = None
+
+
+@dataclass(frozen=True)
+class UrdfText:
+    """A URDF that has been checked. robot: its name; joints: all of them; plain: links with their inertias and joints
+    written anew, for Pinocchio."""
+
+    robot: str
+    joints: tuple[UrdfJoint, ...]
+    plain: str
+
+
+def read(urdf: str) -> UrdfText:
+    """What a URDF says, from one pass that refuses what must not reach a recursive parser; raise UrdfError."""
+    scanner = _Scanner()
+    parser = expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = scanner.start, scanner.end
+    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = scanner.refuse_declaration
+    try:
+        parser.Parse(urdf, True)
+    except expat.ExpatError as error:
+        raise UrdfError(f"the URDF is not well-formed XML: {error}") from None
+    except UnicodeEncodeError as error:
+        raise UrdfError(f"the URDF is not text: {error}") from None
+    links, entries = scanner.root.findall("link"), scanner.root.findall("joint")
+    if len(links) > MAX_LINKS:
+        raise UrdfError(f"the URDF has {len(links)} links, expected at most {MAX_LINKS}")
+    joints = tuple(_joint(entry) for entry in entries)
+    _check_tree([link.get("name", "") for link in links], joints)
+    for joint in joints:
+        if joint.kind not in MOVABLE and joint.kind != "fixed":
+            raise UrdfError(
+                f"joint {joint.name!r} is of type {joint.kind!r}: expected a fixed base and joints of type "
+                f"{', '.join(MOVABLE)} or fixed"
+            )
+    return UrdfText(scanner.root.get("name", ""), joints, ElementTree.tostring(scanner.root, encoding="unicode"))
+
+
+def _joint(entry: ElementTree.Element) -> UrdfJoint:
+    ends = {tag: entry.find(tag) for tag in ("parent", "child", "mimic")}
+    parent, child = ("" if (end := ends[tag]) is None else end.get("link", "") for tag in ("parent", "child"))
+    mimics = None if ends["mimic"] is None else ends["mimic"].get("joint", "")
+    return UrdfJoint(entry.get("name", ""), entry.get("type", ""), parent, child, mimics)
+
+
+def _check_tree(links: Sequence[str], joints: Sequence[UrdfJoint]) -> None:
+    """Raise UrdfError unless joints make links one tree, each with a name of its own."""
+    for kind, names in (("links", links), ("joints", [joint.name for joint in joints])):
+        if twice := [name for name, count in Counter(names).items() if count > 1]:
+            raise UrdfError(f"two {kind} are called {twice[0]!r}, expected names of their own")
+    below: dict[str, list[str]] = {name: [] for name in links}
+    moved: dict[str, str] = {}
+    for joint in joints:
+        for role, name in (("parent", joint.parent), ("child", joint.child)):
+            if name not in below:
+                raise UrdfError(f"joint {joint.name!r} has the {role} {name!r}, expected a link of the URDF")
+        if joint.child in moved:
+            raise UrdfError(
+                f"link {joint.child!r} is the child of two joints, {moved[joint.child]!r} and {joint.name!r}: a closed "
+                "loop cannot be used, expected a tree"
+            )
+        moved[joint.child] = joint.name
+        below[joint.parent].append(joint.child)
+    roots = [name for name in links if name not in moved]
+    if len(roots) > 1:
+        raise UrdfError(f"no joint leads to the links {roots[0]!r} and {roots[1]!r}, expected one root")
+    reached = list(roots)
+    for name in reached:
+        reached += below[name]
+    if missing := sorted(set(links) - set(reached)):
+        raise UrdfError(f"the joints that lead to link {missing[0]!r} are a closed loop, expected a tree")
+
+
+class _Scanner:
+    """Handlers of expat that copy links with their inertias, and joints, and check their names and numbers."""
+
+    def __init__(self) -> None:
+        self.root = ElementTree.Element("robot")
+        self._path: list[tuple[str, ElementTree.Element | None]] = []
+
+    def start(self, tag: str, attributes: dict[str, str]) -> None:
+        if len(self._path) == MAX_DEPTH:
+            raise UrdfError(f"the URDF nests elements more than {MAX_DEPTH} deep")
+        if not self._path:
+            if tag != "robot":
+                raise UrdfError(f"the root element is <{tag[:40]}>, expected <robot>")
+            self.root.set("name", _name(attributes.get("name", "")[:200], "the robot"))
+            self._path.append((tag, self.root))
+            return
+        inside, above = self._path[-1]
+        copied = None
+        if above is not None and tag in TREE[inside]:
+            copied = ElementTree.SubElement(above, tag, self._checked(tag, attributes))
+        self._path.append((tag, copied))
+
+    def end(self, _tag: str) -> None:
+        self._path.pop()
+
+    def refuse_declaration(self, *_: Any) -> None:
+        raise UrdfError("the URDF declares a document type or an entity (<!DOCTYPE>, <!ENTITY>), which is not accepted")
+
+    def _checked(self, tag: str, attributes: dict[str, str]) -> dict[str, str]:
+        """Attributes of an element that are used, in plain numbers."""
+        if tag in ("link", "joint"):
+            kind = {"type": attributes.get("type", "")[:40]} if tag == "joint" else {}
+            return {"name": _name(attributes.get("name", ""), f"a {tag}")} | kind
+        top = self.root[-1]
+        where = f"{top.tag} {top.get('name')!r}"
+        kept = {name: _name(attributes.get(name, ""), f"the {tag} of {where}") for name in NAMES.get(tag, ())}
+        for name, count in NUMBERS.get(tag, {}).items():
+            if (text := attributes.get(name)) is not None:
+                numbers = _numbers(text, count, LARGEST.get(tag, FARTHEST), f"<{tag} {name}> of {where}")
+                kept[name] = " ".join(repr(each) for each in numbers)
+                moves = tag == "axis" and top.get("type") in MOVABLE  # a fixed joint's is often 0 0 0
+                if moves and not DIRECTION[0] <= (length := float(np.hypot.reduce(numbers))) <= DIRECTION[1]:
+                    raise UrdfError(
+                        f"<axis xyz> of {where} is {text[:80]!r}, of length {length:g}, expected a direction"
+                    )
+        return kept
+
+
+def _name(text: str, what: str) -> str:
+    if not text.isprintable():
+        raise UrdfError(f"{what} is called {text[:80]!r}, expected a name that can be printed")
+    return text
+
+
+def _numbers(text: str, count: int, largest: float, what: str) -> list[float]:
+    """The numbers of an attribute; raise UrdfError unless they are so many, and none is larger."""
+    try:
+        numbers = [float(word) for word in text.split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or "_" in text or not all(abs(number) <= largest for number in numbers):
+        several = f"{count} numbers" if count > 1 else "a number"
+        raise UrdfError(f"{what} is {text[:80]!r}, expected {several} of at most {largest:g}")
+    return numbers
