@@ -83,6 +83,13 @@ class GuardedProtocol(HttpToolsProtocol):
         if self._overhead > self.settings.max_header_bytes:
             self._too_long()
 
+    def on_headers_complete(self) -> None:
+        """Begin a request. Trailers, which httptools gives as headers, do not reach it."""
+        if sum(name == b"host" for name, _ in self.headers) > 1:
+            raise ValueError("several Host headers")  # httptools makes an answer of 400 of it
+        super().on_headers_complete()
+        self.headers = list(self.headers)
+
     def on_body(self, body: bytes) -> None:
         """Take a piece of a body; beside bodies, as much again may come: lengths of their pieces."""
         self._overhead -= 2 * len(body)

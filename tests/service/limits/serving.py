@@ -4,6 +4,7 @@ import asyncio
 import json
 import socket
 import threading
+from collections import deque
 from contextlib import suppress
 from typing import Any, Self
 
@@ -23,11 +24,12 @@ from tests.service.server import free_port
 class SmallApp:
     """Answers `hello`; /large: many bytes; /body: the size of the body; /held: once it may. Echoes what streams send.
 
-    begun: how many requests have come; go: lets those that are held go on.
+    begun: how many requests have come; headers: of the last ones; go: lets those that are held go on.
     """
 
     def __init__(self) -> None:
         self.begun = 0
+        self.headers: deque[list[tuple[bytes, bytes]]] = deque(maxlen=2)
         self.go = asyncio.Event()
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
@@ -39,6 +41,7 @@ class SmallApp:
             return
         self.begun += 1
         content = b"hello"
+        self.headers.append(scope["headers"])
         if scope["path"] == "/large":
             content = bytes(64 * 1024 * 1024)
         elif scope["path"] == "/body":

@@ -139,6 +139,21 @@ def test_headers_after_a_body_have_an_end_too(few, none_open):
             client.send(b"a" * MiB * 64)
 
 
+def test_trailers_are_no_headers(few, none_open):
+    trailers = b"Authorization: Bearer forged\r\nX-Forwarded-For: 192.0.2.1\r\n"
+    with Raw(few.port) as client:
+        client.send(POST + b"3\r\nabc\r\n0\r\n" + trailers + b"\r\n" + GET)
+        assert [client.answer(), client.answer()] == [(200, b"3"), (200, b"hello")]
+    host = (b"host", b"localhost")
+    assert list(few.app.headers) == [[host, (b"transfer-encoding", b"chunked")], [host]]
+
+
+def test_a_request_to_two_hosts_is_refused(few, none_open):
+    with Raw(few.port) as client:
+        client.send(GET[:-2] + b"Host: elsewhere\r\n\r\n")
+        assert refusal(client.rest())[:2] == (400, "invalid_request")
+
+
 def test_bodies_in_small_pieces_are_taken(few, none_open):
     with Raw(few.port) as client:
         begun = few.app.begun
