@@ -134,6 +134,6 @@ def identity(home: Path) -> str:
     if re.fullmatch(r"svc_[0-9a-z_]+", known):
         return known
     made = new_id("svc")
-    home.mkdir(parents=True, exist_ok=True)
+    home.mkdir(parents=True, exist_ok=True, mode=0o700)
     path.write_text(made + "\n")
     return made

@@ -10,10 +10,10 @@ import shutil
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Annotated
+from typing import Annotated
 
 from fastapi import Depends
 from sqlalchemy import text
@@ -169,19 +169,28 @@ class HomeInUseError(HomeError):
     """Another service works on the same home."""
 
 
-def hold_home(home: Path) -> IO[str]:
-    """Hold the home for this process; the lock ends with the process, however it ends. Raise HomeError."""
-    try:
-        home.mkdir(parents=True, exist_ok=True)
-        file = (home / ".lock").open("w")
-    except OSError as error:
-        raise HomeError(_unusable(home, error)) from error
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        file.close()
-        raise HomeInUseError(f"another service uses {home}: stop it, or set LIPSERVE_HOME to another folder") from None
-    return file
+def hold_home(home: Path) -> ExitStack:
+    """Hold the home for this process; the locks end with the process, however it ends. Raise HomeError.
+
+    The folder itself is locked: a file in it could be deleted, and made again by a second service. The file is locked
+    for releases up to 0.1, which know nothing else.
+    """
+    with ExitStack() as held:
+        try:
+            home.mkdir(parents=True, exist_ok=True, mode=0o700)
+            folder = os.open(home, os.O_RDONLY | os.O_DIRECTORY)
+            held.callback(os.close, folder)
+            file = held.enter_context((home / ".lock").open("w"))
+        except OSError as error:
+            raise HomeError(_unusable(home, error)) from error
+        for each, needed in ((folder, False), (file, True)):
+            try:
+                fcntl.flock(each, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                if needed or isinstance(error, BlockingIOError):  # NFS and others lock no folders
+                    message = f"another service uses {home}: stop it, or set LIPSERVE_HOME to another folder"
+                    raise HomeInUseError(message) from None
+        return held.pop_all()
 
 
 def check_home(settings: Settings) -> None:

@@ -1,8 +1,10 @@
 """What a service does with the home it finds: sweep what was interrupted, keep what was finished, lock it."""
 
+import fcntl
 import json
 import os
 import shutil
+import stat
 
 import pytest
 from fastapi.testclient import TestClient
@@ -13,7 +15,7 @@ from service.foundation.settings import Settings
 from service.models import registry
 from service.storage.database import Database, JobRow, VersionRow, now
 from service.storage.files import Files
-from service.storage.storage import HomeInUseError
+from service.storage.storage import HomeInUseError, hold_home
 from tests.service.data import ADDRESS, DEADLINE, QUICK, ended, error, job, stream, train, upload
 from tests.service.warm import Served
 
@@ -138,6 +140,33 @@ def test_a_second_service_on_the_same_home_is_refused(second_start):
     _, _, home = second_start
     with pytest.raises(HomeInUseError, match=r"another service uses .*: stop it, or set LIPSERVE_HOME"), started(home):
         pass
+
+
+def test_deleting_the_lock_file_admits_no_second_service(tmp_path):
+    with hold_home(tmp_path / "home"):
+        (tmp_path / "home" / ".lock").unlink()
+        with pytest.raises(HomeInUseError):
+            hold_home(tmp_path / "home")
+    hold_home(tmp_path / "home").close()
+
+
+def test_a_service_of_an_earlier_release_keeps_its_home(tmp_path):
+    with (tmp_path / ".lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # which is all that it locks
+        with pytest.raises(HomeInUseError):
+            hold_home(tmp_path)
+
+
+def test_a_new_home_is_its_owners_alone(tmp_path):
+    home = tmp_path / "home"
+    mask = os.umask(0)
+    try:
+        hold_home(home).close()
+        Database.of(Settings(home=home)).close()
+    finally:
+        os.umask(mask)
+    assert stat.S_IMODE(home.stat().st_mode) == 0o700
+    assert {stat.S_IMODE(file.stat().st_mode) for file in home.glob("lipserve.sqlite3*")} == {0o600}
 
 
 def test_a_second_server_on_the_same_home_says_why_it_ends(server, tmp_path):

@@ -36,8 +36,9 @@ class Sqlite:
     shared = False
 
     def __init__(self, home: Path, timeout_s: float) -> None:
-        home.mkdir(parents=True, exist_ok=True)
+        home.mkdir(parents=True, exist_ok=True, mode=0o700)
         self.path = home / FILE
+        self.path.touch(0o600)  # for its owner alone, as what SQLite puts beside it
         self.engine = create_engine(
             f"sqlite:///{self.path}",
             connect_args={"timeout": timeout_s},
