@@ -11,6 +11,7 @@ variables of the posterior are those of the arm as it was learnt, and the payloa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -301,16 +302,18 @@ class Linearised:
     @cached_property
     def _others(self) -> MixtureKernel | None:
         arm = self.carrier.term.arm
-        others, count = self.load.others, len(self.load.others) - 1
-        return MixtureKernel(others, arm.order, _of_few(count)) if others else None
+        others = self.load.others
+        return MixtureKernel(others, arm.order, _of_few([each.probability for each in others])) if others else None
 
     @cached_property
     def _payload(self) -> PayloadKernel:
         return PayloadKernel(self._arm.arm, self.load.room)
 
 
-def _of_few(count: int) -> float:
-    """How many times their variance so many draws have to be taken for, so that 95 % intervals hold: Student's t."""
+def _of_few(shares: Sequence[float]) -> float:
+    """How many times their variance so many draws have to be taken for, so that 95 % intervals hold: Student's t, of as
+    many as would be equal ones."""
     from scipy.stats import t  # noqa: PLC0415 - serving does without it
 
+    count = max(1.0, 1 / float(np.square(shares).sum()) - 1)
     return float((t.ppf(0.975, count) / quantile(0.95)) ** 2)

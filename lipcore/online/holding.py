@@ -15,6 +15,7 @@ from lipcore.online.batch import Rows
 from lipcore.online.bodies import ANY, WIDTH
 from lipcore.online.held import Held, evenly, no_rows
 from lipcore.online.hypotheses import AFTER, BEFORE, CELL_S, LEAST_BEFORE, Cell, Window, cells_of
+from lipcore.online.payload import arms
 from lipcore.online.verdict import (
     ALIKE,
     AT_ONCE,
@@ -109,6 +110,8 @@ class Watch:
         """The same as another revision of the model sees it."""
         if self.around is not None and self.around.carrier.knows_as(carrier):
             return self
+        if self.around is None and carrier.bends:
+            arms(carrier)  # when something is taken up, they are asked for at once
         return replace(self, held=None if self.held is None else self.held.seen_by(carrier))._around(carrier)
 
     def _around(self, carrier: Carrier) -> Watch:

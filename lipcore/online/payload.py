@@ -13,14 +13,16 @@ Marquardt's, and the covariance is that of the linear model around the last one 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.linalg import qr, solve_triangular
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
+from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative
 from lipcore.kernels.geometry import Geometry
 from lipcore.model.payload import Carrier, Linearised, Load
@@ -40,13 +42,31 @@ LEAST_DAMPING, WORST = 1e-9, 1e8
 """It is not less; and from which on nothing is gained."""
 REACH = 0.5
 """Longest step of the geometry, rad or m."""
-DRAWS, WIDE, RELAXED, SEED = 12, (1.0, 6.0), 30, 0
+DRAWS, WIDE, RELAXED, SEED = 10, (1.0, 6.0), 20, 0
 """Draws from the posterior by which it is judged how far it is from linear, followed from estimate to estimate; how
 many deviations of the linear posterior wide they begin, from and to, as where it is bent it is wider; steps in which
 they become arms that the training allows; and what they are drawn by."""
-LINEAR, FAR = 2.0, 10.0
-"""The mean square, in deviations of the linear posterior, up to which it is as good; and the energy above the least,
-for each number that is unknown, from which on rows have ruled a draw out, nats."""
+LINEAR, SOFT, FAR = 2.0, 3.0, 10.0
+"""The mean square, in deviations of the linear posterior, up to which it is as good; and the energies above the least,
+for each number that is unknown, nats, over which a draw counts e times less, as it has not come far enough yet, and
+from which on rows have ruled it out."""
+
+MEDIAN = 0.6745
+"""Of the absolute value of what has a normal distribution, standard deviations."""
+
+
+def arms(carrier: Carrier) -> tuple[Draw, ...]:
+    """Draws from what the training alone says, with any payload; made once a version, by the revision that asks first,
+    and again where another has learnt more directions."""
+    training, draw = _Training.of(carrier), np.random.default_rng(SEED)
+    size = len(carrier.memory.slope) + len(carrier.memory.outside) + len(carrier.mean) + PARAMETERS
+    known = _ARMS.get(carrier.term, ())
+    if not known or len(known[0].noise) != size:
+        known = _ARMS[carrier.term] = tuple(training.drawn(draw) for _ in range(DRAWS))
+    return known
+
+
+_ARMS: WeakKeyDictionary[ArmKernel, tuple[Draw, ...]] = WeakKeyDictionary()
 
 
 def estimate(
@@ -85,6 +105,9 @@ def estimate(
     draws = tuple(Draw(point.place, noise) for point, noise in drawn) if bent else ()
     load = Load(np.concatenate([at.place.w, payload]), outward @ outward.T, room, at.place.geometry, others)
     of_eta = max(1.0, at.misfit) * root[size:] @ root[size:].T
+    if others:
+        wider = _wider(np.sqrt(np.diagonal(of_eta)), [point.place.eta - eta for point, _ in drawn])
+        of_eta *= np.outer(wider, wider)
     return Estimate(eta, of_eta, load, *problem.gains(at), draws)
 
 
@@ -160,6 +183,11 @@ class _Training:
     carrier: Carrier
     virtual: Seen
 
+    @classmethod
+    def of(cls, carrier: Carrier) -> _Training:
+        motion = Motion.from_arrays(*carrier.memory.motions.swapaxes(0, 1))
+        return cls(carrier, (motion, carrier.rest(motion)))
+
     def at(self, place: Place) -> _Point:
         """The energy of a place, whose payload is left as it is."""
         memory, size = self.carrier.memory, len(place.w)
@@ -170,6 +198,18 @@ class _Training:
         derivative[len(by_arm) :, size:] = np.eye(PARAMETERS)
         residual = np.concatenate([memory.residual(place.w, torque), np.zeros(PARAMETERS)])
         return _Point(place, residual, derivative, 0.0)
+
+    def drawn(self, draw: np.random.Generator) -> Draw:
+        """One of the arms that the training allows, with any payload."""
+        carrier, geometry = self.carrier, self.carrier.term.arm.geometry.moved(self.carrier.step)
+        steps, root = carrier.steps, carrier.root
+        by = draw.uniform(*WIDE) * carrier.memory.root @ draw.standard_normal(len(carrier.mean))
+        w, arm, geometry = carrier.mean + by, carrier.term.arm, geometry.moved(root[steps] * by[steps])
+        w[steps] = (arm.geometry.towards(geometry) - arm.expected) / root[steps]
+        at = self.at(Place(w, geometry, ANY.centre))
+        noise = draw.standard_normal(len(at.residual))
+        still = np.concatenate([noise[:-PARAMETERS], np.zeros(PARAMETERS)])
+        return Draw(_minimum(self, at, RELAXED, still).place, noise)
 
     @cached_property
     def alone(self) -> float:
@@ -201,7 +241,7 @@ class _Problem:
         both = rows if before is None else Rows.concatenate([before, rows])
         return cls(
             carrier,
-            _Training(carrier, seen(Motion.from_arrays(*carrier.memory.motions.swapaxes(0, 1)))),
+            _Training.of(carrier),
             seen(rows.motion()),
             None if before is None else seen(before.motion()),
             both.tau,
@@ -217,17 +257,6 @@ class _Problem:
         if start is None:
             return Place(self.carrier.mean, geometry, self.prior.centre)
         return Place(start.load.mean[:-PARAMETERS], geometry, start.eta)
-
-    def drawn(self, eta: Array, draw: np.random.Generator) -> Draw:
-        """One of the arms that the training allows, and a payload."""
-        start, steps, root = self.begin(None), self.carrier.steps, self.carrier.root
-        by = draw.uniform(*WIDE) * self.carrier.memory.root @ draw.standard_normal(len(start.w))
-        w, arm, geometry = start.w + by, self.carrier.term.arm, start.geometry.moved(root[steps] * by[steps])
-        w[steps] = (arm.geometry.towards(geometry) - arm.expected) / root[steps]
-        at = self.training.at(Place(w, geometry, eta))
-        noise = draw.standard_normal(len(at.residual))
-        still = np.concatenate([noise[:-PARAMETERS], np.zeros(PARAMETERS)])
-        return Draw(_minimum(self.training, at, RELAXED, still).place, noise)
 
     def at(self, place: Place) -> _Point:
         """The energy of a place."""
@@ -271,13 +300,24 @@ def _draws(
         noise = np.append(begin.noise, draw.standard_normal(problem.tau.size))
         return _minimum(problem, problem.at(begin.place), rounds, noise), begin.noise
 
+    def carrying(arm: Draw) -> Draw:
+        return replace(arm, place=replace(arm.place, eta=at.place.eta))
+
     # another revision of the training may know more, or less
     known = [each for each in known if len(each.noise) == len(at.residual) - problem.tau.size]
-    found = [sought(each) for each in known or [problem.drawn(at.place.eta, draw) for _ in range(DRAWS)]]
+    found = [sought(each) for each in known or [carrying(arm) for arm in arms(problem.carrier)]]
     if anew:
         out = _ruled_out(min([at, *(point for point, _ in found)], key=lambda each: each.energy))
-        found = [sought(problem.drawn(at.place.eta, draw), FIRST) if each[0].energy > out else each for each in found]
+        for place, (point, _) in enumerate(found):
+            if point.energy > out:
+                found[place] = sought(carrying(problem.training.drawn(draw)), FIRST)
     return found
+
+
+def _wider(std: Array, off: Sequence[Array]) -> Array:
+    """How many times wider than the linear posterior's std, (10,), draws lie about its mean, at least once; by the
+    median, as some have not come far enough yet. off: of each draw, (10,)."""
+    return np.maximum(1.0, np.median(np.abs(off), axis=0) / (MEDIAN * std))
 
 
 def _ruled_out(least: _Point) -> float:
@@ -293,7 +333,8 @@ def _others(
     Few rows leave a curved valley open, along which a centre of mass and the geometry make up for each other, and the
     linear posterior is tangent to it at one place.
     """
-    known = [each.place for each in points if each.energy < _ruled_out(at)]
+    reached = [each for each in points if each.energy < _ruled_out(at)]
+    known = [each.place for each in reached]
     if not known:
         return (), bool(points)
     off = [np.zeros(len(root))]
@@ -302,7 +343,9 @@ def _others(
         off.append(solve_triangular(root, np.append(w, each.eta - at.place.eta), check_finite=False))
     if np.square(off[1:]).mean() < LINEAR:
         return (), False
-    share, arms = 1 / (1 + len(known)), []
-    for each in (at.place, *known):
-        arms.append(carrier.alternative(each.w, each.geometry, body(each.eta)[0], share))
-    return tuple(arms), True
+    excess = np.array([each.energy - at.energy for each in (at, *reached)])
+    shares = np.exp(-excess / (SOFT * len(root)))
+    return tuple(
+        carrier.alternative(each.w, each.geometry, body(each.eta)[0], share)
+        for each, share in zip((at.place, *known), shares / shares.sum(), strict=True)
+    ), True
