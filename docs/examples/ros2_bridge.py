@@ -17,7 +17,7 @@ import rclpy
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from service.client import ApiError, Client, ServiceUnreachableError
+from lipserve import ApiError, Client, ServiceUnreachableError
 
 WAITING = 100
 """Batches that wait for the service at most: beyond it the oldest are dropped, and that is said."""
