@@ -18,7 +18,7 @@ NO_HOST = "http://localhost"
 
 
 def url_of(url: str | None) -> str:
-    """The address of a service, where None that of the environment, or the one of a service on this machine."""
+    """The address of a service, where None or empty that of the environment, else of one on this machine."""
     return url or os.environ.get(URL_VARIABLE, "").strip() or DEFAULT_URL
 
 
