@@ -39,8 +39,12 @@ async def again():
         return (await client.predict("panda-sim", zeros, zeros, zeros)).tau.tolist()
 with StreamClient("panda-sim") as stream:
     frame = stream.ask(zeros, zeros, zeros)
+try:
+    import lipserve.progress
+except ModuleNotFoundError as error:
+    missing = str(error)
 print(json.dumps({
-    "tau": [answer.tau.tolist(), asyncio.run(again()), frame.tau.tolist()],
+    "missing": missing, "tau": [answer.tau.tolist(), asyncio.run(again()), frame.tau.tolist()],
     "joints": record.joint_names, "event": type(event).__name__,
     "modules": sorted(sys.modules), "names": sorted(each.name for each in distributions()),
 }))
@@ -144,6 +148,7 @@ def test_the_wheel_alone_asks_a_service(server, tmp_path):
     assert (len(seen["joints"]), seen["event"]) == (7, "LiveStatus")
     assert set(seen["names"]) - MORE == DEPENDENCIES | {"lipserve-client"}
     assert set(seen["modules"]).isdisjoint(SERVER)
+    assert seen["missing"] == "bars need Rich: pip install 'lipserve-client[progress]'"
     assert (packages / "lipserve/py.typed").is_file()
     size = sum(each.stat().st_size for each in packages.rglob("*") if each.is_file())
     assert size < MOST_MB * 1_000_000
