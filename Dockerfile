@@ -5,11 +5,12 @@ RUN python -m venv /opt/lipserve
 COPY .ci/install-torch .ci/install-torch
 RUN .ci/install-torch /opt/lipserve/bin/python
 COPY pyproject.toml README.md LICENSE ./
+COPY clients/python clients/python
 COPY lipcore lipcore
 COPY service service
 COPY docs docs
 COPY models/panda-sim models/panda-sim
-RUN /opt/lipserve/bin/python -m pip install --no-cache-dir --disable-pip-version-check '.[cluster]' \
+RUN /opt/lipserve/bin/python -m pip install --no-cache-dir --disable-pip-version-check ./clients/python '.[cluster]' \
     && /opt/lipserve/bin/python -m pip uninstall --yes --quiet setuptools pip \
     && site=$(echo /opt/lipserve/lib/python3*/site-packages) \
     && rm -rf "$site"/torch/include "$site"/torch/share "$site"/torch/test \
@@ -20,7 +21,7 @@ RUN /opt/lipserve/bin/python -m pip install --no-cache-dir --disable-pip-version
     && find "$site"/numpy "$site"/scipy "$site"/sympy "$site"/networkx "$site"/dask \
         "$site"/distributed -type d -name tests -prune -exec rm -rf {} + \
     && cd / && NUMBA_CACHE_DIR=/opt/numba /opt/lipserve/bin/python -m lipcore.warm_up \
-    && /opt/lipserve/bin/python -c "import service.cli.serve, service.cli.worker, service.client, distributed, s3fs, psycopg"
+    && /opt/lipserve/bin/python -c "import service.cli.serve, service.cli.worker, lipserve.sync, distributed, s3fs, psycopg"
 # the last two also leave the bytecode of what a start imports, 50 MB: the container's user cannot write it, and without
 # it every start takes four seconds longer
 

@@ -28,7 +28,7 @@ warm-chain: install
 # of ours, and of tests as pytest rewrites them: each of the processes that tests start would else compile it again
 # (what cannot be collected is said by the tests themselves, in sight)
 bytecode: install
-	$(BIN)/python -m compileall -q lipcore service benchmarks
+	$(BIN)/python -m compileall -q lipcore service clients/python/lipserve benchmarks
 	PYTHONDONTWRITEBYTECODE= $(TEST) --collect-only -q -m "not slow" $(TESTS) > /dev/null || true
 
 # the API as all tests know it with SQLite and local files, once more on PostgreSQL and S3
@@ -64,14 +64,14 @@ image:
 
 install: $(VENV)/.installed
 
-$(VENV)/.installed: pyproject.toml .ci/install-torch
+$(VENV)/.installed: pyproject.toml clients/python/pyproject.toml .ci/install-torch
 	@echo "installing into $(VENV): about 3 GB, two to four minutes"
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, this is " + sys.version)'
 	$(PYTHON) -m venv $(VENV)
 	.ci/install-torch $(BIN)/python
-	$(BIN)/python -m pip install --disable-pip-version-check -e '.[sim,plot,cluster,dev]'
+	$(BIN)/python -m pip install --disable-pip-version-check -e clients/python -e '.[sim,plot,cluster,dev]'
 	@touch $@
 
 clean:
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis dist build
-	find lipcore service tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	find lipcore service clients tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -35,9 +35,8 @@ from benchmarks.soak import running as soak_running
 from benchmarks.soak import table as soak_table
 from benchmarks.workload import BenchError, Source, model_folder
 from lipcore.robots.library import ROBOTS, SimulationUnavailableError
+from lipserve import ApiError, StreamError
 from service.cli.demo import DemoError
-from service.client import ApiError
-from service.client.stream import StreamError
 from service.foundation.errors import ServiceError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)

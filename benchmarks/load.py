@@ -9,8 +9,8 @@ from typing import Any
 
 from benchmarks import processor
 from benchmarks.workload import Bed, BenchError
-from service.foundation.states import ACTIVE, RUNNING
-from service.training.schema import Job
+from lipserve.records.jobs import Job
+from lipserve.states import ACTIVE, RUNNING
 
 START_SECONDS = 120.0
 

@@ -18,12 +18,12 @@ from lipcore.data.samples import Array, Samples
 from lipcore.model.torque_model import TorqueModel
 from lipcore.robots.library import ROBOTS, Robot, load_robot
 from lipcore.robots.simulation import Stream, simulate
+from lipserve import Client
+from lipserve.progress import follow
+from lipserve.states import SUCCEEDED
 from service.cli.demo import ServiceProcess
 from service.cli.simulate import write_recording
-from service.client import Client
-from service.client.progress import follow
 from service.foundation.settings import Settings
-from service.foundation.states import SUCCEEDED
 from service.models import registry
 from service.storage.database import Database
 from service.storage.files import Files, new_id

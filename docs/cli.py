@@ -14,7 +14,7 @@ OUT = Path(__file__).resolve().parent / "reference" / "cli.md"
 HEAD = """# Command line
 
 `--help` after any command prints the same. Commands that ask a service find it by `--url` or `LIPSERVE_URL`
-(`http://127.0.0.1:8000` by default, `unix:///path` for a Unix-domain socket) and send the key in `LIPSERVE_KEY`.
+(`http://127.0.0.1:8000` by default, `unix:///path` for a Unix-domain socket) and send the key in `LIPSERVE_API_KEY`.
 Results are printed to standard output, all else to standard error, so that `--json` prints one JSON document and
 nothing more (`stream --json` one a line). `lipserve --install-completion` makes the shell complete commands, options,
 and the names of models, data sets and jobs of the running service.

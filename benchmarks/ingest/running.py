@@ -16,8 +16,8 @@ from benchmarks.ingest import recording
 from benchmarks.latency.table import NOTHING, Grid, promises
 from benchmarks.latency.targets import Target
 from benchmarks.processes import resident
+from lipserve import Client
 from service.cli.demo import ServiceProcess
-from service.client import Client
 
 MOST_SECONDS, MOST_MIB = 60.0, 500.0
 PROMISED_ROWS = 1_000_000

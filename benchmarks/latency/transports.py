@@ -14,9 +14,9 @@ from benchmarks.latency.subjects import Subject
 from benchmarks.latency.websocket import WebSocket, frame, read_answer, request_frame
 from benchmarks.workload import MODEL, Bed
 from lipcore.data.samples import Array
-from service.client.stream import StreamClient
+from lipserve import StreamClient
+from lipserve.frames import request_bytes
 from service.oip.schema import HEADER
-from service.stream.frames import request_bytes
 
 CLIENT = "ws-client"
 _LABELS = {

@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.clients import Address, BadAnswerError, Connection, GoneError, connect
 from lipcore.data.samples import Array
-from service.stream.frames import ANSWER, ASK_STD, ERROR, HAS_STD, NUMBER, REQUEST
+from lipserve.frames import ANSWER, ASK_STD, ERROR, HAS_STD, NUMBER, REQUEST
 
 _BINARY, _TEXT, _CLOSE, _PING, _PONG = 2, 1, 8, 9, 10
 _FINAL, _MASKED = 0x80, 0x80

@@ -15,7 +15,7 @@ from benchmarks.clients import Address
 from benchmarks.latency.websocket import WebSocket, frame, request_frame
 from benchmarks.timing import Timing, no_collection
 from lipcore.data.samples import Array
-from service.stream.frames import ANSWER, ERROR, request_bytes
+from lipserve.frames import ANSWER, ERROR, request_bytes
 
 RATE = 500.0
 ECHO_EVERY = 5

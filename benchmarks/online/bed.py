@@ -17,8 +17,8 @@ from benchmarks.clients import HttpClient, post
 from benchmarks.workload import BenchError
 from lipcore.data.samples import Array, Samples
 from lipcore.model.torque_model import TorqueModel
+from lipserve import Client
 from service.cli.demo import ServiceProcess
-from service.client import Client
 from service.learning.owner import set_options
 from service.learning.schema import LearningOptions
 from service.models import registry

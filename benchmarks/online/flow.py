@@ -16,7 +16,7 @@ from benchmarks.online.asking import Asked, Asker
 from benchmarks.online.bed import Bed
 from benchmarks.online.sending import BATCH_ROWS, Ack, batch_requests, send_all, stream, stream_frames
 from lipcore.data.samples import Array, Samples
-from service.client.stream import StreamClient
+from lipserve import StreamClient
 
 STREAM = "bench"
 PUSHED_ROWS = 500

@@ -10,7 +10,8 @@ import msgspec
 
 from benchmarks.clients import BadAnswerError, HttpClient, post
 from lipcore.data.samples import Samples
-from service.client.stream import StreamClient, StreamLearnt
+from lipserve import StreamClient
+from lipserve.stream import StreamLearnt
 
 BATCH_ROWS = 100
 _LEAD = 50_000_000

@@ -24,8 +24,8 @@ from benchmarks.workload import BenchError
 from lipcore.data.samples import Array, Samples
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online.learner import OnlineModel
+from lipserve import Client
 from service.cli.demo import ServiceProcess
-from service.client import Client
 
 Victim = Literal["service", "learner"]
 MODEL, STREAM = "durable", "trials"

@@ -12,8 +12,8 @@ from benchmarks.latency.targets import Target
 from benchmarks.scale import streams
 from benchmarks.scale.engines import Engines, eventually, ready
 from benchmarks.scale.part import Part
-from service.client import Client
-from service.foundation.states import ACTIVE
+from lipserve import Client
+from lipserve.states import ACTIVE
 
 NAME = "cancel"
 ENDLESS = {"hyperparameter_samples": 200, "posterior_samples": 60, "max_iterations": 10_000, "starts": 1}

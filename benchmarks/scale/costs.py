@@ -23,9 +23,8 @@ from benchmarks.scale.engines import Engines, eventually, ready, stored
 from benchmarks.scale.part import Part
 from benchmarks.scale.replicas import LEARNING, MODEL
 from lipcore.data.samples import Samples
+from lipserve import Client, StreamClient
 from service.cli.demo import ServiceProcess
-from service.client import Client
-from service.client.stream import StreamClient
 from service.foundation.settings import shipped_models
 
 NAME = "costs"

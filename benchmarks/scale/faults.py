@@ -25,9 +25,9 @@ from benchmarks.scale.part import Part
 from benchmarks.scale.replicas import LEARNING, MODEL
 from benchmarks.workload import BenchError
 from lipcore.data.samples import Samples
+from lipserve import ApiError, Client
+from lipserve.states import ACTIVE, SUCCEEDED
 from service.cli.demo import ServiceProcess
-from service.client import ApiError, Client
-from service.foundation.states import ACTIVE, SUCCEEDED
 
 NAME = "faults"
 STREAM = "faults"

@@ -20,7 +20,7 @@ from benchmarks.scale import streams
 from benchmarks.scale.engines import Engines, eventually, ready
 from benchmarks.scale.part import Part
 from lipcore.data.samples import Samples
-from service.client import ApiError, Client
+from lipserve import ApiError, Client
 
 NAME = "replicas"
 MODEL = "panda-sim"

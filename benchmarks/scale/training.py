@@ -18,8 +18,8 @@ from benchmarks.scale.engines import Engines, ready
 from benchmarks.scale.part import Part
 from benchmarks.scale.peaks import Peaks
 from benchmarks.workload import BenchError
-from service.client import Client
-from service.foundation.states import ACTIVE, SUCCEEDED
+from lipserve import Client
+from lipserve.states import ACTIVE, SUCCEEDED
 
 NAME = "train"
 PROMISED_ROWS = 1_000_000

@@ -18,7 +18,7 @@ from benchmarks.soak.connections import BATCH_ROWS, TAUGHT, Log, stream_of
 from lipcore.data.samples import Array, Samples
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online.learner import OnlineModel
-from service.client import Client
+from lipserve import Client
 
 _PAGE = 100
 

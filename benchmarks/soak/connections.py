@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.clients import Address, HttpClient, post
 from benchmarks.online.sending import Ack, batch_request, send
 from lipcore.data.samples import Array, Samples
-from service.client.stream import StreamClient
+from lipserve import StreamClient
 
 STEADY, TAUGHT = "steady", "taught"
 """The served models: one answers the same for ever, the other one learns."""

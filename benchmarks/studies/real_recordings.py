@@ -27,13 +27,13 @@ from lipcore.kernels.friction import SIGN_WIDTH
 from lipcore.robots.library import pinocchio
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import AUTO
+from lipserve import Client
+from lipserve.asking import Reading
+from lipserve.records.datasets import Dataset
+from lipserve.states import SUCCEEDED
 from service.cli.demo import ServiceProcess
-from service.client import Client
 from service.datasets import store
-from service.datasets.asking import Reading
-from service.datasets.schema import Dataset
 from service.foundation.settings import Settings
-from service.foundation.states import SUCCEEDED
 from service.storage.storage import Storage
 from service.training import holding_out
 

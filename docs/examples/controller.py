@@ -14,8 +14,7 @@ from collections import Counter
 
 import numpy as np
 
-from service.client import Client
-from service.client.stream import StreamClient, StreamError
+from lipserve import Client, StreamClient, StreamError
 
 PERIOD_S = 0.002
 BUDGET_S = 0.001  # of a cycle for the answer: what comes later is no use to this cycle

@@ -2,7 +2,7 @@
 
     python docs/examples/ros2_bridge.py --ros-args -p model:=my-panda -p topic:=/joint_states
 
-It needs rclpy of your ROS 2 in the Python that LIPServe is installed in. Efforts have to be joint torques, N·m, of the
+It needs rclpy of your ROS 2 and `pip install lipserve-client`. Efforts have to be joint torques, N·m, of the
 model's convention. Accelerations are left to the service, which derives them from velocities and times.
 """
 
@@ -17,7 +17,7 @@ import rclpy
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from service.client import ApiError, Client, ServiceUnreachableError
+from lipserve import ApiError, Client, ServiceUnreachableError
 
 WAITING = 100
 """Batches that wait for the service at most: beyond it the oldest are dropped, and that is said."""
@@ -28,11 +28,11 @@ class Bridge(Node):
 
     def __init__(self) -> None:
         super().__init__("lipserve_bridge")
-        given = {"model": "", "url": "http://127.0.0.1:8000", "topic": "/joint_states", "rows": 100}
+        given = {"model": "", "url": "", "topic": "/joint_states", "rows": 100}
         for name, default in given.items():
             self.declare_parameter(name, default)
         self.model, url, topic, self.rows = (self.get_parameter(name).value for name in given)
-        self.client = Client(url)
+        self.client = Client(url)  # where empty, that of LIPSERVE_URL
         serving = self.client.model(self.model).serving_version
         self.joints = self.client.version(self.model, serving).joint_names
         # a sequence is a batch's identity for good: each run of the node is a stream of its own

@@ -139,12 +139,14 @@ def decode(files: Mapping[str, bytes], limits: Limits = DEFAULT_LIMITS) -> Torqu
         raise ModelFormatError(f"the tensors do not make a valid model: {_text(error)}", TENSORS) from error
 
 
-def load(folder: Path, checksums: Mapping[str, str] | None = None, limits: Limits = DEFAULT_LIMITS) -> TorqueModel:
+def load(
+    folder: Path | str, checksums: Mapping[str, str] | None = None, limits: Limits = DEFAULT_LIMITS
+) -> TorqueModel:
     """Load a model that `save` wrote; raise ModelFormatError for anything else.
 
     checksums: sha256 of each file by name, as kept elsewhere, which the files then have to match.
     """
-    files = read_files(folder, limits)
+    files = read_files(Path(folder), limits)
     if checksums is not None:
         check(files, checksums)
     try:

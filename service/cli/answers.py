@@ -10,10 +10,10 @@ import typer
 from rich.table import Table
 
 from lipcore.vocabulary import COMPONENTS
+from lipserve.address import DEFAULT_URL
 from service.cli.connecting import connected, dataset_of
 from service.cli.consoles import CommandError, out, print_json, print_warnings
 from service.cli.options import Alias, Data, Json, Model, Url, Version, alone, group, names, numbers
-from service.foundation.settings import DEFAULT_URL
 
 predict_app = alone()
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import http.client
 import json
-import os
 import re
 import socket
 from collections.abc import Callable, Iterator
@@ -18,15 +17,12 @@ from urllib.parse import quote, urlsplit
 
 import typer
 
+from lipserve.address import UNIX, headers_of, url_of
 from service.cli.consoles import START, CommandError, Explained, err, explain, note
-from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
-    from service.client import Client
-    from service.training.schema import Job
-
-
-UNIX = "unix://"
+    from lipserve import Client
+    from lipserve.records.jobs import Job
 
 
 class _UnixConnection(http.client.HTTPConnection):
@@ -43,7 +39,7 @@ class _UnixConnection(http.client.HTTPConnection):
 
 
 def ask(url: str, path: str, timeout: float = 1.0) -> Any:
-    """Return the JSON at a path of a service, with the key in LIPSERVE_KEY.
+    """Return the JSON at a path of a service, with the key in LIPSERVE_API_KEY.
 
     Raise OSError, HTTPException or ValueError where none answers in time, it refuses, or it is no such service.
     """
@@ -54,9 +50,8 @@ def ask(url: str, path: str, timeout: float = 1.0) -> Any:
     else:
         kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
         connection = kind(parts.netloc, timeout=timeout)
-    key = os.environ.get("LIPSERVE_KEY", "").strip()
     try:
-        connection.request("GET", path, headers={"Authorization": f"Bearer {key}"} if key else {})
+        connection.request("GET", path, headers=headers_of(None))
         answer = connection.getresponse()
         if answer.status != http.client.OK:
             raise ValueError(f"status {answer.status}")
@@ -106,7 +101,7 @@ def _listed(context: typer.Context, path: str, name: Callable[[dict[str, Any]], 
 
 
 def _asked(context: typer.Context, path: str) -> Any:
-    url = context.params.get("url") or os.environ.get("LIPSERVE_URL") or DEFAULT_URL
+    url = url_of(context.params.get("url"))
     try:
         return ask(url, path)
     except (OSError, HTTPException, ValueError):
@@ -122,8 +117,8 @@ MOST_NAMES = 20
 def connected(url: str) -> Iterator[Client]:
     """A client of the service at `url`; raise CommandError with a hint where it refuses or is not there."""
     # takes long to import, and help needs none of it
-    from service.client import ApiError, Client, ServiceUnreachableError  # noqa: PLC0415
-    from service.stream.exchange import StreamError  # noqa: PLC0415
+    from lipserve import ApiError, Client, ServiceUnreachableError  # noqa: PLC0415
+    from lipserve.exchange import StreamError  # noqa: PLC0415
 
     try:
         with Client(url) as client:
@@ -176,7 +171,7 @@ def watch(client: Client, job: Job, cancels: bool) -> tuple[Job, bool]:
 
     cancels: Ctrl-C cancels the job and waits for its end, a second one does not wait; else the job goes on.
     """
-    from service.client.progress import job_bar  # noqa: PLC0415 - takes long to import; help needs none
+    from lipserve.progress import job_bar  # noqa: PLC0415 - takes long to import; help needs none
 
     try:
         with job_bar(err) as show:

@@ -56,9 +56,7 @@ def print_result(value: Any, as_json: bool, *lines: str) -> None:
 
 def plain(value: Any) -> Any:
     """Return records, arrays, paths and numbers as JSON knows them; numbers that are not finite become null."""
-    if hasattr(value, "model_dump"):  # a record of the API
-        return value.model_dump(mode="json")
-    if hasattr(value, "as_dict"):  # a result of the client
+    if hasattr(value, "as_dict"):  # a record or a result of the client
         return value.as_dict()
     if is_dataclass(value) and not isinstance(value, type):
         return {each.name: plain(getattr(value, each.name)) for each in fields(value)}
@@ -111,14 +109,14 @@ def explain(error: Exception, expected: tuple[type[Exception], ...] = ()) -> Exp
 
 def _refusals() -> tuple[type[Exception], ...]:
     """Errors that tell what a service has said, of modules that are imported: others cannot have been raised."""
-    kinds = {"service.client.sending": "ApiError", "service.stream.exchange": "StreamError"}
+    kinds = {"lipserve.sending": "ApiError", "lipserve.exchange": "StreamError"}
     return tuple(getattr(sys.modules[module], name) for module, name in kinds.items() if module in sys.modules)
 
 
 START = "start a service with `lipserve serve`, or name another by --url or LIPSERVE_URL"
 KEY = (
-    "the service asks for an API key: put yours into LIPSERVE_KEY; `lipserve keys create --name me --scope admin`, run "
-    "where the service's home is, makes one"
+    "the service asks for an API key: put yours into LIPSERVE_API_KEY; `lipserve keys create --name me --scope admin`, "
+    "run where the service's home is, makes one"
 )
 SCOPE = "this key may not do that: `lipserve keys create --name … --scope …` makes one that may"
 

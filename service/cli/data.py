@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
+from lipserve.address import DEFAULT_URL
+from lipserve.asking import SUFFIXES, Reading
 from service.cli import connecting
 from service.cli.connecting import connected
 from service.cli.consoles import echo, out, print_json, print_result
 from service.cli.options import DatasetId, Json, Limit, Url, Yes, confirm, group, names, pairs
-from service.datasets.asking import SUFFIXES, Reading
-from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
-    from service.datasets.schema import Dataset
+    from lipserve.records.datasets import Dataset
 
 app = group("Recordings and their reports: add, list, show and delete them.")
 

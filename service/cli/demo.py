@@ -19,14 +19,14 @@ from rich.table import Table
 from lipcore.data.samples import Samples
 from lipcore.robots.library import Robot, SimulationUnavailableError, load_robot
 from lipcore.robots.simulation import FAST, Stream, simulate
+from lipserve import ApiError, Client, Evaluation, Prediction
+from lipserve.asking import Reading
+from lipserve.progress import follow
+from lipserve.states import SUCCEEDED
 from service.cli.consoles import out
 from service.cli.options import alone
 from service.cli.plotting import draw_torque
 from service.cli.simulate import write_recording
-from service.client import ApiError, Client, Evaluation, Prediction
-from service.client.progress import follow
-from service.datasets.asking import Reading
-from service.foundation.states import SUCCEEDED
 
 MODEL = "panda-demo"
 START_SECONDS = 60.0

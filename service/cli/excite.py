@@ -28,11 +28,11 @@ from lipcore.robots.library import ROBOTS, Robot, SimulationUnavailableError, lo
 from lipcore.robots.simulation import FAST, Stream, sinusoids
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import JointType
+from lipserve import ApiError, Client
+from lipserve.address import DEFAULT_URL, URL_VARIABLE
 from service.cli import plotting
 from service.cli.consoles import err, print_json
 from service.cli.options import Json, alone
-from service.client import ApiError, Client
-from service.foundation.settings import DEFAULT_URL
 from service.models import archive
 
 MAX_URDF_BYTES = 16 * 1024 * 1024
@@ -211,7 +211,7 @@ def excite(
     budget: Annotated[float, typer.Option(help="Most seconds of the search.")] = PlanOptions.budget_s,
     seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal motions where the budget suffices.")] = 0,
     plot: Annotated[Path | None, typer.Option(dir_okay=False, help="Also draw the motion, .png or .svg.")] = None,
-    url: Annotated[str, typer.Option("--url", envvar="LIPSERVE_URL", help="Address of the service.")] = DEFAULT_URL,
+    url: Annotated[str, typer.Option("--url", envvar=URL_VARIABLE, help="Address of the service.")] = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
     """Plan a motion within a robot's limits that tells most of what its model does not know yet."""

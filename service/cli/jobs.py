@@ -12,15 +12,15 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from lipcore.vocabulary import CHOICES, DEFAULT_ESTIMATOR
+from lipserve.address import DEFAULT_URL
 from service.cli import connecting
 from service.cli.connecting import connected, dataset_of, watch
 from service.cli.consoles import INTERRUPTED, CommandError, echo, note, out, print_json
 from service.cli.models import print_held_out, print_promotion, print_selection
 from service.cli.options import HELD_OUT_BY, PROMOTION, JobId, Json, Limit, Url, alone, group, names, pairs
-from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
-    from service.training.schema import Job
+    from lipserve.records.jobs import Job
 
 
 app = group("Training jobs: list, show, follow, cancel and retry them.")
@@ -163,7 +163,7 @@ def train(
 ) -> None:
     """Upload recordings and train a model on them. Ctrl-C cancels the job."""
     # the client takes long to import; help needs none
-    from service.client.call import new_key  # noqa: PLC0415
+    from lipserve.call import new_key  # noqa: PLC0415
 
     options: dict[str, Any] = {name: _value(text) for name, text in pairs("--option", option).items()}
     if prior is not None:

@@ -118,7 +118,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Learn a manipulator's inverse dynamics and serve torques with uncertainty.",
     epilog="Exit codes: 0 done; 1 refused or failed, standard error says why; 2 the command line cannot be read; "
-    "130 ended by Ctrl-C. Commands that ask a service find it by --url or LIPSERVE_URL, their key in LIPSERVE_KEY.",
+    "130 ended by Ctrl-C. Commands that ask a service find it by --url or LIPSERVE_URL, their key in LIPSERVE_API_KEY.",
 )
 
 

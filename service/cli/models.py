@@ -11,16 +11,16 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from lipserve.address import DEFAULT_URL
 from service.cli import connecting
 from service.cli.connecting import connected, dataset_of
 from service.cli.consoles import CommandError, echo, note, out, print_json, print_result, print_warnings
 from service.cli.options import Alias, Data, Json, Limit, Model, Url, Version, Yes, confirm, group
-from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
-    from service.client.results.arm import Version as VersionRecord
-    from service.models.schema import Alias as AliasRecord
-    from service.models.schema import Selection
+    from lipserve.records.models import Alias as AliasRecord
+    from lipserve.records.models import Selection
+    from lipserve.results.arm import Version as VersionRecord
 
 app = group("Models: list, show, promote, roll back, compare, export, import and delete them.")
 SERVING = "serving"
@@ -61,7 +61,7 @@ def show(model: Model, version: Version = None, url: Url = DEFAULT_URL, as_json:
         record = client.model(model)
         detail = client.version(model, version or record.serving_version)
     if as_json:
-        print_json({"model": record.model_dump(mode="json"), "version": detail.model_dump(mode="json")})
+        print_json({"model": record, "version": detail})
         return
     echo(f"{record.name}: version {record.serving_version} serves, {record.latest_version} is the newest")
     table = Table("version", "estimator", "made", "named")
@@ -296,8 +296,8 @@ def _print_version(version: VersionRecord) -> None:
     print_warnings(version.warnings)
     arm = version.arm
     if arm is not None:
+        from lipserve.results.arm import LIMITS  # noqa: PLC0415
         from service.cli.tables import arm_tables  # noqa: PLC0415 - as above
-        from service.client.results.arm import LIMITS  # noqa: PLC0415
 
         for table in arm_tables(arm):
             out.print(table)

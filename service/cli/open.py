@@ -9,11 +9,11 @@ from urllib.parse import quote
 
 import typer
 
+from lipserve.address import DEFAULT_URL, UNIX
 from service.cli import connecting
-from service.cli.connecting import UNIX, ask
+from service.cli.connecting import ask
 from service.cli.consoles import START, CommandError, print_result
 from service.cli.options import Json, Url, alone
-from service.foundation.settings import DEFAULT_URL
 
 app = alone()
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 from pydantic import ValidationError
 
+from lipserve.address import URL_VARIABLE
 from service.cli import connecting
 from service.cli.consoles import CommandError
 from service.foundation.settings import Settings
@@ -22,7 +23,7 @@ PROMOTION = ["ask", "always"]
 
 
 Url = Annotated[
-    str, typer.Option("--url", envvar="LIPSERVE_URL", help="Address of the service: http://… or unix:///path.")
+    str, typer.Option("--url", envvar=URL_VARIABLE, help="Address of the service: http://… or unix:///path.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 Limit = Annotated[int, typer.Option(min=1, help="Most that are listed.")]

@@ -6,16 +6,17 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from msgspec.structs import replace
 from rich.markup import escape
 from rich.table import Table
 
+from lipserve.address import DEFAULT_URL
 from service.cli.connecting import connected
 from service.cli.consoles import CommandError, echo, out, print_json
 from service.cli.options import Json, Model, Url, alone, numbers
-from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
-    from service.learning.control.payload_schema import PayloadBody, Payloads, StreamPayload, Vector
+    from lipserve.records.payloads import PayloadBody, Payloads, StreamPayload, Vector
 
 app = alone()
 STATES = {
@@ -60,7 +61,7 @@ def payload(
             known = client.payload(model)
     streams = [each for each in known.streams if stream in (None, each.stream_id)]
     if as_json:
-        print_json(known.model_copy(update={"streams": streams}))
+        print_json(replace(known, streams=streams))
         return
     _print(known, streams)
 

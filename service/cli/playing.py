@@ -21,8 +21,9 @@ from lipcore.data.samples import Array
 from lipcore.robots.library import SimulationUnavailableError, load_robot
 from lipcore.robots.simulation import FAST, Payload, Stream, simulate
 from lipcore.vocabulary import TorqueConvention
+from lipserve import StreamClient, StreamError
+from lipserve.exchange import StreamAnswer, StreamLearnt
 from service.cli.consoles import CommandError
-from service.client.stream import StreamClient, StreamError
 from service.datasets.formats.opening import open_table
 from service.datasets.mapping.reading import read
 from service.datasets.options import UploadOptions
@@ -30,7 +31,6 @@ from service.datasets.staging import Staged, prepare
 from service.foundation.errors import ServiceError
 from service.foundation.settings import Settings
 from service.storage.storage import Disk
-from service.stream.exchange import StreamAnswer, StreamLearnt
 
 BAND = 1.959963984540054
 """Standard deviations on both sides that hold 95 %."""

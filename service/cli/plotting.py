@@ -9,7 +9,7 @@ import numpy as np
 
 from lipcore.data.samples import Samples
 from lipcore.excitation import Plan
-from service.client import Prediction
+from lipserve import Prediction
 
 HEADINGS = ("position, rad (m)", "speed, per s", "acceleration, per s²")
 

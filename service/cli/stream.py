@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
+from lipserve.address import DEFAULT_URL
 from service.cli.connecting import connected
 from service.cli.consoles import INTERRUPTED, CommandError, echo, note, out, print_json
 from service.cli.options import ROBOTS, Alias, Json, Model, Url, Version, alone
-from service.foundation.settings import DEFAULT_URL
 
 if TYPE_CHECKING:
+    from lipserve import StreamClient
     from service.cli.playing import Motion, Tally
-    from service.client.stream import StreamClient
 
 app = alone()
 SECONDS = 60.0

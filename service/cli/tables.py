@@ -9,11 +9,11 @@ from numpy.typing import ArrayLike
 from rich.markup import escape
 from rich.table import Table
 
-from service.client.results.arm import Arm
-from service.client.results.evaluation import Comparison, Evaluation
-from service.client.results.series import Prediction
-from service.datasets.schema import AgainstRobot, DatasetReport, JointExcitation, JointNoise, Weight
-from service.models.schema import Selection
+from lipserve.records.datasets import AgainstRobot, DatasetReport, JointExcitation, JointNoise, Weight
+from lipserve.records.models import Selection
+from lipserve.results.arm import Arm
+from lipserve.results.evaluation import Comparison, Evaluation
+from lipserve.results.series import Prediction
 
 
 def prediction_tables(answer: Prediction) -> list[Table]:

@@ -11,7 +11,7 @@ from fastapi import Query
 from lipcore.data.signals import CUTOFF
 from lipcore.preparation.recipe import Filtering, Form, Recipe
 from lipcore.vocabulary import TorqueConvention
-from service.datasets.asking import MEDIA_TYPES, SUFFIXES
+from lipserve.asking import MEDIA_TYPES, SUFFIXES
 from service.foundation.errors import invalid_request
 from service.foundation.fields import BINARY, upload_body
 from service.web.route import read_json

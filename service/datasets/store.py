@@ -16,13 +16,13 @@ from sqlalchemy.exc import SQLAlchemyError
 from lipcore.data.samples import Array, Samples
 from lipcore.profiles import Profile
 from lipcore.vocabulary import JointType
+from lipserve.states import ACTIVE
 from service.datasets.mapping.reading import read
 from service.datasets.options import UploadOptions
 from service.datasets.report.making import make_report
 from service.datasets.schema import MOST_STARTS, Dataset, DatasetPage, Preview, PreviewColumn
 from service.datasets.staging import Staged, column, prepare, staging
 from service.foundation.errors import ConflictError, not_found
-from service.foundation.states import ACTIVE
 from service.robots.store import profile_of
 from service.storage import sample_file
 from service.storage.database import Database, DatasetRow, JobRow, now

@@ -11,8 +11,6 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 CHECKOUT_MODELS = Path(__file__).resolve().parents[2] / "models"
 PACKAGED_MODELS = Path(__file__).resolve().parents[1] / "shipped"
-DEFAULT_URL = "http://127.0.0.1:8000"
-"""Where a service listens by default, for its clients."""
 CONNECTIONS = 20
 """Most connections to PostgreSQL of one process, unless set."""
 

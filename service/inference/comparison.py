@@ -8,6 +8,7 @@ from math import isfinite
 from lipcore.data import metrics
 from lipcore.data.metrics import Answer, Comparison, Difference, evaluate
 from lipcore.data.samples import Samples
+from lipserve.states import Outcome
 from service.foundation.errors import invalid_request
 from service.foundation.fields import finite
 from service.inference import schema
@@ -70,7 +71,7 @@ def _answer(served: Served, samples: Samples) -> Answer:
     return answer.interval
 
 
-def _verdict(first: int, second: int, compared: Comparison) -> tuple[schema.Outcome, str]:
+def _verdict(first: int, second: int, compared: Comparison) -> tuple[Outcome, str]:
     """What the difference says, for programs and in words."""
     if compared.blocks < metrics.MIN_BLOCKS:
         return "cannot_tell", (
@@ -81,7 +82,7 @@ def _verdict(first: int, second: int, compared: Comparison) -> tuple[schema.Outc
     (density, nmse), (clear, larger_or_smaller) = total.mean.tolist(), total.significant.tolist()
     better, worse = (first, second) if density > 0 else (second, first)
     if clear:
-        outcome: schema.Outcome = "first_better" if better == first else "second_better"
+        outcome: Outcome = "first_better" if better == first else "second_better"
         text = (
             f"Version {better} predicts better than version {worse}: its negative log predictive density is lower by "
         )

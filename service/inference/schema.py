@@ -17,6 +17,7 @@ from pydantic import (
 )
 
 from lipcore.vocabulary import COMPONENTS, ComponentName, TorqueConvention
+from lipserve.states import Outcome
 from service.foundation.errors import invalid_request
 from service.foundation.fields import each_once, rows_of_numbers
 from service.inference.payload import Payload
@@ -300,9 +301,6 @@ class TraceResponse(BaseModel):
         description="Whether the model was trained on these samples: then it looks better than it is. Not on what it "
         "held out"
     )
-
-
-Outcome = Literal["first_better", "second_better", "no_difference", "cannot_tell"]
 
 
 class CompareRequest(BaseModel):

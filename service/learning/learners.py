@@ -17,10 +17,10 @@ from typing import Annotated, Any, TypeVar
 
 from fastapi import Depends
 
+from lipserve.states import PartState
 from service.compute.process import Place
 from service.foundation.errors import BusyError
 from service.foundation.fields import of_app
-from service.foundation.states import PartState
 from service.learning.ingest.batches import Frames, FramesResult, observe_batch, observe_frames
 from service.learning.ingest.intake import Intake
 from service.learning.ingest.monitor import Monitor

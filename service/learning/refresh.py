@@ -16,9 +16,9 @@ from typing import Any, Literal
 from sqlalchemy import Select, select
 from sqlalchemy.orm import Session
 
+from lipserve.states import ACTIVE
 from service.foundation.errors import BusyError, ConflictError
 from service.foundation.settings import Settings
-from service.foundation.states import ACTIVE
 from service.learning import owner
 from service.learning.learner.publication import Contested, Published
 from service.learning.learners import Learners

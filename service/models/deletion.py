@@ -8,8 +8,8 @@ from collections.abc import Collection
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
+from lipserve.states import ACTIVE
 from service.foundation.errors import ConflictError, not_found
-from service.foundation.states import ACTIVE
 from service.models import registry
 from service.models.loaded import LoadedModels
 from service.storage.database import (

@@ -18,6 +18,7 @@ from lipcore.profiles.profile import read_limits
 from lipcore.robots.library import ROBOTS, UnknownRobotError, profile_urdf
 from lipcore.robots.urdf import RigidBody, describe
 from lipcore.robots.urdf_text import MOVABLE, UrdfError
+from lipserve.states import ACTIVE
 from service.foundation.errors import (
     ConflictError,
     InvalidDataError,
@@ -27,7 +28,6 @@ from service.foundation.errors import (
     problem,
 )
 from service.foundation.fields import LONGEST, for_people
-from service.foundation.states import ACTIVE
 from service.robots.schema import ProfileJoint, Robot, RobotPage, RobotProfile
 from service.storage.database import Database, JobRow, RobotRow, now
 from service.storage.files import new_id

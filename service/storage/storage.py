@@ -19,10 +19,10 @@ from fastapi import Depends
 from sqlalchemy import text
 from sqlalchemy.exc import SQLAlchemyError
 
+from lipserve.states import PartState
 from service.foundation.errors import StorageFullError
 from service.foundation.fields import of_app
 from service.foundation.settings import Settings
-from service.foundation.states import PartState
 from service.storage.database.engine import FILE, Database, DriverMissingError
 from service.storage.database.migrations import DatabaseVersionError
 from service.storage.files import Files, FilesUnreachableError

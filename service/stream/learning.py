@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lipcore.data.samples import Array
+from lipserve.frames import NUMBER, REQUEST
 from service.foundation.errors import ErrorBody, ServiceError, invalid_request
 from service.learning.ingest.batches import Frames
 from service.learning.learners import Learners
 from service.models.loaded import Served
-from service.stream.frames import NUMBER, REQUEST
 from service.web.storage_errors import translated
 
 logger = logging.getLogger(__name__)

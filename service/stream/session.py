@@ -18,13 +18,13 @@ from anyio import to_thread
 from starlette.types import Message, Receive, Send
 
 from lipcore.model.external import external
+from lipserve import frames
 from service.foundation.errors import ErrorBody, ErrorResponse, ServiceError, invalid_request
 from service.foundation.settings import Settings
 from service.inference.predicting import Query, check_answer
 from service.learning.learners import Learners
 from service.models.loaded import Served
 from service.models.registry import SERVING
-from service.stream import frames
 from service.stream.learning import Learning, Taught
 from service.web.access.middleware import subprotocol_of
 from service.web.observability.meters import StreamMeter

@@ -11,12 +11,12 @@ import logging
 import time
 from secrets import token_hex
 
+from lipserve.states import QUEUED
 from service import __version__
 from service.compute import remote
 from service.compute.cluster import Cluster, needs_gpu
 from service.compute.executors import ClusterUnavailableError, lost
 from service.compute.process import Slot
-from service.foundation.states import QUEUED
 from service.storage.database import JobRow
 from service.training import lifecycle
 from service.training.lifecycle import Ended, Hand

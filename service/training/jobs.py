@@ -13,6 +13,7 @@ from lipcore.fitting.base import BaseMismatchError, Kind, check_base
 from lipcore.fitting.estimators import UnknownEstimatorError, check_estimator
 from lipcore.fitting.options import FitOptions
 from lipcore.robots.library import ROBOTS, SimulationUnavailableError
+from lipserve.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING
 from service.datasets import store
 from service.foundation.errors import (
     BusyError,
@@ -24,7 +25,6 @@ from service.foundation.errors import (
     problem,
 )
 from service.foundation.settings import Settings
-from service.foundation.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING
 from service.journal import log
 from service.models import registry
 from service.models.loaded import LoadedModels

@@ -10,7 +10,7 @@ from prometheus_client.registry import Collector
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from service.foundation.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, PartState
+from lipserve.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, PartState
 from service.storage.database import Database, JobRow
 from service.training.queue import JobQueue
 from service.web.observability.meters import Durations, MetricKind

@@ -16,12 +16,12 @@ from lipcore.data.metrics import Comparison, compare
 from lipcore.data.samples import Samples
 from lipcore.files.manifest import ModelFormatError
 from lipcore.model.torque_model import TorqueModel
+from lipserve.states import PromotionOption
 from service.models import aliases, registry
 from service.models.lineage import answer_of, learnt_from
 from service.models.schema import Promotion
 from service.storage.database import Database, LearnerRow, VersionRow
 from service.storage.files import Files
-from service.training.schema import PromotionOption
 
 LEAST_COVERAGE = 0.9
 CANDIDATE = "candidate"

@@ -10,6 +10,7 @@ from anyio import to_thread
 from fastapi import APIRouter, Depends, Response, status
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
+from lipserve.states import ACTIVE
 from service.foundation.errors import (
     BusyError,
     ConflictError,
@@ -18,7 +19,6 @@ from service.foundation.errors import (
     TooLargeError,
     responses,
 )
-from service.foundation.states import ACTIVE
 from service.models.loaded import LoadedModels, LoadedModelsDep
 from service.storage.database import JobRow
 from service.training import jobs

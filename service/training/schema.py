@@ -8,11 +8,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from lipcore.fitting.options import MOST_SECONDS, FitOptions, GeometryOption, Standing
 from lipcore.vocabulary import AUTO, CHOICES, DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS, JointType
-from service.foundation.states import JobState
+from lipserve.states import JobState, PromotionOption
 from service.models.schema import VERSION, Holdout, ModelName
 
 _DEFAULTS = FitOptions()
-PromotionOption = Literal["ask", "always"]
 
 
 class Options(BaseModel):

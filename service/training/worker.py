@@ -16,10 +16,10 @@ from lipcore.fitting.task import Task
 from lipcore.model.torque_model import TorqueModel
 from lipcore.training.conditioning import should_condition
 from lipcore.training.train import fit_model
+from lipserve.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, JobState, PromotionOption
 from service.compute.executors import ClusterUnavailableError
 from service.foundation.errors import ServiceError, StorageFullError, StorageUnavailableError
 from service.foundation.settings import Settings
-from service.foundation.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, JobState
 from service.models import registry
 from service.models.lineage import MOST_SAMPLES, figures, software
 from service.models.schema import Promotion
@@ -30,7 +30,6 @@ from service.training import lifecycle, promotion, refresh_data, repeating
 from service.training.holding_out import CannotHoldOutError
 from service.training.material import CANDIDATES, Material, observed, recorded
 from service.training.pulse import Pulse, Remaining, SupersededError
-from service.training.schema import PromotionOption
 from service.training.summing import all_rows
 from service.web import storage_errors
 from service.web.observability.logs import job_id

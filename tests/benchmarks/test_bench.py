@@ -18,7 +18,7 @@ from benchmarks.latency.websocket import read_answer, request_frame
 from benchmarks.timing import Timing, median
 from benchmarks.workload import BenchError, Source
 from lipcore.robots.simulation import Stream
-from service.stream.frames import ANSWER, ERROR, REQUEST
+from lipserve.frames import ANSWER, ERROR, REQUEST
 from tests.service.data import QUICK
 
 MS = 1_000_000

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from service.client.stream import StreamClient
+from lipserve import StreamClient
 
 
 @contextmanager

@@ -3,16 +3,12 @@
 import contextlib
 import io
 import json
-import os
 import sys
 import traceback
-
-from service.foundation import settings
 
 
 def main() -> None:
     """Answer every line on standard input."""
-    settings.DEFAULT_URL = os.environ["LIPSERVE_URL"]  # the port that a reader's service has is taken here
     namespace = {"__name__": "__main__"}
     for line in sys.stdin:
         printed, error = io.StringIO(), None

@@ -68,6 +68,14 @@ def test_loaded_model_answers_as_the_saved_one(model: TorqueModel, samples: Samp
     assert again.estimator.name == model.estimator.name
 
 
+def test_a_folder_may_be_named_by_a_text(model: TorqueModel, folder: Path) -> None:
+    q = np.zeros(2)
+    assert np.array_equal(load(str(folder)).predict(q, q, q).tau, load(folder).predict(q, q, q).tau)
+    missing = str(folder.with_name("nothing"))
+    with pytest.raises(ModelFormatError, match=f"{missing}/manifest.json cannot be read: .*No such file"):
+        load(missing)
+
+
 def test_manifest_can_be_read_and_vouches_for_the_tensors(model: TorqueModel, folder: Path) -> None:
     manifest = json.loads((folder / "manifest.json").read_text())
     payload = (folder / "model.safetensors").read_bytes()

@@ -11,7 +11,7 @@ import numpy as np
 from lipcore.data.samples import Samples
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate
-from service.foundation.states import ACTIVE
+from lipserve.states import ACTIVE
 from service.learning.learners import Learners
 from service.models.loaded import LoadedModels
 from service.storage.storage import Storage

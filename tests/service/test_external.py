@@ -7,8 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from service.client import AsyncClient
-from service.client.stream import StreamClient, StreamError
+from lipserve import AsyncClient, StreamClient, StreamError
 from tests.service.data import DEADLINE
 from tests.service.oip import ask as infer
 from tests.service.oip import message, path_of, refused, tensors

@@ -22,7 +22,7 @@ from lipcore.data.motion import Motion
 from lipcore.model import dynamics
 from lipcore.model.body import Body
 from lipcore.model.payload import Carrier, NoArmError
-from service.client import AsyncClient
+from lipserve import AsyncClient
 from service.inference import predicting
 from service.models import declared
 from service.models.declared import Declared

@@ -8,7 +8,7 @@ from sqlalchemy import update
 
 import lipcore
 from lipcore.robots.library import ROBOTS, load_robot, profile_urdf
-from service.client import ApiError, Client
+from lipserve import ApiError, Client
 from service.foundation.errors import InvalidRequestError
 from service.models import registry
 from service.robots import store

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from websockets.sync.client import unix_connect
 
-from service.client import Client
+from lipserve import Client
 from service.web.server.sockets import SocketError, UnixSocket
 from tests.service.data import DEADLINE
 from tests.service.server import Server

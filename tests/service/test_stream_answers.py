@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from websockets.exceptions import InvalidStatus
 
-from service.client.stream import StreamClient
+from lipserve import StreamClient
 from tests.service.data import DEADLINE, ended, eventually, queue, stream, train, upload
 from tests.service.streams import MOTION, STD, STREAM, ask, dial, frame, hello, motions, read, saved_model
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from websockets.sync.server import unix_serve
 
-from service.client.stream import StreamClient, StreamError, StreamRefusal
+from lipserve import StreamClient, StreamError
+from lipserve.stream import StreamRefusal
 from tests.service.data import DEADLINE
 from tests.service.server import free_port
 from tests.service.streams import MOTION as PAIR

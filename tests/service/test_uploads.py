@@ -5,8 +5,8 @@ import io
 import numpy as np
 import pytest
 
+from lipserve.asking import MEDIA_TYPES, SUFFIXES
 from service.datasets import store
-from service.datasets.asking import MEDIA_TYPES, SUFFIXES
 from tests.service.data import QUICK, arrays, columns, csv, error, job, npz, post, queue, service_of, stream, upload
 
 TRUE = stream()

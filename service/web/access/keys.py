@@ -148,7 +148,9 @@ class Keyring:
     def find(self, secret: bytes | None) -> Key:
         """Return the key that a request carries, valid or not; raise UnauthorizedError where it carries none."""
         if secret is None:
-            message = "no API key was given, expected the header `Authorization: Bearer lip_…` (clients: LIPSERVE_KEY)"
+            message = (
+                "no API key was given, expected the header `Authorization: Bearer lip_…` (clients: LIPSERVE_API_KEY)"
+            )
             raise UnauthorizedError(message, headers={"WWW-Authenticate": CHALLENGE})
         digest = digest_of(secret)
         key = self._keys.get(digest[:INDEXED])

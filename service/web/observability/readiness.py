@@ -14,10 +14,10 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Depends
 from pydantic import BaseModel, Field
 
+from lipserve.states import PartState
 from service import __version__
 from service.foundation.errors import NotReadyError, problem, responses
 from service.foundation.fields import of_app
-from service.foundation.states import PartState
 from service.web.route import Route
 
 

@@ -5,7 +5,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from service.client.sending import headers_of
+from lipserve.address import headers_of
 from service.foundation.settings import Settings
 from service.storage.database import Database
 from service.web.access import keys
@@ -93,9 +93,9 @@ def test_keys_of_a_running_service(lipserve, guarded, monkeypatch):
 
 
 def test_clients_take_the_key_of_the_environment(monkeypatch):
-    monkeypatch.delenv("LIPSERVE_KEY", raising=False)
+    monkeypatch.delenv("LIPSERVE_API_KEY", raising=False)
     assert headers_of(None) == {}
-    monkeypatch.setenv("LIPSERVE_KEY", "lip_abc\n")
+    monkeypatch.setenv("LIPSERVE_API_KEY", "lip_abc\n")
     assert headers_of(None) == {"Authorization": "Bearer lip_abc"}
     assert headers_of("lip_def") == {"Authorization": "Bearer lip_def"}
     assert headers_of("") == {}

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from service.client import Client
-from service.client.stream import StreamClient, StreamError
+from lipserve import Client, StreamClient, StreamError
 from service.foundation.settings import Settings
 from service.storage.database import Database
 from service.web.access import keys
@@ -142,7 +141,7 @@ def _established(port, peer):
 
 
 def test_the_python_clients(locked, make, monkeypatch):
-    monkeypatch.delenv("LIPSERVE_KEY", raising=False)
+    monkeypatch.delenv("LIPSERVE_API_KEY", raising=False)
     with pytest.raises(StreamError) as caught:
         StreamClient("panda-sim", locked.url)
     assert caught.value.code == "unauthorized"

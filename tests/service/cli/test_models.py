@@ -3,8 +3,8 @@
 import pytest
 
 from lipcore.robots.urdf import describe
+from lipserve.records.models import Selection, SelectionCandidate, SelectionHeldOut
 from service.cli.models import print_selection
-from service.models.schema import Selection, SelectionCandidate, SelectionHeldOut
 from tests.service.models.versions import JOINTS, WARNING
 
 
@@ -84,11 +84,11 @@ def test_refusals_say_what_to_do(refused, arm, arguments, hint):
 
 def judged(estimator, nmse, **given):
     figures = {"log_density": 1.5, "difference": -0.25, "standard_error": 0.1, "coverage": [0.9, None], "seconds": 2.0}
-    return SelectionCandidate(estimator=estimator, nmse=nmse, error=None, **{**figures, **given})
+    return SelectionCandidate(estimator=estimator, nmse=nmse, **{**figures, "error": None, **given})
 
 
 def test_how_an_estimator_was_chosen_is_printed(capsys):
-    failed = SelectionCandidate.model_construct(estimator="lip-chain", error="no [factor]")
+    failed = judged("lip-chain", None, log_density=None, error="no [factor]")
     best = judged("rigid-body", [0.01, 0.03], difference=0.0, standard_error=None)
     held = SelectionHeldOut(rows=90, blocks=6, repeats=True)
     made = {"asked": "auto", "chosen": "rigid-body", "reason": "it errs least", "held_out": held}
@@ -105,6 +105,6 @@ def test_how_an_estimator_was_chosen_is_printed(capsys):
     )
     assert not [each for each in parts if each not in out]
     nothing = SelectionHeldOut(rows=0, blocks=0, repeats=False)
-    print_selection(Selection.model_construct(**{**made, "held_out": nothing}, table=[failed]))
+    print_selection(Selection(**{**made, "held_out": nothing}, table=[failed]))
     out = capsys.readouterr().out
     assert ("not judged" in out, "failed: no [factor]" in out, "flatter" in out) == (True, True, False)

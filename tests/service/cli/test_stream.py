@@ -6,9 +6,9 @@ import signal
 import numpy as np
 import pytest
 
+from lipserve import StreamClient
+from lipserve.exchange import StreamAnswer
 from service.cli.playing import Tally, recorded
-from service.client.stream import StreamClient
-from service.stream.exchange import StreamAnswer
 from tests.service.data import stream, train, upload
 
 

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from service.client import Client
+from lipserve import Client
 from tests.service.cli.conftest import QUICKLY, options_of_train
 from tests.service.data import ENDLESS, ended, queue, stream, upload
 
@@ -92,7 +92,7 @@ def interrupted(monkeypatch):
 
         yield look
 
-    monkeypatch.setattr("service.client.progress.job_bar", bar)
+    monkeypatch.setattr("lipserve.progress.job_bar", bar)
 
 
 @pytest.fixture(scope="module")

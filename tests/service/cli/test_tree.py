@@ -8,11 +8,11 @@ import pytest
 from lipcore.fitting.estimators import ESTIMATORS
 from lipcore.robots.library import ROBOTS
 from lipcore.vocabulary import AUTO, CHOICES
+from lipserve import ApiError
 from service import __version__
 from service.cli import consoles, options
 from service.cli.consoles import plain
 from service.cli.main import Commands
-from service.client import ApiError
 from tests.service.server import free_port
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
@@ -130,7 +130,7 @@ def test_address_of_the_dashboard(asked, server):
 @pytest.mark.parametrize(
     ("status", "code", "hint"),
     [
-        (401, "unauthorized", "put yours into LIPSERVE_KEY"),
+        (401, "unauthorized", "put yours into LIPSERVE_API_KEY"),
         (403, "forbidden", "lipserve keys create"),
         (429, "busy", "try again in a moment"),
         (422, "invalid_request", None),

@@ -6,7 +6,7 @@ import httpx
 import pytest
 from fastapi.testclient import TestClient
 
-from service.client import Client, sending
+from lipserve import Client, sending
 from tests.service.data import ADDRESS
 
 
@@ -41,7 +41,7 @@ def over(transport: httpx.BaseTransport, **options: object) -> Client:
 def pauses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Nothing waits; what would have been waited for is listed."""
     listed: list[float] = []
-    monkeypatch.setattr("service.client.sync.time.sleep", listed.append)
+    monkeypatch.setattr("lipserve.sync.time.sleep", listed.append)
     return listed
 
 

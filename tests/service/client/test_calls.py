@@ -5,10 +5,10 @@ import inspect
 import httpx
 import pytest
 
+from lipserve import ApiError, AsyncClient, Client, ServiceUnreachableError, calls
+from lipserve.call import ROUTES
+from lipserve.sending import FIRST_PAUSE_S, LONGEST_PAUSE_S, RETRIES
 from service.cli.simulate import write_recording
-from service.client import ApiError, AsyncClient, Client, ServiceUnreachableError, calls
-from service.client.call import ROUTES
-from service.client.sending import FIRST_PAUSE_S, LONGEST_PAUSE_S, RETRIES
 from tests.service.client.conftest import over
 from tests.service.data import QUICK, stream, upload
 

@@ -6,9 +6,8 @@ import httpx
 import numpy as np
 import pytest
 
+from lipserve import ApiError, AsyncClient, AsyncStreamClient, Client, ServiceUnreachableError, StreamError
 from service.cli.simulate import write_recording
-from service.client import ApiError, AsyncClient, Client, ServiceUnreachableError
-from service.client.stream import AsyncStreamClient, StreamError
 from tests.service.data import DEADLINE, QUICK, stream, upload
 from tests.service.server import free_port
 from tests.service.streams import MOTION, TAU

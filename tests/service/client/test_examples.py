@@ -10,8 +10,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from service.client import Client
-from service.client.stream import StreamError
+from lipserve import Client, StreamError
 from tests.service.data import stream
 from tests.service.streams import MOTION
 

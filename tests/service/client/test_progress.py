@@ -5,9 +5,9 @@ import io
 import pytest
 from rich.console import Console
 
+from lipserve import progress
+from lipserve.progress import follow, upload_bar
 from service.cli.simulate import write_recording
-from service.client import progress
-from service.client.progress import follow, upload_bar
 from tests.service.data import ENDLESS, QUICK, stream, upload
 
 

@@ -7,13 +7,11 @@ import pinocchio as pin
 import pytest
 
 from lipcore.robots.urdf import RigidBody
-from service.client.call import Answer
-from service.client.results import arm as arm_results
-from service.client.results.arm import Arm, read_arm
-from service.client.results.evaluation import read_evaluation
-from service.client.results.series import LiveRows, read_live
-from service.learning.control.schema import LiveLost
-from service.models.schema import Version
+from lipserve.call import Answer
+from lipserve.records.live import LiveLost
+from lipserve.results.arm import Arm, Version, read_arm
+from lipserve.results.evaluation import read_evaluation
+from lipserve.results.series import LiveRows, read_live
 from tests.lipcore.arms import parameters_of
 from tests.service.client.conftest import over
 from tests.service.data import stream, upload
@@ -145,10 +143,11 @@ REVERSED = JOINTS[::-1]
 NAMES = {"joint_names": list(REVERSED), "joint_types": ["revolute"] * 7}
 
 
-def version(parameters) -> Version:
-    return Version.model_construct(
-        model="m", version=1, joint_names=list(REVERSED), joint_types=["revolute"] * 7, parameters=parameters
-    )
+def version(parameters, **given) -> Version:
+    nothing = ("training_range", "options", "fit", "calibration", "lineage")
+    known = {"model": "m", "version": 1, "created_at": "2026-01-01T00:00:00+00:00", "job": None, "estimator": "lip"}
+    known |= {**NAMES, "torque_convention": "gravity_included", "noise_std": [0.1] * 7, "parameters": parameters}
+    return Version(**{**known, **{name: {} for name in nothing}, **given})
 
 
 @pytest.fixture(scope="module")
@@ -213,13 +212,8 @@ def test_friction_of_slow_joints_is_shown_where_it_was_learnt(robot, arm):
 
 
 def test_a_version_is_printed_with_its_warnings_and_its_arm(robot):
-    known = client_version(robot, estimator="rigid-body", warnings=["joint 3 hardly moved"])
+    known = version(parameters_of(robot), estimator="rigid-body", warnings=["joint 3 hardly moved"])
     lines = str(known).splitlines()
     assert lines[:2] == [f"m version 1: rigid-body, 7 joints: {', '.join(REVERSED)}", "careful: joint 3 hardly moved"]
     assert str(known.arm) in str(known)
-    assert str(client_version(None, estimator="lip", warnings=[])).endswith(REVERSED[-1])
-
-
-def client_version(robot, **given):
-    made = version(None if robot is None else parameters_of(robot))
-    return arm_results.Version.model_construct(**{**made.__dict__, **given})
+    assert str(version(None)).endswith(REVERSED[-1])

@@ -15,7 +15,7 @@ from lipcore.data import independence
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.vocabulary import LEARNT
-from service.foundation.states import ACTIVE
+from lipserve.states import ACTIVE
 from tests.service.data import eventually, job, stream
 from tests.service.faults.injection import PATIENCE
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import httpx
 import pytest
 
-from service.client.stream import StreamClient
+from lipserve import StreamClient
 from service.storage.database.engine import PATIENCE_S
 from tests.service.data import arrays, error, eventually, npz, stream
 from tests.service.faults.actions import Observe, Serve, Train, Unlearn, Upload, UploadRobot

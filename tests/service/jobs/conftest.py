@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 
+from lipserve.states import ACTIVE, QUEUED
 from service.foundation.settings import Settings
-from service.foundation.states import ACTIVE, QUEUED
 from service.storage.database import Database, JobRow, now
 from service.storage.files import Files
 from service.storage.storage import Disk, Storage

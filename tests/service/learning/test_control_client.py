@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from service.client import ApiError, Client
+from lipserve import ApiError, Client
 from service.learning import owner
 from tests.service.archives.packing import exported, send, unpack
 from tests.service.learning.lessons import LESSON, QUERIES, answered
@@ -20,11 +20,11 @@ def client(school):
 
 
 def same(answer, body):
-    assert answer.model_dump(mode="json") == body
+    assert answer.as_dict() == body
 
 
 def same_items(answers, body):
-    assert [each.model_dump(mode="json") for each in answers] == body["items"]
+    assert [each.as_dict() for each in answers] == body["items"]
 
 
 def test_what_is_seen(school, client):

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from service.client import Client
+from lipserve import Client
 from tests.service.data import eventually
 from tests.service.learning.lessons import apart
 from tests.service.learning.recordings import batch, learnt_from, logged, part, recording, send

@@ -10,7 +10,7 @@ from prometheus_client.parser import text_string_to_metric_families as parse
 from lipcore.model.body import Body
 from lipcore.online.bodies import CENTRE, WIDTH
 from lipcore.online.bodies import body as parameters_of
-from service.client import ApiError, AsyncClient, Client
+from lipserve import ApiError, AsyncClient, Client
 from service.learning.control import payload
 from tests.service.learning.following import following
 from tests.service.learning.payloads import MASS, OFFSET, lift
@@ -42,7 +42,7 @@ def gauges(server, model):
 
 def test_what_is_taken_up_is_seen_everywhere_alike(server, client, carrier):
     seen = client.payload(carrier)
-    assert seen.model_dump(mode="json") == server.client.get(f"/v1/models/{carrier}/payload").json()
+    assert seen.as_dict() == server.client.get(f"/v1/models/{carrier}/payload").json()
     assert (seen.frame, seen.link, seen.reason, seen.default) == ("learnt", "panda_joint7", None, None)
     (stream,) = (each for each in seen.streams if each.stream_id == CELL)
     assert (stream.state, stream.declared) == ("payload", False)

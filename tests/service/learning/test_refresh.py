@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 
 import pytest
 
-from service.foundation.states import CANCELLED, FAILED, RUNNING
+from lipserve.states import CANCELLED, FAILED, RUNNING
 from service.journal import log
 from service.learning import refresh
 from service.learning.learner.publication import Published

@@ -12,7 +12,7 @@ from sqlalchemy.orm import undefer
 
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
-from service.client.stream import StreamClient, StreamError
+from lipserve import StreamClient, StreamError
 from service.foundation.settings import Settings
 from service.journal import log
 from service.storage.database import Database, EventRow

@@ -3,8 +3,7 @@
 import pytest
 from websockets.exceptions import InvalidStatus
 
-from service.client import ApiError, Client
-from service.client.stream import StreamClient, StreamError
+from lipserve import ApiError, Client, StreamClient, StreamError
 from tests.service.data import train
 from tests.service.streams import MOTION, TAU, ask, dial, frame, hello
 

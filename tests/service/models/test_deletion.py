@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import pytest
 from sqlalchemy import select, update
 
+from lipserve.states import CANCELLED, RUNNING
 from service.foundation.errors import ConflictError, NotFoundError, UnreadableVersionError
 from service.foundation.settings import Settings
-from service.foundation.states import CANCELLED, RUNNING
 from service.journal import snapshots
 from service.learning.learner.learnt import LearntVersions
 from service.models import registry

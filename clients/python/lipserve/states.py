@@ -1,4 +1,4 @@
-"""States of a job."""
+"""States and choices as the API names them."""
 
 from __future__ import annotations
 
@@ -15,3 +15,8 @@ ACTIVE = (QUEUED, RUNNING)
 
 PartState = Literal["ok", "warning", "failed"]
 """Of a part of the service."""
+
+PromotionOption = Literal["ask", "always"]
+"""When a version answers by itself: if it does well on what was held out, or in any case."""
+Outcome = Literal["first_better", "second_better", "no_difference", "cannot_tell"]
+"""Of a comparison of two versions."""

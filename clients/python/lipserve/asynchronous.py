@@ -10,12 +10,12 @@ from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 import httpx
 
-from service.client import sending
-from service.client.call import Answer, Call, Page, bound
-from service.client.methods import POLL_SECONDS, Calls, Followed, Listed, One, looking
-from service.client.stream import AsyncStreamClient
-from service.learning.control.schema import Learning
-from service.training.schema import Job
+from lipserve import sending
+from lipserve.call import Answer, Call, Page, bound
+from lipserve.methods import POLL_SECONDS, Calls, Followed, Listed, One, looking
+from lipserve.records.jobs import Job
+from lipserve.records.learning import Learning
+from lipserve.stream import AsyncStreamClient
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -93,7 +93,7 @@ class AsyncClient(Calls, makers={One: _async, Listed: _listed, Followed: _follow
     async def set_learning(self, model: str, **options: Any) -> Learning:
         """Set how a model learns; options of `LearningOptions` by name, those left out keep their values."""
         known = await self.learning(model)
-        return await self.put_learning(model, {**known.options.model_dump(), **options})
+        return await self.put_learning(model, {**known.options.as_dict(), **options})
 
     def stream(self, model: str, **options: Any) -> AsyncStreamClient:
         """A torque stream, to be opened with `async with`; options: those of `AsyncStreamClient` but for the address

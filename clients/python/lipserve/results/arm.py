@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from service.client.results import Array, Plain, array, html_table, text_table
-from service.models import schema
+from lipserve.records import models
+from lipserve.results import Array, Plain, array, html_table, text_table
 
 LIMITS = (
     "Torque cannot tell an arm from its mirror image, nor where a frame lies along its axis.",
@@ -101,7 +101,7 @@ class Arm(Plain):
         return tables + "".join(f"<p>{each}</p>" for each in LIMITS)
 
 
-class Version(schema.Version):
+class Version(models.Version, frozen=True, kw_only=True):
     """A version as the API shows it; `arm` is what it has learnt of its arm, and `print` shows that."""
 
     @property
@@ -116,7 +116,7 @@ class Version(schema.Version):
         return title if self.arm is None else f"{title}\n\n{self.arm}"
 
 
-def read_arm(version: schema.Version) -> Arm | None:
+def read_arm(version: models.Version) -> Arm | None:
     """The arm of a version; None where its estimator has no rigid bodies."""
     parameters = version.parameters or {}
     if "inertia" not in parameters:

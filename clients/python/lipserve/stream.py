@@ -15,9 +15,8 @@ from websockets.asyncio import client as awaited
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 from websockets.sync.client import connect
 
-from service.client.sending import headers_of
-from service.foundation.settings import DEFAULT_URL
-from service.stream.exchange import (
+from lipserve.address import Address, headers_of, url_of
+from lipserve.exchange import (
     Exchange,
     StreamAnswer,
     StreamError,
@@ -51,8 +50,8 @@ class _Stream(StreamSide):
     def __init__(
         self,
         model: str,
-        url: str = DEFAULT_URL,
-        unix: Path | None = None,
+        url: str | None = None,
+        unix: Path | str | None = None,
         version: int | None = None,
         timeout: float = 10.0,
         stream_id: str | None = None,
@@ -63,11 +62,13 @@ class _Stream(StreamSide):
         payload: bool = False,
     ) -> None:
         headers = headers_of(key)
-        self.timeout, self._url, self._unix = timeout, url, unix
+        address = Address.of(url_of(url))
+        self.timeout, self._url = timeout, address.base
+        self._unix = address.unix if unix is None else Path(unix)
         self._exchange = Exchange(stream_id, first_sequence)
         asked = {"version": version, "alias": alias, "stream_id": stream_id}
         asked |= {"scale": 1 if scale else None, "payload": 1 if payload else None}
-        self._destination = destination(url, model, **asked)
+        self._destination = destination(address.base, model, **asked)
         self._options: dict[str, Any] = {
             "compression": None,
             "open_timeout": timeout,
@@ -106,13 +107,12 @@ class _Stream(StreamSide):
 class StreamClient(_Stream):
     """One stream; use it as a context manager or close it. Not to be shared between threads.
 
-    model: its name; unix: path of the service's Unix-domain socket, instead of host and port of the address; version:
-    pins one, alias: follows what that points to, else the version that serves answers; timeout: longest wait for the
-    connection, and for one answer, in s; stream_id: name of the source of the torques that are sent to learn from, None
-    where only answers are wanted; first_sequence: of the first frame: to send frames again after a lost connection,
-    take the first of them above `learnt.through`; key: API key, that of the environment variable LIPSERVE_KEY where
-    None; scale, payload: whether answers carry the factor on the half width of their intervals, and what the arm
-    carries.
+    model: its name; url, key: as of `Client`; unix: path of the service's Unix-domain socket, instead of host and port
+    of the address; version: pins one, alias: follows what that points to, else the version that serves answers;
+    timeout: longest wait for the connection, and for one answer, in s; stream_id: name of the source of the torques
+    that are sent to learn from, None where only answers are wanted; first_sequence: of the first frame: to send frames
+    again after a lost connection, take the first of them above `learnt.through`; scale, payload: whether answers carry
+    the factor on the half width of their intervals, and what the arm carries.
     Raise StreamError where the service cannot be reached or refuses.
     """
 

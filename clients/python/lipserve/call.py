@@ -10,17 +10,19 @@ import json
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import wraps
+from functools import cache, wraps
 from pathlib import Path
 from secrets import token_hex
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 from urllib.parse import quote
 
-from pydantic import BaseModel
+import msgspec
+
+from lipserve.records import Record
 
 P = ParamSpec("P")
 T = TypeVar("T")
-Record = TypeVar("Record", bound=BaseModel)
+R = TypeVar("R", bound=Record)
 
 ROUTES: dict[tuple[str, str], str] = {}
 """(method, path as in the OpenAPI document) of every route that there is a call of, and the call's name."""
@@ -120,17 +122,29 @@ def route(
     return decorate
 
 
-def record(kind: type[Record]) -> Callable[[Answer], Record]:
+class _Listed(msgspec.Struct, Generic[T]):
+    items: list[T]
+    next_cursor: str | None = None
+
+
+@cache
+def _decoder(kind: type[T]) -> msgspec.json.Decoder[T]:
+    return msgspec.json.Decoder(kind)
+
+
+def record(kind: type[R]) -> Callable[[Answer], R]:
     """Read a record of the API."""
-    return lambda answer: kind.model_validate_json(answer.body)
+    decoder = _decoder(kind)
+    return lambda answer: decoder.decode(answer.body)
 
 
-def page(kind: type[Record]) -> Callable[[Answer], Page[Record]]:
+def page(kind: type[R]) -> Callable[[Answer], Page[R]]:
     """Read one page of a list of records."""
+    decoder = _decoder(_Listed[kind])  # type: ignore[valid-type]
 
-    def read(answer: Answer) -> Page[Record]:
-        document = json.loads(answer.body)
-        return Page([kind.model_validate(item) for item in document["items"]], document.get("next_cursor"))
+    def read(answer: Answer) -> Page[R]:
+        listed: _Listed[R] = decoder.decode(answer.body)
+        return Page(listed.items, listed.next_cursor)
 
     return read
 

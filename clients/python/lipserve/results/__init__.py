@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from service.client.call import Answer
+from lipserve.call import Answer
 
 Array = NDArray[np.float64]
 Result = TypeVar("Result")

@@ -6,14 +6,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeElapsedColumn, TransferSpeedColumn
+try:
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeElapsedColumn, TransferSpeedColumn
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError("bars need Rich: pip install 'lipserve-client[progress]'", name=error.name) from error
 
-from service.foundation.states import ACTIVE
-from service.training.schema import Job
+from lipserve.records.jobs import Job
+from lipserve.states import ACTIVE
 
 if TYPE_CHECKING:  # which shows its progress with this
-    from service.client.sync import Client
+    from lipserve.sync import Client
 
 PLAIN_EVERY = 5.0
 """Seconds between two lines where the console is no terminal."""

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Unpack
 
-from service.client.call import KEY_HEADER, Call, Page, Route, given, new_key, nothing, page, record, route
-from service.client.results.series import Preview, read_preview
-from service.datasets.asking import MEDIA_TYPE_OF, SUFFIXES, Reading, query_of
-from service.datasets.schema import Dataset
-from service.robots.schema import ProfileList, Robot, RobotProfile
+from lipserve.asking import MEDIA_TYPE_OF, SUFFIXES, Reading, query_of
+from lipserve.call import KEY_HEADER, Call, Page, Route, given, new_key, nothing, page, record, route
+from lipserve.records.datasets import Dataset
+from lipserve.records.robots import Robot, RobotProfile
+from lipserve.results.series import Preview, read_preview
 
 UPLOAD_TIMEOUT = 600.0
 """Longest wait for a recording to be read and prepared, s."""
@@ -104,7 +104,7 @@ def delete_robot(at: Route, robot: str) -> Call[None]:
 @route("GET", "/v1/robots/profiles")
 def profiles(at: Route) -> Call[list[RobotProfile]]:
     """Every robot that is known by name: joints, limits, what its effort means."""
-    return at(lambda answer: ProfileList.model_validate_json(answer.body).items, names={})
+    return at(lambda answer: page(RobotProfile)(answer).items, names={})
 
 
 @route("GET", "/v1/robots/profiles/{name}")

@@ -10,12 +10,12 @@ from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 import httpx
 
-from service.client import sending
-from service.client.call import Answer, Call, Page, bound
-from service.client.methods import POLL_SECONDS, Calls, Followed, Listed, One, looking
-from service.client.stream import StreamClient
-from service.learning.control.schema import Learning
-from service.training.schema import Job
+from lipserve import sending
+from lipserve.call import Answer, Call, Page, bound
+from lipserve.methods import POLL_SECONDS, Calls, Followed, Listed, One, looking
+from lipserve.records.jobs import Job
+from lipserve.records.learning import Learning
+from lipserve.stream import StreamClient
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -52,10 +52,11 @@ def _followed(make: Callable[P, Call[T]]) -> Callable[Concatenate[Client, P], It
 class Client(Calls, makers={One: _sync, Listed: _listed, Followed: _followed}):
     """Synchronous client; use it as a context manager or close it. Threads may share it.
 
-    url: http://host:port, or unix:///path of the service's Unix-domain socket; timeout: longest wait for an answer, s;
-    key: API key, that of the environment variable LIPSERVE_KEY where None; retries: most repetitions of a call that may
-    be repeated, where the connection is lost or the service asks to come back; uploads and jobs carry an identity, so
-    that a repetition does not do them twice.
+    url: http://host:port, or unix:///path of the service's Unix-domain socket, where None that of the environment
+    variable LIPSERVE_URL, else http://127.0.0.1:8000; timeout: longest wait for an answer, s; key: API key, that of the
+    environment variable LIPSERVE_API_KEY where None; retries: most repetitions of a call that may be repeated, where
+    the connection is lost or the service asks to come back; uploads and jobs carry an identity, so that a repetition
+    does not do them twice.
     Methods raise ServiceUnreachableError where no service answers, ApiError where it refuses.
     """
 
@@ -92,7 +93,7 @@ class Client(Calls, makers={One: _sync, Listed: _listed, Followed: _followed}):
 
     def set_learning(self, model: str, **options: Any) -> Learning:
         """Set how a model learns; options of `LearningOptions` by name, those left out keep their values."""
-        return self.put_learning(model, {**self.learning(model).options.model_dump(), **options})
+        return self.put_learning(model, {**self.learning(model).options.as_dict(), **options})
 
     def stream(self, model: str, **options: Any) -> StreamClient:
         """Open a torque stream; options: those of `StreamClient` but for the address and the key."""

@@ -8,22 +8,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from service.client.call import Call, Page, Route, given, page, record, route
-from service.client.results.series import Live, read_live
-from service.learning.control.payload_schema import Payloads
-from service.learning.control.schema import (
-    Alarm,
-    Decided,
-    Learning,
-    Observation,
-    ObservationDetail,
-    Quality,
-    Replayed,
-    RolledBack,
-    Unlearnt,
-)
-from service.learning.schema import ObservationResponse
-from service.training.schema import Job
+from lipserve.call import Call, Page, Route, given, page, record, route
+from lipserve.records.jobs import Job
+from lipserve.records.learning import Alarm, Decided, Learning, Quality, RolledBack
+from lipserve.records.observations import Observation, ObservationDetail, ObservationResponse, Replayed, Unlearnt
+from lipserve.records.payloads import Payloads
+from lipserve.results.series import Live, read_live
 
 BATCH = "/v1/models/{model}/observations/{stream_id}/{sequence}"
 PAYLOAD = "/v1/models/{model}/payload"

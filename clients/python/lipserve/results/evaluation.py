@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.client.results import Array, Plain, figure, html_table, reading, text_table
-from service.inference.schema import Outcome
+from lipserve.results import Array, Plain, figure, html_table, reading, text_table
+from lipserve.states import Outcome
 
 
 @dataclass(frozen=True, eq=False)

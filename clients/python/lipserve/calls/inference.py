@@ -10,12 +10,11 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from service.client.call import Answer, Call, Route, document, given, record, route
-from service.client.results import Array, array
-from service.client.results.evaluation import Comparison, Evaluation, read_comparison, read_evaluation
-from service.client.results.series import Prediction, Trace, read_prediction, read_trace
-from service.oip.schema import ModelMetadata, ModelReady, ServerLive, ServerMetadata, ServerReady
-from service.web.observability.readiness import Live, Ready
+from lipserve.call import Answer, Call, Route, document, given, record, route
+from lipserve.records.server import Live, ModelMetadata, ModelReady, Ready, ServerLive, ServerMetadata, ServerReady
+from lipserve.results import Array, array
+from lipserve.results.evaluation import Comparison, Evaluation, read_comparison, read_evaluation
+from lipserve.results.series import Prediction, Trace, read_prediction, read_trace
 
 
 @route("POST", "/v1/models/{model}/predict", repeatable=True)

@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from service.client.call import KEY_HEADER, Answer, Call, Page, Route, given, new_key, nothing, page, record, route
-from service.client.results.arm import Version
-from service.models.schema import Alias, AliasList, Model
-from service.training.schema import Job, PromotionOption
+from lipserve.call import KEY_HEADER, Answer, Call, Page, Route, given, new_key, nothing, page, record, route
+from lipserve.records.jobs import Job
+from lipserve.records.models import Alias, Model
+from lipserve.results.arm import Version
+from lipserve.states import PromotionOption
 
 
 @route("POST", "/v1/jobs", repeatable=True)
@@ -114,7 +115,7 @@ def delete_version(at: Route, model: str, version: int) -> Call[None]:
 @route("GET", "/v1/models/{model}/aliases")
 def aliases(at: Route, model: str) -> Call[list[Alias]]:
     """Every alias of a model, `serving` first."""
-    return at(lambda answer: AliasList.model_validate_json(answer.body).items, names={"model": model})
+    return at(lambda answer: page(Alias)(answer).items, names={"model": model})
 
 
 @route("PUT", "/v1/models/{model}/aliases/{alias}")

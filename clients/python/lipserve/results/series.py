@@ -10,9 +10,9 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
-from service.client.call import Answer
-from service.client.results import Array, Plain, reading, shape_arrays
-from service.learning.control.schema import LiveLost, LiveStatus
+from lipserve.call import Answer, record
+from lipserve.records.live import LiveLost, LiveStatus
+from lipserve.results import Array, Plain, reading, shape_arrays
 
 
 def interval(
@@ -200,6 +200,7 @@ Live = LiveRows | LiveStatus | LiveLost | None
 
 
 _read_rows = reading(LiveRows)
+_read_status, _read_lost = record(LiveStatus), record(LiveLost)
 
 
 def read_live(answer: Answer) -> Live:
@@ -207,7 +208,7 @@ def read_live(answer: Answer) -> Live:
     if answer.event == "rows":
         return _read_rows(answer)
     if answer.event == "status":
-        return LiveStatus.model_validate_json(answer.body)
+        return _read_status(answer)
     if answer.event == "lost":
-        return LiveLost.model_validate_json(answer.body)
+        return _read_lost(answer)
     return None

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from websockets.exceptions import ConnectionClosed
 
-from service.stream.frames import (
+from lipserve.frames import (
     ANSWER,
     ASK_EXTERNAL,
     ASK_LEARN,

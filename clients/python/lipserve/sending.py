@@ -1,4 +1,4 @@
-"""What both clients share of sending a call: errors, addresses, requests, files, server-sent events, attempts.
+"""What both clients share of sending a call: errors, requests, files, server-sent events, attempts.
 
 A lost connection, and answers 429 and 503 that say when to come back, are no reason to give up at once; but only for
 calls that do the same however often they arrive. A service that has answered this client before is waited for while it
@@ -8,7 +8,6 @@ starts again; one that never has is told to be missing at once.
 from __future__ import annotations
 
 import json
-import os
 import random
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -19,7 +18,7 @@ from typing import Any, BinaryIO
 
 import httpx
 
-from service.client.call import Answer, Call
+from lipserve.call import Answer, Call
 
 
 class ServiceUnreachableError(ConnectionError):
@@ -51,42 +50,8 @@ def refused(status: int, body: bytes, retry_after: float | None = None) -> ApiEr
         return ApiError(status, "http_error", body[:500].decode(errors="replace"), [], retry_after)
 
 
-VARIABLE = "LIPSERVE_KEY"
-"""Environment variable that clients take the key from."""
-UNIX = "unix://"
-NO_HOST = "http://localhost"
-"""What HTTP says the host is where a socket leads to the service."""
 CHUNK = 1 << 18
 """Bytes of a file that are sent together."""
-
-
-def headers_of(key: str | None) -> dict[str, str]:
-    """Headers of a client's requests with its key, where None the one of the environment, or none at all.
-
-    Raise ValueError, which does not repeat it, where it cannot be a key.
-    """
-    given = (os.environ.get(VARIABLE, "") if key is None else key).strip()
-    if not given.isascii() or not given.isprintable() or " " in given:
-        raise ValueError(f"key (or {VARIABLE}) holds other characters than keys do, expected lip_…")
-    return {"Authorization": f"Bearer {given}"} if given else {}
-
-
-@dataclass(frozen=True)
-class Address:
-    """Where a service is. base: of its routes; unix: path of its Unix-domain socket, None where a host is named."""
-
-    base: str
-    unix: Path | None
-
-    @classmethod
-    def of(cls, url: str) -> Address:
-        """Read http://host:port or unix:///path; raise ValueError."""
-        if not url.startswith(UNIX):
-            return cls(url, None)
-        path = url.removeprefix(UNIX)
-        if not path.startswith("/"):
-            raise ValueError(f"url is {url!r}, expected unix:// and an absolute path, as unix:///run/lipserve.sock")
-        return cls(NO_HOST, Path(path))
 
 
 def request_of(call: Call[Any]) -> dict[str, Any]:
@@ -114,7 +79,7 @@ def content_of(call: Call[Any]) -> Iterator[Iterator[bytes] | None]:
         file = stack.enter_context(call.file.open("rb"))
         content: Iterator[bytes] = iter(partial(file.read, CHUNK), b"")
         if call.shown is not None:
-            from service.client.progress import upload_bar  # noqa: PLC0415 - rich, for those who look
+            from lipserve.progress import upload_bar  # noqa: PLC0415 - rich, for those who look
 
             content = stack.enter_context(upload_bar(call.shown, call.file.stat().st_size))(content)
         yield content

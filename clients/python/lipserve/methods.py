@@ -6,16 +6,16 @@ from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar, overload
 
-from service.client import calls
-from service.client.call import Call, Page
-from service.client.sending import RETRIES, Address, Reach, headers_of
-from service.foundation.settings import DEFAULT_URL
-from service.foundation.states import ACTIVE
-from service.training.schema import Job
+from lipserve import calls
+from lipserve.address import Address, headers_of, url_of
+from lipserve.call import Call, Page
+from lipserve.records.jobs import Job
+from lipserve.sending import RETRIES, Reach
+from lipserve.states import ACTIVE
 
 if TYPE_CHECKING:
-    from service.client.asynchronous import AsyncClient
-    from service.client.sync import Client
+    from lipserve.asynchronous import AsyncClient
+    from lipserve.sync import Client
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -74,10 +74,11 @@ class Calls:
                 setattr(cls, name, makers[type(member)](member.make))
 
     def __init__(
-        self, url: str = DEFAULT_URL, timeout: float = 120.0, key: str | None = None, retries: int = RETRIES
+        self, url: str | None = None, timeout: float = 120.0, key: str | None = None, retries: int = RETRIES
     ) -> None:
-        self.url, self._key, self._address = url, key, Address.of(url)
-        self._reach = Reach(url, retries)
+        self.url = url_of(url)
+        self._key, self._address = key, Address.of(self.url)
+        self._reach = Reach(self.url, retries)
         uds = None if self._address.unix is None else str(self._address.unix)
         self._http = self._connected(uds, base_url=self._address.base, timeout=timeout, headers=headers_of(key))
 
@@ -157,7 +158,7 @@ def looking(on_progress: Callable[[Job], None] | None, progress: bool) -> Iterat
     with ExitStack() as stack:
         looks = [] if on_progress is None else [on_progress]
         if progress:
-            from service.client.progress import job_bar  # noqa: PLC0415 - rich, for those who look
+            from lipserve.progress import job_bar  # noqa: PLC0415 - rich, for those who look
 
             looks.append(stack.enter_context(job_bar()))
 
