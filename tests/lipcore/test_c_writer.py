@@ -272,3 +272,21 @@ def test_a_covariance_that_rounding_has_spoilt_is_refused() -> None:
     spoilt = replace(model, posterior=replace(model.posterior, root=1.001 * model.posterior.root))
     with pytest.raises(ValueError, match="not positive definite"):
         c_files(spoilt, ORIGIN)
+
+
+@needs_compiler
+@pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler, c++, which is not installed")
+def test_the_example_controls_with_it(tmp_path: Path) -> None:
+    model = load(PANDA)
+    compiled(c_files(model, ORIGIN), tmp_path)
+    subprocess.run(["cc", *FLAGS, "-c", SOURCE], cwd=tmp_path, check=True)
+    example = Path(__file__).parents[2] / "docs/examples/feedforward_controller.cpp"
+    strict = ("-std=c++17", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2", "-I.")
+    command = ["c++", *strict, str(example), "lipserve_model.o", "-o", "controller"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    limits = np.array([model.training_range["q"][end] for end in ("min", "max")])
+    for middle, used in ((limits.mean(0), 20), (limits[1] + 1.0, 0)):
+        ran = subprocess.run(
+            ["./controller", "20", *map(str, middle)], cwd=tmp_path, check=True, capture_output=True, text=True
+        )
+        assert ran.stdout.startswith(f"used {used} of 20, the longest cycle took")
