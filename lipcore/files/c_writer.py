@@ -174,8 +174,10 @@ def _arm_table(geometry: Geometry, step: Array, bodies: Array, change: Array, ow
         at += count
     shift = (turn @ along[..., None])[..., 0]
     turned = [np.stack([moved(axes[j].T, np.zeros(3), each[j]) for j in range(n)]) for each in (bodies, change)]
-    numbers = (turn.reshape(n, 9), place, tilt, shift, *turned, own)
-    return "{\n" + ",\n".join(map(_braced, (geometry.gravity, *numbers))) + "}"
+    names = ("gravity", "turn", "place", "tilt", "shift", "body", "change", "own")
+    numbers = (geometry.gravity, turn.reshape(n, 9), place, tilt, shift, *turned, own)
+    fields = [f".{name} = {_braced(value)}" for name, value in zip(names, numbers, strict=True)]
+    return "{\n" + ",\n".join(fields) + "}"
 
 
 def _panels(root: Array) -> Array:
@@ -221,7 +223,7 @@ def _braced(values: Any) -> str:
     texts, lines, line = [repr(float(each)) for each in values], list[str](), ""
     for text in texts:
         if len(line) + len(text) > LINE:
-            lines.append(line)
+            lines.append(line.rstrip())
             line = ""
         line += f"{text}, "
     return "{" + "\n".join([*lines, line]).rstrip(", ") + "}"
