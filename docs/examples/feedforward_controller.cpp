@@ -1,8 +1,8 @@
-// A controller in the manner of ros2_control whose feedforward is an exported model: no network, no allocation, no wait.
+// A controller as of ros2_control whose feedforward is an exported model: no network, no allocation, no wait.
 //
 //     lipserve models export panda-sim --c .
 //     cc -O2 -c lipserve_model.c
-//     c++ -std=c++17 -O2 feedforward_controller.cpp lipserve_model.o -o feedforward_controller && ./feedforward_controller
+//     c++ -std=c++17 -O2 feedforward_controller.cpp lipserve_model.o -o controller && ./controller
 //
 // In ROS 2 the class derives from controller_interface::ControllerInterface: on_configure and update are its methods of
 // these names, references and commands its interfaces. Nothing here stands between a wrong torque and your hardware:
