@@ -16,6 +16,7 @@ from rich.console import Console
 
 from benchmarks import facts
 from benchmarks.clients import BadAnswerError
+from benchmarks.exported import running as exported_running
 from benchmarks.ingest import running as ingest_running
 from benchmarks.ingest.recording import FORMATS
 from benchmarks.latency import table
@@ -253,6 +254,32 @@ def scale(
     if json_file is not None:
         results.write(json_file)
     _tell(list(results.grids()), results.notes(), results.targets(), console, markdown, strict)
+
+
+@app.command()
+def exported(
+    folder: Annotated[
+        Path, typer.Option(exists=True, file_okay=False, help="Of a saved model of rigid bodies.")
+    ] = exported_running.SHIPPED,
+    calls: Annotated[int, typer.Option(min=20, help="Of each function.")] = 1_000_000,
+    flags: Annotated[str, typer.Option(help="Of cc, with spaces.")] = "-O2",
+    eigen: Annotated[
+        Path | None,
+        typer.Option(exists=True, file_okay=False, help="Headers of Eigen: times Pinocchio in C++, not from Python."),
+    ] = None,
+    seed: Seed = 0,
+    json_file: JsonFile = None,
+    markdown: Markdown = None,
+    strict: Strict = False,
+) -> None:
+    """Time a model as C beside Pinocchio, and compare its numbers with the model's on random states."""
+    console = _begin()
+    options = exported_running.Options(folder.absolute(), calls, flags=tuple(flags.split()), eigen=eigen, seed=seed)
+    results = exported_running.run(options, console)
+    found = exported_running.targets(results)
+    if json_file is not None:
+        results.write(json_file, _judged(found))
+    _tell(exported_running.grids(results), [], found, console, markdown, strict)
 
 
 def _begin() -> Console:

@@ -114,7 +114,7 @@ def open_bed(home: Path, source: Source, console: Console) -> Iterator[Bed]:
                     _train(client, home, dataset, robot, source, console), robot, samples, source.stream
                 )
             else:
-                workload = Workload.load(source.folder, _simulator(source.folder), None, source.stream)
+                workload = Workload.load(source.folder, simulator(source.folder), None, source.stream)
             yield Bed(client, ("127.0.0.1", service.port), unix, dataset, workload, service.process.pid)
     finally:
         service.stop()
@@ -162,7 +162,7 @@ def _unseen(stream: Stream) -> Stream:
     return replace(stream, n_sinusoids=QUERY_SINUSOIDS)
 
 
-def _simulator(folder: Path) -> Robot | None:
+def simulator(folder: Path) -> Robot | None:
     """The robot whose joints the model has, where it can be simulated."""
     names = tuple(json.loads((folder / "manifest.json").read_bytes())["joint_names"])
     found = next((name for name, source in ROBOTS.items() if source.free == names), None)

@@ -6,7 +6,7 @@ pyproject.toml, checks it):
     warm_up                                 above all: trains one of each, so that all is compiled
     training, files, online, excitation     on one floor; none of them knows another:
         training     samples in, a model out; `auto` chooses the estimator
-        files        a model as files: manifest, tensors, URDF, checked when read
+        files        a model as files: manifest, tensors, checked when read; as URDF and as C
         online       learning from a live stream: gates, records, changes, what is learnt and taken back
         excitation   the motion that tells a model most
     arm          the rigid arm learnt from torque alone: geometry, masses, friction (sections 6 and 7)

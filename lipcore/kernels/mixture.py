@@ -26,17 +26,17 @@ class MixtureKernel(LinearKernel):
     (K,), are independent with variance one, or a larger one where a few arms stand for many.
 
     arms: the first one and the others, K + 1; order: (n,), the data's joint at each place of the chain; variance: of
-    the weights.
+    the weights. mixing: L, (K, K).
     """
 
     def __init__(self, arms: Sequence[Alternative], order: NDArray[np.int64], variance: float = 1.0) -> None:
         self.n_joints, self.size, self._variance = len(order), len(arms) - 1, variance
         self._order = order.astype(np.int64)
         shares = np.array([each.probability for each in arms[1:]])
-        mixing = np.ascontiguousarray(np.linalg.cholesky(np.diag(shares) - np.outer(shares, shares)))
-        self._mean = torch.from_numpy(np.linalg.solve(mixing, shares))
+        self.mixing = np.ascontiguousarray(np.linalg.cholesky(np.diag(shares) - np.outer(shares, shares)))
+        self._mean = torch.from_numpy(np.linalg.solve(self.mixing, shares))
         self._arms = (
-            mixing,
+            self.mixing,
             np.stack([each.geometry.constants for each in arms]),
             arms[0].geometry.gravity,
             np.stack([each.parameters for each in arms]),

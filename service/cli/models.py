@@ -160,14 +160,32 @@ def compare(
 @app.command("export")
 def export_(
     model: Model,
-    path: Annotated[Path, typer.Argument(help="Archive to write, .tar.", dir_okay=False)],
+    path: Annotated[Path | None, typer.Argument(help="Archive to write, .tar.", dir_okay=False)] = None,
+    c: Annotated[
+        Path | None,
+        typer.Option("--c", help="Folder for lipserve_model.c and .h instead, for control loops.", file_okay=False),
+    ] = None,
     version: Version = None,
     alias: Alias = None,
     learnt: Annotated[bool, typer.Option(help="With what it has learnt online; else as it was trained.")] = True,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
-    """Write a version as an archive that another service imports."""
+    """Write a version as an archive that another service imports, or with --c as C99 for hard real time.
+
+    The latter has torque and standard deviation of a model of rigid bodies, also with a payload, without dependencies
+    or allocation: `cc -O2 -c lipserve_model.c`; lipserve_model.h says how to use it.
+    """
+    if (path is None) == (c is None):
+        raise CommandError("path and --c are " + ("missing" if c is None else "both given") + ", expected one of them")
+    if c is not None:
+        with connected(url) as client:
+            client.export(model, c, version, alias, learnt, format="c")
+        source, header = c / "lipserve_model.c", c / "lipserve_model.h"
+        text = f"{source} and {header}: {source.stat().st_size:,} bytes; `cc -O2 -c {source}` compiles it"
+        print_result({"source": source, "header": header}, as_json, text)
+        return
+    assert path is not None
     with connected(url) as client:
         written = client.export(model, path, version, alias, learnt)
     size = written.stat().st_size

@@ -1,4 +1,5 @@
-"""A version for use elsewhere: an archive with its files, their checksums and what made them, or its arm as a URDF.
+"""A version for use elsewhere: an archive with its files, their checksums and what made them, as C, or its arm as a
+URDF.
 
 An archive is a tar file of a few plain files, by exact name and of limited size. Of `tarfile` only what makes and reads
 a single header is used: the rest follows links, sparse files, extended headers and numbers of any size, of which an
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from lipcore.files import persistence
+from lipcore.files.c_writer import SUPPORTED, Origin, c_files
 from lipcore.files.manifest import MANIFEST, ROBOT, TENSORS, ModelFormatError
 from lipcore.files.urdf_writer import urdf_of_parameters
 from service.foundation.errors import InvalidRequestError, UnreadableVersionError, invalid_request, problem
@@ -107,20 +109,34 @@ class Exported:
     pieces: Iterator[bytes]
 
 
-def export(loaded: LoadedModels, model: str, version: int | None, alias: str | None, learnt: bool) -> Exported:
+def export(
+    loaded: LoadedModels, model: str, version: int | None, alias: str | None, learnt: bool, as_c: bool = False
+) -> Exported:
     """Archive a version, the one that serves where none is named. Not for the event loop.
 
-    learnt: with what it has learnt online, else as trained. Nothing is sent before all of it has been checked. Raise
-    NotFoundError, InvalidRequestError for both a version and an alias, UnreadableVersionError for damaged files,
-    StorageFullError.
+    learnt: with what it has learnt online, else as trained; as_c: as the source and header of `lipcore.files.c_writer`.
+    Nothing is sent before all of it has been checked. Raise NotFoundError, InvalidRequestError for both a version and
+    an alias and for what is not written as C, UnreadableVersionError for damaged files, StorageFullError.
     """
     row = _find(loaded, model, version, alias)
     try:
         files, revision = _files(loaded, row, learnt)
+        decoded = persistence.decode(files) if as_c else None
     except ModelFormatError as error:
         registry.find(loaded.database, row.model, row.version)  # it may have been deleted meanwhile
         message = f"version {row.version} of model {row.model!r} cannot be exported: {error}"
         raise UnreadableVersionError(message) from error
+    suffix = f"-r{revision}" if revision else ""
+    if decoded is not None:
+        origin = Origin(row.model, row.version, revision, persistence.sha256(files[TENSORS]))
+        try:
+            written = c_files(decoded, origin)
+        except ValueError as error:
+            item = problem("version", row.version, f"a version of estimator {' or '.join(SUPPORTED)}")
+            message = f"version {row.version} of model {row.model!r} cannot be written as C: {error}"
+            raise InvalidRequestError(message, [item]) from error
+        file = _packed(loaded, {name: text.encode() for name, text in written.items()})
+        return Exported(f"{row.model}-v{row.version}{suffix}-c.tar", file.tell(), _pieces(file))
     about = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -135,7 +151,6 @@ def export(loaded: LoadedModels, model: str, version: int | None, alias: str | N
     files = {EXPORT: _json(about), **files}
     sums = {name: persistence.sha256(content) for name, content in files.items()}
     file = _packed(loaded, {CHECKSUMS: _json(sums), **files})
-    suffix = f"-r{revision}" if revision else ""
     return Exported(f"{row.model}-v{row.version}{suffix}.tar", file.tell(), _pieces(file))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from anyio import to_thread
 from fastapi import APIRouter, Path, Query, Request, Response, status
@@ -80,9 +80,17 @@ async def export_version(
     version: WhichVersion = None,
     alias: WhichAlias = None,
     learnt: Annotated[bool, Query(description="With what it has learnt online; false: as it was trained")] = True,
+    format: Annotated[  # noqa: A002 - the field's own name
+        Literal["archive", "c"], Query(description="`c`: C99 for control loops, of `rigid-body`; others answer 422")
+    ] = "archive",
 ) -> StreamingResponse:
-    """One archive with all that another service needs to answer alike; `export.json` in it says what it holds."""
-    archived = await to_thread.run_sync(archive.export, loaded, model, version, alias, learnt, limiter=turns)
+    """One archive with all that another service needs to answer alike; `export.json` in it says what it holds.
+
+    With `format=c` an archive of `lipserve_model.c` and `lipserve_model.h`: torque and its standard deviation in C99,
+    without dependencies or allocation. The header says how to use them.
+    """
+    as_c = format == "c"
+    archived = await to_thread.run_sync(archive.export, loaded, model, version, alias, learnt, as_c, limiter=turns)
     headers = {"Content-Length": str(archived.size), "Content-Disposition": f'attachment; filename="{archived.name}"'}
     return StreamingResponse(archived.pieces, media_type=archive.MEDIA_TYPE, headers=headers)
 

@@ -78,6 +78,9 @@ def test_an_arm_is_drawn_and_moved(visitor: Visitor, arm: str) -> None:
     with page.expect_download() as saved:
         page.get_by_role("button", name="Save as URDF").click()
     assert saved.value.suggested_filename == "drawn-v1.urdf"
+    with page.expect_download() as saved:
+        page.get_by_role("button", name="Save as C").click()
+    assert saved.value.suggested_filename == "drawn-v1-c.tar"
     assert audit(page) == []
     visitor.shot("arm", height=1500)
     # the same window made narrow: another one would compile all that draws in 3-D once more

@@ -56,6 +56,20 @@ def test_an_archive_is_written_read_and_deleted(asked, arm, refused, tmp_path):
     assert "no model 'cli-imported'" in refused("models", "show", "cli-imported")
 
 
+def test_a_version_is_written_as_c(asked, refused, arm, robot_arm, tmp_path):
+    folder = tmp_path / "made" / "c"
+    written = asked("models", "export", robot_arm, "--c", folder, "--version", 1, "--json")
+    assert sorted(written.values()) == sorted(map(str, folder.iterdir()))
+    assert f'#define LIPSERVE_MODEL "{robot_arm}"' in (folder / "lipserve_model.h").read_text()
+    assert "cc -O2 -c" in asked("models", "export", robot_arm, "--c", folder, "--version", 1)
+    assert "estimator is 'se', expected one of rigid-body" in refused(
+        "models", "export", arm[0], "--c", tmp_path / "none", "--version", 1
+    )
+    assert not (tmp_path / "none").exists()
+    assert "both given, expected one of them" in refused("models", "export", robot_arm, "x.tar", "--c", folder)
+    assert "missing, expected one of them" in refused("models", "export", robot_arm)
+
+
 def test_what_a_version_has_learnt_of_its_arm_is_shown(asked, refused, robot_arm):
     text = asked("models", "show", robot_arm, "--version", 1)
     assert f"careful: {WARNING}" in text

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import tarfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from lipserve.call import KEY_HEADER, Answer, Call, Page, Route, given, new_key, nothing, page, record, route
 from lipserve.records.jobs import Job
@@ -80,6 +82,8 @@ def retry(at: Route, job: str, *, idempotency_key: str | None = None) -> Call[Jo
 
 ARCHIVE_TIMEOUT = 600.0
 """Longest wait for an archive to be packed or checked, s."""
+C_FILES = ("lipserve_model.c", "lipserve_model.h")
+"""What a version as C is."""
 
 
 @route("GET", "/v1/models")
@@ -139,18 +143,34 @@ def rollback_alias(at: Route, model: str, alias: str) -> Call[Alias]:
 
 @route("GET", "/v1/models/{model}/export")
 def export(
-    at: Route, model: str, path: Path | str, version: int | None = None, alias: str | None = None, learnt: bool = True
+    at: Route,
+    model: str,
+    path: Path | str,
+    version: int | None = None,
+    alias: str | None = None,
+    learnt: bool = True,
+    format: Literal["archive", "c"] = "archive",  # noqa: A002 - the API's own name
 ) -> Call[Path]:
     """Write a version as an archive to `path`, whole or not at all, and return it; see `import_model`.
 
-    The version that serves, unless one is named. learnt: with what it has learnt online, else as it was trained.
+    The version that serves, unless one is named. learnt: with what it has learnt online, else as it was trained;
+    format: `c` writes `lipserve_model.c` and `lipserve_model.h` to the folder `path`, for a model of rigid bodies.
     """
     path = Path(path)
 
     def read(answer: Answer) -> Path:
+        if format == "c":
+            path.mkdir(parents=True, exist_ok=True)
+            with tarfile.open(fileobj=io.BytesIO(answer.body)) as archive:
+                for name in C_FILES:
+                    content = archive.extractfile(name)
+                    assert content is not None  # a plain file
+                    (path / name).write_bytes(content.read())
         return path
 
     params = given(version=version, alias=alias) | {"learnt": learnt}
+    if format == "c":
+        return at(read, names={"model": model}, params={**params, "format": format}, timeout=ARCHIVE_TIMEOUT)
     return at(read, names={"model": model}, params=params, save_to=path, timeout=ARCHIVE_TIMEOUT)
 
 

@@ -6,7 +6,7 @@ import { button, card, empty } from "../../ui.js";
 import { CANNOT, drawable, drawing, LEGEND } from "../arm/drawing.js";
 import { middle } from "../arm/kinematics.js";
 import { jointTable, massTable } from "../arm/tables.js";
-import { saveUrdf } from "./export.js";
+import { saveC, saveUrdf } from "./export.js";
 
 const STEPS = 200;
 const DEGREES = 180 / Math.PI;
@@ -29,7 +29,12 @@ export async function arm(view, { name, version }, { signal }) {
       figure,
       h("p", { class: "hint" }, `${CANNOT} ${LEGEND}${upturned(parameters.geometry.gravity)}`),
       posture,
-      h("div", { class: "actions" }, button("Save as URDF", () => saveUrdf(name, version.version))),
+      h(
+        "div",
+        { class: "actions" },
+        button("Save as URDF", () => saveUrdf(name, version.version)),
+        version.estimator === "rigid-body" ? button("Save as C", () => saveC(name, version.version)) : null,
+      ),
     ),
     card("In numbers", jointTable(version), massTable(version), h("p", { class: "hint" }, `Masses are the physically possible ones nearest to what was learnt${off(parameters.inertia)}. All as trained, without what was learnt online.`)),
   );

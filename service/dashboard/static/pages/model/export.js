@@ -1,4 +1,4 @@
-// A version as an archive, and its arm as a URDF: fetched with the key where one is needed and handed to the browser as a file.
+// A version as an archive or as C, and its arm as a URDF: fetched with the key where one is needed and handed to the browser as a file.
 
 import { ApiError } from "../../api.js";
 import { h } from "../../dom.js";
@@ -14,9 +14,14 @@ export function saveUrdf(name, version) {
   return save(name, version, "urdf", "urdf");
 }
 
-async function save(name, version, what, ending) {
+/** Save a version as C99, in an archive of two files. */
+export function saveC(name, version) {
+  return save(name, version, "export", "tar", "&format=c");
+}
+
+async function save(name, version, what, ending, more = "") {
   const headers = key() ? { authorization: `Bearer ${key()}` } : {};
-  const answer = await fetch(`/v1/models/${encodeURIComponent(name)}/${what}?version=${version}`, { headers });
+  const answer = await fetch(`/v1/models/${encodeURIComponent(name)}/${what}?version=${version}${more}`, { headers });
   if (!answer.ok) {
     const said = (await answer.json()).error;
     throw new ApiError(answer.status, said.code, said.message, said.detail);

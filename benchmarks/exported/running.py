@@ -1,0 +1,156 @@
+"""Write a model as C, compile it with this machine's `cc`, time it, and compare its numbers with the model's."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from benchmarks import facts
+from benchmarks.latency.baselines import rnea
+from benchmarks.latency.table import Grid, promises
+from benchmarks.latency.targets import Target
+from benchmarks.timing import Timing, measure
+from benchmarks.workload import BenchError, simulator
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Array
+from lipcore.files.c_weights import Learnt
+from lipcore.files.c_writer import SOURCE, Origin, c_files
+from lipcore.files.persistence import load
+from lipcore.robots.library import Robot, pinocchio
+
+HERE = Path(__file__).parent
+SHIPPED = HERE.parents[1] / "models/panda-sim"
+EXACT = 2000
+"""Queries whose standard deviation is also computed without rounding."""
+PINOCCHIO = ("BOOST_MPL_LIMIT_LIST_SIZE=30", "BOOST_MPL_CFG_NO_PREPROCESSED_HEADERS")
+"""What Pinocchio's own CMake files define."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """folder: of the model; calls: of each function; queries: random states; flags: of the compiler; eigen: folder of
+    Eigen's headers, to time Pinocchio in C++, in Python where None; seed: of the states."""
+
+    folder: Path
+    calls: int = 1_000_000
+    queries: int = 100_000
+    flags: tuple[str, ...] = ("-O2",)
+    eigen: Path | None = None
+    seed: int = 0
+
+
+@dataclass
+class Results:
+    """Everything that was measured. timings: µs by subject; sizes: bytes by file; deviations: relative, by what."""
+
+    machine: dict[str, str]
+    timings: dict[str, Timing] = field(default_factory=dict)
+    sizes: dict[str, int] = field(default_factory=dict)
+    deviations: dict[str, float] = field(default_factory=dict)
+
+    def write(self, path: Path, promised: list[dict[str, Any]]) -> None:
+        """Write all figures as JSON."""
+        path.write_text(json.dumps({**asdict(self), "targets": promised}, indent=2) + "\n")
+
+
+def run(options: Options, console: Console) -> Results:
+    """Measure one model; raise BenchError where something does not compile."""
+    model, results = load(options.folder), Results(facts.machine())
+    draw, limits = np.random.default_rng(options.seed).uniform, model.training_range
+    size = options.queries, model.n_joints
+    motion = np.stack([draw(limits[name]["min"], limits[name]["max"], size) for name in ("q", "dq", "ddq")], axis=1)
+    with tempfile.TemporaryDirectory(prefix="lipserve-bench-") as home:
+        folder = Path(home)
+        for name, text in c_files(model, Origin(options.folder.name, 1, 0, "")).items():
+            (folder / name).write_text(text)
+        motion.tofile(folder / "queries")
+        command = ["cc", "-std=c99", *options.flags, f"-I{folder}", str(HERE / "timing.c"), str(folder / SOURCE)]
+        _do([*command, "-o", str(folder / "timing"), "-lm"], folder)
+        _do(["cc", "-std=c99", *options.flags, "-c", SOURCE, "-o", "model.o"], folder)
+        results.sizes = {path.name: path.stat().st_size for path in sorted(folder.glob("*model.*"))}
+        calls = str(options.calls)
+        for subject in ("nothing", "mean", "std"):
+            console.print(f"{subject}: {options.calls:,} calls", highlight=False)
+            _do([str(folder / "timing"), subject, calls, "queries", "times", "answers"], folder)
+            results.timings[subject] = Timing.of(np.fromfile(folder / "times", np.int64))
+        answers = np.fromfile(folder / "answers").reshape(-1, 2, model.n_joints)
+        robot = simulator(options.folder)
+        if robot is not None and options.eigen is not None:
+            console.print("Pinocchio in C++: it takes half a minute to compile", highlight=False)
+            results.timings["Pinocchio's rnea, C++"] = _in_cpp(robot, options, motion, folder)
+        elif robot is not None:
+            times = measure(rnea(robot, motion[:1000]), options.calls // 10)
+            results.timings["Pinocchio's rnea, called from Python"] = Timing.of(times)
+    q, dq, ddq = (np.ascontiguousarray(part) for part in motion.transpose(1, 0, 2))
+    expected, learnt = model.predict(q, dq, ddq), Learnt.of(model)
+    few = Motion.from_arrays(q[:EXACT], dq[:EXACT], ddq[:EXACT])
+    variance = learnt.variance(learnt.features(few, learnt.arm)) + model.posterior.misfit.variance(few).numpy()
+    exact = np.sqrt(np.maximum(variance, model.posterior.floor.numpy()))
+    results.deviations = {
+        # where a torque passes through zero nothing is left of its digits
+        "tau, of the service's or of tau_std": _relative(answers[:, 0], expected.tau, expected.tau_std),
+        "tau_std, of the service's": _relative(answers[:, 1], expected.tau_std, 0.0),
+        f"tau_std, of that without the service's rounding ({EXACT} states)": _relative(answers[:EXACT, 1], exact, 0.0),
+    }
+    return results
+
+
+def grids(results: Results) -> list[Grid]:
+    """The tables."""
+    rows = [
+        (name, *(f"{value:.2f}" for value in (each.p50, each.p99, each.p999, each.largest)), f"{each.count:,}")
+        for name, each in results.timings.items()
+    ]
+    return [
+        Grid("machine", ("", ""), list(results.machine.items()), texts=True),
+        Grid("µs a call, the clock's own (nothing) included", ("", "p50", "p99", "p99.9", "largest", "calls"), rows),
+        Grid("bytes", ("", ""), [(name, f"{size:,}") for name, size in results.sizes.items()]),
+        Grid("largest relative deviation", ("", ""), [(k, f"{v:.1e}") for k, v in results.deviations.items()]),
+        replace(promises(targets(results)), columns=("", "promised", "measured", "")),
+    ]
+
+
+def targets(results: Results) -> list[Target]:
+    """What is promised of an arm of seven joints."""
+    mean, std = results.timings["mean"], results.timings["std"]
+    tau, _, exact = results.deviations.values()
+    return [
+        Target("torque: p50", mean.p50, "µs", "≤", 2),
+        Target("torque and its standard deviation: p50", std.p50, "µs", "≤", 10),
+        Target("torque: largest relative deviation", tau, "", "≤", 1e-9),
+        Target("standard deviation: the same, of exact arithmetic", exact, "", "≤", 1e-9),
+    ]
+
+
+def _in_cpp(robot: Robot, options: Options, motion: Array, folder: Path) -> Timing:
+    prefix = Path(str(pinocchio().__file__)).parents[4]  # cmeel.prefix, where the wheel has its headers
+    robot.model.saveToText(str(folder / "robot"))
+    np.array([np.concatenate([robot.configuration(q), dq, ddq]) for q, dq, ddq in motion]).tofile(folder / "motions")
+    defined = [f"-D{each}" for each in (*PINOCCHIO, "PINOCCHIO_ENABLE_TEMPLATE_INSTANTIATION")]
+    command = ["c++", "-std=c++17", *options.flags, *defined, f"-I{options.eigen}", f"-I{prefix / 'include'}"]
+    libraries = [f"-L{prefix / 'lib'}", f"-Wl,-rpath,{prefix / 'lib'}", "-lpinocchio_default", "-lboost_serialization"]
+    _do([*command, str(HERE / "rnea.cpp"), *libraries, "-o", "rnea"], folder)
+    _do([str(folder / "rnea"), "robot", str(options.calls), "motions", "times"], folder)
+    return Timing.of(np.fromfile(folder / "times", np.int64))
+
+
+def _do(command: Sequence[str], folder: Path) -> None:
+    """Run a command; raise BenchError with what it says where it fails."""
+    try:
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)  # noqa: S603 - ours
+    except FileNotFoundError:
+        raise BenchError(f"{command[0]} is not installed, expected a C compiler of that name") from None
+    if done.returncode:
+        raise BenchError(f"{' '.join(command)} exits with {done.returncode}: {done.stderr[:2000]}")
+
+
+def _relative(values: Array, expected: Array, least: Array | float) -> float:
+    return float((np.abs(values - expected) / np.maximum(np.abs(expected), least)).max())

@@ -1,0 +1,146 @@
+"""The weights of arm and friction as C needs them: tau = Φ w, w ~ N(ŵ, C), in as few features as there are.
+
+φ_b are the features that are not sums of others, Φᵀ = T φ_b, and Tᵀ C T = U Uᵀ, so that φᵀ C φ = |Uᵀ φ_b|².
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Array
+from lipcore.files.twofold import Twofold, upper_root
+from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.compiled.arm_recursion import PARAMETERS
+from lipcore.kernels.friction import FrictionKernel
+from lipcore.kernels.geometry import Geometry
+from lipcore.model.body import LOWER
+from lipcore.model.torque_model import TorqueModel
+
+MASS, HX, HY, HZ, XX, XY, YY, XZ, YZ, ZZ = range(PARAMETERS)
+
+
+class UnsupportedEstimatorError(ValueError):
+    """The model is of an estimator that is not written as C."""
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """A model's weights. arm, friction: its terms; mean: (p,) of all, the arm's first; prior: (p,) their variances
+    beforehand, Λ; known: Q Λ, (p, p), so that their covariance is Λ − (Q Λ)ᵀ Q Λ; factor: on their deviations."""
+
+    arm: ArmKernel
+    friction: FrictionKernel
+    mean: Array
+    prior: Array
+    known: Twofold
+    factor: float
+
+    @classmethod
+    def of(cls, model: TorqueModel) -> Learnt:
+        """What a model has learnt; raise UnsupportedEstimatorError where that is more than arm and friction."""
+        posterior, terms = model.posterior, model.estimator.terms
+        arm, friction = terms["rigid_body"], terms["friction"]
+        assert isinstance(arm, ArmKernel)
+        assert isinstance(friction, FrictionKernel)
+        if posterior.basis.term is not None or list(posterior.basis.linear) != [arm, friction]:
+            raise UnsupportedEstimatorError("the posterior holds more than rigid bodies and friction")
+        diagonals = [each.covariance(posterior.params).detach().diagonal().numpy() for each in (arm, friction)]
+        prior, centre = np.concatenate(diagonals), arm.prior_weights()
+        assert centre is not None
+        mean = posterior.weights.numpy() * prior
+        mean[: arm.size] += centre.numpy()
+        known = Twofold.of(posterior.root.numpy()) * Twofold.of(prior)
+        return cls(arm, friction, mean, prior, known, posterior.std_factor)
+
+    def root(self, expand: Array) -> Array:
+        """U, upper triangular, with U Uᵀ = Tᵀ C T. expand: T, (p, p_b)."""
+        made = Twofold.of(expand)
+        known = self.known @ made
+        before = (made * Twofold.of(self.prior[:, None])).T @ made
+        return self.factor * upper_root(before - known.T @ known)
+
+    def variance(self, features: Array) -> Array:
+        """φᵀ C φ of each of N queries and n joints, (N, n). features: Φ, (N, n, p)."""
+        rows = Twofold.of(features.reshape(-1, features.shape[2]))
+        before, white = rows * rows * Twofold.of(self.prior), rows @ self.known.T
+        left = before.sums() - (white * white).sums()
+        return self.factor**2 * left.high.reshape(features.shape[:2])
+
+    def features(self, motion: Motion, arm: ArmKernel) -> Array:
+        """Φ of N motions, (N, n, p); arm: with a payload among its parameters, or as it was learnt."""
+        return np.concatenate([arm.features(motion).numpy(), self.friction.features(motion).numpy()], axis=2)
+
+
+def axes_of(geometry: Geometry) -> Array:
+    """Axes of the written frames in those of the geometry: (n, 3, 3), the two across the joint's axis and itself."""
+    return np.concatenate([geometry.across, geometry.axis[:, None]], axis=1).mT
+
+
+def moved(turn: Array, place: Array, body: Array) -> Array:
+    """Ten parameters of a body in the frame where its own, (3, 3) axes turned by `turn`, lies at `place`, (3,) m."""
+    about = np.zeros((3, 3))
+    about[LOWER] = body[XX:]
+    about = about + np.tril(about, -1).T
+    mass, first = body[MASS], turn @ body[HX:XX]
+    # second moments, which are those of points
+    second = turn @ (0.5 * np.trace(about) * np.eye(3) - about) @ turn.T
+    second = second + np.outer(place, first) + np.outer(first, place) + mass * np.outer(place, place)
+    return np.concatenate([[mass], first + mass * place, (np.trace(second) * np.eye(3) - second)[LOWER]])
+
+
+def regrouped(learnt: Learnt) -> tuple[list[list[int]], Array]:
+    """Which of each body's ten numbers torque depends on, and T: (p, p_b), rows as the model's weights.
+
+    A body that is symmetric about a joint's axis may as well be fixed to the link before: three numbers of a body
+    behind a revolute joint, and all inertia behind a prismatic one, are sums of those of the link before.
+    """
+    arm = learnt.arm.arm
+    n, axes, unit = arm.n_joints, axes_of(arm.geometry), np.eye(PARAMETERS)
+    before = np.concatenate([np.eye(3)[None], axes[:-1]])
+    slides = [kind == "prismatic" for kind in arm.geometry.joint_types]
+    # the first joint moves its body about, or along, one axis only
+    kept = [[MASS] if slides[0] else [HX, HY, ZZ]]
+    kept += [[MASS, HX, HY, HZ] if each else [HX, HY, XX, XY, XZ, YZ, ZZ] for each in slides[1:]]
+    size = sum(map(len, kept))
+    expand, at = np.zeros((n, PARAMETERS, size)), 0
+    for j, names in enumerate(kept):
+        expand[j, names, at + np.arange(len(names))] = 1.0
+        at += len(names)
+        if j == 0:
+            continue
+        turn = before[j].T @ arm.geometry.rotation[j] @ axes[j]
+        place = before[j].T @ arm.geometry.translation[j]
+        if slides[j]:
+            for name in range(XX, PARAMETERS):
+                expand[j, name] = moved(turn, place, unit[name]) @ expand[j - 1]
+        else:
+            for name in (MASS, HZ):
+                expand[j, name] = moved(turn, place, unit[name]) @ expand[j - 1]
+            round_ = moved(turn, place, unit[XX] + unit[YY]) @ expand[j - 1]
+            expand[j, YY] = round_ - expand[j, XX]
+    return kept, _in_weights(learnt, axes, expand)
+
+
+def _in_weights(learnt: Learnt, axes: Array, expand: Array) -> Array:
+    """T of all weights. expand: (n, 10, b), what features of the bodies in their written frames are."""
+    arm, n, size = learnt.arm.arm, learnt.arm.n_joints, expand.shape[2]
+    rubbing = len(learnt.friction.terms)
+    rest = learnt.arm.size - (PARAMETERS + 1) * n
+    out = np.zeros((len(learnt.mean), n * (1 + rubbing) + size + rest))
+    first = n * (1 + rubbing)
+    for j, joint in enumerate(arm.order):
+        # features turn as the parameters' dual: Y' π' = Y π for π' = M π, so Y = Y' M
+        turned = np.stack([moved(axes[j].T, np.zeros(3), each) for each in np.eye(PARAMETERS)], axis=1)
+        out[PARAMETERS * joint : PARAMETERS * (joint + 1), first : first + size] = turned.T @ expand[j]
+        own = j * (1 + rubbing)
+        out[PARAMETERS * n + joint, own] = 1.0
+        for term in range(rubbing):
+            out[learnt.arm.size + rubbing * joint + term, own + 1 + term] = 1.0
+    steps = learnt.arm.steps
+    out[steps, first + size : first + size + arm.steps] = np.eye(arm.steps)
+    if learnt.arm.others is not None:
+        out[steps.stop : learnt.arm.size, first + size + arm.steps :] = learnt.arm.others.mixing.T
+    return out

@@ -1,0 +1,37 @@
+"""`python -m benchmarks exported`: a short run on the shipped model."""
+
+import json
+
+import pytest
+from rich.console import Console
+
+from benchmarks.exported import running
+from benchmarks.exported.running import SHIPPED, Options, grids, run, targets
+from benchmarks.workload import BenchError
+from tests.lipcore.test_c_writer import needs_compiler
+
+
+@needs_compiler
+def test_a_short_run(tmp_path):
+    results = run(Options(SHIPPED, calls=500, queries=300), Console(quiet=True))
+    assert [each.count for each in results.timings.values()] == [500, 500, 500, 50]
+    assert results.timings["nothing"].p50 < results.timings["mean"].p50 < results.timings["std"].p50
+    assert max(results.deviations.values()) < 1e-5
+    met = {each.name: each.met for each in targets(results)}
+    assert met["torque: largest relative deviation"]
+    assert met["standard deviation: the same, of exact arithmetic"]
+    assert all(len(row) == len(grid.columns) for grid in grids(results) for row in grid.rows)
+    results.write(tmp_path / "results.json", [])
+    assert json.loads((tmp_path / "results.json").read_text())["sizes"]["model.o"] > 10_000
+
+
+@needs_compiler
+def test_what_does_not_compile_is_said():
+    with pytest.raises(BenchError, match="-fno-such-flag"):
+        run(Options(SHIPPED, calls=20, queries=20, flags=("-fno-such-flag",)), Console(quiet=True))
+
+
+def test_a_compiler_that_is_missing_is_said(monkeypatch):
+    monkeypatch.setenv("PATH", "/nowhere")
+    with pytest.raises(BenchError, match="cc is not installed"):
+        running.run(Options(SHIPPED, calls=20, queries=20), Console(quiet=True))

@@ -1,0 +1,292 @@
+"""A model as C: compiled as its header says, it gives the numbers of the model, and can tell whether it does."""
+
+import ctypes
+import re
+import shutil
+import subprocess
+import threading
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lipcore import FitOptions, TorqueModel, load, train
+from lipcore.data.motion import Motion
+from lipcore.files.c_weights import UnsupportedEstimatorError
+from lipcore.files.c_writer import HEADER, SOURCE, Origin, c_files
+from lipcore.fitting.estimators import make_estimator
+from lipcore.model.body import Body
+from lipcore.model.payload import Carrier
+from lipcore.posterior.compression import linear
+from lipcore.posterior.misfit import Misfit
+from tests.lipcore.arm_oracles import arm, followed, pendulum_from_its_tip, recorded
+from tests.lipcore.test_arm_model import with_alternatives
+
+OPTIONS = FitOptions(device="cpu", statistics="chosen")
+ORIGIN = Origin("an-arm", 3, 7, "0123")
+FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
+PANDA = Path(__file__).parents[2] / "models/panda-sim"
+INERTIA = np.array([[0.020, 0.003, 0.001], [0.003, 0.015, -0.002], [0.001, -0.002, 0.010]])
+BODY = Body(2.0, np.array([0.05, -0.03, 0.12]), INERTIA)
+
+needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler, cc, which is not installed")
+
+
+def compiled(files: dict[str, str], folder: Path, *more: str) -> Path:
+    """The source as a shared library, compiled without a warning."""
+    for name, text in files.items():
+        (folder / name).write_text(text, encoding="ascii")
+    command = ["cc", *FLAGS, *more, "-shared", "-fPIC", SOURCE, "-o", "model.so", "-lm"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder / "model.so"
+
+
+class Payload(ctypes.Structure):
+    _fields_ = [("mass", ctypes.c_double), ("com", ctypes.c_double * 3), ("inertia", ctypes.c_double * 9)]
+
+
+def payload_of(body: Body) -> Payload:
+    inertia = np.zeros((3, 3)) if body.inertia is None else body.inertia
+    return Payload(body.mass, (ctypes.c_double * 3)(*body.com), (ctypes.c_double * 9)(*inertia.ravel()))
+
+
+def numbers(row: np.ndarray) -> ctypes.Array:
+    return (ctypes.c_double * len(row)).from_buffer(row)
+
+
+def asked(path: Path, motion: np.ndarray, body: Body | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of motions (3, N, n); the mean is the same with and without the latter."""
+    library, motion = ctypes.CDLL(str(path)), np.ascontiguousarray(motion)
+    tau, alone, std = (np.full_like(motion[0], np.nan) for _ in range(3))
+    carried = None if body is None else ctypes.byref(payload_of(body))
+    for k in range(motion.shape[1]):
+        query = [numbers(part[k]) for part in motion]
+        if body is None:
+            library.lipserve_torque(*query, numbers(alone[k]))
+            library.lipserve_torque_std(*query, numbers(tau[k]), numbers(std[k]))
+        else:
+            library.lipserve_torque_payload(*query, carried, numbers(alone[k]))
+            library.lipserve_torque_std_payload(*query, carried, numbers(tau[k]), numbers(std[k]))
+    np.testing.assert_array_equal(alone, tau)
+    return tau, std
+
+
+def drawn(model: TorqueModel, count: int, seed: int, beyond: float = 1.0) -> np.ndarray:
+    """Motions (3, N, n) within the training's range, or `beyond` times as far."""
+    draw, limits = np.random.default_rng(seed).uniform, model.training_range
+    each = [draw(limits[name]["min"], limits[name]["max"], (count, model.n_joints)) for name in ("q", "dq", "ddq")]
+    return beyond * np.stack(each)
+
+
+ROUNDING = 64 * np.finfo(float).eps
+"""Of k(x, x): by how much the service's variance, its difference with a number nearly as large, may be off."""
+
+
+def exact_std(model: TorqueModel, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """tau_std of the posterior's own formula, k(x, x) − |Q c|², in fractions; and k(x, x)."""
+    posterior, query = model.posterior, Motion.from_arrays(*motion)
+    features = np.concatenate([each.features(query).numpy() for each in posterior.basis.linear], axis=2)
+    prior = np.concatenate([each.covariance(posterior.params).detach().diagonal() for each in posterior.basis.linear])
+    fraction = np.frompyfunc(Fraction, 1, 1)
+    features, root = fraction(features), fraction(posterior.root.numpy())
+    cross = features * fraction(prior)
+    before = (cross * features).sum(2)
+    variance = (before - ((cross @ root.T) ** 2).sum(2)).astype(float) * posterior.std_factor**2
+    variance += posterior.misfit.variance(query).numpy()
+    return np.sqrt(np.maximum(variance, posterior.floor.numpy())), before.astype(float)
+
+
+def learnt(kinds: str, seed: int) -> TorqueModel:
+    geometry, _, robot = arm(kinds, seed)
+    return followed(geometry, robot, recorded(robot, 1, 100), OPTIONS)
+
+
+def with_misfit(model: TorqueModel) -> TorqueModel:
+    """The same with all that adds to a variance."""
+    rng, n = np.random.default_rng(0), model.n_joints
+    rows = np.stack([rng.uniform(0.1, 1.0, n), np.full(n, 0.1), *rng.uniform(0.5, 1.0, (3, n))])
+    misfit = Misfit.unpacked(model.posterior.noise_variance.new_tensor(rows))
+    floor = model.posterior.noise_variance.new_tensor([1e-4, 10.0, *[1e-4] * (n - 2)])
+    return replace(model, posterior=replace(model.posterior, misfit=misfit, floor=floor, std_factor=1.3))
+
+
+def with_others() -> TorqueModel:
+    _, _, robot = arm("RPR", 51)
+    return with_alternatives(learnt("RPR", 51), recorded(robot, 1, 100), 2)
+
+
+def with_slow_friction() -> TorqueModel:
+    """An arm whose friction has its fourth term."""
+    _, _, robot = arm("RRR", 50)
+    model, samples = learnt("RRR", 50), recorded(robot, 1, 100)
+    posterior = model.posterior
+    estimator = make_estimator("rigid-body", model.joint_types, arm=replace(model.arm, stribeck=True))
+    widths = posterior.params["friction.log_std"]
+    params = {**posterior.params, "friction.log_std": torch.cat([widths, widths[:, 1:2]], dim=1)}
+    variance = posterior.noise_variance.expand(samples.tau.shape)
+    made = linear(estimator.kernel, params, samples, variance, 0.01, 1.0, posterior.misfit)
+    return replace(model, estimator=estimator, posterior=made.posterior)
+
+
+MODELS = {
+    "panda": lambda: load(PANDA),
+    "prismatic": lambda: learnt("RPR", 51),
+    "prismatic first": lambda: learnt("PRR", 50),
+    "alternatives": with_others,
+    "fixed, from its tip": lambda: pendulum_from_its_tip("fixed", OPTIONS),
+    "calibrated, from its tip": lambda: pendulum_from_its_tip("calibrate", OPTIONS),
+    "friction of slow joints": with_slow_friction,
+    "misfit": lambda: with_misfit(learnt("RRR", 50)),
+}
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", MODELS)
+def test_its_numbers_are_those_of_the_model(name: str, tmp_path: Path) -> None:
+    model = MODELS[name]()
+    path = compiled(c_files(model, ORIGIN), tmp_path)
+    assert ctypes.CDLL(str(path)).lipserve_selftest() == 0
+    for seed, beyond in ((1, 1.0), (2, 3.0)):
+        motion = drawn(model, 1500, seed, beyond)
+        tau, std = asked(path, motion)
+        expected = model.predict(*motion)
+        np.testing.assert_allclose(tau, expected.tau, rtol=1e-9, atol=1e-12 * np.abs(expected.tau).max())
+        few = 3 if model.n_joints > 3 else 30
+        exact, before = exact_std(model, motion[:, :few])
+        np.testing.assert_allclose(std[:few], exact, rtol=1e-9)
+        rounding = np.abs(std[:few] ** 2 - expected.tau_std[:few] ** 2) / before
+        assert rounding.max() < ROUNDING
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", ["panda", "prismatic", "alternatives", "fixed, from its tip"])
+@pytest.mark.parametrize("body", [BODY, Body(0.7, np.array([0.1, 0.2, -0.3]))], ids=["body", "point"])
+def test_a_payload_is_that_which_a_query_declares(name: str, body: Body, tmp_path: Path) -> None:
+    model = MODELS[name]()
+    motion, carrier = drawn(model, 300, 1), Carrier(model)
+    expected = carrier.carrying(carrier.known(body.parameters)).predict(*motion)
+    tau, std = asked(compiled(c_files(model, ORIGIN), tmp_path), motion, body)
+    np.testing.assert_allclose(tau, expected.tau, rtol=1e-9, atol=1e-10 * np.abs(expected.tau).max())
+    np.testing.assert_allclose(std, expected.tau_std, rtol=1e-5)  # the service's own rounding, see ROUNDING
+    empty, _ = asked(tmp_path / "model.so", motion, replace(body, mass=1e-300, inertia=None))
+    np.testing.assert_array_equal(empty, asked(tmp_path / "model.so", motion)[0])
+
+
+@needs_compiler
+def test_the_self_test_finds_a_number_that_is_another(tmp_path: Path) -> None:
+    files = c_files(load(PANDA), ORIGIN)
+    text = files[SOURCE]
+    tables = text[: text.index("static const double MISFIT")]
+    found = [each.span() for each in re.finditer(r"-?\d+\.\d{12,}(e-?\d+)?", tables)]
+    large = [span for span in found if abs(float(text[slice(*span)])) > 0.05]
+    for start, end in np.random.default_rng(0).choice(large, 8, replace=False):
+        wrong = repr(float(text[start:end]) * (1 + 1e-5))
+        path = compiled({**files, SOURCE: text[:start] + wrong + text[end:]}, _made(tmp_path / str(start)))
+        assert ctypes.CDLL(str(path)).lipserve_selftest() > 0, text[start:end]
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
+@needs_compiler
+def test_it_writes_nothing_but_what_it_is_given(tmp_path: Path) -> None:
+    """No symbol of the object is writable data, and no function of libc but five of libm is called."""
+    compiled(c_files(with_others(), ORIGIN), tmp_path)
+    subprocess.run(["cc", *FLAGS, "-c", SOURCE, "-o", "model.o"], cwd=tmp_path, check=True)
+    listed = subprocess.run(["nm", "model.o"], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    kinds = {line.split()[-1]: line.split()[-2] for line in listed.splitlines()}
+    called = {name for name, kind in kinds.items() if kind == "U"}
+    by_compilers = {"memcpy", "memmove", "memset", "sincos", "_GLOBAL_OFFSET_TABLE_", "__stack_chk_fail"}
+    assert called - by_compilers <= {"sin", "cos", "sqrt", "exp", "tanh"}
+    assert set(kinds.values()) <= set("TtRrU"), kinds
+
+
+@needs_compiler
+def test_threads_do_not_disturb_each_other(tmp_path: Path) -> None:
+    model = load(PANDA)
+    path = compiled(c_files(model, ORIGIN), tmp_path)
+    motions = [drawn(model, 2000, seed) for seed in (1, 2)]
+    alone, together = [asked(path, motion) for motion in motions], [None, None]
+
+    def ask(place: int) -> None:
+        together[place] = asked(path, motions[place])
+
+    threads = [threading.Thread(target=ask, args=(place,)) for place in (0, 1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for before, after in zip(alone, together, strict=True):
+        np.testing.assert_array_equal(before, after)
+
+
+@needs_compiler
+def test_intervals_and_the_range_of_the_training(tmp_path: Path) -> None:
+    model = load(PANDA)
+    library = ctypes.CDLL(str(compiled(c_files(model, ORIGIN), tmp_path)))
+    motion = drawn(model, 2, 1)
+    std, half = np.full(7, 0.02), np.zeros(7)
+    library.lipserve_interval(numbers(std), numbers(half))
+    expected = 1.959963984540054 * model.scale * np.sqrt(std**2 + model.noise_std**2)
+    np.testing.assert_allclose(half, expected, rtol=1e-12)
+    assert library.lipserve_in_range(*[numbers(part[0]) for part in motion]) == 1
+    for part, name in enumerate(("q", "dq", "ddq")):
+        for joint, value in ((0, model.training_range[name]["max"][0] + 1e-6), (6, np.nan)):
+            far = motion[:, 0].copy()
+            far[part, joint] = value
+            assert library.lipserve_in_range(*[numbers(row) for row in far]) == 0
+
+
+def test_names_cannot_end_a_comment_or_a_string(tmp_path: Path) -> None:
+    names = ("*/ int x; /*", '", 0}; int y; //', "gelenk ü\\\n?/")
+    model = replace(learnt("RRR", 50), joint_names=names)
+    files = c_files(model, Origin('*/"\\', 1, 0, "*/"))
+    assert all(text.isascii() for text in files.values())
+    code = re.sub(r'/\*.*?\*/|"(\\.|[^"\\\n])*"', "", files[HEADER] + files[SOURCE], flags=re.DOTALL)
+    assert "int x" not in code
+    assert "int y" not in code
+    if shutil.which("cc") is None:
+        return
+    library = ctypes.CDLL(str(compiled(files, tmp_path)))
+    size = max(len(name.encode()) for name in names) + 1
+    stored = (ctypes.c_char * (3 * size)).in_dll(library, "lipserve_joint_names").raw
+    assert [stored[k * size : (k + 1) * size].rstrip(b"\0").decode() for k in range(3)] == list(names)
+
+
+def test_other_estimators_are_refused() -> None:
+    _, _, robot = arm("RRR", 50)
+    few = FitOptions(device="cpu", hyperparameter_samples=20, max_iterations=2, starts=1)
+    model = train(recorded(robot, 1, 40), robot.joint_types, "lip-chain", few)
+    with pytest.raises(UnsupportedEstimatorError, match="'lip-chain', expected one of rigid-body for C"):
+        c_files(model, ORIGIN)
+
+
+def test_a_covariance_that_rounding_has_spoilt_is_refused() -> None:
+    model = load(PANDA)
+    spoilt = replace(model, posterior=replace(model.posterior, root=1.001 * model.posterior.root))
+    with pytest.raises(ValueError, match="not positive definite"):
+        c_files(spoilt, ORIGIN)
+
+
+@needs_compiler
+@pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler, c++, which is not installed")
+def test_the_example_controls_with_it(tmp_path: Path) -> None:
+    model = load(PANDA)
+    compiled(c_files(model, ORIGIN), tmp_path)
+    subprocess.run(["cc", *FLAGS, "-c", SOURCE], cwd=tmp_path, check=True)
+    example = Path(__file__).parents[2] / "docs/examples/feedforward_controller.cpp"
+    strict = ("-std=c++17", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2", "-I.")
+    command = ["c++", *strict, str(example), "lipserve_model.o", "-o", "controller"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    limits = np.array([model.training_range["q"][end] for end in ("min", "max")])
+    for middle, used in ((limits.mean(0), 20), (limits[1] + 1.0, 0)):
+        ran = subprocess.run(
+            ["./controller", "20", *map(str, middle)], cwd=tmp_path, check=True, capture_output=True, text=True
+        )
+        assert ran.stdout.startswith(f"used {used} of 20, the longest cycle took")
