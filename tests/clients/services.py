@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
-from websockets.utils import accept_key
+from websockets.utils import accept_key, apply_mask
 
 from tests.service.data import DEADLINE
 
@@ -25,13 +25,13 @@ class Talk:
 
     def take(self, count: int) -> bytes:
         """So many bytes of the client; raise ConnectionError where it has gone."""
-        data = b""
+        data = bytearray()
         while len(data) < count:
             part = self.connection.recv(count - len(data))
             if not part:
                 raise ConnectionError("the client is gone")
             data += part
-        return data
+        return bytes(data)
 
     def read(self) -> tuple[int, bytes]:
         """Opcode and payload of the client's next frame."""
@@ -42,7 +42,7 @@ class Talk:
         if size > 125:
             size = int.from_bytes(self.take(2 if size == 126 else 8), "big")
         mask, payload = self.take(4), self.take(size)
-        return first & 15, bytes(byte ^ mask[k % 4] for k, byte in enumerate(payload))
+        return first & 15, apply_mask(payload, mask) if payload else b""
 
     def request(self) -> int:
         """Sequence of the client's next request."""
@@ -128,6 +128,7 @@ def serving(*services: Callable[[socket.socket], None]) -> Iterator[str]:
     failures: list[BaseException] = []
     ended = threading.Event()
     with socket.create_server(("127.0.0.1", 0)) as server:
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)  # a client has to wait for those who do not read
 
         def accept() -> None:
             for number in range(10**6):

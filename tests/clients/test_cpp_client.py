@@ -67,12 +67,13 @@ def test_answers_are_those_of_the_model(driver, server, url, panda):
         assert (report["asked"], report["answered"], report["stale"], report["connections"]) == (40, 40, 0, 1)
 
 
-def test_a_loop_asks_and_teaches_and_all_of_it_is_logged_once(driver, server, url):
+def test_a_loop_asks_and_teaches_and_all_of_it_is_logged_once_whatever_signals_come(driver, server, url):
     measured, name = panda_rows(150), f"loop-{url[:4]}"
-    with Driver(driver, measured, url=url, stream_id=name, **PANDA) as client:
+    with Driver(driver, measured, url=url, stream_id=name, alarms=1, **PANDA) as client:
         client.do(f"connect {FAR}")
         report = client.do(f"loop 150 0 {int(DEADLINE * 1e6)} 0")
         assert (report["ask_ok"], report["teach_ok"]) == (150, 150)
+        assert report["alarms"] > 0
         report = client.do(f"flush {FAR}")
         assert (report["status"], report["unsettled"]) == ("ok", 0)
         assert report["accepted"] + report["rejected"] == 150

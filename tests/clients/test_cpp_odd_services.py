@@ -141,6 +141,31 @@ def test_what_is_refused_is_counted_and_said(driver):
         assert client.do(f"ask 0 {FAR}")["status"] == "ok"
 
 
+def test_what_the_socket_does_not_take_at_once_is_sent_in_parts(driver):
+    """100 frames of a thousand joints, 3 MB: more than the sockets buffer while nobody reads."""
+    measured = np.random.default_rng(0).uniform(-1, 1, (100, 4, 1000))
+    may_read, seen = threading.Event(), []
+
+    def slow(talk):
+        assert may_read.wait(DEADLINE)
+        for sequence in range(1, 101):
+            opcode, payload = talk.read()
+            seen.append(opcode == 2 and payload[16:] == measured[sequence - 1].tobytes())
+            talk.answer(sequence)
+        talk.text(learnt={"through": 100, "accepted": 100, "duplicates": 0, "rejected": {}, "revision": 1})
+        reading(talk)
+
+    names = [f"joint {k}" for k in range(1000)]
+    options = {"model": "m", "stream_id": "arm", "window": 100}
+    service = streaming(slow, joint_names=names, noise_std=[0.1] * 1000)
+    with serving(service) as url, Driver(driver, measured, url=url, **options) as client:
+        assert client.do(f"connect {FAR}")["status"] == "ok"
+        assert client.do("teach 0 100")["unsettled"] == 100
+        may_read.set()
+        assert client.do(f"flush {FAR}")["accepted"] == 100
+    assert seen == [True] * 100
+
+
 def test_a_full_backlog_keeps_no_more_and_asks_on(driver):
     options = {"model": "m", "stream_id": "arm", "backlog": 4}
     with serving(streaming(answering)) as url, Driver(driver, ROWS, url=url, **options) as client:

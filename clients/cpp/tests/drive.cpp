@@ -4,11 +4,15 @@
 //     connect SECONDS | ask ROW SECONDS [std|learn|external …] | teach FROM TO | flush SECONDS | tick | close | end
 //     loop CYCLES PERIOD_US BUDGET_US FIRST_ROW    asks and teaches in every cycle; says "cycle" in the middle
 //     loop-ask CYCLES PERIOD_US BUDGET_US FIRST_ROW    only asks
-// Its options are arguments, name=value; rows=FILE has rows of 4 · joints doubles: q, dq, ddq, tau.
+// Its options are arguments, name=value; rows=FILE has rows of 4 · joints doubles: q, dq, ddq, tau; alarms=1: a signal
+// interrupts the client's system calls every 50 µs.
 
 #include "allocations.hpp"
 
+#include <sys/time.h>
+
 #include <algorithm>
+#include <csignal>
 #include <cstdio>
 #include <fstream>
 #include <iostream>
@@ -54,6 +58,28 @@ std::string list(const double* values, std::size_t count) {
   }
   return out + "]";
 }
+
+/// Interrupts system calls while it lives, every 50 µs where there are alarms.
+class Alarms {
+ public:
+  static void allow() {
+    struct sigaction action {};
+    action.sa_handler = [](int) { ++rung; };  // without SA_RESTART: what waits ends with EINTR
+    sigaction(SIGALRM, &action, nullptr);
+    allowed = true;
+  }
+  Alarms() { set(50); }
+  ~Alarms() { set(0); }
+
+  static inline volatile std::sig_atomic_t rung = 0;
+
+ private:
+  static void set(int period) {
+    const itimerval every{{0, period}, {0, period}};
+    if (allowed) setitimer(ITIMER_REAL, &every, nullptr);
+  }
+  static inline bool allowed = false;
+};
 
 class Driver {
  public:
@@ -112,6 +138,7 @@ class Driver {
 
   template <class Call>
   static Status watched(Call call) {
+    const Alarms alarms;
     const allocations::Watch watch;
     return call();
   }
@@ -163,7 +190,8 @@ class Driver {
     const lipserve::Counters& counters = client_.counters();
     const lipserve::Error& error = client_.error();
     std::string out = "{\"status\": " + quoted(name_of(status)) + more_;
-    out += member("allocations", allocations::count) + member("connected", client_.connected());
+    out += member("allocations", allocations::count) + member("alarms", static_cast<long>(Alarms::rung));
+    out += member("connected", client_.connected());
     out += member("unsettled", client_.unsettled()) + member("through", learnt.through);
     out += member("accepted", learnt.accepted) + member("duplicates", learnt.duplicates);
     out += member("rejected", learnt.rejected) + member("refused", learnt.refused);
@@ -213,6 +241,7 @@ int main(int count, char** arguments) {
   options.silence_s = number("silence_s", options.silence_s);
   if (!allocations::able()) return std::puts("cannot count allocations here"), 3;
   Driver driver(options, given["rows"]);
+  if (given.count("alarms")) Alarms::allow();
   for (std::string line; std::getline(std::cin, line) && line != "end";) {
     std::istringstream words(line);
     driver.run(words);

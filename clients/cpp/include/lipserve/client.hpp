@@ -1085,6 +1085,7 @@ inline void Client::close() {
     write_some();
   }
   if (stage_ == Stage::broken || stage_ == Stage::down) return;
+  if (stage_ == Stage::open) --counters_.losses;  // this is none
   drop(Status::unreachable, "closed", "closed by this client");
   retry_at_ = 0, backoff_ = 0;
 }
@@ -1112,7 +1113,10 @@ Status Client::run(Deadline until, bool patient, Done done) {
     }
     if (stage_ == Stage::down && (now >= until.ns || (!patient && retry_at_ >= until.ns))) return absent();
     if (stage_ == Stage::open) fill();
-    if (stage_ >= Stage::upgrading && out_begin_ != out_end_) write_some();
+    if (stage_ >= Stage::upgrading && out_begin_ != out_end_) {
+      write_some();
+      if (stage_ == Stage::down) continue;  // lost
+    }
 
     const bool last = now >= until.ns;
     std::int64_t wake = until.ns;
@@ -1253,7 +1257,8 @@ inline void Client::take_upgrade(const std::uint8_t* data, std::size_t size) {
   detail::accept_of(key_, expected);
   std::size_t letters = 0;
   const char* const accept = header(begin, head_size_, "sec-websocket-accept", letters);
-  if (!accept || letters != 28 || std::memcmp(accept, expected, 28) != 0)
+  const bool accepted = accept && letters == 28 && std::memcmp(accept, expected, 28) == 0;
+  if (!accepted || !header(begin, head_size_, "upgrade", letters))
     return fail("what answers is no WebSocket: it has not accepted the key");
   if (header(begin, head_size_, "sec-websocket-extensions", letters)) return fail("an extension that nobody asked for");
   stage_ = Stage::greeting;
