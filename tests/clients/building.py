@@ -24,12 +24,23 @@ def here(*compilers: str) -> tuple[str, ...]:
 @cache
 def sanitizers(compiler: str) -> tuple[str, ...]:
     """Options that switch the sanitizers on, none where the compiler comes without their runtime."""
+    return SANITIZED if _runs(compiler, "int main() {}\n", *SANITIZED) else ()
+
+
+def fuzzes(compiler: str) -> bool:
+    """Whether the compiler comes with a fuzzer."""
+    program = 'extern "C" int LLVMFuzzerTestOneInput(const unsigned char*, unsigned long) { return 0; }\n'
+    return _runs(compiler, program, "-fsanitize=fuzzer", arguments=("-runs=1",))
+
+
+def _runs(compiler: str, text: str, *options: str, arguments: tuple[str, ...] = ()) -> bool:
     with tempfile.TemporaryDirectory() as folder:
         source, program = Path(folder, "empty.cpp"), Path(folder, "empty")
-        source.write_text("int main() {}\n")
-        built = subprocess.run([compiler, *SANITIZED, source, "-o", program], capture_output=True, check=False)
-        runs = built.returncode == 0 and subprocess.run([program], capture_output=True, check=False).returncode == 0
-    return SANITIZED if runs else ()
+        source.write_text(text)
+        made = subprocess.run([compiler, *options, source, "-o", program], capture_output=True, check=False)
+        if made.returncode != 0:
+            return False
+        return subprocess.run([program, *arguments], capture_output=True, check=False).returncode == 0
 
 
 def built(compiler: str, source: str, folder: Path, *options: str) -> Path:

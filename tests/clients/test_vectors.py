@@ -13,7 +13,7 @@ from websockets.frames import Frame, Opcode
 from websockets.utils import accept_key, apply_mask
 
 from service.stream.exchange import Exchange, StreamError, read_answer
-from tests.clients.building import CPP, VECTORS, built, checked, sanitizers
+from tests.clients.building import CPP, VECTORS, built, checked, fuzzes, here, sanitizers
 from tests.service.streams import read
 
 
@@ -151,3 +151,19 @@ def test_the_cpp_client_compiles_optimised_and_without_exceptions(compiler, tmp_
     source = tmp_path / "bare.cpp"
     source.write_text("#include <lipserve/client.hpp>\nint main() { lipserve::Client client{{}}; }\n")
     built(compiler, str(source), tmp_path, "-O3", "-fno-exceptions", "-fno-rtti")
+
+
+@pytest.mark.slow
+def test_nothing_that_is_sent_makes_the_cpp_client_read_what_is_not_there(tmp_path):
+    """Fuzzed from the vectors on, with a fixed seed; the fuzzer ends with an error where a sanitizer speaks."""
+    options = ("-O1", "-g", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all")
+    if not here("clang++") or not fuzzes("clang++"):
+        pytest.skip("clang++ with its fuzzer is not installed")
+    corpus = tmp_path / "corpus"
+    corpus.mkdir()
+    for kind, group in KINDS.items():
+        for vector in group:
+            data = vector["bytes"][32:] if kind == "error" else vector["bytes"]
+            (corpus / f"{kind}-{vector['name']}").write_bytes(data)
+    program = built("clang++", "tests/fuzz.cpp", tmp_path, *options)
+    checked(program, "-runs=100000", "-seed=1", "-max_len=400", str(corpus))

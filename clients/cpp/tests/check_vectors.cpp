@@ -294,6 +294,8 @@ void check_json() {
   CHECK(json.member("last").there());
   CHECK(!json.member("missing").there());
   CHECK(json.member("last").integer() == -1);
+  const std::vector<char> odd{'"', '\\', '\0', '\\', 't', '"'};
+  CHECK(text_of(detail::Json(odd.data(), odd.data() + odd.size())).empty());  // as it is cut at the 0
   char small[4];
   const std::string word = "\"aéé\"";
   CHECK(detail::Json(word.data(), word.data() + word.size()).text(small, sizeof small));

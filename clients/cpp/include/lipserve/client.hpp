@@ -175,7 +175,7 @@ struct Options {
   std::size_t backlog = 16384;
   /// Frames of each kind, asked and taught, that may wait for their answers. What is sent again after a lost connection
   /// delays an `ask` by at most so many answers.
-  unsigned window = 8;
+  unsigned window = 4;
   double attempt_s = 2.0;           // longest wait for one connection
   double silence_s = 3.0;           // an answer that takes longer: the connection counts as lost
   double retry_first_s = 0.01;      // wait before the next attempt, doubled from one to the next
@@ -422,8 +422,7 @@ class Json {
         at += end_ - at > 4 ? 4 : end_ - at - 1;
         copy.character(code);
       } else {
-        const char* const known = std::strchr("n\nt\tr\rb\bf\f", *at);
-        copy.add(known ? known[1] : *at);
+        copy.add(unescaped(*at));
       }
     }
     copy.add("");  // no half character at the end
@@ -476,6 +475,16 @@ class Json {
   }
 
  private:
+  static char unescaped(char letter) {
+    switch (letter) {
+      case 'n': return '\n';
+      case 't': return '\t';
+      case 'r': return '\r';
+      case 'b': return '\b';
+      case 'f': return '\f';
+      default: return letter;
+    }
+  }
   static bool digit(char letter) { return letter >= '0' && letter <= '9'; }
   static const char* space(const char* at, const char* end) {
     while (at != end && (*at == ' ' || *at == '\t' || *at == '\n' || *at == '\r')) ++at;
@@ -601,11 +610,13 @@ class Inbox {
   enum class Event : std::uint8_t { more, message, control, broken };
 
   void use(std::uint8_t* buffer, std::size_t capacity) { data = buffer, capacity_ = capacity; }
-  void reset() { have_ = 0, need_ = 2, inside_ = false, open_ = false, size = length = 0; }
+  void reset() { have_ = 0, need_ = 2, inside_ = open_ = false, size = length = 0, why = nullptr; }
 
-  /// Take bytes from `at` on until something is complete (then call again), or all are taken (`more`).
+  /// Take bytes from `at` on until something is complete (then call again), or all are taken (`more`). Once broken it
+  /// stays so until `reset`.
   Event take(const std::uint8_t*& at, const std::uint8_t* end) {
     for (;;) {
+      if (why) return Event::broken;
       if (!inside_) {
         for (; have_ < need_; ++at) {
           if (at == end) return Event::more;
@@ -634,7 +645,7 @@ class Inbox {
   std::uint64_t length = 0;        // of all of it
   std::uint8_t control[most_control];
   std::size_t control_size = 0;
-  const char* why = "";            // it is broken
+  const char* why = nullptr;       // it is broken
 
  private:
   bool begin() {
