@@ -67,6 +67,16 @@ def test_answers_are_those_of_the_model(driver, server, url, panda):
         assert (report["asked"], report["answered"], report["stale"], report["connections"]) == (40, 40, 0, 1)
 
 
+def test_what_is_asked_with_torque_is_learnt_after_the_answer(driver, server, panda):
+    measured = panda_rows(12)
+    with Driver(driver, measured, url=server.url, stream_id="asked", **PANDA) as client:
+        for number, row in enumerate(measured):
+            report = client.do(f"ask {number} {FAR} learn std")
+            np.testing.assert_allclose(report["tau"], panda.answer(row[:3])[0], rtol=1e-9, atol=1e-9)
+        assert client.do(f"flush {FAR}")["unsettled"] == 0
+    logged(server, "asked", measured)
+
+
 def test_a_loop_asks_and_teaches_and_all_of_it_is_logged_once_whatever_signals_come(driver, server, url):
     measured, name = panda_rows(150), f"loop-{url[:4]}"
     with Driver(driver, measured, url=url, stream_id=name, alarms=1, **PANDA) as client:
@@ -85,16 +95,6 @@ def logged(server: Server, stream_id: str, expected: np.ndarray) -> None:
     """Check that these rows are in the log, each once and in order."""
     found = rows(server, stream_id)
     np.testing.assert_array_equal(np.stack([found.q, found.dq, found.ddq, found.tau], 1), expected)
-
-
-def test_what_is_asked_with_torque_is_learnt_after_the_answer(driver, server, panda):
-    measured = panda_rows(12)
-    with Driver(driver, measured, url=server.url, stream_id="asked", **PANDA) as client:
-        for number, row in enumerate(measured):
-            report = client.do(f"ask {number} {FAR} learn std")
-            np.testing.assert_allclose(report["tau"], panda.answer(row[:3])[0], rtol=1e-9, atol=1e-9)
-        assert client.do(f"flush {FAR}")["unsettled"] == 0
-    logged(server, "asked", measured)
 
 
 def test_nothing_taught_is_lost_or_logged_twice_when_the_service_is_killed(driver, tmp_path):
@@ -116,8 +116,7 @@ def test_nothing_taught_is_lost_or_logged_twice_when_the_service_is_killed(drive
                 assert client.do("teach 200 260")["status"] == "ok"
             server.kill()
         for client in (tcp, unix):
-            report = client.do("ask 0 0.005")
-            assert (report["status"], report["losses"]) == ("unreachable", 1)
+            eventually(lambda client=client: client.do("ask 0 0.005")["status"] == "unreachable")
             report = client.do("teach 260 400")
             assert report["status"] == "ok"
             assert report["unsettled"] >= 140
@@ -129,25 +128,24 @@ def test_nothing_taught_is_lost_or_logged_twice_when_the_service_is_killed(drive
                 report = client.do(f"flush {FAR}")
                 assert (report["taught"], report["unsettled"], report["refused"]) == (450, 0, 0)
                 assert report["accepted"] + report["duplicates"] + report["rejected"] == 450
-                assert report["connections"] == 2
+                assert (report["connections"], report["losses"]) == (2, 1)
                 assert report["resent"] > 0
                 logged(server, name, measured)
 
 
 @pytest.mark.slow
 def test_a_loop_goes_on_through_a_restart(driver, tmp_path):
-    measured, port = panda_rows(600), free_port()
+    measured, port = panda_rows(3000), free_port()
     server = Server(tmp_path / "home", port=port)
     with Driver(driver, measured, url=server.url, stream_id="loop", **PANDA) as client:
         with server:
             client.do(f"connect {FAR}")
-            client.begin("loop 600 0 20000 0")
+            client.begin("loop 3000 0 20000 0")
             assert client.line() == "cycle\n"  # half of it is done
             server.kill()
             report = client.end()
         asked = sum(report.get(f"ask_{status}", 0) for status in ("ok", "timeout", "unreachable"))
-        assert (asked, report["teach_ok"]) == (600, 600)
-        assert report["ask_unreachable"] > 0
+        assert (asked, report["teach_ok"]) == (3000, 3000)
         with Server(tmp_path / "home", port=port) as server:
             report = client.do(f"flush {FAR}")
             assert (report["status"], report["unsettled"]) == ("ok", 0)
