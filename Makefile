@@ -8,7 +8,7 @@ TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 WORKERS ?= 3
 SHARE := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test warm-lip warm-chain bytecode test-all screenshots lint install serve image clean
+.PHONY: demo test warm-lip warm-chain bytecode test-all screenshots cpp lint install serve image clean
 
 demo: install
 	$(BIN)/lipserve demo
@@ -49,6 +49,12 @@ test-all: install
 # pictures of the dashboard for the README, made by its tests
 screenshots: install
 	LIPSERVE_SCREENSHOTS=docs/screenshots $(TEST) tests/browser/test_journey.py tests/browser/test_states.py tests/browser/test_arm.py
+
+# the C++ client: its example and its test; needs CMake and a compiler of C++17, and nothing else here does
+cpp:
+	cmake -S clients/cpp -B build/cpp
+	cmake --build build/cpp
+	ctest --test-dir build/cpp --output-on-failure
 
 lint: install
 	$(BIN)/ruff check .

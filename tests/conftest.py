@@ -13,7 +13,14 @@ settings.register_profile("lipserve", derandomize=True, deadline=None, max_examp
 settings.register_profile("thorough", settings.get_profile("lipserve"), max_examples=100)  # of `make test-all`
 settings.load_profile("lipserve")
 
-TOGETHER = ("tests/browser/", "tests/cluster/", "tests/docs/", "tests/service/test_stream_", "tests/service/cli/")
+TOGETHER = (
+    "tests/browser/",
+    "tests/cluster/",
+    "tests/docs/",
+    "tests/clients/",
+    "tests/service/test_stream_",
+    "tests/service/cli/",
+)
 """Beginnings of the paths of tests that share what takes seconds to start: each runs in one process. The longest first:
 what takes long and begins late keeps the other processes waiting."""
 

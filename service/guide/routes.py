@@ -42,6 +42,7 @@ ORDER = (
     "reference/api.md",
     "reference/cli.md",
     "reference/metrics.md",
+    "reference/stream-protocol.md",
     "reproduction/results.md",
 )
 """Pages beside the index, as the guide lists them. What is not listed here is not a page."""

@@ -7,13 +7,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from sqlalchemy import select
+from sqlalchemy.orm import undefer
 from websockets.sync.client import ClientConnection, connect
 
 import lipcore
 from lipcore import TorqueModel
+from lipcore.online.batch import Rows
 from service.foundation.settings import Settings
+from service.journal import log
 from service.models import registry
-from service.storage.database import Database
+from service.storage.database import Database, EventRow
 from service.storage.files import Files
 from tests.service.data import DEADLINE
 from tests.service.server import Server
@@ -129,3 +133,19 @@ def saved_model(server: Server, name: str, version: int) -> TorqueModel:
 def motions(count: int, n: int = 2, seed: int = 0) -> np.ndarray:
     """Motions (count, 3, n) near those that the models are trained on."""
     return np.random.default_rng(seed).uniform(-0.5, 0.5, (count, 3, n))
+
+
+def batches(server: Server, stream_id: str) -> list[EventRow]:
+    """What is durable of a stream, in the order of the log."""
+    database = Database.of(Settings(home=server.home))
+    try:
+        with database.session() as session:
+            query = select(EventRow).where(EventRow.stream_id == stream_id, EventRow.kind == "batch")
+            return list(session.scalars(query.order_by(EventRow.number).options(undefer(EventRow.payload))))
+    finally:
+        database.close()
+
+
+def rows(server: Server, stream_id: str) -> Rows:
+    """All rows that are durable of a stream."""
+    return Rows.concatenate([log.decode(event.payload) for event in batches(server, stream_id)])

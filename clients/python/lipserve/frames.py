@@ -75,6 +75,7 @@ duplicate and is applied once. What was refused is lost, unless it is sent again
 LIPSERVE_STREAM_FLUSH_ROWS wait to be logged, the service reads no further.
 
 The query of the address: `version` pins one, else the newest answers as soon as it is there, between two frames;
+`alias` follows what that points to; `min_revision` waits until the version that answers has learnt that much;
 `std=1` answers tau_std to every frame, as if each had flag 1; `scale=1` answers the scale to every frame: tau ± 1.96 ·
 scale · √(tau_std² + noise_std²) holds 95 % of what is measured, by what this stream_id has taught until then, or where
 there is none by what all recent ones have; `payload=1` answers to every frame what the arm carries; `stream_id` names

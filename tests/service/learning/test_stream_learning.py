@@ -7,18 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import select, text
-from sqlalchemy.orm import undefer
+from sqlalchemy import text
 
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipserve import StreamClient, StreamError
 from service.foundation.settings import Settings
-from service.journal import log
-from service.storage.database import Database, EventRow
+from service.storage.database import Database
 from tests.service.data import DEADLINE, eventually, stream, train, upload
 from tests.service.server import Server
-from tests.service.streams import STREAM, dial, frame, hello, read, saved_model
+from tests.service.streams import STREAM, batches, dial, frame, hello, read, rows, saved_model
 
 
 @dataclass(frozen=True)
@@ -50,22 +48,6 @@ def learning(tmp_path_factory):
 
 def client_of(server: Server, stream_id: str, model: str = "pendulum", **options: Any) -> StreamClient:
     return StreamClient(model, server.url, timeout=DEADLINE, stream_id=stream_id, **options)
-
-
-def batches(server: Server, stream_id: str) -> list[EventRow]:
-    """What is durable of a stream, in the order of the log."""
-    database = Database.of(Settings(home=server.home))
-    try:
-        with database.session() as session:
-            query = select(EventRow).where(EventRow.stream_id == stream_id, EventRow.kind == "batch")
-            return list(session.scalars(query.order_by(EventRow.number).options(undefer(EventRow.payload))))
-    finally:
-        database.close()
-
-
-def rows(server: Server, stream_id: str) -> Rows:
-    """All rows that are durable of a stream."""
-    return Rows.concatenate([log.decode(event.payload) for event in batches(server, stream_id)])
 
 
 def sent_once(found: Rows, measured: Measured, indices: list[int]) -> None:

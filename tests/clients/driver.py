@@ -1,0 +1,76 @@
+"""A C++ client in a process of its own, which does what it is told line by line: clients/cpp/tests/drive.cpp."""
+
+import json
+import os
+import subprocess
+import threading
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from tests.service.data import DEADLINE
+
+
+class Driver:
+    """The client; options: those of `lipserve::Options`, as the program takes them. rows: (N, 4, n) q, dq, ddq, tau."""
+
+    def __init__(self, program: Path, rows: np.ndarray | None = None, **options: Any) -> None:
+        if rows is not None:
+            file = program.with_name(f"{program.name}-{id(self)}.rows")
+            file.write_bytes(np.ascontiguousarray(rows, "<f8").tobytes())
+            options |= {"rows": file, "joints": rows.shape[2]}
+        environment = {name: value for name, value in os.environ.items() if not name.startswith("LIPSERVE_")}
+        environment |= {name: options.pop(name) for name in list(options) if name.startswith("LIPSERVE_")}
+        self.process = subprocess.Popen(
+            [program, *(f"{name}={value}" for name, value in options.items())],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=environment,
+        )
+        self._limit = threading.Timer(4 * DEADLINE, self.process.kill)  # a client that hangs fails its test
+        self._limit.start()
+
+    def begin(self, line: str) -> None:
+        """Let it do something."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(line + "\n")
+        self.process.stdin.flush()
+
+    def line(self) -> str:
+        """The next line that it prints."""
+        assert self.process.stdout is not None
+        assert self.process.stderr is not None
+        if line := self.process.stdout.readline():
+            return line
+        raise AssertionError(self.process.stderr.read())
+
+    def end(self) -> dict[str, Any]:
+        """What has become of what it was to do. Nothing may have been allocated for it."""
+        while not (line := self.line()).startswith("{"):
+            pass
+        report: dict[str, Any] = json.loads(line)
+        assert report["allocations"] == 0, report
+        return report
+
+    def do(self, line: str) -> dict[str, Any]:
+        """Do something, and return what has become of it."""
+        self.begin(line)
+        return self.end()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            _, errors = self.process.communicate("" if self.process.poll() is not None else "end\n", DEADLINE)
+            if error is None:  # sanitizers speak at the end, too
+                assert self.process.returncode == 0, errors
+        finally:
+            self._limit.cancel()
+            self.process.kill()
