@@ -44,6 +44,12 @@ class Talk:
         mask, payload = self.take(4), self.take(size)
         return first & 15, apply_mask(payload, mask) if payload else b""
 
+    def end(self) -> None:
+        """Say no more, and wait for the client to go: to close while something is unread takes back what was said."""
+        self.connection.shutdown(socket.SHUT_WR)
+        while self.connection.recv(1 << 16):
+            pass
+
     def request(self) -> int:
         """Sequence of the client's next request."""
         opcode, payload = self.read()
@@ -115,6 +121,7 @@ def streaming(script: Callable[[Talk], None], **hello: object) -> Callable[[sock
         talk = Talk(connection)
         talk.text(**{**HELLO, **hello})
         script(talk)
+        talk.end()
 
     return serve
 

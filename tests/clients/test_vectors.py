@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from service.stream.exchange import Exchange, StreamError, read_answer
 from websockets.frames import Frame, Opcode
 from websockets.utils import accept_key, apply_mask
 
+from lipserve.exchange import Exchange, StreamError, read_answer
 from tests.clients.building import CPP, VECTORS, built, checked, fuzzes, here, sanitizers
 from tests.service.streams import read
 
