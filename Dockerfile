@@ -29,7 +29,7 @@ FROM python:3.11-slim
 # Pinocchio's OpenMP runtime, which slim images lack
 RUN apt-get update && apt-get install --yes --no-install-recommends libgomp1 && rm -rf /var/lib/apt/lists/*
 RUN useradd --system --uid 10001 --no-create-home --shell /usr/sbin/nologin lipserve \
-    && mkdir /data && chown lipserve /data
+    && mkdir --mode=700 /data && chown lipserve /data
 COPY --from=build /opt/lipserve /opt/lipserve
 # compiled kernels; writable, since another processor than the build's compiles its own
 COPY --from=build --chown=lipserve /opt/numba /opt/numba
