@@ -15,7 +15,7 @@ from lipcore.online.errors import whitened
 from lipcore.robots.urdf import PARAMETERS
 
 if TYPE_CHECKING:
-    from lipcore.online.payload import Draw
+    from lipcore.online.draws import Draw
 
 Seen = tuple[Motion, tuple[Array, Array]]
 """Instants, and what terms other than the arm make there."""

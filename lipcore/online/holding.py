@@ -13,9 +13,9 @@ from lipcore.model.body import Body
 from lipcore.model.payload import Carrier, Linearised, Load
 from lipcore.online.batch import Rows
 from lipcore.online.bodies import ANY, WIDTH
+from lipcore.online.draws import arms
 from lipcore.online.held import Held, evenly, no_rows
 from lipcore.online.hypotheses import AFTER, BEFORE, CELL_S, LEAST_BEFORE, Cell, Window, cells_of
-from lipcore.online.payload import arms
 from lipcore.online.verdict import (
     ALIKE,
     AT_ONCE,

@@ -14,59 +14,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.linalg import qr, solve_triangular
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
-from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative
-from lipcore.kernels.geometry import Geometry
-from lipcore.model.payload import Carrier, Linearised, Load
+from lipcore.model.payload import Carrier, Load
 from lipcore.online.batch import Rows
-from lipcore.online.bodies import ANY, WIDTH, Known, body, inverse
+from lipcore.online.bodies import ANY, Known, body, inverse
+from lipcore.online.draws import SEED, Draw, Place, Point, Training, arms, linearised_around, minimum
 from lipcore.online.errors import correlation_roots, whitened
 from lipcore.online.estimate import Estimate, Seen, alone, rows_of
 from lipcore.online.linear import linear
 from lipcore.robots.urdf import PARAMETERS
 
-FIRST, ROUNDS, FEW, STILL = 30, 8, 4, 0.01
+FIRST, ROUNDS, FEW = 30, 8, 4
 """Steps at most of an estimate from nothing, of one that begins at another, and of a draw from its posterior: an answer
-waits for them; and the least that one gains, nats."""
-DAMPING, LESS, MORE = 1e-3, 0.15, 8.0
-"""At first, as a share of the curvature; its factors after a step that gains, and after one that does not."""
-LEAST_DAMPING, WORST = 1e-9, 1e8
-"""It is not less; and from which on nothing is gained."""
-REACH = 0.5
-"""Longest step of the geometry, rad or m."""
-DRAWS, WIDE, RELAXED, SEED = 10, (1.0, 6.0), 20, 0
-"""Draws from the posterior by which it is judged how far it is from linear, followed from estimate to estimate; how
-many deviations of the linear posterior wide they begin, from and to, as where it is bent it is wider; steps in which
-they become arms that the training allows; and what they are drawn by."""
+waits for them."""
 LINEAR, SOFT, FAR = 2.0, 3.0, 10.0
 """The mean square, in deviations of the linear posterior, up to which it is as good; and the energies above the least,
 for each number that is unknown, nats, over which a draw counts e times less, as it has not come far enough yet, and
 from which on rows have ruled it out."""
-
 MEDIAN = 0.6745
 """Of the absolute value of what has a normal distribution, standard deviations."""
-
-
-def arms(carrier: Carrier) -> tuple[Draw, ...]:
-    """Draws from what the training alone says, with any payload; made once a version, by the revision that asks first,
-    and again where another has learnt more directions."""
-    training, draw = _Training.of(carrier), np.random.default_rng(SEED)
-    size = len(carrier.memory.slope) + len(carrier.memory.outside) + len(carrier.mean) + PARAMETERS
-    known = _ARMS.get(carrier.term, ())
-    if not known or len(known[0].noise) != size:
-        known = _ARMS[carrier.term] = tuple(training.drawn(draw) for _ in range(DRAWS))
-    return known
-
-
-_ARMS: WeakKeyDictionary[ArmKernel, tuple[Draw, ...]] = WeakKeyDictionary()
 
 
 def estimate(
@@ -86,12 +58,12 @@ def estimate(
     if start is not None and len(start.load.mean) != size + PARAMETERS:
         start = None
     draw = np.random.default_rng([SEED, len(rows)])
-    at = _minimum(problem, problem.at(problem.begin(start)), FIRST if start is None else ROUNDS)
+    at = minimum(problem, problem.at(problem.begin(start)), FIRST if start is None else ROUNDS)
     # with more rows, what was as good as linear stays so
     settled = start is not None and not start.draws and not anew
     drawn = [] if settled else _draws(problem, at, () if start is None else start.draws, draw, anew)
     if drawn:  # each of which is the minimum for other noise
-        other = _minimum(problem, min([point for point, _ in drawn], key=lambda each: each.energy), ROUNDS)
+        other = minimum(problem, min([point for point, _ in drawn], key=lambda each: each.energy), ROUNDS)
         at = min([at, other], key=lambda each: each.energy)
     # not from the curvature, of whose condition the root is enough: a covariance above the prior's is none
     root = solve_triangular(qr(at.derivative, mode="r")[0][: size + PARAMETERS], np.eye(size + PARAMETERS))
@@ -112,120 +84,12 @@ def estimate(
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
-    """An arm and its payload. w: (M,); geometry: of the arm; eta: (10,)."""
-
-    w: Array
-    geometry: Geometry
-    eta: Array
-
-    def moved(self, carrier: Carrier, step: Array) -> Place:
-        """The place a whitened step away, (M + 10,), or as far in its direction as is gone at once."""
-        size, steps = len(self.w), carrier.steps
-        by, eta = carrier.memory.root @ step[:size], step[size:]
-        longest = max(np.abs(eta / WIDTH).max() / 2, np.abs(carrier.root[steps] * by[steps]).max() / REACH)
-        by, eta = by / max(1.0, longest), eta / max(1.0, longest)
-        w, arm, geometry = self.w + by, carrier.term.arm, self.geometry.moved(carrier.root[steps] * by[steps])
-        w[steps] = (arm.geometry.towards(geometry) - arm.expected) / carrier.root[steps]
-        return Place(w, geometry, self.eta + eta)
-
-
-@dataclass(frozen=True, eq=False)
-class Draw:
-    """A draw from the posterior: the place of least energy for other noise. noise: of what is known beforehand."""
-
-    place: Place
-    noise: Array
-
-
-@dataclass(frozen=True, eq=False)
-class _Point:
-    """The energy of a place. residual, derivative: of it, by whitened steps; misfit: mean square of the rows' part."""
-
-    place: Place
-    residual: Array
-    derivative: Array
-    misfit: float
-
-    @property
-    def energy(self) -> float:
-        """Nats."""
-        return 0.5 * float(self.residual @ self.residual)
-
-
-def _minimum(problem: _Training | _Problem, at: _Point, rounds: int, shift: Array | float = 0.0) -> _Point:
-    """Where the energy is least, or what is reached in so many steps; shift: what the residuals should be."""
-    damping, carrier = DAMPING, problem.carrier
-    for _ in range(rounds):
-        off = at.residual - shift
-        energy = 0.5 * float(off @ off)
-        curvature, gradient = at.derivative.T @ at.derivative, at.derivative.T @ off
-        while damping < WORST:
-            step = np.asarray(np.linalg.solve(curvature + damping * np.diag(np.diagonal(curvature)), -gradient))
-            trial = problem.at(at.place.moved(carrier, step))
-            left = trial.residual - shift
-            gained = energy - 0.5 * float(left @ left)
-            if gained >= 0:
-                break
-            damping *= MORE
-        else:
-            break
-        at, damping = trial, max(LESS * damping, LEAST_DAMPING)
-        if gained < STILL:
-            break
-    return at
-
-
-@dataclass(frozen=True, eq=False)
-class _Training:
-    """What the training of an arm says. virtual: motions of its memory."""
-
-    carrier: Carrier
-    virtual: Seen
-
-    @classmethod
-    def of(cls, carrier: Carrier) -> _Training:
-        motion = Motion.from_arrays(*carrier.memory.motions.swapaxes(0, 1))
-        return cls(carrier, (motion, carrier.rest(motion)))
-
-    def at(self, place: Place) -> _Point:
-        """The energy of a place, whose payload is left as it is."""
-        memory, size = self.carrier.memory, len(place.w)
-        features, torque = rows_of(_around(self.carrier, place, np.zeros(PARAMETERS)), *self.virtual)
-        by_arm = memory.derivative(features[:size])
-        derivative = np.zeros((len(by_arm) + PARAMETERS, size + PARAMETERS))
-        derivative[: len(by_arm), :size] = by_arm
-        derivative[len(by_arm) :, size:] = np.eye(PARAMETERS)
-        residual = np.concatenate([memory.residual(place.w, torque), np.zeros(PARAMETERS)])
-        return _Point(place, residual, derivative, 0.0)
-
-    def drawn(self, draw: np.random.Generator) -> Draw:
-        """One of the arms that the training allows, with any payload."""
-        carrier, geometry = self.carrier, self.carrier.term.arm.geometry.moved(self.carrier.step)
-        steps, root = carrier.steps, carrier.root
-        by = draw.uniform(*WIDE) * carrier.memory.root @ draw.standard_normal(len(carrier.mean))
-        w, arm, geometry = carrier.mean + by, carrier.term.arm, geometry.moved(root[steps] * by[steps])
-        w[steps] = (arm.geometry.towards(geometry) - arm.expected) / root[steps]
-        at = self.at(Place(w, geometry, ANY.centre))
-        noise = draw.standard_normal(len(at.residual))
-        still = np.concatenate([noise[:-PARAMETERS], np.zeros(PARAMETERS)])
-        return Draw(_minimum(self, at, RELAXED, still).place, noise)
-
-    @cached_property
-    def alone(self) -> float:
-        """Energy of the arm as it was learnt, nats."""
-        memory, mean = self.carrier.memory, self.carrier.mean
-        alone = memory.residual(mean, memory.base + np.tensordot(mean, memory.features, axes=1))
-        return 0.5 * float(alone @ alone)
-
-
-@dataclass(frozen=True, eq=False)
 class _Problem:
     """What is minimised. loaded, free: motions with a payload, and without; tau: of both, the free ones first, (N, n)
     N·m; roots: see `correlation_roots`, of both."""
 
     carrier: Carrier
-    training: _Training
+    training: Training
     loaded: Seen
     free: Seen | None
     tau: Array
@@ -241,7 +105,7 @@ class _Problem:
         both = rows if before is None else Rows.concatenate([before, rows])
         return cls(
             carrier,
-            _Training.of(carrier),
+            Training.of(carrier),
             seen(rows.motion()),
             None if before is None else seen(before.motion()),
             both.tau,
@@ -258,13 +122,13 @@ class _Problem:
             return Place(self.carrier.mean, geometry, self.prior.centre)
         return Place(start.load.mean[:-PARAMETERS], geometry, start.eta)
 
-    def at(self, place: Place) -> _Point:
+    def at(self, place: Place) -> Point:
         """The energy of a place."""
         trained, size = self.training.at(place), len(place.w)
         payload, slope = body(place.eta)
-        features, torque = rows_of(_around(self.carrier, place, payload), *self.loaded)
+        features, torque = rows_of(linearised_around(self.carrier, place, payload), *self.loaded)
         if self.free is not None:
-            others, torque_free = rows_of(_around(self.carrier, place, np.zeros(PARAMETERS)), *self.free)
+            others, torque_free = rows_of(linearised_around(self.carrier, place, np.zeros(PARAMETERS)), *self.free)
             others[-PARAMETERS:] = 0.0
             features, torque = np.concatenate([others, features], axis=1), np.concatenate([torque_free, torque])
         features, off = whitened(self.roots, features, torque - self.tau)
@@ -274,9 +138,9 @@ class _Problem:
         derivative[len(trained.derivative) - PARAMETERS : len(trained.derivative), size:] = root
         residual = np.concatenate([trained.residual, off])
         residual[len(trained.residual) - PARAMETERS : len(trained.residual)] = root @ (place.eta - self.prior.centre)
-        return _Point(place, residual, derivative, float((off**2).mean()))
+        return Point(place, residual, derivative, float((off**2).mean()))
 
-    def gains(self, at: _Point) -> tuple[float, float]:
+    def gains(self, at: Point) -> tuple[float, float]:
         """Nats by which a payload, and a contact of constant torque, explain the rows better than the arm does without
         either, which is linear then."""
         least, volume, contact = alone(self.carrier, self.free, self.loaded, self.tau, self.roots)
@@ -284,21 +148,16 @@ class _Problem:
         return self.training.alone + least - at.energy + 0.5 * (volume - float(curved)), contact
 
 
-def _around(carrier: Carrier, place: Place, payload: Array) -> Linearised:
-    nothing = np.zeros((0, 0))
-    return Linearised(carrier, Load(np.append(place.w, payload), nothing, np.ones(PARAMETERS), place.geometry))
-
-
 def _draws(
-    problem: _Problem, at: _Point, known: Sequence[Draw], draw: np.random.Generator, anew: bool
-) -> list[tuple[_Point, Array]]:
+    problem: _Problem, at: Point, known: Sequence[Draw], draw: np.random.Generator, anew: bool
+) -> list[tuple[Point, Array]]:
     """Draws from the posterior, with their noise: minima for other noise of the training, of what is known of payloads
     and of the rows (randomised maximum likelihood, Kitanidis 1995, Oliver et al. 1996). known: of fewer rows; anew:
     whether those that rows have ruled out begin again."""
 
-    def sought(begin: Draw, rounds: int = FEW) -> tuple[_Point, Array]:
+    def sought(begin: Draw, rounds: int = FEW) -> tuple[Point, Array]:
         noise = np.append(begin.noise, draw.standard_normal(problem.tau.size))
-        return _minimum(problem, problem.at(begin.place), rounds, noise), begin.noise
+        return minimum(problem, problem.at(begin.place), rounds, noise), begin.noise
 
     def carrying(arm: Draw) -> Draw:
         return replace(arm, place=replace(arm.place, eta=at.place.eta))
@@ -320,14 +179,12 @@ def _wider(std: Array, off: Sequence[Array]) -> Array:
     return np.maximum(1.0, np.median(np.abs(off), axis=0) / (MEDIAN * std))
 
 
-def _ruled_out(least: _Point) -> float:
+def _ruled_out(least: Point) -> float:
     """Energy from which on a draw is ruled out, nats."""
     return least.energy + FAR * len(least.derivative.T)
 
 
-def _others(
-    carrier: Carrier, at: _Point, root: Array, points: Sequence[_Point]
-) -> tuple[tuple[Alternative, ...], bool]:
+def _others(carrier: Carrier, at: Point, root: Array, points: Sequence[Point]) -> tuple[tuple[Alternative, ...], bool]:
     """Arms all over the posterior where it is far from linear, the most likely one first; and whether it is.
 
     Few rows leave a curved valley open, along which a centre of mass and the geometry make up for each other, and the
