@@ -23,7 +23,7 @@ from service.inference.predicting import decode, encode
 from service.models.loaded import LoadedModels, LoadedModelsDep
 from service.models.served import Served, reached
 from service.web.limits.requests import PredictionsDep
-from service.web.route import OCTETS, Reply, Route, hot_route, is_json, media_type
+from service.web.route import JSON, OCTETS, Reply, Route, hot_route, is_json, media_type
 
 _CONTENT: dict[str, Any] = {
     "application/json": {"schema": {}, "example": {"q": [0.0, -0.5], "dq": [0.1, 0.0], "ddq": [0.0, 0.5]}},
@@ -38,12 +38,14 @@ echo_hot = APIRouter(tags=["inference"], responses=responses(TooLargeError))
 
 
 async def _echo(scope: Scope, body: bytes) -> Reply | None:
-    given = media_type(scope)
-    return Reply(body, given) if given else None
+    if not media_type(scope):
+        return None
+    return Reply(body, JSON if is_json(scope) else OCTETS)
 
 
 async def echo(request: Request) -> Response:
-    """Answer the body as it came, with its media type, on the way that a query takes, limits and all.
+    """Answer the body as it came, on the way that a query takes, limits and all: JSON as such, anything else as octets,
+    so that nobody's page seems to be the service's.
 
     What a query takes longer is what the service computes; what the echo takes is HTTP, and the measuring client.
     """

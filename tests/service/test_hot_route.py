@@ -163,10 +163,18 @@ def test_what_is_decoded_and_encoded_is_what_is_documented():
         assert fields == {name: field.is_required() for name, field in documented.model_fields.items()}
 
 
-@pytest.mark.parametrize(("body", "media_type"), [(b"\x00\xff" * 500, "application/x-any"), (b"", "a/b")])
-def test_the_echo(api, body, media_type):
-    answer = api.post("/v1/echo", content=body, headers={"content-type": media_type})
-    assert (answer.status_code, answer.content, answer.headers["content-type"]) == (200, body, media_type)
+@pytest.mark.parametrize(
+    ("body", "given", "answered"),
+    [
+        (b"\x00\xff" * 500, "application/x-any", "application/octet-stream"),
+        (b"<script>alert(1)</script>", "text/html", "application/octet-stream"),
+        (b"", "a/b", "application/octet-stream"),
+        (b"{}", "application/json; charset=utf-8", "application/json"),
+    ],
+)
+def test_the_echo(api, body, given, answered):
+    answer = api.post("/v1/echo", content=body, headers={"content-type": given})
+    assert (answer.status_code, answer.content, answer.headers["content-type"]) == (200, body, answered)
     assert answer.headers["x-content-type-options"] == "nosniff"
     plain = api.post("/v1/echo", content=b"abc")
     assert (plain.content, plain.headers["content-type"]) == (b"abc", "application/octet-stream")

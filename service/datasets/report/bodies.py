@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
@@ -209,6 +208,8 @@ def torque_order(bodies: Bodies, signals: Signals) -> Order | None:
 
     Every column is fitted with the torque and friction of every joint; the assignment with the least errors counts.
     """
+    from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - serving does without it
+
     gravity, rest = bodies.parts(signals)
     dq, tau, n = signals.dq, signals.tau, signals.q.shape[1]
     errors = np.empty((EIGHTHS, n, n))
