@@ -76,8 +76,11 @@ def test_what_a_controller_measures_is_learnt_while_it_asks(learning, measured):
     trained = saved_model(learning, "pendulum", 1)
     model = OnlineModel.start(trained).learn(found).model()
     assert {answer.revision for answer in after} == {learnt.revision}
-    np.testing.assert_allclose([answer.tau for answer in after], [model.answer(each)[0] for each in unseen], rtol=1e-6)
-    assert max(np.abs(after[k].tau - trained.answer(unseen[k])[0]).max() for k in range(len(unseen))) > 1e-4
+    answered = np.array([answer.tau for answer in after])
+    np.testing.assert_allclose(answered, [model.answer(each)[0] for each in unseen], rtol=1e-6)
+    # rows that come faster teach less, as they say the same again: how much is the machine's, more than rounding is not
+    before = np.array([trained.answer(each)[0] for each in unseen])
+    assert np.abs(answered / before - 1).max() > 1e-5
 
 
 def test_nothing_is_acknowledged_before_it_is_in_the_database(learning, measured):
