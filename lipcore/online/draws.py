@@ -49,8 +49,12 @@ class Place:
         size, steps = len(self.w), carrier.steps
         by, eta = carrier.memory.root @ step[:size], step[size:]
         longest = max(np.abs(eta / WIDTH).max() / 2, np.abs(carrier.root[steps] * by[steps]).max() / REACH)
-        by, eta = by / max(1.0, longest), eta / max(1.0, longest)
-        w, arm, geometry = self.w + by, carrier.term.arm, self.geometry.moved(carrier.root[steps] * by[steps])
+        return self.shifted(carrier, by / max(1.0, longest), eta / max(1.0, longest))
+
+    def shifted(self, carrier: Carrier, by: Array, eta: Array) -> Place:
+        """The place where w is larger by (M,), its geometry moved as far, and η by (10,)."""
+        steps, arm = carrier.steps, carrier.term.arm
+        w, geometry = self.w + by, self.geometry.moved(carrier.root[steps] * by[steps])
         w[steps] = (arm.geometry.towards(geometry) - arm.expected) / carrier.root[steps]
         return Place(w, geometry, self.eta + eta)
 
@@ -138,12 +142,10 @@ class Training:
 
     def drawn(self, draw: np.random.Generator) -> Draw:
         """One of the arms that the training allows, with any payload."""
-        carrier, geometry = self.carrier, self.carrier.term.arm.geometry.moved(self.carrier.step)
-        steps, root = carrier.steps, carrier.root
+        carrier = self.carrier
+        learnt = Place(carrier.mean, carrier.term.arm.geometry.moved(carrier.step), ANY.centre)
         by = draw.uniform(*WIDE) * carrier.memory.root @ draw.standard_normal(len(carrier.mean))
-        w, arm, geometry = carrier.mean + by, carrier.term.arm, geometry.moved(root[steps] * by[steps])
-        w[steps] = (arm.geometry.towards(geometry) - arm.expected) / root[steps]
-        at = self.at(Place(w, geometry, ANY.centre))
+        at = self.at(learnt.shifted(carrier, by, np.zeros(PARAMETERS)))
         noise = draw.standard_normal(len(at.residual))
         still = np.concatenate([noise[:-PARAMETERS], np.zeros(PARAMETERS)])
         return Draw(minimum(self, at, RELAXED, still).place, noise)
@@ -165,10 +167,10 @@ def linearised_around(carrier: Carrier, place: Place, payload: Array) -> Lineari
 def arms(carrier: Carrier) -> tuple[Draw, ...]:
     """Draws from what the training alone says, with any payload; made once a version, by the revision that asks first,
     and again where another has learnt more directions."""
-    training, draw = Training.of(carrier), np.random.default_rng(SEED)
     size = len(carrier.memory.slope) + len(carrier.memory.outside) + len(carrier.mean) + PARAMETERS
     known = _ARMS.get(carrier.term, ())
     if not known or len(known[0].noise) != size:
+        training, draw = Training.of(carrier), np.random.default_rng(SEED)
         known = _ARMS[carrier.term] = tuple(training.drawn(draw) for _ in range(DRAWS))
     return known
 
