@@ -13,16 +13,20 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
+from math import inf
+from multiprocessing.process import BaseProcess
 from typing import Any, ParamSpec, Protocol, Self, TypeVar
 
 from lipcore.fitting.hyperparameters import FitCancelledError
 from service.compute import remote
 from service.compute.process import Place, start_process
+from service.compute.progress import LOOK_S, Progress
 from service.foundation.settings import Settings
 from service.web.observability import logs
 
@@ -81,7 +85,8 @@ class Inline(Executor):
 
 
 class Processes(Executor):
-    """Processes of this host in the place of this one: as nice, on the same CPUs. A pool that broke is replaced."""
+    """Processes of this host in the place of this one: as nice, on the same CPUs. A pool that broke is replaced, one
+    that hangs is broken."""
 
     def __init__(self, settings: Settings) -> None:
         self._new = partial(
@@ -93,22 +98,45 @@ class Processes(Executor):
             initargs=(Place(settings.training_threads, log=logs.current()),),
         )
         self._pool = self._new()
+        self._progress = Progress(
+            lambda: [each.pid for each in self._processes() if each.pid], settings.job_heartbeat_s, inf
+        )
+        self._looked = time.monotonic()
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Hand a call to the next free process."""
         try:
-            return self._pool.submit(fn, *args, **kwargs)
+            future = self._pool.submit(fn, *args, **kwargs)
         except BrokenProcessPool:
             self._pool.shutdown(wait=False, cancel_futures=True)
             self._pool = self._new()
-            return self._pool.submit(fn, *args, **kwargs)
+            self._progress.step()
+            future = self._pool.submit(fn, *args, **kwargs)
+        future.add_done_callback(lambda _: self._progress.step())
+        return future
+
+    def look(self) -> None:
+        """End all processes where none of them has got on for `job_heartbeat_s` while work waits: one that others wait
+        for hangs. To be asked often."""
+        if time.monotonic() - self._looked < LOOK_S / 4:
+            return
+        self._looked = time.monotonic()
+        if (reason := self._progress.look()) is not None:
+            logger.error("processes that sum up statistics hang and are killed: %s", reason)
+            self._progress.step()
+            for process in self._processes():
+                process.kill()
+
+    def _processes(self) -> list[BaseProcess]:
+        # there is no public way to them: `kill_workers` of Python 3.14 may wait
+        return list((self._pool._processes or {}).values())
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Give up what waits; without `wait` the processes are ended, whatever they do."""
-        processes = list((self._pool._processes or {}).values())
+        processes = self._processes()
         self._pool.shutdown(wait=wait, cancel_futures=cancel_futures)
         if not wait:
-            for process in processes:  # `kill_workers` of Python 3.14 may wait
+            for process in processes:
                 process.kill()
 
 
@@ -249,6 +277,8 @@ def summed(
                     raise ShardFailedError(message)
                 tries[number] += 1
                 running[executor.submit(work, shards[number])] = number
+            if isinstance(executor, Processes):
+                executor.look()
             for future in wait(running, 0 if more else POLL_S, FIRST_COMPLETED).done:
                 number, error = running.pop(future), _error(future)
                 if error is None:

@@ -165,6 +165,18 @@ class Settings(BaseSettings):
     learner_niceness: int = Field(
         10, ge=0, le=19, description="Niceness of the learner process and of the threads that take observations."
     )
+    learner_heartbeat_s: float = Field(
+        45.0,
+        ge=1,
+        description="Time in s in which a learner process neither ends a step nor computes, after which it is "
+        "replaced.",
+    )
+    learner_step_s: float = Field(
+        900.0, ge=1, description="Longest that one step of the learner process may take, s; then it is replaced."
+    )
+    learner_lag_s: float = Field(
+        30.0, gt=0, description="Time in s for which observations may wait to be learnt before readiness warns of it."
+    )
     quality_windows_s: tuple[float, ...] = Field(
         (60.0, 600.0, 3600.0), min_length=1, description="Windows of the prequential quality, s."
     )
@@ -241,7 +253,10 @@ class Settings(BaseSettings):
         1.0, gt=0, le=1.5, description="Time in s that a training process has to obey a cancel; then it is killed."
     )
     job_heartbeat_s: float = Field(
-        60.0, ge=5, description="Time in s without a sign of life after which a training process is killed."
+        60.0,
+        ge=5,
+        description="Time in s without a sign of life after which a training process is killed; it gives none once it "
+        "has not got on for as long.",
     )
     job_start_s: float = Field(
         120.0, gt=0, description="Time in s that a training process may take to start; then it is killed."

@@ -21,6 +21,7 @@ from lipserve.states import PartState
 from service.compute.process import Place
 from service.foundation.errors import BusyError
 from service.foundation.fields import of_app
+from service.journal import log
 from service.learning.ingest.batches import Frames, FramesResult, observe_batch, observe_frames
 from service.learning.ingest.intake import Intake
 from service.learning.ingest.monitor import Monitor
@@ -40,7 +41,7 @@ MOST_THREADS = 2
 MOST_WAITING = 100
 """Batches that wait for their turn; more are refused, as their rows fill the memory."""
 RESTART_S = 10.0
-"""Time in s within which a learner process that died should have been started again."""
+"""Time in s within which a learner process that died should have been started again, or one that stands still go on."""
 
 
 class IngestThreads:
@@ -119,6 +120,7 @@ class Learners:
         self._lock = threading.Lock()
         self._monitors: dict[str, Monitor] = {}
         self._status: dict[tuple[str, int], Status] = {}
+        self._revisions: dict[tuple[str, int], int] = {}  # of versions that were behind, at the last look
         self.process = LearnerProcess(settings, self._receive)
         loaded.learn_from(self.process.wake)
         loaded.when_deleted.append(self.forget)
@@ -171,15 +173,39 @@ class Learners:
             self._status = {key: status for key, status in self._status.items() if key[0] != model}
 
     def look(self, lasting: Lasting) -> tuple[PartState, str]:
-        """Whether the learner process runs where something learns, for readiness."""
+        """Whether the learner process runs and gets on where something learns, for readiness; not for the event loop.
+        What waits is a warning: of one version that cannot learn, others and all answers know nothing."""
         if not self.process.needed:
             return "ok", "not needed yet"
         gone = lasting(self.process.pid is None)
-        if gone is None:
-            return "ok", "runs"
-        if gone <= RESTART_S:
+        if gone is not None and gone <= RESTART_S:
             return "warning", "is being started"
-        return "failed", f"has not run for {gone:.0f} s: observations are stored, but not learnt"
+        if gone is not None:
+            return "failed", f"has not run for {gone:.0f} s: observations are stored, but not learnt"
+        if (silent_s := self.process.silent_s) > RESTART_S:
+            return "failed", f"has not got on for {silent_s:.0f} s: observations are stored, but not learnt"
+        behind, stands = self._behind()
+        waited = lasting(stands, "lag")
+        if waited is not None and waited > self.settings.learner_lag_s:
+            return "warning", f"runs, but {behind} events wait, of which it has learnt none for {waited:.0f} s"
+        return "ok", "runs"
+
+    def _behind(self) -> tuple[int, bool]:
+        """Events that wait to be learnt by versions that answer, and whether one of these has not learnt since this was
+        asked last."""
+        behind, before = 0, self._revisions
+        self._revisions = {}
+        with self.database.session() as session:
+            for model in self.monitors():
+                served = self.loaded.hot(model, None)
+                if served is None:
+                    continue
+                key = model, served.version
+                wait = log.newest(session, model) - log.start_of(session, *key) - served.revision
+                if wait > 0:
+                    behind += wait
+                    self._revisions[key] = served.revision
+        return behind, any(before.get(key) == revision for key, revision in self._revisions.items())
 
     def status(self, model: str, version: int) -> Status:
         """The learner process's latest messages about a version."""

@@ -28,6 +28,8 @@ KINDS = (JOBS, FINISHED, DURATION)
 BOUNDS = (1.0, 3.0, 10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 10_800.0, 36_000.0)
 START_S = 60.0
 """Time in s within which a job should have been started where a training process is free."""
+SILENT_S = 10.0
+"""Time in s for which a training process that is well is silent at most: it beats twice a second."""
 OUTCOMES = (SUCCEEDED, FAILED, CANCELLED)
 
 
@@ -69,6 +71,9 @@ def look(queue: JobQueue, lasting: Lasting) -> tuple[PartState, str]:
         return ("warning" if none else "ok"), f"{words}, the cluster takes {cluster.jobs} at a time"
     stuck = lasting(waiting > 0 and running < queue.settings.training_workers)
     if stuck is None or stuck <= START_S:
+        silent_s = queue.silent_s
+        if silent_s > SILENT_S:
+            return "warning", f"{words}; a training process has given no sign of life for {silent_s:.0f} s"
         return "ok", words
     return "failed", f"{waiting} jobs wait, though no more than {running} have run for {stuck:.0f} s"
 

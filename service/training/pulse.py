@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable
 from contextvars import copy_context
+from math import inf
 from types import TracebackType
 from typing import Any, Self
 
 from lipcore.fitting.hyperparameters import FitProgress
+from service.compute.progress import Progress
 from service.storage.database import Database, JobRow, now
 
 SEARCH = "hyperparameters"
@@ -74,13 +77,15 @@ class SupersededError(RuntimeError):
 
 
 class Pulse:
-    """Beats while its block runs. The fit asks and tells it without waiting for the database.
+    """Beats while its block runs and gets on. The fit asks and tells it without waiting for the database.
+
+    A process whose work hangs has a pulse no longer, and is ended by whoever looks for it: see `lifecycle`.
 
     own: reads the job's row in a session; raises SupersededError where it is not this attempt's any more; model: that
-    the job is of, so that those who write of others need not wait for a beat.
+    the job is of, so that those who write of others need not wait for a beat; quiet_s: longest time without progress.
     """
 
-    def __init__(self, database: Database, own: Callable[[Any], JobRow], model: str) -> None:
+    def __init__(self, database: Database, own: Callable[[Any], JobRow], model: str, quiet_s: float = inf) -> None:
         self.database, self.own, self.model = database, own, model
         self.remaining: Remaining | None = None
         self._began = time.monotonic()
@@ -88,6 +93,8 @@ class Pulse:
         self._ends: float | None = None
         self._latest: dict[str, Any] = {"stage": "loading"}
         self._stop, self._superseded = False, False
+        pids = (os.getpid(),)
+        self._progress, self._hangs = Progress(lambda: pids, quiet_s, inf), False
         self._wake, self._ended = threading.Event(), False
         # in the context of the job, which its log lines name
         self._thread = threading.Thread(target=copy_context().run, args=(self._beat,), daemon=True, name="pulse")
@@ -108,6 +115,7 @@ class Pulse:
 
     def progress(self, at: FitProgress) -> None:
         """Take the fit's progress; it is written with the next beat."""
+        self._progress.step()
         if self.remaining is not None:
             self.remaining.step(at, time.monotonic())
         changed = at.stage != self._latest["stage"]
@@ -128,6 +136,7 @@ class Pulse:
 
     def share(self, done: float) -> None:
         """Take what share of the pass is done; how long the rest takes shows from then on."""
+        self._progress.step()
         clock = time.monotonic()
         if self._latest["stage"] != STATISTICS or self._pass_began[1] == 0.0:  # not by how long workers take to start
             self._pass_began = clock, done
@@ -144,11 +153,13 @@ class Pulse:
 
     def stage(self, name: str) -> None:
         """Say what is done now."""
+        self._progress.step()
         self._latest = {**self._latest, "stage": name, "estimator": None}
         self._wake.set()
 
     def cancelled(self) -> bool:
         """Whether to stop; raise SupersededError where the job was given to another attempt."""
+        self._progress.step()  # whoever asks is at work, if only waiting for the processes that share it
         if self._superseded:
             raise SupersededError
         return self._stop
@@ -181,5 +192,13 @@ class Pulse:
     def _exchange(self) -> None:
         with self.database.transaction(self.model) as session:
             row = self.own(session)
-            row.progress, row.heartbeat_at = self.as_json(), now()
+            if self._gets_on():
+                row.progress, row.heartbeat_at = self.as_json(), now()
             self._stop = row.cancel_requested
+
+    def _gets_on(self) -> bool:
+        reason = self._progress.look()
+        if reason is not None and not self._hangs:
+            logger.error("no signs of life are given any more: %s", reason)
+        self._hangs = reason is not None
+        return not self._hangs

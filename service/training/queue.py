@@ -85,6 +85,12 @@ class JobQueue:
         """End the process that runs a job, if one does, unless it ends within `job_cancel_grace_s`: it is cancelled."""
         self._inbox.put(partial(self._stop, job))
 
+    @property
+    def silent_s(self) -> float:
+        """Longest time in s for which a process that runs a job has given no sign of life."""
+        clock = time.monotonic()
+        return max((clock - each.beat_at for each in list(self._hands) if each.ran is not None), default=0.0)
+
     def recover(self) -> list[str]:
         """Queue again every job that an earlier run of the service left unfinished; return their ids."""
         with self.database.transaction() as session:

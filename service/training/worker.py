@@ -85,7 +85,7 @@ def _claim(settings: Settings, database: Database, job: str) -> Claim | None:
 
 def _train(settings: Settings, database: Database, files: Files, claim: Claim) -> None:
     try:
-        with Pulse(database, lambda session: _own(session, claim), claim.model) as pulse:
+        with Pulse(database, lambda session: _own(session, claim), claim.model, settings.job_heartbeat_s) as pulse:
             if claim.request.get("refresh") is None:
                 material = recorded(settings, database, files, claim.request)
             else:

@@ -1,4 +1,4 @@
-"""The learner process as the service sees it: woken, listened to, and started again when it dies.
+"""The learner process as the service sees it: woken, listened to, and started again when it dies or hangs.
 
 Nothing here imports numerics: the process takes its place on the machine before it does, see `training.process`.
 """
@@ -18,6 +18,7 @@ from multiprocessing.process import BaseProcess
 from typing import TYPE_CHECKING
 
 from service.compute.process import Place, call, start_process, training_place
+from service.compute.progress import LOOK_S, Progress
 from service.foundation.settings import Settings
 
 if TYPE_CHECKING:  # numerics, see above
@@ -29,6 +30,8 @@ FIRST_PAUSE, LONGEST_PAUSE = 0.5, 30.0
 """Seconds until a process that died is started again: each time twice as long, unless it lived for LONGEST_PAUSE."""
 END_SECONDS = 5.0
 """Longest wait for the process to store what it has learnt and end."""
+BEAT, BEAT_S = "beat", 1.0
+"""What the process says after a step, and how often it says so at most, s."""
 
 
 def learner_place(settings: Settings) -> Place:
@@ -47,6 +50,7 @@ class LearnerProcess:
         self._models: set[str] = set()
         self._connection: Connection | None = None
         self._process: BaseProcess | None = None
+        self._progress: Progress | None = None
         self._threads: list[threading.Thread] = []
         self._closing = False
 
@@ -55,6 +59,12 @@ class LearnerProcess:
         """Id of the process, None while there is none."""
         process = self._process
         return None if process is None or not process.is_alive() else process.pid
+
+    @property
+    def silent_s(self) -> float:
+        """Seconds for which the process has not got on; 0 while it does, or there is none."""
+        progress = self._progress
+        return 0.0 if progress is None else progress.silent_s
 
     @property
     def needed(self) -> bool:
@@ -100,10 +110,10 @@ class LearnerProcess:
                 self._changed.notify_all()
                 if self._closing:  # while it was started: the sender has gone already
                     self._process.kill()
-            self._listen(connection)
+            self._listen(connection, self._process)
             self._process.join()
             with self._changed:
-                self._connection = None
+                self._connection = self._progress = None
                 if self._closing:
                     return
                 pause = FIRST_PAUSE if time.monotonic() - began >= LONGEST_PAUSE else pause
@@ -120,13 +130,26 @@ class LearnerProcess:
         theirs.close()  # the process has its own: with this one open, its end would go unnoticed
         return ours, process
 
-    def _listen(self, connection: Connection) -> None:
-        """Hand on the messages of the process, until it has ended."""
+    def _listen(self, connection: Connection, process: BaseProcess) -> None:
+        """Hand on the messages of the process, until it has ended; end it where it does not get on. What it had learnt
+        is in the log, from which the next one goes on."""
+        pids = () if process.pid is None else (process.pid,)
+        quiet_s, step_s = self.settings.learner_heartbeat_s, self.settings.learner_step_s
+        progress = self._progress = Progress(lambda: pids, quiet_s, step_s)
         while True:
             try:
-                message = connection.recv()
+                message = connection.recv() if connection.poll(min(LOOK_S, quiet_s / 4)) else None
             except (EOFError, OSError):
                 return
+            if message is None:
+                if (reason := progress.look()) is not None and process.is_alive():
+                    logger.error("the learner process hangs and is killed: %s", reason)
+                    process.kill()
+                    return
+                continue
+            progress.step()
+            if message == BEAT:
+                continue
             try:
                 self.on_message(message)
             except Exception:  # the next one may be right

@@ -14,6 +14,7 @@ from service.journal import snapshots
 from service.learning.learner import publication
 from service.learning.learner.contest import Duels
 from service.learning.learner.follower import Follower
+from service.learning.learner.process import BEAT, BEAT_S
 from service.learning.learner.publication import Failed, Message
 from service.models import registry
 from service.storage.database import Database, LearnerRow
@@ -27,17 +28,22 @@ FIRST_PAUSE, LONGEST_PAUSE = 1.0, 60.0
 
 
 def run(settings: Settings, connection: Connection) -> None:
-    """Follow the models whose names come over the connection, until it ends or None comes."""
+    """Follow the models whose names come over the connection, until it ends or None comes; tell of each step that it is
+    done, and at rest every BEAT_S."""
     database, files = Database.of(settings), Files.of(settings)
     publication.clear(files)
     snapshots.sweep(database, files)
     learner = Learner(database, files, settings)
     try:
         with suppress(EOFError, BrokenPipeError):  # the service is gone
-            while (models := _woken(connection, learner.pause())) is not None:
+            beaten = time.monotonic()
+            while (models := _woken(connection, min(learner.pause(), BEAT_S))) is not None:
                 learner.wake(models)
                 for message in learner.turn():
                     connection.send(message)
+                if time.monotonic() - beaten >= BEAT_S:  # by this thread, which does the work: no other one knows
+                    connection.send(BEAT)
+                    beaten = time.monotonic()
         learner.close()
     finally:
         database.close()
@@ -46,7 +52,7 @@ def run(settings: Settings, connection: Connection) -> None:
 def _woken(connection: Connection, seconds: float) -> set[str] | None:
     """Names of the models that the service wakes within so many seconds, None where it is time to end."""
     models: set[str] = set()
-    while connection.poll(None if seconds == inf else seconds):
+    while connection.poll(seconds):
         names = connection.recv()
         if names is None:
             return None

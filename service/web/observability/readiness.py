@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Protocol
 
 from fastapi import APIRouter, Depends
 from pydantic import BaseModel, Field
@@ -38,8 +38,15 @@ StoppingDep = Annotated[Stopping, Depends(of_app("stopping"))]
 KEPT_S = 1.0
 """Seconds for which a report holds: however many ask, a part is looked at once in this time."""
 
-Lasting = Callable[[bool], float | None]
-"""For how many seconds something has been wrong whenever it was looked at; None where it is not wrong now."""
+
+class Lasting(Protocol):
+    """For how many seconds something has been wrong whenever it was looked at; None where it is not wrong now."""
+
+    def __call__(self, wrong: bool, what: str = "") -> float | None:
+        """wrong: whether it is so now; what: it is, where a part asks for several things."""
+        ...
+
+
 Look = Callable[[Lasting], tuple[PartState, str]]
 """Looks at one part and says in words how it is; may raise whatever the part raises."""
 
@@ -65,7 +72,7 @@ class Readiness:
         self.looks, self._stopping = looks, stopping
         self._clock, self._lock = clock, threading.Lock()
         self._report, self._until = tuple[Check, ...](), -float("inf")
-        self._wrong_since: dict[str, float] = {}
+        self._wrong_since: dict[tuple[str, str], float] = {}
 
     def report(self) -> tuple[Check, ...]:
         """How all parts are, just now or within the last KEPT_S; never raises."""
@@ -89,11 +96,11 @@ class Readiness:
             reason = getattr(error, "strerror", None) or error  # without paths: whoever reads this needs no key
             return Check(name, "failed", f"{type(error).__name__}: {reason}")
 
-    def _lasting(self, what: str, wrong: bool) -> float | None:
+    def _lasting(self, part: str, wrong: bool, what: str = "") -> float | None:
         if not wrong:
-            self._wrong_since.pop(what, None)
+            self._wrong_since.pop((part, what), None)
             return None
-        return self._clock() - self._wrong_since.setdefault(what, self._clock())
+        return self._clock() - self._wrong_since.setdefault((part, what), self._clock())
 
 
 ReadinessDep = Annotated[Readiness, Depends(of_app("readiness"))]
@@ -133,8 +140,9 @@ async def live() -> Live:
 @router.get("/ready", summary="Can the service answer?", responses=responses(NotReadyError))
 def ready(readiness: ReadinessDep) -> Ready:
     """Answer once the models are loaded, and while each part works: the database and the home can be written and are
-    not full, the versions that serve can be read, the learner runs where something learns, training jobs are started,
-    and the service is not stopping. Otherwise `detail` names the parts that do not. Looked at once a second at most.
+    not full, the versions that serve can be read, the learner gets on where something learns, training jobs are
+    started, and the service is not stopping. Otherwise `detail` names the parts that do not. Looked at once a second
+    at most.
     """
     report = readiness.report()
     if failed := [each for each in report if each.state == "failed"]:

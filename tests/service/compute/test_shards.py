@@ -15,7 +15,7 @@ from lipcore.fitting.hyperparameters import FitCancelledError
 from service.compute import executors
 from service.compute.executors import AHEAD, Inline, ShardFailedError, shard_executor, summed
 from service.foundation.settings import Settings
-from tests.service.compute.work import dying, numbers
+from tests.service.compute.work import dying, freezing, numbers
 
 SHARDS = list(range(37))
 
@@ -82,6 +82,15 @@ def test_a_lost_process_costs_its_shard_another_attempt(tmp_path):
         found = summed(executor, partial(dying, str(tmp_path)), SHARDS, never)
     assert found.tobytes() == expected.tobytes()
     assert {"3", "20"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_a_process_that_hangs_costs_its_shard_another_attempt(tmp_path):
+    expected = summed(Inline(), numbers, SHARDS, never)
+    settings = Settings(home=tmp_path, statistics_workers=2, training_cpus=2)
+    with shard_executor(settings.model_copy(update={"job_heartbeat_s": 3.0})) as executor:
+        found = summed(executor, partial(freezing, str(tmp_path)), SHARDS, never)
+    assert found.tobytes() == expected.tobytes()
+    assert (tmp_path / "3").exists()
 
 
 def test_progress_counts_what_is_added():

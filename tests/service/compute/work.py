@@ -21,6 +21,15 @@ def dying(folder: str, shard: int) -> np.ndarray:
     return numbers(shard)
 
 
+def freezing(folder: str, shard: int) -> np.ndarray:
+    """The same, but the first attempt at one of the shards suspends its process."""
+    mark = os.path.join(folder, str(shard))
+    if shard == 3 and not os.path.exists(mark):
+        open(mark, "w").close()
+        os.kill(os.getpid(), signal.SIGSTOP)
+    return numbers(shard)
+
+
 def home(shard: int) -> np.ndarray:
     """The length of the name of the home of whoever does it."""
     from service.compute.executors import placed

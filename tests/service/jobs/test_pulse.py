@@ -79,6 +79,20 @@ def test_a_database_that_fails_for_a_while_stops_nothing(beating, monkeypatch, c
     assert not talk.cancelled()
 
 
+def test_work_that_hangs_has_no_pulse(beating, monkeypatch, caplog):
+    """The thread that beats lives on; what counts is whether the work does."""
+    database, talk = beating
+    eventually(lambda: row(database).heartbeat_at)
+    monkeypatch.setattr(talk._progress, "look", lambda: "it has not got on for 60 s")
+    eventually(lambda: "no signs of life are given any more: it has not got on for 60 s" in caplog.text)
+    before = row(database).heartbeat_at
+    change(database, cancel_requested=True)
+    eventually(talk.cancelled)  # it has beaten, or tried to
+    assert row(database).heartbeat_at == before
+    monkeypatch.undo()
+    eventually(lambda: row(database).heartbeat_at != before)
+
+
 def test_nothing_is_written_after_the_end(beating):
     database, talk = beating
     eventually(lambda: row(database).heartbeat_at)

@@ -1,6 +1,6 @@
 """The queue of jobs, with processes that hang, die and do not listen: every job ends or goes on."""
 
-from service.training import queue
+from service.training import metrics, queue
 from tests.service.data import eventually
 from tests.service.jobs import workers
 from tests.service.jobs.conftest import messages_of
@@ -41,6 +41,14 @@ def test_a_process_without_a_sign_of_life_is_ended_and_its_job_started_again_but
     assert messages_of(seen)[:3] == ["started", f"{silent}: queued again", "started"]
     assert seen.error["message"].startswith(silent)
     assert "2 times" in seen.error["message"]
+
+
+def test_the_service_knows_of_a_process_that_is_silent(bench, monkeypatch):
+    jobs = bench(workers.frozen, job_heartbeat_s=1000.0)
+    jobs.running(jobs.submit("frozen"))
+    monkeypatch.setattr(metrics, "SILENT_S", 0.1)
+    seen = eventually(lambda: (now := metrics.look(jobs.queue, lambda wrong: None))[0] == "warning" and now)
+    assert seen[1].startswith("0 jobs wait, 1 run; a training process has given no sign of life for ")
 
 
 def test_a_job_whose_process_cannot_start_fails_in_the_end_and_the_service_knows(bench, monkeypatch):

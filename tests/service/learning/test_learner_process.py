@@ -26,8 +26,8 @@ linux = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="reads /
 class Serving:
     """What the service does with a learner process: answer with what it publishes. arm: a model that learns."""
 
-    def __init__(self, home):
-        self.arm = Arm.open(home, learner_niceness=1)
+    def __init__(self, home, **settings):
+        self.arm = Arm.open(home, learner_niceness=1, **settings)
         self.loaded = LoadedModels(self.arm.storage, LearntVersions(self.arm.database, self.arm.files), capacity=4)
         self.loaded.preload()
         self.messages = []
@@ -110,6 +110,29 @@ def test_a_killed_learner_comes_back_and_catches_up(serving, caplog):
     revisions = [each.revision for each in serving.messages if each.model == serving.arm.model]
     assert revisions == sorted(revisions)
     assert revisions[-1] == 4
+
+
+def test_a_learner_that_hangs_is_replaced_and_nothing_is_lost(home, caplog):
+    hasty = Serving(home, learner_heartbeat_s=2.0)
+    try:
+        hasty.teach(0, 1)
+        hasty.answering(2)
+        first = hasty.learner.pid
+        os.kill(first, signal.SIGSTOP)  # it is there, but does nothing any more
+        hasty.teach(2, 3)
+        same(hasty.answering(4), at_once(range(4)))
+        assert hasty.learner.pid not in (None, first)
+        assert "the learner process hangs and is killed: it has not got on for 2 s" in caplog.text
+    finally:
+        hasty.close()
+
+
+def test_a_learner_at_rest_says_that_it_gets_on(serving):
+    serving.teach(0)
+    serving.answering(1)
+    process = serving.learner._progress
+    process.silent_s = 7.0
+    eventually(lambda: process.silent_s == 0.0)
 
 
 def test_what_it_knows_is_stored_when_the_service_ends(alone):

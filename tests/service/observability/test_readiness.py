@@ -6,6 +6,7 @@ from contextlib import closing
 import pytest
 
 from service import __version__
+from service.journal import log
 from service.learning.learner.process import LearnerProcess
 from service.learning.learners import RESTART_S
 from service.storage import storage
@@ -112,6 +113,37 @@ def test_a_learner_that_is_gone_for_long_is_found(api, look, clock, monkeypatch)
     assert look(service)["learner"] == ("ok", "runs")
     monkeypatch.setattr(LearnerProcess, "pid", None)
     assert look(service)["learner"][0] == "warning"  # gone anew
+
+
+def test_a_learner_that_hangs_is_found(api, look, monkeypatch):
+    service = service_of(api)
+    monkeypatch.setattr(LearnerProcess, "needed", True)
+    monkeypatch.setattr(LearnerProcess, "pid", 1)
+    monkeypatch.setattr(LearnerProcess, "silent_s", RESTART_S)
+    assert look(service)["learner"] == ("ok", "runs")
+    monkeypatch.setattr(LearnerProcess, "silent_s", 44.0)
+    message = "has not got on for 44 s: observations are stored, but not learnt"
+    assert look(service)["learner"] == ("failed", message)
+
+
+def test_observations_that_wait_for_long_are_found(api, trained, look, clock, monkeypatch):
+    service = service_of(api)
+    learners, limit = service.learners, service.learners.settings.learner_lag_s
+    monkeypatch.setattr(LearnerProcess, "needed", True)
+    monkeypatch.setattr(LearnerProcess, "pid", 1)
+    service.loaded.get(trained.name, None)
+    monkeypatch.setattr(learners, "monitors", lambda: {trained.name: None})
+    newest = 57
+    monkeypatch.setattr(log, "newest", lambda session, model: newest)
+    assert look(service)["learner"] == ("ok", "runs")  # they have just come
+    clock.now += 1.0
+    assert look(service)["learner"] == ("ok", "runs")
+    clock.now += limit + 1.0
+    state, message = look(service)["learner"]
+    assert state == "warning"
+    assert message == f"runs, but 57 events wait, of which it has learnt none for {limit + 1.0:.0f} s"
+    newest = 0
+    assert look(service)["learner"] == ("ok", "runs")
 
 
 def test_jobs_that_nobody_starts_are_found(no_worker, look, clock):
