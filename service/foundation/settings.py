@@ -114,7 +114,16 @@ class Settings(BaseSettings):
     max_queued_jobs: Count = Field(100, description="Most jobs that may wait; more are answered 429.")
     max_loaded_models: Count = Field(4, description="Model versions kept in memory.")
 
-    max_connections: Count = Field(512, description="Most connections at a time, streams included; more are refused.")
+    max_connections: Count = Field(
+        512,
+        description="Most connections at a time, streams included. Beyond it those that ask nothing are closed, and "
+        "where all ask something, new ones are refused; /health is still answered.",
+    )
+    max_connections_per_client: Count = Field(
+        128,
+        description="The same of one address, or network of IPv6; trusted proxies and local sockets have as many as "
+        "there may be.",
+    )
     max_requests: Count = Field(256, description="Most requests that are answered at a time; more are answered 429.")
     max_requests_per_s: float | None = Field(
         None, gt=0, description="Most requests per s of one key, or address without keys; not limited by default."

@@ -253,7 +253,11 @@ def client_of(scope: Scope) -> str:
     if key is not None:
         return f"the API key {key}"
     client = scope.get("client")
-    host: str = client[0] if client else ""
+    return network_of(client[0]) if client else LOCAL
+
+
+def network_of(host: str) -> str:
+    """An address, or of IPv6 the network that it is in, in words."""
     if ":" in host:
         try:
             address = ip_address(host.partition("%")[0])

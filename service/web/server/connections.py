@@ -25,6 +25,7 @@ from websockets.protocol import State
 from service.foundation.errors import BusyError, ErrorBody, ErrorResponse, refuse
 from service.foundation.settings import Settings
 from service.web.limits.requests import HEALTH
+from service.web.server.room import Room
 
 REFUSED = 64
 """Connections beyond the most there may be that are told so; others are closed without a word."""
@@ -34,6 +35,7 @@ class GuardedProtocol(HttpToolsProtocol):
     """One HTTP connection, with limits. Times are looked at when something happens rarely, not with each request."""
 
     settings: ClassVar[Settings]
+    room: ClassVar[Room]
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -42,22 +44,25 @@ class GuardedProtocol(HttpToolsProtocol):
         self._left, self._resumed = 0, False
         self._upgraded = False  # to a stream, which reads the socket from then on
         self._known: object = None
+        self.peer: str | None = None
         self._overhead = 0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin, unless there are too many connections."""
+        """Begin, unless there are too many connections, none of which gives way."""
         super().connection_made(transport)
-        beyond = len(self.connections) - self.settings.max_connections
+        self.peer = self.room.peer(self.client)
+        beyond, why = self.room.admit(self, self.connections)
         if beyond > REFUSED:
             transport.abort()
             return
         if beyond > 0:
-            self.app = _Crowded(self.app, self.settings.max_connections)
+            self.app = _Crowded(self.app, why)
             self.ws_protocol_class = None
         self._head = self.loop.call_later(self.settings.header_s, self._late)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Forget the connection."""
+        self.room.gone(self)
         self._cancel_head()
         if self._unread is not None:
             self._unread.cancel()
@@ -87,6 +92,7 @@ class GuardedProtocol(HttpToolsProtocol):
         """Begin a request. Trailers, which httptools gives as headers, do not reach it."""
         if sum(name == b"host" for name, _ in self.headers) > 1:
             raise ValueError("several Host headers")  # httptools makes an answer of 400 of it
+        self.room.busy(self)
         super().on_headers_complete()
         self.headers = list(self.headers)
 
@@ -98,8 +104,15 @@ class GuardedProtocol(HttpToolsProtocol):
     def on_response_complete(self) -> None:
         """Go on after an answer, which may not have left yet."""
         super().on_response_complete()
-        if self._unread is None and self.transport.get_write_buffer_size():
+        unread = self.transport.get_write_buffer_size() > 0
+        if unread and self._unread is None:
             self._watch_reading()
+        if self.cycle.response_complete:  # else the next one waits already
+            self.room.rest(self, unread)
+
+    def leave(self) -> None:
+        """Close at once, for one that may be about to ask."""
+        self.transport.abort()
 
     def pause_writing(self) -> None:
         """Wait until the client reads on."""
@@ -185,20 +198,20 @@ class GuardedProtocol(HttpToolsProtocol):
 class _Crowded:
     """What answers on a connection that is one too many: health as always, anything else with 429."""
 
-    def __init__(self, app: ASGIApp, most: int) -> None:
-        self.app, self.most = app, most
+    def __init__(self, app: ASGIApp, why: str) -> None:
+        self.app, self.why = app, why
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["path"].startswith(HEALTH):
             await self.app(scope, receive, send)
             return
-        message = f"{self.most} connections are open, the most there may be (LIPSERVE_MAX_CONNECTIONS): try again"
-        await refuse(BusyError(message, headers={"Retry-After": "1", "Connection": "close"}), scope, receive, send)
+        headers = {"Retry-After": "1", "Connection": "close"}
+        await refuse(BusyError(f"{self.why}: try again", headers=headers), scope, receive, send)
 
 
 def guarded(settings: Settings) -> type[GuardedProtocol]:
     """Class of connections with the limits of the settings, for `uvicorn.Config(http=...)`."""
-    return type("GuardedProtocol", (GuardedProtocol,), {"settings": settings})
+    return type("GuardedProtocol", (GuardedProtocol,), {"settings": settings, "room": Room(settings)})
 
 
 CONNECTION = "lipserve.connection"

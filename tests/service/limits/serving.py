@@ -24,11 +24,12 @@ from tests.service.server import free_port
 class SmallApp:
     """Answers `hello`; /large: many bytes; /body: the size of the body; /held: once it may. Echoes what streams send.
 
-    begun: how many requests have come; headers: of the last ones; go: lets those that are held go on.
+    begun: how many requests have come; asking: how many of them are not answered yet; headers: of the last ones; go:
+    lets those that are held go on.
     """
 
     def __init__(self) -> None:
-        self.begun = 0
+        self.begun = self.asking = 0
         self.headers: deque[list[tuple[bytes, bytes]]] = deque(maxlen=2)
         self.go = asyncio.Event()
 
@@ -40,11 +41,18 @@ class SmallApp:
                 await stream.send_bytes(data)
             return
         self.begun += 1
+        self.asking += 1
+        try:
+            await self._answer(scope, receive, send)
+        finally:
+            self.asking -= 1
+
+    async def _answer(self, scope: Any, receive: Any, send: Any) -> None:
         content = b"hello"
         self.headers.append(scope["headers"])
         if scope["path"] == "/large":
             content = bytes(64 * 1024 * 1024)
-        elif scope["path"] == "/body":
+        elif scope["path"].endswith("/body"):
             content = str(len(await Request(scope, receive).body())).encode()
         elif scope["path"] == "/held":
             await self.go.wait()

@@ -39,6 +39,14 @@ def none_open(few):
     return few
 
 
+def occupy(serving, *clients):
+    """Let clients ask something that is not answered yet: the rest of their bodies is still to come."""
+    before = serving.app.asking
+    for client in clients:
+        client.send(POST)
+    eventually(lambda: serving.app.asking == before + len(clients))
+
+
 def test_requests_one_after_the_other_are_answered(few, none_open):
     with Raw(few.port) as client:
         for _ in range(2 * 4096 // len(GET)):  # headers of many requests are not those of one
@@ -165,9 +173,7 @@ def test_bodies_in_small_pieces_are_taken(few, none_open):
 
 def test_more_connections_than_allowed_are_told_so_until_one_ends(few, none_open):
     with Raw(few.port) as first, Raw(few.port) as second:
-        for client in (first, second):
-            client.send(GET)
-            assert client.answer() == (200, b"hello")
+        occupy(few, first, second)
         with Raw(few.port) as third:
             third.send(GET)
             status, code, message = refusal(third.rest())
@@ -186,11 +192,94 @@ def test_more_connections_than_allowed_are_told_so_until_one_ends(few, none_open
 
 
 def test_connections_far_beyond_the_most_are_not_even_told(few, none_open):
-    clients = [Raw(few.port) for _ in range(2 + REFUSED)]
+    clients = []
     try:
-        eventually(lambda: few.connections == 2 + REFUSED)
+        for number in range(2 + REFUSED):
+            clients.append(Raw(few.port))
+            clients[-1].send(POST.replace(b"/body", b"/health/body", 1))  # which all may ask for
+            eventually(lambda number=number: few.app.asking == number + 1)
         with Raw(few.port) as one_more:
             assert one_more.rest() == b""
     finally:
         for client in clients:
             client.socket.close()
+
+
+def test_who_asks_nothing_keeps_nobody_out(few, none_open):
+    """Renewed as often as they are closed, many more than there may be, and without a key."""
+    with Raw(few.port) as asking:
+        occupy(few, asking)
+        silent = [Raw(few.port) for _ in range(600)]
+        try:
+            for renewed in range(20):
+                with Raw(few.port) as client:
+                    client.send(GET)
+                    assert client.answer() == (200, b"hello")
+                    silent[renewed].socket.close()
+                    silent[renewed] = Raw(few.port)
+            with Raw(few.port) as client:
+                client.send(GET.replace(b"/", b"/health/live", 1))
+                assert client.answer() == (200, b"hello")
+            asking.send(b"0\r\n\r\n")
+            assert asking.answer() == (200, b"0")  # what is being answered has not given way
+        finally:
+            for each in silent:
+                each.socket.close()
+
+
+def test_who_has_never_asked_gives_way_first_then_who_asked_longest_ago():
+    with Serving(max_connections=3) as serving, Raw(serving.port) as kept:
+        kept.send(GET)
+        assert kept.answer() == (200, b"hello")
+        with Raw(serving.port) as unread, Raw(serving.port) as silent:
+            unread.send(GET)
+            assert unread.answer() == (200, b"hello")
+            with Raw(serving.port) as third:
+                third.send(GET)
+                assert third.answer() == (200, b"hello")
+                assert silent.rest() == b""
+                with Raw(serving.port) as fourth:
+                    fourth.send(GET)
+                    assert fourth.answer() == (200, b"hello")
+                    assert kept.rest() == b""
+                    unread.send(GET)
+                    assert unread.answer() == (200, b"hello")
+
+
+def test_one_address_has_its_own_most():
+    limits = {"max_connections": 100, "max_connections_per_client": 2}
+    direct = Serving(**limits, trusted_proxies="192.0.2.1")
+    with direct as serving, Raw(serving.port) as first, Raw(serving.port) as second:
+        occupy(serving, first, second)
+        with Raw(serving.port) as third:
+            third.send(GET)
+            status, code, message = refusal(third.rest())
+            assert (status, code) == (429, "busy")
+            assert "127.0.0.1 has 2 connections" in message
+        with Raw(serving.port) as third:
+            third.send(GET.replace(b"/", b"/health/live", 1))
+            assert third.answer() == (200, b"hello")
+        first.send(b"0\r\n\r\n")
+        assert first.answer() == (200, b"0")
+        with Raw(serving.port) as third:  # takes the place of the one that rests now
+            third.send(GET)
+            assert third.answer() == (200, b"hello")
+            assert first.rest() == b""
+    with Serving(**limits, trusted_proxies="127.0.0.0/8") as serving:  # a proxy's: behind it are many
+        clients = [Raw(serving.port) for _ in range(4)]
+        for client in clients:
+            client.send(GET)
+            assert client.answer() == (200, b"hello")
+        assert serving.connections == 4
+        for client in clients:
+            client.socket.close()
+
+
+def test_streams_count_among_the_connections_of_an_address():
+    limits = {"max_connections_per_client": 1, "trusted_proxies": "192.0.2.1"}
+    with Serving(**limits) as serving, connect(f"ws://127.0.0.1:{serving.port}/") as stream:
+        with Raw(serving.port) as second:
+            second.send(GET)
+            assert refusal(second.rest())[:2] == (429, "busy")
+        stream.send(b"still there?")
+        assert stream.recv(DEADLINE) == b"still there?"
