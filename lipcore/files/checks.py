@@ -10,6 +10,8 @@ from lipcore.files.strict_json import quote
 
 LARGEST = 1e12
 """No motion, torque or parameter in SI units is larger."""
+LARGEST_SQUARE = LARGEST**2
+"""The same of what is a torque squared: covariances and jitter."""
 MAX_NAME = 100
 
 

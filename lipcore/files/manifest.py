@@ -10,6 +10,7 @@ from lipcore.files import strict_json
 from lipcore.files.arm import check_inertia, check_rotor, read_geometry
 from lipcore.files.checks import (
     LARGEST,
+    LARGEST_SQUARE,
     check_choice,
     check_keys,
     check_list,
@@ -134,7 +135,7 @@ def _check_options(name: str, value: Any, n: int) -> None:
 
 def _check_fit(name: str, value: Any, n: int) -> None:
     _check_scalars(name, value, n)
-    check_numbers(f"{name}.jitter", value.get("jitter", 0.0), low=0, high=LARGEST)
+    check_numbers(f"{name}.jitter", value.get("jitter", 0.0), low=0, high=LARGEST_SQUARE)
 
 
 def _check_compact(name: str, value: Any, n: int) -> None:

@@ -22,6 +22,7 @@ from service.cli.options import Json, alone
 from service.foundation.errors import DamagedDataError
 from service.foundation.settings import Settings
 from service.journal.log import decode
+from service.models import registry
 from service.storage.database import Database, DatasetRow, EventRow, RobotRow, SnapshotRow, VersionRow
 from service.storage.database.engine import FILE
 from service.storage.files import Files, FilesUnreachableError
@@ -125,7 +126,7 @@ def _versions(database: Database, files: Files) -> Iterator[_Finding]:
 
 def _read_version(files: Files, row: VersionRow) -> None:
     probe(files.load_version(row.folder, row.checksums))
-    if files.read_version(row.folder, persistence.read_manifest) != row.manifest:
+    if files.read_version(row.folder, persistence.read_manifest) != registry.manifest_on_disk(row):
         raise ValueError("manifest.json is not the manifest that the database has")
 
 

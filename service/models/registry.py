@@ -50,6 +50,15 @@ class Serving(NamedTuple):
     change: int
 
 
+PROMOTION = "promotion"
+"""What a version's row has beside its manifest: the file was written before it was known."""
+
+
+def manifest_on_disk(row: VersionRow) -> dict[str, Any]:
+    """The manifest of a version as its file has it."""
+    return {name: value for name, value in row.manifest.items() if name != PROMOTION}
+
+
 def publish(
     session: Session,
     model: str,
@@ -76,7 +85,7 @@ def publish(
             folder=folder,
             created_at=now(),
             job=job,
-            manifest=manifest if promotion is None else {**manifest, "promotion": promotion.model_dump()},
+            manifest=manifest if promotion is None else {**manifest, PROMOTION: promotion.model_dump()},
             checksums=checksums(manifest),
         )
     )
