@@ -19,8 +19,9 @@ from service.foundation.errors import InvalidDataError, invalid_data, problem
 from service.foundation.settings import Settings
 from service.models import archive, registry
 from service.models.archive import CHECKSUMS, EXPORT, ArchiveError
+from service.models.archive_fields import FIELDS
 from service.models.loaded import LoadedModels
-from service.models.schema import HoldoutLineage, ModelName, Version
+from service.models.schema import ModelName, Version
 from service.storage.database import LearnerRow, ServingRow, now
 from service.storage.files import new_id
 from service.web.storage_errors import undecided
@@ -52,28 +53,6 @@ class About(BaseModel):
     created_at: str = Field(max_length=40)
     exported_at: str = Field(max_length=40)
     software: dict[str, str | int] = Field(max_length=20)
-
-
-class LineageDataset(BaseModel):
-    """A data set as a lineage names it."""
-
-    model_config = ConfigDict(strict=True)
-
-    id: str = Field(max_length=40)
-    name: str = Field("", max_length=1000)
-    sha256: str = Field("", max_length=64)
-    rows: int = Field(0, ge=0, lt=2**63)
-
-
-class Lineage(BaseModel):
-    """What the service reads of a lineage; whatever else there is goes with it unread."""
-
-    model_config = ConfigDict(strict=True)
-
-    datasets: list[LineageDataset] = Field([], max_length=10_000)
-    imported: list[dict[str, Any]] = Field([], max_length=1000)
-    learnt: dict[str, Any] | None = None
-    holdout: HoldoutLineage | None = None
 
 
 def add(loaded: LoadedModels, upload: Path, name: str | None) -> Version:
@@ -159,15 +138,22 @@ def _checked(files: Mapping[str, bytes], settings: Settings) -> dict[str, Any]:
         manifest_bytes=MANIFEST_BYTES,
         robot_bytes=settings.max_urdf_bytes,
     )
+    where = ""
     try:
         manifest = read_manifest_bytes(files[MANIFEST], limits)
         if ROBOT in files and "robot" not in manifest:
             raise ModelFormatError(f"{ROBOT} is there, but the manifest names no robot", ROBOT)
         _check_texts(manifest)
         _check_options(manifest["options"], settings)
-        Lineage.model_validate(manifest["lineage"])
+        for entry, fields in FIELDS.items():
+            if entry in manifest:
+                where = entry
+                fields.model_validate(manifest[entry])
         model = persistence.decode(files, limits)
         probe(model)
+        basis = model.posterior.basis
+        sizes = {"inducing_outputs": len(basis.outputs), "inducing_samples": len(basis.inducing), "weights": len(basis)}
+        manifest["compact"] = {**manifest["compact"], **sizes}
         manifest["parameters"] = report(model.posterior, model.estimator, model.joint_names)
         manifest["warnings"] = warnings(model, manifest["parameters"])
         manifest["hyperparameters"] = {name: value.tolist() for name, value in model.posterior.params.items()}
@@ -175,7 +161,7 @@ def _checked(files: Mapping[str, bytes], settings: Settings) -> dict[str, Any]:
     except ModelFormatError as error:
         raise InvalidDataError(f"{error.file}: {error}", [problem(error.file, str(error), "a valid model")]) from None
     except ValidationError as error:
-        raise _invalid(f"{MANIFEST}: lineage", error) from None
+        raise _invalid(f"{MANIFEST}: {where}", error) from None
     except (ValueError, ArithmeticError) as error:  # parameters that no fit has
         raise invalid_data(TENSORS, str(error), "parameters that are finite numbers") from None
     return manifest

@@ -103,6 +103,8 @@ def install(app: FastAPI) -> None:
 
 async def _answer(request: Request, error: Exception) -> JSONResponse:
     answer = translated(error)
+    if answer is None and isinstance(error, FileNotFoundError) and not request.app.state.storage.files.in_place():
+        answer = StorageUnavailableError("files cannot be read or written now: the home of the service is gone")
     if answer is None:
         raise error  # as unexpected as any other
     logger.error("%s at %s: %s", answer.code, request.scope["path"], error)

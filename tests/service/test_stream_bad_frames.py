@@ -5,7 +5,7 @@ import pytest
 from websockets.exceptions import ConnectionClosedError
 
 from tests.service.data import DEADLINE
-from tests.service.streams import ASK_EXTERNAL, ERROR, MOTION, TAU, UNREAD, ask, dial, frame, hello
+from tests.service.streams import ASK_EXTERNAL, ERROR, MOTION, TAU, UNREAD, ask, dial, frame, hello, read
 
 
 def changed(row, joint, value):
@@ -80,3 +80,18 @@ def test_a_giant_frame_ends_the_stream_before_it_is_read(streaming):
     with dial(streaming.server) as connection:
         hello(connection)
         assert ask(connection, bytes(64 * 1024)).error["code"] == "invalid_request"
+
+
+def test_a_text_that_is_none_ends_the_stream_in_one_word(streaming):
+    before = len(streaming.server.log.read_text())
+    with dial(streaming.server) as connection:
+        hello(connection)
+        connection.send(b"\xff\xfe", text=True)
+        with pytest.raises(ConnectionClosedError) as ended:
+            connection.recv(DEADLINE)
+    assert (ended.value.rcvd.code, ended.value.rcvd.reason) == (1007, "a text message is not UTF-8")
+    with dial(streaming.server) as connection:
+        hello(connection)
+        connection.send([b"caf", b"\xc3", b"\xa9"], text=True)  # a letter may come in two pieces
+        assert read(connection.recv(DEADLINE)).error["detail"][0]["value"] == "a text message"
+    assert "Traceback" not in streaming.server.log.read_text()[before:]

@@ -3,6 +3,7 @@ columns of Arrow as columns of numbers: cells of text, and what is nested: `name
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -67,9 +68,12 @@ def stacked(columns: Sequence[Array]) -> Iterator[Array]:
         yield np.column_stack([each[start : start + step] for each in columns])
 
 
+_ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")
+
+
 def first_line(error: BaseException) -> str:
-    """The first line of an error's message, its type where it has none."""
-    return (str(error).strip() or type(error).__name__).splitlines()[0]
+    """The first line of an error's message, its type where it has none; without addresses of objects in memory."""
+    return _ADDRESS.sub("", (str(error).strip() or type(error).__name__).splitlines()[0])
 
 
 def left_out(names: Sequence[str], reason: str) -> list[str]:

@@ -103,7 +103,12 @@ class LearnerProcess:
         pause = FIRST_PAUSE
         while not self._closing:
             began = time.monotonic()
-            connection, self._process = self._start()
+            try:
+                connection, self._process = self._start()
+            except Exception:  # no memory, too many processes: another time there may be
+                logger.exception("the learner process cannot be started: tried again")
+                pause = self._rest(pause)
+                continue
             with self._changed:
                 self._connection = connection
                 self._waiting |= self._models
@@ -118,8 +123,13 @@ class LearnerProcess:
                     return
                 pause = FIRST_PAUSE if time.monotonic() - began >= LONGEST_PAUSE else pause
                 logger.error("the learner process ended with exit code %s; it is started again", self._process.exitcode)
-                self._changed.wait_for(lambda: self._closing, pause)
-                pause = min(2 * pause, LONGEST_PAUSE)
+            pause = self._rest(pause)
+
+    def _rest(self, pause: float) -> float:
+        """Wait before the next start; return how long to wait before the one after that."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closing, pause)
+        return min(2 * pause, LONGEST_PAUSE)
 
     def _start(self) -> tuple[Connection, BaseProcess]:
         context = multiprocessing.get_context("spawn")

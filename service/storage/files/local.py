@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -71,8 +72,8 @@ class Local:
         return {"datasets": self.datasets, "versions": self.versions, "snapshots": self.snapshots}
 
     def file(self, key: str, again: bool = False) -> Path:
-        """Where a file lies, or would."""
-        return self._home / key
+        """Where a file lies, or would; raise FileNotFoundError where its folder is gone: that is no damaged file."""
+        return _in_place(self._home / key)
 
     def write(self, key: str, write: Callable[[IO[bytes]], Result]) -> Result:
         """Store a file durably, whole or not at all; return what `write` does."""
@@ -83,8 +84,8 @@ class Local:
         (self._home / key).unlink(missing_ok=True)
 
     def version(self, name: str, again: bool = False) -> Path:
-        """Folder of a version."""
-        return self.versions / name
+        """Folder of a version; raise as `file` does."""
+        return _in_place(self.versions / name)
 
     def has_version(self, name: str) -> bool:
         """Whether the files of a version are there, as far as can be told at once."""
@@ -132,6 +133,12 @@ class Local:
 
     def try_out(self) -> None:
         """Nothing, as `check`."""
+
+
+def _in_place(path: Path) -> Path:
+    if not path.parent.is_dir():
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
+    return path
 
 
 def remove(path: Path) -> None:

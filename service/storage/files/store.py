@@ -97,6 +97,10 @@ class Files:
         """Folders on the disk of the home that grow, by what is in them."""
         return self._place.kinds
 
+    def in_place(self) -> bool:
+        """Whether the folders of the home are still there: somebody may have deleted it under a running service."""
+        return all(each.is_dir() for each in (self.uploads, self.learning, *self.folders.values()))
+
     def write_samples(self, dataset: str, rows: int, n_joints: int, array: ArrayOf) -> str:
         """Store samples durably under a new id, asking for one array after the other; return their sha256."""
         return self._place.write(_samples(dataset), lambda file: sample_file.write(file, rows, n_joints, array))

@@ -254,6 +254,20 @@ class StreamProtocol(WebSocketsSansIOProtocol):
         self.arrived = perf_counter()
         super().data_received(data)
 
+    def send_receive_event_to_app(self) -> None:
+        """Hand on a message; a text that is none ends the stream, and is not logged: clients may send any number."""
+        if self.curr_msg_data_type == "text" and not self.close_sent:
+            try:
+                b"".join(self.frames).decode()
+            except UnicodeDecodeError:
+                self.frames = []
+                if self.handshake_complete:
+                    self.end(CloseCode.INVALID_DATA, "a text message is not UTF-8")
+                else:
+                    self.abort()
+                return
+        super().send_receive_event_to_app()
+
     def abort(self) -> None:
         """Close at once, whatever is still to be written: for a client that does not read."""
         self.transport.abort()

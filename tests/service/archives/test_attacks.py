@@ -194,6 +194,22 @@ MANIFEST_ATTACKS = [
     (("options", "command"), "rm", "command"),
     (("fit", "jitter"), -1, "fit.jitter"),
     (("fit", "deep"), {}, "fit.deep"),
+    (("fit", "seconds"), "<img src=x onerror=alert(1)>", "fit.seconds"),
+    (("fit", "seconds"), -1.0, "fit.seconds"),
+    (("fit", "iterations"), 1.5, "fit.iterations"),
+    (("fit", "converged"), 1, "fit.converged"),
+    (("fit", "device"), "<b>", "fit.device"),
+    (("fit", "corrupt"), "none", "fit.corrupt"),
+    (("fit", "unknown"), "<b>", "fit.unknown"),
+    (("compact", "weights"), True, "compact.weights"),
+    (("compact", "std_max"), -0.1, "compact.std_max"),
+    (("compact", "tolerance_reached"), 1, "compact.tolerance_reached"),
+    (("compact", "unknown"), "<b>", "compact.unknown"),
+    (("lineage", "training_metrics", "rmse"), [-1.0, 0.1], "training_metrics.rmse.0"),
+    (("lineage", "training_metrics", "coverage"), [0.5, 1.5], "training_metrics.coverage.1"),
+    (("lineage", "training_process", "seconds"), -1.0, "training_process.seconds"),
+    (("lineage", "training_process", "note"), "<b>", "training_process.note"),
+    (("lineage", "job"), 7, "lineage.job"),
     (("compact", "data_samples"), "many", "compact.data_samples"),
     (("calibration", "function_std_factor"), 0.5, "function_std_factor"),
     (("training_range", "q", "min"), [0.0], "training_range.q.min"),
@@ -220,6 +236,12 @@ def test_wrong_manifest(api, files, path, value, reply):
     assert reply in body["message"]
     assert body["detail"][0]["field"].startswith((MANIFEST, TENSORS))
     assert api.get("/v1/models/refused").status_code == 404
+
+
+def test_sizes_are_those_of_the_tensors_whatever_the_manifest_says(api, files, trained):
+    packed = pack(with_json(files, MANIFEST, at(("compact", "weights"), 10**9)))
+    known = api.get(f"/v1/models/{trained.name}/versions/1").json()["compact"]
+    assert send(api, packed, name="sized").json()["compact"] == known
 
 
 def test_robot_that_no_manifest_names(api, files):

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shutil
 import sqlite3
 import subprocess
 from collections.abc import Callable, Iterator
@@ -21,7 +22,7 @@ from service.storage.database.engine import FILE
 from service.storage.files import Files
 from service.storage.storage import HomeError, check_home
 from service.web.storage_errors import translated
-from tests.service.data import DEADLINE, arrays, error, npz, service_of, stream
+from tests.service.data import ADDRESS, DEADLINE, arrays, error, npz, service_of, stream, upload
 from tests.service.faults.storage import small_disk
 from tests.service.test_robots import urdf
 from tests.service.warm import Served
@@ -230,3 +231,38 @@ def test_a_service_says_why_it_cannot_start(tmp_path):
     assert ended.wait(DEADLINE) == 1
     assert f"error: the database {tmp_path / FILE} cannot be used: file is not a database." in log.read_text()
     assert "Traceback" not in log.read_text()
+
+
+@pytest.mark.own_files("the home of a service that others share holds next to nothing")
+@pytest.mark.parametrize("gone", ["the home", "all but the database"])
+def test_a_home_that_is_deleted_is_storage_that_fails(tmp_path, gone):
+    home = tmp_path / "home"
+    with TestClient(create_app(Settings(home=home)), ADDRESS, raise_server_exceptions=False) as api:
+        dataset = upload(api, stream())["id"]
+        assert api.post("/v1/models/panda-sim/predict", json=ZERO).status_code == 200
+        if gone == "the home":
+            shutil.rmtree(home)
+        else:
+            for folder in filter(Path.is_dir, list(home.iterdir())):
+                shutil.rmtree(folder)
+        body = {name: getattr(stream(), name).tolist() for name in ("q", "tau")}
+        asked = [
+            api.get(f"/v1/datasets/{dataset}/preview"),
+            api.get("/v1/models/panda-sim/export"),
+            api.post("/v1/models/import", content=bytes(2048), headers={"content-type": "application/x-tar"}),
+            api.post("/v1/datasets", content=npz(**body), headers={"content-type": "application/x-npz"}),
+        ]
+        if gone == "the home":
+            observation = {
+                "stream_id": "s",
+                "sequence": 1,
+                "t": [0.0],
+                **{name: [[0.0] * 7] for name in (*ZERO, "tau")},
+            }
+            asked.append(api.post("/v1/models/panda-sim/observations", json=observation))
+            asked.append(api.post("/v1/robots", content=urdf(), headers={"content-type": "application/xml"}))
+            asked.append(api.get("/metrics"))
+        for each in asked:
+            error(each, 503, "storage_unavailable")
+        assert str(home) not in "".join(each.text for each in asked)
+        assert api.post("/v1/models/panda-sim/predict", json=ZERO).status_code == 200  # what is in memory answers

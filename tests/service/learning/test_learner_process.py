@@ -127,6 +127,20 @@ def test_a_learner_that_hangs_is_replaced_and_nothing_is_lost(home, caplog):
         hasty.close()
 
 
+def test_where_the_system_starts_no_learner_it_is_tried_again(alone, monkeypatch, caplog):
+    start, failures = alone.learner._start, iter([BlockingIOError("no more processes")])
+
+    def sometimes():
+        for failure in failures:
+            raise failure
+        return start()
+
+    monkeypatch.setattr(alone.learner, "_start", sometimes)
+    alone.teach(0)
+    alone.answering(1)
+    assert "the learner process cannot be started" in caplog.text
+
+
 def test_a_learner_at_rest_says_that_it_gets_on(serving):
     serving.teach(0)
     serving.answering(1)
