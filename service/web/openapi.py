@@ -3,10 +3,17 @@ error codes."""
 
 from __future__ import annotations
 
+import hashlib
+import re
+from base64 import b64encode
 from collections.abc import Iterator
 from typing import Any
 
 from fastapi import FastAPI
+from starlette.datastructures import MutableHeaders
+from starlette.routing import Mount
+from starlette.routing import Route as StarletteRoute
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.foundation import errors
 from service.foundation.errors import ServiceError
@@ -18,8 +25,55 @@ DESCRIPTION = "An API key with scopes, `Authorization: Bearer lip_…`:\n\n" + "
 )
 
 
+PAGES = ("/docs", "/docs/oauth2-redirect", "/static-offline-docs")
+POLICY = (
+    "default-src 'self'; script-src 'self'{scripts}; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+"""Nothing comes from other hosts, no other site frames it, and only the scripts run that the page came with."""
+_SCRIPT = re.compile(rb"<script>(.*?)</script>", re.DOTALL)
+
+
+class Guarded:
+    """A page of the documentation, or a file of it, with a policy of what it may do."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer as the application does, which makes pages in one piece."""
+        started: Message | None = None
+
+        async def with_policy(message: Message) -> None:
+            nonlocal started
+            if message["type"] == "http.response.start":
+                started = message
+                return
+            if started is not None:
+                headers = MutableHeaders(scope=started)
+                html = headers.get("content-type", "").startswith("text/html")
+                headers["content-security-policy"] = policy(message.get("body", b"") if html else b"")
+                headers["x-content-type-options"] = "nosniff"
+                headers["referrer-policy"] = "no-referrer"
+                begun, started = started, None
+                await send(begun)
+            await send(message)
+
+        await self._app(scope, receive, with_policy)
+
+
+def policy(page: bytes) -> str:
+    """The policy of a page: of the scripts that stand in it each runs as it is, by its sha256."""
+    hashes = (b64encode(hashlib.sha256(each).digest()).decode() for each in _SCRIPT.findall(page))
+    return POLICY.format(scripts="".join(f" 'sha256-{each}'" for each in hashes))
+
+
 def install(app: FastAPI, keys_needed: bool) -> None:
-    """Complete the document that the application makes of its routes, once it is asked for; see `add_scopes`."""
+    """Complete the document that the application makes of its routes, once it is asked for; see `add_scopes`. Guard the
+    pages that show it."""
+    for route in app.router.routes:
+        if isinstance(route, Mount | StarletteRoute) and route.path in PAGES:
+            route.app = Guarded(route.app)
     made = app.openapi
 
     def openapi() -> dict[str, Any]:

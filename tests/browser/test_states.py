@@ -120,3 +120,13 @@ def test_a_service_that_stops_answering_is_said_to_be_gone(windows: Visit, dashb
     expect(page.get_by_role("region", name="Health").get_by_role("status")).to_contain_text("ready")
     expect(page.get_by_text("What is shown below is as of")).to_have_count(0)
     visitor.problems = [problem for problem in visitor.problems if "ERR_INTERNET_DISCONNECTED" not in problem]
+
+
+def test_the_reference_of_the_api_is_shown_under_its_policy(windows: Visit, dashboard: Dashboard) -> None:
+    visitor = windows(dashboard.server.url)
+    page = visitor.page
+    page.goto(f"{dashboard.server.url}/docs")
+    page.get_by_text("Can the service answer?").click()
+    page.get_by_role("button", name="Try it out").click()
+    page.get_by_role("button", name="Execute").click()
+    expect(page.get_by_text("can be read and written").first).to_be_visible()

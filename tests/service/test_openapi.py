@@ -1,6 +1,8 @@
 """The OpenAPI document: complete, and true to what the service answers."""
 
+import hashlib
 import re
+from base64 import b64encode
 
 import numpy as np
 import pytest
@@ -128,6 +130,18 @@ def test_the_example_of_an_inference_is_answered_as_documented(api, operations, 
     numbers, view = ([each.pop("data") for each in body["outputs"]] for body in (result, expected))
     assert result == expected
     assert np.allclose(numbers, view, atol=0.1)
+
+
+@pytest.mark.parametrize("path", ["/docs", "/docs/oauth2-redirect", "/static-offline-docs/swagger-ui-bundle.js"])
+def test_the_documentation_runs_its_own_scripts_only_and_nobody_frames_it(api, path):
+    answer = api.get(path)
+    policy = dict(each.strip().split(" ", 1) for each in answer.headers["content-security-policy"].split(";"))
+    assert policy["default-src"] == "'self'"
+    assert policy["frame-ancestors"] == policy["base-uri"] == "'none'"
+    scripts = re.findall(r"<script>(.*?)</script>", answer.text, re.DOTALL) if path.startswith("/docs") else []
+    hashes = [f"'sha256-{b64encode(hashlib.sha256(each.encode()).digest()).decode()}'" for each in scripts]
+    assert policy["script-src"].split() == ["'self'", *hashes]
+    assert answer.headers["x-content-type-options"] == "nosniff"
 
 
 def test_the_documentation_page_loads_nothing_from_other_hosts(api):

@@ -47,7 +47,9 @@ def subprotocol_of(offered: Iterable[str]) -> str | None:
 
 
 SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
-"""Methods that change nothing, and whose answers browsers keep from pages of other sites."""
+"""Methods that change nothing."""
+FOREIGN = frozenset({b"cross-site", b"same-site"})
+"""What a browser says of a request that a page of another origin makes: another port is one, of the same site."""
 MOST_KNOWN = 100
 _HOST = re.compile(r"(?:\[([^\[\]]*)\]|([^:\[\]]*))(?::[0-9]*)?")
 """An address of IPv6 in brackets, or another name, and a port or none."""
@@ -57,8 +59,10 @@ class LocalAccess:
     """Middleware that refuses requests of other sites' web pages.
 
     Host: a site can let its own name lead to 127.0.0.1 (DNS rebinding), and its pages then pass for this service's own;
-    but the name stays theirs. Origin: a page may send to any address, but has to say from where. Neither header can be
-    changed by a page; a program that asks does without Origin.
+    but the name stays theirs. Origin, and Sec-Fetch-Site where a browser leaves that out: a page may ask any address,
+    but has to say from where. It could not read the answer, but hold streams of events open, or have archives made. A
+    link that somebody follows is no such request. None of these headers can be changed by a page; a program that asks
+    does without.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -68,20 +72,34 @@ class LocalAccess:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on, or answer it with 403."""
         if scope["type"] != "lifespan":
-            host = origin = None
+            host = origin = site = mode = target = None
             for name, value in scope["headers"]:
                 if name == b"host":
                     host = value
                 elif name == b"origin":
                     origin = value
+                elif name == b"sec-fetch-site":
+                    site = value
+                elif name == b"sec-fetch-mode":
+                    mode = value
+                elif name == b"sec-fetch-dest":
+                    target = value
             if host is not None and host not in self._known and not self._is_local(host):
                 await refuse(_wrong_host(host), scope, receive, send)
                 return
-            changes = scope["type"] == "websocket" or scope["method"] not in SAFE
-            if origin is not None and changes and origin.partition(b"://")[2] != host:
+            if origin is not None and origin.partition(b"://")[2] != host:
                 await refuse(_wrong_origin(origin), scope, receive, send)
                 return
+            if site in FOREIGN and not self._is_link(scope, mode, target):
+                await refuse(_wrong_origin(b"of a page that is " + (site or b"")), scope, receive, send)
+                return
         await self.app(scope, receive, send)
+
+    @staticmethod
+    def _is_link(scope: Scope, mode: bytes | None, target: bytes | None) -> bool:
+        """Whether a browser asks for a page to be shown by itself, not within one of another site."""
+        safe = scope["type"] == "http" and scope["method"] in SAFE
+        return safe and mode == b"navigate" and target == b"document"
 
     def _is_local(self, host: bytes) -> bool:
         name = host.decode("latin-1")

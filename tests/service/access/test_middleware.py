@@ -52,10 +52,31 @@ def test_own_pages_and_programs_may_ask(api):
     assert api.post("/v1/echo", content=b"1", headers=headers).content == b"1"
 
 
-def test_what_changes_nothing_is_left_to_browsers(api):
-    answer = api.get("/v1/models", headers={"Origin": "http://evil.example"})
-    assert answer.status_code == 200
-    assert "access-control-allow-origin" not in answer.headers
+FOREIGN = [
+    {"Origin": "http://evil.example"},
+    {"Origin": "null"},
+    {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "no-cors", "Sec-Fetch-Dest": "image"},
+    {"Sec-Fetch-Site": "same-site", "Sec-Fetch-Mode": "no-cors", "Sec-Fetch-Dest": "empty"},  # of another port
+    {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "iframe"},
+]
+"""What browsers send for pages of other sites, which cannot read the answer."""
+
+
+@pytest.mark.parametrize("headers", FOREIGN, ids=lambda each: " ".join(each.values()))
+@pytest.mark.parametrize("path", ["/v1/models", "/v1/models/panda-sim/live", "/v1/models/panda-sim/export", "/metrics"])
+def test_pages_of_other_sites_have_nothing_done_for_them(api, path, headers):
+    refusal = error(api.get(path, headers=headers), 403, "forbidden")
+    assert refusal["detail"][0]["field"] == "origin"
+
+
+def test_links_and_own_pages_are_followed(api):
+    link = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}
+    own = {"Sec-Fetch-Site": "same-origin", "Sec-Fetch-Mode": "cors", "Sec-Fetch-Dest": "empty"}
+    for headers in (link, own, {"Sec-Fetch-Site": "none", "Sec-Fetch-Mode": "navigate"}):
+        answer = api.get("/guide", headers=headers)
+        assert answer.status_code == 200
+        assert "access-control-allow-origin" not in answer.headers
+    error(api.post("/v1/echo", content=b"1", headers=link), 403, "forbidden")
 
 
 def test_a_service_with_keys_goes_by_the_key_alone(guarded):
