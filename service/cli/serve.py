@@ -10,6 +10,7 @@ import uvicorn
 
 from service.app import create_app
 from service.cli.options import alone, settings_of
+from service.compute.allocator import keep_little
 from service.storage.storage import HomeError, check_home
 from service.web.observability import logs
 from service.web.server import sockets
@@ -27,6 +28,7 @@ def serve(
 ) -> None:
     """Serve models and run training jobs."""
     settings = settings_of(host=host, port=port, uds=uds)
+    keep_little()
     logs.configure(logs.LogOptions(settings.log_level, settings.log_format))
     check_home(settings)  # before the app opens it for good: what is wrong is said without a traceback
     served = create_app(settings)
