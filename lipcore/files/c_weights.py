@@ -11,7 +11,6 @@ import numpy as np
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
-from lipcore.files.twofold import Twofold, upper_root
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.compiled.arm_recursion import PARAMETERS
 from lipcore.kernels.friction import FrictionKernel
@@ -28,14 +27,13 @@ class UnsupportedEstimatorError(ValueError):
 
 @dataclass(frozen=True)
 class Learnt:
-    """A model's weights. arm, friction: its terms; mean: (p,) of all, the arm's first; prior: (p,) their variances
-    beforehand, Λ; known: Q Λ, (p, p), so that their covariance is Λ − (Q Λ)ᵀ Q Λ; factor: on their deviations."""
+    """A model's weights. arm, friction: its terms; mean: (p,) of all, the arm's first; left: Q Λ, (p, p), with their
+    prior variances Λ, so that their covariance is (Q Λ)ᵀ Q Λ; factor: on their deviations."""
 
     arm: ArmKernel
     friction: FrictionKernel
     mean: Array
-    prior: Array
-    known: Twofold
+    left: Array
     factor: float
 
     @classmethod
@@ -52,22 +50,17 @@ class Learnt:
         assert centre is not None
         mean = posterior.weights.numpy() * prior
         mean[: arm.size] += centre.numpy()
-        known = Twofold.of(posterior.root.numpy()) * Twofold.of(prior)
-        return cls(arm, friction, mean, prior, known, posterior.std_factor)
+        return cls(arm, friction, mean, posterior.root.numpy() * prior, posterior.std_factor)
 
     def root(self, expand: Array) -> Array:
         """U, upper triangular, with U Uᵀ = Tᵀ C T. expand: T, (p, p_b)."""
-        made = Twofold.of(expand)
-        known = self.known @ made
-        before = (made * Twofold.of(self.prior[:, None])).T @ made
-        return self.factor * upper_root(before - known.T @ known)
+        # with columns and rows in reverse order, and without the product, whose condition is the square
+        made = np.asarray(np.linalg.qr((self.left @ expand)[:, ::-1], mode="r"))
+        return self.factor * made[::-1, ::-1].T
 
     def variance(self, features: Array) -> Array:
         """φᵀ C φ of each of N queries and n joints, (N, n). features: Φ, (N, n, p)."""
-        rows = Twofold.of(features.reshape(-1, features.shape[2]))
-        before, white = rows * rows * Twofold.of(self.prior), rows @ self.known.T
-        left = before.sums() - (white * white).sums()
-        return self.factor**2 * left.high.reshape(features.shape[:2])
+        return np.asarray(((self.factor * features @ self.left.T) ** 2).sum(2))
 
     def features(self, motion: Motion, arm: ArmKernel) -> Array:
         """Φ of N motions, (N, n, p); arm: with a payload among its parameters, or as it was learnt."""

@@ -55,7 +55,7 @@ class Origin:
 
 def c_files(model: TorqueModel, origin: Origin) -> dict[str, str]:
     """The texts of SOURCE and HEADER by name, ASCII. Raise UnsupportedEstimatorError for an estimator that is not of
-    SUPPORTED, and ValueError where the posterior's covariance is lost to rounding."""
+    SUPPORTED."""
     if model.estimator.name not in SUPPORTED:
         raise UnsupportedEstimatorError(
             f"estimator is {model.estimator.name!r}, expected one of {', '.join(SUPPORTED)} for C"
@@ -210,7 +210,7 @@ def _vectors(model: TorqueModel, learnt: Learnt) -> Array:
 
 
 def _expected(model: TorqueModel, learnt: Learnt, motion: Motion, term: ArmKernel) -> tuple[Array, Array]:
-    """Mean and standard deviation of the torque of N motions, (N, n), as `Evaluator` has them, without its rounding."""
+    """Mean and standard deviation of the torque of N motions, (N, n), as `Evaluator` has them."""
     features, posterior = learnt.features(motion, term), model.posterior
     variance = learnt.variance(features) + posterior.misfit.variance(motion).numpy()
     return features @ learnt.mean, np.sqrt(np.maximum(variance, posterior.floor.numpy()))
