@@ -27,40 +27,42 @@ class UnsupportedEstimatorError(ValueError):
 
 @dataclass(frozen=True)
 class Learnt:
-    """A model's weights. arm, friction: its terms; mean: (p,) of all, the arm's first; left: Q Λ, (p, p), with their
-    prior variances Λ, so that their covariance is (Q Λ)ᵀ Q Λ; factor: on their deviations."""
+    """A model's weights. arm, friction: its terms; mean: (p,) of all weights, the arm's first; left: Q Λ, (p, p), with
+    their prior variances Λ, so that their covariance is (Q Λ)ᵀ Q Λ; shared: (p, m), what m torques of a nonlinear term
+    add to Q Λ Φᵀ where they have the covariances c with a query's: Q c; factor: on their deviations."""
 
     arm: ArmKernel
     friction: FrictionKernel
     mean: Array
     left: Array
+    shared: Array
     factor: float
 
     @classmethod
     def of(cls, model: TorqueModel) -> Learnt:
-        """What a model has learnt; raise UnsupportedEstimatorError where that is more than arm and friction."""
+        """What a model has learnt; raise UnsupportedEstimatorError where its weights are others than those two's."""
         posterior, terms = model.posterior, model.estimator.terms
         arm, friction = terms["rigid_body"], terms["friction"]
         assert isinstance(arm, ArmKernel)
         assert isinstance(friction, FrictionKernel)
-        if posterior.basis.term is not None or list(posterior.basis.linear) != [arm, friction]:
-            raise UnsupportedEstimatorError("the posterior holds more than rigid bodies and friction")
+        if list(posterior.basis.linear) != [arm, friction]:
+            raise UnsupportedEstimatorError("the posterior holds more weights than those of rigid bodies and friction")
         diagonals = [each.covariance(posterior.params).detach().diagonal().numpy() for each in (arm, friction)]
-        prior, centre = np.concatenate(diagonals), arm.prior_weights()
+        prior, centre, first = np.concatenate(diagonals), arm.prior_weights(), len(posterior.basis.outputs)
         assert centre is not None
-        mean = posterior.weights.numpy() * prior
+        mean = posterior.weights.numpy()[first:] * prior
         mean[: arm.size] += centre.numpy()
-        return cls(arm, friction, mean, posterior.root.numpy() * prior, posterior.std_factor)
+        rows = posterior.root.numpy()[first:]
+        return cls(arm, friction, mean, rows[:, first:] * prior, rows[:, :first], posterior.std_factor)
 
-    def root(self, expand: Array) -> Array:
-        """U, upper triangular, with U Uᵀ = Tᵀ C T. expand: T, (p, p_b)."""
+    def root(self, expand: Array) -> tuple[Array, Array]:
+        """U, upper triangular, with U Uᵀ = Tᵀ C T, and V, (p_b, m): the deviation is |Uᵀ φ_b + V c|. expand: T, (p,
+        p_b)."""
+        size = expand.shape[1]
         # with columns and rows in reverse order, and without the product, whose condition is the square
-        made = np.asarray(np.linalg.qr((self.left @ expand)[:, ::-1], mode="r"))
-        return self.factor * made[::-1, ::-1].T
-
-    def variance(self, features: Array) -> Array:
-        """φᵀ C φ of each of N queries and n joints, (N, n). features: Φ, (N, n, p)."""
-        return np.asarray(((self.factor * features @ self.left.T) ** 2).sum(2))
+        turn, made = np.linalg.qr((self.left @ expand)[:, ::-1])
+        shared = turn.T @ self.shared
+        return self.factor * made[::-1, ::-1].T, self.factor * shared[:size][::-1]
 
     def features(self, motion: Motion, arm: ArmKernel) -> Array:
         """Φ of N motions, (N, n, p); arm: with a payload among its parameters, or as it was learnt."""
