@@ -152,6 +152,19 @@ def test_what_is_learnt_is_exact_and_triangular(first: int, count: int, largest:
     assert torch.count_nonzero(whole.triu(1)) == 0
 
 
+@pytest.mark.parametrize("first", [0, 7, 20])
+def test_eigenvalues_say_the_same_where_rounding_has_gone_too_far(first: int, monkeypatch) -> None:
+    columns = np.random.default_rng(0).standard_normal((20, 3)) * np.geomspace(1, 100, 20)[:, None]
+    sums = Statistics(torch.from_numpy(columns @ columns.T), torch.ones(20).double(), 3)
+    expected = solve(sums, None, first)
+    monkeypatch.setattr("lipcore.posterior.statistics._by_cholesky", lambda a: None)
+    found = solve(sums, None, first)
+    assert np.allclose(found.covariance.numpy(), expected.covariance.numpy(), rtol=0, atol=1e-9)
+    assert np.allclose(found.mean.numpy(), expected.mean.numpy(), rtol=0, atol=1e-9)
+    assert not torch.equal(found.root, expected.root)
+    assert torch.count_nonzero(found.root.triu(1)) == 0
+
+
 @pytest.mark.parametrize("factor", [-0.1, 1.1, float("nan")])
 def test_ages_that_are_none_are_refused(factor: float) -> None:
     with pytest.raises(ValueError, match="factor is"):
