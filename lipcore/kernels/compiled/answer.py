@@ -106,18 +106,12 @@ def answer(
     full = what == COVARIANCE
     for query in range(queries):
         _begin(blocks[query, -1], full, covariance[query])
-    panel, first = ROWS * size, 0
-    while first < size:  # all queries meet a panel while the cache holds it
-        reach = min(first + ROWS, chosen if first < chosen else size)
-        sign = -1.0 if first < chosen else 1.0
-        for query in range(queries):
-            for group in range(groups):
-                columns = query * step + group * size * WIDTH
-                multiply(fixed, panel, memory, columns, reach, memory, products + group * ROWS * WIDTH)
-            _add_squares(memory, products, sign, full, covariance[query])
-        panel, first = panel + ROWS * reach, reach
+    panel = _add_panels(fixed, ROWS * size, 0, chosen, size, memory, full, covariance)
     for query in range(queries):
-        _end(std_factor * std_factor, full, covariance[query])
+        _scale(-1.0, full, covariance[query])
+    _add_panels(fixed, panel, chosen, size, size, memory, full, covariance)
+    for query in range(queries):
+        _scale(std_factor * std_factor, full, covariance[query])
         speed, acceleration = 0.0, 0.0
         for j in range(n):
             speed += (motions[query, 1, j] / misfit[3, j]) ** 2
@@ -181,29 +175,50 @@ def _gather(rows: Array, outputs: Indices, features: Array, n: int, at: int, mem
 
 @compiled
 def _begin(prior: Array, full: bool, out: Array) -> None:
-    """Write the nonlinear term's own covariance, (n, n); unless `full` only its diagonal."""
+    """Write minus the nonlinear term's own covariance, (n, n); unless `full` only its diagonal."""
     out[:] = 0.0
     for i in range(prior.shape[0]):
         for j in range(0 if full else i, i + 1):
-            out[i, j] = prior[i, j]
+            out[i, j] = -prior[i, j]
 
 
 @compiled
-def _add_squares(memory: Array, products: int, sign: float, full: bool, out: Array) -> None:
-    """Add sign Vᵀ V of one panel's products V, (groups, ROWS, WIDTH); unless `full` only its diagonal."""
+def _add_panels(
+    fixed: Array, panel: int, first: int, last: int, size: int, memory: Array, full: bool, out: Array
+) -> int:
+    """Add the squares of the root's rows from `first` to before `last`, whose panels begin at `panel`, times the
+    columns in memory, to those of N queries, (N, n, n). Return where the next panel begins."""
+    queries, groups = out.shape[0], (out.shape[1] + WIDTH - 1) // WIDTH
+    step = groups * size * WIDTH
+    products = queries * step
+    for row in range(first, last, ROWS):  # all queries meet a panel while the cache holds it
+        reach = min(row + ROWS, last)
+        for query in range(queries):
+            for group in range(groups):
+                columns = query * step + group * size * WIDTH
+                multiply(fixed, panel, memory, columns, reach, memory, products + group * ROWS * WIDTH)
+            _add_squares(memory, products, full, out[query])
+        panel += ROWS * reach
+    return panel
+
+
+@compiled
+def _add_squares(memory: Array, products: int, full: bool, out: Array) -> None:
+    """Add Vᵀ V of one panel's products V, (groups, ROWS, WIDTH); unless `full` only its diagonal."""
     for i in range(out.shape[0]):
         left = products + (i // WIDTH) * ROWS * WIDTH + i % WIDTH
-        for j in range(0 if full else i, i + 1):
-            right = products + (j // WIDTH) * ROWS * WIDTH + j % WIDTH
-            total = 0.0
-            for r in range(ROWS):
-                total += memory[left + r * WIDTH] * memory[right + r * WIDTH]
-            out[i, j] += sign * total
+        for r in range(ROWS):
+            out[i, i] += memory[left + r * WIDTH] * memory[left + r * WIDTH]
+        if full:
+            for j in range(i):
+                right = products + (j // WIDTH) * ROWS * WIDTH + j % WIDTH
+                for r in range(ROWS):
+                    out[i, j] += memory[left + r * WIDTH] * memory[right + r * WIDTH]
 
 
 @compiled
-def _end(scale: float, full: bool, out: Array) -> None:
-    """Multiply by `scale`, both triangles where `full`."""
+def _scale(factor: float, full: bool, out: Array) -> None:
+    """Multiply by a factor, both triangles where `full`."""
     for i in range(out.shape[0]):
         for j in range(0 if full else i, i + 1):
-            out[i, j] = out[j, i] = scale * out[i, j]
+            out[i, j] = out[j, i] = factor * out[i, j]
