@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.compiled.arm_recursion import PARAMETERS
@@ -63,10 +62,6 @@ class Learnt:
         turn, made = np.linalg.qr((self.left @ expand)[:, ::-1])
         shared = turn.T @ self.shared
         return self.factor * made[::-1, ::-1].T, self.factor * shared[:size][::-1]
-
-    def features(self, motion: Motion, arm: ArmKernel) -> Array:
-        """Φ of N motions, (N, n, p); arm: with a payload among its parameters, or as it was learnt."""
-        return np.concatenate([arm.features(motion).numpy(), self.friction.features(motion).numpy()], axis=2)
 
 
 def axes_of(geometry: Geometry) -> Array:
