@@ -107,7 +107,7 @@ class Belief:
     @property
     def root(self) -> Tensor:
         """Q, (M, M): Q c, of a cross covariance c, has as its square what the model has learnt of those torques."""
-        return torch.zeros((0, 0), dtype=torch.float64) if self.posterior is None else self.posterior.root
+        return torch.zeros((0, 0), dtype=torch.float64) if self.posterior is None else self.posterior.learnt
 
 
 @dataclass(frozen=True)

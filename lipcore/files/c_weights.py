@@ -9,9 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
-from lipcore.files.twofold import Twofold, upper_root
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.compiled.arm_recursion import PARAMETERS
 from lipcore.kernels.friction import FrictionKernel
@@ -28,50 +26,42 @@ class UnsupportedEstimatorError(ValueError):
 
 @dataclass(frozen=True)
 class Learnt:
-    """A model's weights. arm, friction: its terms; mean: (p,) of all, the arm's first; prior: (p,) their variances
-    beforehand, Λ; known: Q Λ, (p, p), so that their covariance is Λ − (Q Λ)ᵀ Q Λ; factor: on their deviations."""
+    """A model's weights. arm, friction: its terms; mean: (p,) of all weights, the arm's first; left: Q Λ, (p, p), with
+    their prior variances Λ, so that their covariance is (Q Λ)ᵀ Q Λ; shared: (p, m), what m torques of a nonlinear term
+    add to Q Λ Φᵀ where they have the covariances c with a query's: Q c; factor: on their deviations."""
 
     arm: ArmKernel
     friction: FrictionKernel
     mean: Array
-    prior: Array
-    known: Twofold
+    left: Array
+    shared: Array
     factor: float
 
     @classmethod
     def of(cls, model: TorqueModel) -> Learnt:
-        """What a model has learnt; raise UnsupportedEstimatorError where that is more than arm and friction."""
+        """What a model has learnt; raise UnsupportedEstimatorError where its weights are others than those two's."""
         posterior, terms = model.posterior, model.estimator.terms
         arm, friction = terms["rigid_body"], terms["friction"]
         assert isinstance(arm, ArmKernel)
         assert isinstance(friction, FrictionKernel)
-        if posterior.basis.term is not None or list(posterior.basis.linear) != [arm, friction]:
-            raise UnsupportedEstimatorError("the posterior holds more than rigid bodies and friction")
+        if list(posterior.basis.linear) != [arm, friction]:
+            raise UnsupportedEstimatorError("the posterior holds more weights than those of rigid bodies and friction")
         diagonals = [each.covariance(posterior.params).detach().diagonal().numpy() for each in (arm, friction)]
-        prior, centre = np.concatenate(diagonals), arm.prior_weights()
+        prior, centre, first = np.concatenate(diagonals), arm.prior_weights(), len(posterior.basis.outputs)
         assert centre is not None
-        mean = posterior.weights.numpy() * prior
+        mean = posterior.weights.numpy()[first:] * prior
         mean[: arm.size] += centre.numpy()
-        known = Twofold.of(posterior.root.numpy()) * Twofold.of(prior)
-        return cls(arm, friction, mean, prior, known, posterior.std_factor)
+        rows = posterior.root.numpy()[first:]
+        return cls(arm, friction, mean, rows[:, first:] * prior, rows[:, :first], posterior.std_factor)
 
-    def root(self, expand: Array) -> Array:
-        """U, upper triangular, with U Uᵀ = Tᵀ C T. expand: T, (p, p_b)."""
-        made = Twofold.of(expand)
-        known = self.known @ made
-        before = (made * Twofold.of(self.prior[:, None])).T @ made
-        return self.factor * upper_root(before - known.T @ known)
-
-    def variance(self, features: Array) -> Array:
-        """φᵀ C φ of each of N queries and n joints, (N, n). features: Φ, (N, n, p)."""
-        rows = Twofold.of(features.reshape(-1, features.shape[2]))
-        before, white = rows * rows * Twofold.of(self.prior), rows @ self.known.T
-        left = before.sums() - (white * white).sums()
-        return self.factor**2 * left.high.reshape(features.shape[:2])
-
-    def features(self, motion: Motion, arm: ArmKernel) -> Array:
-        """Φ of N motions, (N, n, p); arm: with a payload among its parameters, or as it was learnt."""
-        return np.concatenate([arm.features(motion).numpy(), self.friction.features(motion).numpy()], axis=2)
+    def root(self, expand: Array) -> tuple[Array, Array]:
+        """U, upper triangular, with U Uᵀ = Tᵀ C T, and V, (p_b, m): the deviation is |Uᵀ φ_b + V c|. expand: T, (p,
+        p_b)."""
+        size = expand.shape[1]
+        # with columns and rows in reverse order, and without the product, whose condition is the square
+        turn, made = np.linalg.qr((self.left @ expand)[:, ::-1])
+        shared = turn.T @ self.shared
+        return self.factor * made[::-1, ::-1].T, self.factor * shared[:size][::-1]
 
 
 def axes_of(geometry: Geometry) -> Array:

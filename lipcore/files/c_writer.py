@@ -2,8 +2,8 @@
 
 Torque is linear in the weights w of arm and friction, tau = Φ w with w ~ N(ŵ, C). The mean is written as one recursion
 over the bodies and their change with the learnt step (no features), the standard deviation as |Uᵀ φ_b|, see
-`c_weights`. Each joint's frame is turned so that its axis is z, and the two vectors across it, which the steps of the
-geometry are about, are x and y.
+`c_weights`. A chain of energies adds its covariances with stored torques, see `c_energy`. Each joint's frame is turned
+so that its axis is z, and the two vectors across it, which the steps of the geometry are about, are x and y.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from lipcore.data.metrics import LEVEL, quantile
-from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
+from lipcore.files.c_energy import Energy
 from lipcore.files.c_weights import Learnt, UnsupportedEstimatorError, axes_of, moved, regrouped
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.compiled.answer import ACCELERATED
@@ -30,8 +30,8 @@ from lipcore.model.body import Body
 from lipcore.model.torque_model import TorqueModel
 
 TEMPLATES = Path(__file__).parent / "c"
-SOURCE, HEADER = "lipserve_model.c", "lipserve_model.h"
-SUPPORTED = ("rigid-body",)
+SOURCE, HEADER, ENERGY = "lipserve_model.c", "lipserve_model.h", "energy.c"
+SUPPORTED = ("rigid-body", "rigid-body+lip-chain")
 """Estimators whose models can be written."""
 WIDE = 8
 """Columns of a panel of the root."""
@@ -55,18 +55,21 @@ class Origin:
 
 def c_files(model: TorqueModel, origin: Origin) -> dict[str, str]:
     """The texts of SOURCE and HEADER by name, ASCII. Raise UnsupportedEstimatorError for an estimator that is not of
-    SUPPORTED, and ValueError where the posterior's covariance is lost to rounding."""
+    SUPPORTED."""
     if model.estimator.name not in SUPPORTED:
         raise UnsupportedEstimatorError(
             f"estimator is {model.estimator.name!r}, expected one of {', '.join(SUPPORTED)} for C"
         )
     learnt = Learnt.of(model)
-    fields = _texts(model, origin) | _tables(model, learnt)
+    fields = _texts(model, origin) | _tables(model, learnt) | {"stack": _stack(model)}
     written = {}
     for name in (SOURCE, HEADER):
-        template = Template((TEMPLATES / f"{name}.in").read_text(encoding="ascii"))
-        written[name] = template.substitute(fields)
+        written[name] = _template(name).substitute(fields)
     return written
+
+
+def _template(name: str) -> Template:
+    return Template((TEMPLATES / f"{name}.in").read_text(encoding="ascii"))
 
 
 def _tables(model: TorqueModel, learnt: Learnt) -> dict[str, str]:
@@ -74,6 +77,7 @@ def _tables(model: TorqueModel, learnt: Learnt) -> dict[str, str]:
     arm, posterior = learnt.arm.arm, model.posterior
     n, size, order = arm.n_joints, PARAMETERS * arm.n_joints, arm.order
     kept, expand = regrouped(learnt)
+    root, shared = learnt.root(expand)
     others = 0 if learnt.arm.others is None else learnt.arm.others.size
     rubbing = learnt.mean[learnt.arm.size :].reshape(n, -1)
     own = np.concatenate([learnt.mean[size : size + n, None], rubbing], axis=1)[order]
@@ -119,7 +123,8 @@ def _tables(model: TorqueModel, learnt: Learnt) -> dict[str, str]:
         "arm": table,
         "arms": arms,
         "share": share,
-        "root": _braced(_panels(learnt.root(expand))),
+        "root": _braced(_panels(root)),
+        **_energy(Energy.of(posterior), shared),
         "misfit": _braced(posterior.misfit.packed().numpy()),
         "floor": _braced(posterior.floor.numpy()),
         "range": _braced(np.array(limits)),
@@ -180,6 +185,34 @@ def _arm_table(geometry: Geometry, step: Array, bodies: Array, change: Array, ow
     return "{\n" + ",\n".join(fields) + "}"
 
 
+def _energy(energy: Energy | None, shared: Array) -> dict[str, str]:
+    """What `energy.c.in` becomes: nothing for rigid bodies alone. shared: V of `Learnt.root`."""
+    if energy is None:
+        return {"outputs": "0", "energy": ""}
+    padded = np.pad(shared, ((0, -len(shared) % WIDE), (0, 0)))
+    names = ("constant", "cosine", "sine")
+    fields = {
+        "outputs": str(len(energy.alpha)),
+        "groups": str(len(energy.samples)),
+        **{name: _braced(column) for name, column in zip(names, energy.shares.T, strict=True)},
+        "scales": _braced(energy.scales),
+        "weights": _braced(np.tril(energy.weights)),
+        "samples": _braced(energy.samples),
+        "places": "{" + ",\n".join(_integers(row) for row in energy.places) + "}",
+        "alpha": _braced(energy.alpha),
+        "learnt": _braced(_panels(energy.factor * energy.learnt.T)),
+        "shared": _braced(padded.reshape(-1, WIDE, padded.shape[1]).transpose(0, 2, 1).reshape(-1)),
+        "factor": repr(energy.factor**2),
+    }
+    return {"outputs": fields["outputs"], "energy": _template(ENERGY).substitute(fields)}
+
+
+def _stack(model: TorqueModel) -> str:
+    """Kilobytes that a call takes, of its largest arrays: links; covariances and products of energies."""
+    n, outputs = model.n_joints, len(model.posterior.basis.outputs)
+    return str(round(2 * n + (8e-3 * n * outputs + 0.6 * n**2 if outputs else 0.0)))
+
+
 def _panels(root: Array) -> Array:
     """The root's columns, WIDE at a time, row by row down to the diagonal: flat; zeros fill the last."""
     size = len(root)
@@ -189,31 +222,29 @@ def _panels(root: Array) -> Array:
 
 
 def _vectors(model: TorqueModel, learnt: Learnt) -> Array:
-    """Queries within the training's range, and what the service's own features make of them: (VECTORS, 5, n)."""
-    arm, n = learnt.arm.arm, learnt.arm.n_joints
-    limits, draw = model.training_range, np.random.default_rng(0).uniform
+    """Queries within the training's range, and the model's own answers: (VECTORS, 5, n)."""
+    limits, draw, n = model.training_range, np.random.default_rng(0).uniform, model.n_joints
     motions = [draw(limits[name]["min"], limits[name]["max"], (VECTORS, n)) for name in ("q", "dq", "ddq")]
     out = []
     for rows, carried in ((slice(0, VECTORS // 2), False), (slice(VECTORS // 2, VECTORS), True)):
-        q, dq, ddq = (each[rows] for each in motions)
-        motion = Motion.from_arrays(q, dq, ddq)
-        term, more = learnt.arm, np.zeros((len(motion), n))
+        motion = [each[rows] for each in motions]
+        q, dq, ddq = motion
+        answer = (_carrying(model, learnt) if carried else model).predict(q, dq, ddq)
+        more = np.zeros_like(answer.tau)
         if carried:
-            parameters = arm.parameters.copy()
-            parameters[-1] += PAYLOAD.parameters
-            term = ArmKernel(replace(arm, parameters=parameters))
-            features = PayloadKernel(arm, np.ones(PARAMETERS)).rows(motion.arrays())
+            features = PayloadKernel(learnt.arm.arm, np.ones(PARAMETERS)).rows(np.stack(motion, axis=1))
             more = np.einsum("nkj,k->nj", features, PAYLOAD.parameters)
-        tau, std = _expected(model, learnt, motion, term)
-        out.append(np.stack([motion.q, motion.dq, motion.ddq, tau + more, std], axis=1))
+        out.append(np.stack([*motion, answer.tau + more, answer.tau_std], axis=1))
     return np.concatenate(out)
 
 
-def _expected(model: TorqueModel, learnt: Learnt, motion: Motion, term: ArmKernel) -> tuple[Array, Array]:
-    """Mean and standard deviation of the torque of N motions, (N, n), as `Evaluator` has them, without its rounding."""
-    features, posterior = learnt.features(motion, term), model.posterior
-    variance = learnt.variance(features) + posterior.misfit.variance(motion).numpy()
-    return features @ learnt.mean, np.sqrt(np.maximum(variance, posterior.floor.numpy()))
+def _carrying(model: TorqueModel, learnt: Learnt) -> TorqueModel:
+    """The model whose torque changes with the geometry as that of an arm with PAYLOAD does."""
+    parameters = learnt.arm.arm.parameters.copy()
+    parameters[-1] += PAYLOAD.parameters
+    loaded = ArmKernel(replace(learnt.arm.arm, parameters=parameters))
+    basis = replace(model.posterior.basis, linear=(loaded, learnt.friction))
+    return replace(model, posterior=replace(model.posterior, basis=basis))
 
 
 def _braced(values: Any) -> str:

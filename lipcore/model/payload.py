@@ -112,9 +112,10 @@ class Carrier:
     @cached_property
     def covariance(self) -> Array:
         """Covariance Σ of the whitened variables, (M, M)."""
-        posterior = self.model.posterior
-        learnt = (posterior.root @ posterior.basis.root).numpy()
-        values, vectors = np.linalg.eigh(np.eye(len(learnt)) - learnt.T @ learnt)
+        covariance = self.model.posterior.covariance.numpy()
+        values, vectors = np.linalg.eigh(covariance)
+        if values[0] >= LEAST:
+            return np.asarray(covariance)
         # what samples tell to rounding has a variance of either sign
         return np.asarray((vectors * np.maximum(values, LEAST)) @ vectors.T)
 
@@ -211,7 +212,7 @@ class Carrier:
         solved = CompactPosterior.solved(
             around.estimator.kernel,
             around.basis,
-            known(torch.from_numpy(mean), torch.from_numpy(covariance)),
+            known(torch.from_numpy(mean), torch.from_numpy(covariance), len(around.basis.outputs)),
             posterior.noise_variance,
             posterior.std_factor,
             posterior.floor,

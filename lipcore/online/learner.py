@@ -161,7 +161,7 @@ class OnlineModel:
         updated = CompactPosterior.solved(
             posterior.kernel,
             posterior.basis,
-            self.now.solve(self.walk),
+            self.now.solve(self.walk, len(posterior.basis.outputs)),
             posterior.noise_variance,
             posterior.std_factor,
             None if floor is None else torch.from_numpy(np.array(floor, np.float64)),

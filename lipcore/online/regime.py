@@ -104,9 +104,9 @@ class Regime:
         """What the rows say of the variables in the newest epoch."""
         return self.folded(walk, 0).statistics
 
-    def solve(self, walk: Walk | None = None) -> Solution:
-        """Posterior of the whitened variables, friction that of the newest epoch."""
-        return solve(self.sums(walk), self.centre)
+    def solve(self, walk: Walk | None = None, first: int = 0) -> Solution:
+        """Posterior of the whitened variables, friction that of the newest epoch. first: see `Solution`."""
+        return solve(self.sums(walk), self.centre, first)
 
     def folded(self, walk: Walk | None, kept: int = KEPT) -> Regime:
         """The same knowledge with at most `kept` epochs left: friction of the others is eliminated for good."""

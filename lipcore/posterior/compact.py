@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -13,7 +14,7 @@ from lipcore.kernels.base import LinearKernel, Params, TorqueKernel
 from lipcore.posterior.basis import Basis
 from lipcore.posterior.exact import Posterior, Prediction
 from lipcore.posterior.misfit import Misfit
-from lipcore.posterior.statistics import Solution, Statistics, solve
+from lipcore.posterior.statistics import Solution, Statistics, learnt_root, solve
 
 
 @dataclass(frozen=True)
@@ -24,9 +25,11 @@ class CompactPosterior(Posterior):
     c = cov(u, f(x)) = B φ(x):
 
         mean       E f(x) + φᵀ ŵ                = E f(x) + cᵀ α,     α = B⁻ᵀ ŵ
-        variance   k(x, x) − φᵀφ + φᵀ Σ φ       = k(x, x) − |Q c|²,  QᵀQ = B⁻ᵀ (I − Σ) B⁻¹
+        variance   k(x, x) − φᵀφ + φᵀ Σ φ       = k₁(x, x) − |Q₁ c|² + |Q₂ c|²,     Q = R B⁻¹
 
-    where φ does not reach, the variance is the prior's. root: Q, (M, M) lower triangular; noise_variance: (n,) R;
+    where φ does not reach, the variance is the prior's. k₁ is the nonlinear term, to whose torques the rows Q₁ belong:
+    of the linear ones, which may be far less certain beforehand than afterwards, nothing is subtracted (see
+    `Solution`). root: Q, (M, M) lower triangular; noise_variance: (n,) R;
     floor: (n,) (N·m)², which the variance of a torque is never below, whatever the samples say; zero but for models
     that learn online (see `online.record.error_floor`). misfit: variance of the torque besides.
     statistics: what it was made from; None where that is more than one sum.
@@ -54,7 +57,9 @@ class CompactPosterior(Posterior):
         noise_variance: (n,) (N·m)²; std_factor: calibration; misfit: none where None. Raise NotPositiveDefiniteError
         for statistics that no samples have.
         """
-        posterior = cls.solved(kernel, basis, solve(statistics), noise_variance, std_factor, None, misfit)
+        posterior = cls.solved(
+            kernel, basis, solve(statistics, None, len(basis.outputs)), noise_variance, std_factor, None, misfit
+        )
         return replace(posterior, statistics=statistics)
 
     @classmethod
@@ -103,11 +108,13 @@ class CompactPosterior(Posterior):
     ) -> CompactPosterior:
         """Posterior of the torques, given that of the whitened variables.
 
-        noise_variance: (n,) (N·m)²; floor: (n,) (N·m)²; misfit; none where None.
+        solution: whose `first` are the nonlinear term's; noise_variance: (n,) (N·m)²; floor: (n,) (N·m)²; misfit; none
+        where None.
         """
+        assert solution.first == len(basis.outputs)
         weights = torch.linalg.solve_triangular(basis.root.T, solution.mean[:, None], upper=True)[:, 0]
         # and not from QᵀQ itself: B⁻¹ is badly conditioned
-        root = torch.linalg.solve_triangular(basis.root, solution.learnt, upper=False, left=False)
+        root = torch.linalg.solve_triangular(basis.root, solution.root, upper=False, left=False)
         floor = torch.zeros_like(noise_variance) if floor is None else floor
         misfit = Misfit.none(len(noise_variance)) if misfit is None else misfit
         return cls(kernel, basis.params, std_factor, weights, basis, noise_variance, root, floor, misfit)
@@ -128,9 +135,21 @@ class CompactPosterior(Posterior):
         more = torch.maximum(self.misfit.variance(query), self.floor - variance)
         return Prediction(prediction.mean, prediction.covariance + torch.diag_embed(more))
 
+    @cached_property
+    def covariance(self) -> Tensor:
+        """Σ of the whitened variables, (M, M)."""
+        return Solution(self.weights, self.root @ self.basis.root, len(self.basis.outputs)).covariance
+
+    @cached_property
+    def learnt(self) -> Tensor:
+        """What samples explain of any quantity: (M, M) lower triangular, whose square is B⁻ᵀ (I − Σ) B⁻¹."""
+        root = learnt_root(self.covariance)
+        out: Tensor = torch.linalg.solve_triangular(self.basis.root, root, upper=False, left=False)
+        return out
+
     def whiten(self, cross: Tensor) -> Tensor:
-        """Q c, (M, K). cross: covariance of the variables with K quantities, (M, K)."""
-        return self.root @ cross
+        """Columns whose square is explained, (M, K). cross: covariance of the variables with K quantities, (M, K)."""
+        return self.learnt @ cross
 
     def with_torques(self, term: TorqueKernel, covariance: Callable[[Motion], Tensor]) -> Tensor:
         """Covariance of the variables with K quantities of the nonlinear term, zero for linear weights: (M, K).

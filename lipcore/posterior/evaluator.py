@@ -39,8 +39,8 @@ class Evaluator:
     """Posterior torques of a robot with n joints from M = m + P anchors: m inducing outputs, then all linear weights.
 
     With g(x) the covariance of the anchors with the torques at x, (M, n), the mean is E f(x) + gᵀ weights and the
-    covariance std_factor² (k(x, x) − (Q g)ᵀ (Q g)), to whose diagonal the misfit is added, and which is
-    raised to `floor` where it is below.
+    covariance std_factor² (k₁(x, x) − (Q₁ g)ᵀ (Q₁ g) + (Q₂ g)ᵀ (Q₂ g)), with k₁ of the nonlinear term and Q₁ the first
+    m rows of Q, to whose diagonal the misfit is added, and which is raised to `floor` where it is below.
 
     term: the kernel's nonlinear term, None if it has none. params: hyperparameters of all terms. inducing: S samples,
     None without `term`. outputs: (m,), which of their torques, as sample · n + joint. linear: the linear terms in the
@@ -227,4 +227,7 @@ def _lay_out(weights: Array, root: Array, means: Array, variances: Array) -> Arr
     scale[len(scale) - len(variances) :] = variances
     slopes = weights * scale
     slopes[len(scale) - len(means) :] += means
-    return np.concatenate([variances, pack(slopes[None], triangular=False), pack(root * scale, triangular=True)])
+    root, chosen = root * scale, len(weights) - len(variances)
+    # a panel has rows of one sign
+    panels = [pack(root[:chosen], 0), pack(root[chosen:], chosen)]
+    return np.concatenate([pack(slopes[None], len(slopes)), *panels])

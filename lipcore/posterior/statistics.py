@@ -17,6 +17,9 @@ from lipcore.posterior.linalg import NotPositiveDefiniteError
 
 ROUNDING = 1e-8
 """Share of the largest eigenvalue of the statistics by which the smallest may lie below zero."""
+BELOW = 1e-5
+"""How far below zero the eigenvalues of the statistics may lie by rounding without being looked at: by such a share a
+variance of which samples say nothing may exceed the prior's."""
 BLOCK = 256
 """Rows below which a product with itself is computed at once."""
 
@@ -37,10 +40,23 @@ class Statistics:
 
 @dataclass(frozen=True)
 class Solution:
-    """Posterior N(mean, Σ) of the M whitened variables. learnt: (M, M) lower triangular, learntᵀ learnt = I − Σ."""
+    """Posterior N(mean, Σ) of the M whitened variables, and what its variances are sums of, without a difference.
+
+    root: R, (M, M) lower triangular. Its first rows R₁, of `first` variables, are what is learnt of them by who knows
+    the others, I − R₁ᵀR₁ = Σ₁₁ − Σ₁₂ Σ₂₂⁻¹ Σ₂₁; the others R₂ are what is left of all: Σ = I₁ − R₁ᵀR₁ + R₂ᵀR₂.
+    """
 
     mean: Tensor
-    learnt: Tensor
+    root: Tensor
+    first: int = 0
+
+    @property
+    def covariance(self) -> Tensor:
+        """Σ, (M, M)."""
+        learnt, left = self.root[: self.first], self.root[self.first :]
+        out = left.T @ left - learnt.T @ learnt
+        out.diagonal()[: self.first].add_(1.0)
+        return out
 
 
 def empty(size: int) -> Statistics:
@@ -124,60 +140,95 @@ def copied(statistics: Statistics) -> Statistics:
     return Statistics(statistics.a.clone(), statistics.b.clone(), statistics.samples)
 
 
-def solve(statistics: Statistics, centre: Tensor | None = None) -> Solution:
+def solve(statistics: Statistics, centre: Tensor | None = None, first: int = 0) -> Solution:
     """Posterior of the whitened variables given the statistics, with the prior N(centre, I).
 
-    Mean (I + A)⁻¹ (centre + b), covariance Σ = (I + A)⁻¹. centre: (M,), zero where None.
-    Raise NotPositiveDefiniteError for statistics that no samples have.
+    Mean (I + A)⁻¹ (centre + b), covariance Σ = (I + A)⁻¹ = L⁻ᵀ L⁻¹. centre: (M,), zero where None; first: see
+    `Solution`. Raise NotPositiveDefiniteError for statistics that no samples have.
     """
     right = statistics.b if centre is None else centre + statistics.b
-    return _by_cholesky(statistics.a, right) or _by_eigenvalues(statistics.a, right)
+    factor = _by_cholesky(statistics.a)
+    if factor is None:
+        factor = _by_eigenvalues(statistics.a)
+    mean = torch.cholesky_solve(right[:, None], factor)[:, 0]
+    unit = torch.eye(len(factor), dtype=factor.dtype)
+    left = torch.linalg.solve_triangular(factor.T, unit[:, first:], upper=True).T
+    return Solution(mean, _stacked(torch.cholesky_inverse(factor[:first, :first]), left), first)
 
 
-def known(mean: Tensor, covariance: Tensor) -> Solution:
+def known(mean: Tensor, covariance: Tensor, first: int = 0) -> Solution:
     """The posterior N(mean, Σ) of whitened variables, (M,) and (M, M), as it stands; Σ is nowhere above the prior's I.
 
     Raise NotPositiveDefiniteError where it is.
     """
+    learnt_root(covariance)
+    left = _lower_root(covariance)
+    given = left[:first, :first]
+    return Solution(mean, _stacked(given.T @ given, left[first:]), first)
+
+
+def learnt_root(covariance: Tensor) -> Tensor:
+    """Q, (M, M) lower triangular, with QᵀQ = I − Σ: what is learnt of whitened variables of covariance Σ.
+
+    Raise NotPositiveDefiniteError where Σ exceeds the prior's I.
+    """
     explained = -covariance
     explained.diagonal().add_(1.0)
-    upper, failed = torch.linalg.cholesky_ex(explained.flip(0, 1), upper=True)
+    return _lower_root(explained)
+
+
+def _stacked(given: Tensor, left: Tensor) -> Tensor:
+    """R of `Solution`. given: Σ₁₁ − Σ₁₂ Σ₂₂⁻¹ Σ₂₁; left: R₂."""
+    first = len(given)
+    if not first:
+        return left.contiguous()
+    out = torch.zeros((first + len(left),) * 2, dtype=left.dtype)
+    out[:first, :first], out[first:] = learnt_root(given), left
+    return out
+
+
+def _lower_root(matrix: Tensor) -> Tensor:
+    """Q, lower triangular, with QᵀQ a symmetric matrix; raise NotPositiveDefiniteError for one that is no square."""
+    some = matrix.diagonal() != 0
+    if not some.all():  # of others nothing is learnt, or all is known
+        out = torch.zeros_like(matrix)
+        out[torch.outer(some, some)] = _lower_root(matrix[some][:, some]).reshape(-1)
+        return out
+    # with the variables in reverse order it is Uᵀ U: the factor that is sought is the lower triangular one
+    upper, failed = torch.linalg.cholesky_ex(matrix.flip(0, 1), upper=True)
     if not failed:
-        return Solution(mean, upper.flip(0, 1))
-    values, vectors = torch.linalg.eigh(explained)
-    if not float(values[0]) >= -ROUNDING:
-        raise NotPositiveDefiniteError(f"a covariance exceeds the prior's by {-float(values[0]):.3g}, expected less")
+        lower: Tensor = upper.flip(0, 1)
+        return lower
+    values, vectors = torch.linalg.eigh(matrix)
+    if not float(values[0]) >= -BELOW:
+        raise NotPositiveDefiniteError(f"a covariance is {-float(values[0]):.3g} above the prior's or below zero")
     root = values.clamp_min(0.0).sqrt()[:, None] * vectors.T
-    return Solution(mean, torch.linalg.qr(root.flip(1), mode="r").R.flip(0, 1))
+    lower = torch.linalg.qr(root.flip(1), mode="r").R.flip(0, 1)
+    return lower
 
 
-def _by_cholesky(a: Tensor, right: Tensor) -> Solution | None:
-    """The posterior where samples tell of every variable, so that I − Σ is positive definite; None elsewhere."""
+def _by_cholesky(a: Tensor) -> Tensor | None:
+    """L, lower triangular, with L Lᵀ = I + A; None where A is not one that samples have, to BELOW."""
     total = a.clone()
-    total.diagonal().add_(1.0)
+    total.diagonal().add_(BELOW)
+    if torch.linalg.cholesky_ex(total).info:
+        return None
+    total.copy_(a).diagonal().add_(1.0)
     factor, failed = torch.linalg.cholesky_ex(total)
-    if failed:
-        return None
-    explained = torch.cholesky_inverse(factor).neg_()
-    explained.diagonal().add_(1.0)
-    # with the variables in reverse order, explained = Uᵀ U: the factor that is sought is the lower triangular one
-    upper, failed = torch.linalg.cholesky_ex(explained.flip(0, 1), upper=True)
-    if failed:
-        return None
-    return Solution(torch.cholesky_solve(right[:, None], factor)[:, 0], upper.flip(0, 1))
+    return None if failed else factor
 
 
-def _by_eigenvalues(a: Tensor, right: Tensor) -> Solution:
+def _by_eigenvalues(a: Tensor) -> Tensor:
     """The same from any statistics, at three times the cost; raise NotPositiveDefiniteError for impossible ones."""
     values, vectors = torch.linalg.eigh(a)
     if not float(values[0]) >= -ROUNDING * max(float(values[-1]), 1.0):
         raise NotPositiveDefiniteError(
             f"statistics of size {len(values)} have the eigenvalue {float(values[0]):.3g}, expected none below zero"
         )
-    values = values.clamp_min(0.0)
-    mean = vectors @ ((vectors.T @ right) / (1 + values))
-    root = (values / (1 + values)).sqrt()[:, None] * vectors.T
-    return Solution(mean, torch.linalg.qr(root.flip(1), mode="r").R.flip(0, 1))
+    root = (1 + values.clamp_min(0.0)).sqrt()[:, None] * vectors.T
+    upper: Tensor = torch.linalg.qr(root, mode="r").R
+    # the Cholesky factor has a positive diagonal
+    return (upper * upper.diagonal().sign()[:, None]).T
 
 
 def _square(features: Tensor) -> Tensor:

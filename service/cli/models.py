@@ -173,8 +173,8 @@ def export_(
 ) -> None:
     """Write a version as an archive that another service imports, or with --c as C99 for hard real time.
 
-    The latter has torque and standard deviation of a model of rigid bodies, also with a payload, without dependencies
-    or allocation: `cc -O2 -c lipserve_model.c`; lipserve_model.h says how to use it.
+    The latter has torque and standard deviation of a model of rigid bodies (and `lip-chain`), also with a
+    payload, without dependencies or allocation: `cc -O2 -c lipserve_model.c`; lipserve_model.h says how to use it.
     """
     if (path is None) == (c is None):
         raise CommandError("path and --c are " + ("missing" if c is None else "both given") + ", expected one of them")

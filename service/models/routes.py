@@ -81,7 +81,7 @@ async def export_version(
     alias: WhichAlias = None,
     learnt: Annotated[bool, Query(description="With what it has learnt online; false: as it was trained")] = True,
     format: Annotated[  # noqa: A002 - the field's own name
-        Literal["archive", "c"], Query(description="`c`: C99 for control loops, of `rigid-body`; others answer 422")
+        Literal["archive", "c"], Query(description="`c`: C99 for control loops, where rigid bodies are known; else 422")
     ] = "archive",
 ) -> StreamingResponse:
     """One archive with all that another service needs to answer alike; `export.json` in it says what it holds.

@@ -46,10 +46,12 @@ def motions(n: int, seed: int, size: int = 5) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-2, 2, (size, 3, n))
 
 
-def followed(geometry: Geometry, robot: Robot, samples: Samples, options: FitOptions) -> TorqueModel:
+def followed(
+    geometry: Geometry, robot: Robot, samples: Samples, options: FitOptions, estimator: str = "rigid-body"
+) -> TorqueModel:
     """The model of an arm that is followed from its true geometry, where a search would lead after seconds."""
     task = Task(samples, robot.joint_types, options)
-    return fit_estimator(task, "rigid-body", learn(task, begin=(geometry.canonical(),)))
+    return fit_estimator(task, estimator, learn(task, begin=(geometry.canonical(),)))
 
 
 def recorded(robot: Robot, seed: int, size: int = 120, noise: float = 0.01, viscous: float = 0.2) -> Samples:

@@ -46,11 +46,11 @@ class Case:
 
     def dense(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean (N, n) and covariance (N, n, n) by the formulas of `Evaluator`, matrix by matrix."""
-        mean, prior, explained = self.parts()
-        return mean, FACTOR**2 * (prior - explained)
+        mean, prior, explained, left = self.parts()
+        return mean, FACTOR**2 * (prior - explained + left)
 
-    def parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mean, and the covariances a priori and explained by the data."""
+    def parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Mean, and the covariances of the nonlinear term a priori, of it explained, and of the weights left."""
         query, n = self.query, self.query.n_joints
         prior = SumKernel(*([] if self.term is None else [self.term]), *self.linear)
         rows = []
@@ -61,9 +61,10 @@ class Case:
             rows.append(each.covariance(self.params) @ features.reshape(len(query) * n, -1).T)
         cross = torch.cat(rows)
         mean = prior.mean(query) + (torch.from_numpy(self.weights) @ cross).reshape(-1, n)
-        white = (torch.from_numpy(self.root) @ cross).reshape(-1, len(query), n)
-        explained = torch.einsum("kmi,kmj->mij", white, white)
-        return mean.numpy(), prior.variance(self.params, query).numpy(), explained.numpy()
+        white, chosen = (torch.from_numpy(self.root) @ cross).reshape(-1, len(query), n), len(self.outputs)
+        explained, left = (torch.einsum("kmi,kmj->mij", part, part) for part in (white[:chosen], white[chosen:]))
+        before = np.zeros((len(query), n, n)) if self.term is None else self.term.variance(self.params, query).numpy()
+        return mean.numpy(), before, explained.numpy(), left.numpy()
 
 
 def rigid_body(name: str, order: tuple[int, ...] | None = None, **options: object) -> ArmKernel:
@@ -108,10 +109,11 @@ def case(
         root=root,
         query=motion[samples:],
     )
-    _, prior, explained = made.parts()
-    # up to half of a variance is explained: an error in that half would show, and little cancels
-    diagonals = (part.diagonal(axis1=1, axis2=2) for part in (explained, prior))
-    made.root = root * np.sqrt(0.5 / np.divide(*diagonals).max())
+    if term is not None and kernel:
+        _, prior, explained, _ = made.parts()
+        # up to half of a variance is explained: an error in that half would show, and little cancels
+        diagonals = (part.diagonal(axis1=1, axis2=2) for part in (explained, prior))
+        made.root = root * np.sqrt(0.5 / np.divide(*diagonals).max())
     return made
 
 

@@ -92,7 +92,7 @@ def test_it_is_one_process_whose_friction_walks(base: TorqueModel, rows: Rows, t
     mean, covariance = process(base, rows, time_s, ((rows.time - BEGAN) // (time_s / 10)).astype(int))
     found = online.now.solve(online.walk)
     np.testing.assert_allclose(found.mean.numpy(), mean, rtol=0, atol=1e-6 * np.abs(mean).max())
-    spread = np.eye(len(mean)) - (found.learnt.T @ found.learnt).numpy()
+    spread = found.covariance.numpy()
     np.testing.assert_allclose(spread, covariance, rtol=0, atol=1e-6)
 
 
@@ -102,7 +102,7 @@ def test_it_follows_friction_and_leaves_the_arm_alone(base: TorqueModel, rows: R
     late = rows.take(slice(-20, None))
     answers = [each.model().predict(late.q, late.dq, late.ddq).tau for each in (plain, walked)]
     assert np.mean((answers[1] - late.tau) ** 2) < 0.9 * np.mean((answers[0] - late.tau) ** 2)
-    spread = [np.sqrt(1 - each.now.solve(each.walk).learnt.square().sum(0).numpy()) for each in (plain, walked)]
+    spread = [np.sqrt(each.now.solve(each.walk).covariance.diagonal().numpy()) for each in (plain, walked)]
     ratio = spread[1] / spread[0]
     others = np.setdiff1d(np.arange(len(ratio)), friction)
     assert ratio[friction].max() > 2
@@ -142,7 +142,7 @@ def test_a_long_pause_leaves_friction_as_open_as_at_first_and_the_rest_as_it_was
     early = replace(rows.take(slice(0, 60)), time=rows.time[:60])
     later = replace(rows.take(slice(60, 61)), time=rows.time[60:61] + 1e9, weight=np.full(1, 1e-12))
     before, after = walking(base, 5.0).learn(early), walking(base, 5.0).learn(early).learn(later)
-    one, other = (np.sqrt(1 - each.now.solve(each.walk).learnt.square().sum(0).numpy()) for each in (before, after))
+    one, other = (np.sqrt(each.now.solve(each.walk).covariance.diagonal().numpy()) for each in (before, after))
     np.testing.assert_allclose(other[friction], 1.0, atol=1e-6)
     centre = (base.posterior.basis.root.T @ base.posterior.weights).numpy()
     np.testing.assert_allclose(after.now.solve(after.walk).mean.numpy()[friction], centre[friction], atol=1e-6)

@@ -1,6 +1,8 @@
 """Exact posterior and evidence against dense references, and the compact posterior against the exact one."""
 
 from dataclasses import replace
+from decimal import Decimal, localcontext
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 import torch
 from scipy.stats import multivariate_normal
 
-from lipcore import FitOptions, Samples, TorqueModel, train
+from lipcore import FitOptions, Samples, TorqueModel, load, train
 from lipcore.data.motion import Motion
 from lipcore.fitting.estimators import ESTIMATORS
 from lipcore.kernels.base import Params, SumKernel, TorqueKernel
@@ -27,6 +29,7 @@ from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import ROBOT_ESTIMATORS
 from tests.lipcore.oracles import KERNELS, Problem, TorchForm, in_full, random_problem
 
+PANDA = Path(__file__).parents[2] / "models/panda-sim"
 JOINTS = ("revolute", "prismatic", "revolute")
 N_JOINTS = len(JOINTS)
 STEP = 1e-4
@@ -252,6 +255,31 @@ def test_its_size_does_not_follow_the_number_of_samples(chain: Case) -> None:
         exact = ExactPosterior.fit(kernel, params, samples.motion(), samples.torque())
         sizes.append(len(compress(exact, samples.torque(), 0.02, 1500).posterior.basis))
     assert sizes[1] < 1.25 * sizes[0]
+
+
+def test_a_standard_deviation_far_below_the_priors_has_its_digits() -> None:
+    """|L⁻¹ φ|, I + A = L Lᵀ, of the shipped Panda's statistics, with fifty digits. What samples leave of a torque's
+    variance is 1e-8 of what was there before, and as a difference would have eight digits less."""
+    model = load(PANDA)
+    posterior, count = model.posterior, 5
+    assert posterior.statistics is not None
+    draw, limits = np.random.default_rng(3).uniform, model.training_range
+    motion = [draw(limits[name]["min"], limits[name]["max"], (count, 7)) for name in ("q", "dq", "ddq")]
+    with localcontext(prec=50):
+        exact = np.frompyfunc(Decimal, 1, 1)
+        total = exact(posterior.statistics.a.numpy()) + exact(np.eye(len(posterior.basis)))
+        rows = exact(posterior.basis.features(Motion.from_arrays(*motion)).numpy())
+        before = (rows * rows).sum(0)
+        for k in range(len(total)):  # elimination, column by column, of the matrix and the features at once
+            factor = total[k + 1 :, k] / total[k, k]
+            total[k + 1 :] -= factor[:, None] * total[k]
+            rows[k + 1 :] -= factor[:, None] * rows[k]
+        left = (rows * rows / np.diagonal(total)[:, None]).sum(0)
+        shares = (left / before).astype(float)
+    assert np.median(shares) < 1e-7
+    variance = model.posterior.std_factor**2 * left.astype(float).reshape(count, 7)
+    variance += posterior.misfit.variance(Motion.from_arrays(*motion)).numpy()
+    np.testing.assert_allclose(model.predict(*motion).tau_std, np.sqrt(variance), rtol=1e-8)
 
 
 def test_statistics_that_no_samples_have_are_refused(chain: Case) -> None:

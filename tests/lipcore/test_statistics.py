@@ -16,7 +16,18 @@ from lipcore.kernels.base import SumKernel
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.posterior.basis import Basis
 from lipcore.posterior.linalg import NotPositiveDefiniteError
-from lipcore.posterior.statistics import Statistics, collect, decay, empty, merge, solve, subtract, update
+from lipcore.posterior.statistics import (
+    Statistics,
+    collect,
+    decay,
+    empty,
+    known,
+    learnt_root,
+    merge,
+    solve,
+    subtract,
+    update,
+)
 from lipcore.posterior.summing import Summing, Total
 from lipcore.training.conditioning import condition
 from tests.choosing import slow
@@ -101,7 +112,7 @@ def test_sums_are_those_of_every_sample_by_itself_and_their_solution_that_of_lin
     # the dual form: conditioning on the N n values themselves
     gain = rows.T @ np.linalg.inv(rows @ rows.T + np.diag(variances))
     assert np.allclose(solution.mean.numpy(), centre.numpy() + gain @ (values - rows @ centre.numpy()), atol=1e-9)
-    assert np.allclose((solution.learnt.T @ solution.learnt).numpy(), gain @ rows, atol=1e-9)
+    assert np.allclose(np.eye(len(basis)) - solution.covariance.numpy(), gain @ rows, atol=1e-9)
 
 
 def test_large_products_are_symmetric_and_those_of_small_ones() -> None:
@@ -117,22 +128,41 @@ def test_large_products_are_symmetric_and_those_of_small_ones() -> None:
 
 
 @pytest.mark.parametrize(("count", "largest"), [(3, 1e2), (20, 1e2), (60, 1e2), (60, 1e5)])
-def test_what_is_learnt_is_exact_and_triangular(count: int, largest: float) -> None:
+@pytest.mark.parametrize("first", [0, 7, 20])
+def test_what_is_learnt_is_exact_and_triangular(first: int, count: int, largest: float) -> None:
     """From samples that tell of all 20 variables or only of some, as much of one as 1e10 times another's prior."""
     generator = np.random.default_rng(count)
     columns = generator.standard_normal((20, count)) * np.geomspace(1, largest, 20)[:, None]
     b, centre = generator.standard_normal(20), generator.standard_normal(20)
     found = solve(
-        Statistics(torch.from_numpy(columns @ columns.T), torch.from_numpy(b), count), torch.from_numpy(centre)
+        Statistics(torch.from_numpy(columns @ columns.T), torch.from_numpy(b), count), torch.from_numpy(centre), first
     )
     # from the columns and not from their products, whose condition number is the square
     vectors, values, _ = np.linalg.svd(columns)
     values = np.concatenate([values, np.zeros(20 - len(values))]) ** 2
     learnt = (vectors * (values / (1 + values))) @ vectors.T
     mean = (vectors / (1 + values)) @ vectors.T @ (centre + b)
-    assert np.allclose((found.learnt.T @ found.learnt).numpy(), learnt, rtol=0, atol=1e-10)
+    assert np.allclose(np.eye(20) - found.covariance.numpy(), learnt, rtol=0, atol=1e-10)
     assert np.allclose(found.mean.numpy(), mean, rtol=0, atol=1e-9)
-    assert torch.count_nonzero(found.learnt.triu(1)) == 0
+    assert torch.count_nonzero(found.root.triu(1)) == 0
+    again = known(found.mean, found.covariance, first)
+    assert np.allclose(again.covariance.numpy(), found.covariance.numpy(), rtol=0, atol=1e-9)
+    whole = learnt_root(found.covariance)
+    assert np.allclose((whole.T @ whole).numpy(), learnt, rtol=0, atol=1e-10)
+    assert torch.count_nonzero(whole.triu(1)) == 0
+
+
+@pytest.mark.parametrize("first", [0, 7, 20])
+def test_eigenvalues_say_the_same_where_rounding_has_gone_too_far(first: int, monkeypatch) -> None:
+    columns = np.random.default_rng(0).standard_normal((20, 3)) * np.geomspace(1, 100, 20)[:, None]
+    sums = Statistics(torch.from_numpy(columns @ columns.T), torch.ones(20).double(), 3)
+    expected = solve(sums, None, first)
+    monkeypatch.setattr("lipcore.posterior.statistics._by_cholesky", lambda a: None)
+    found = solve(sums, None, first)
+    assert np.allclose(found.covariance.numpy(), expected.covariance.numpy(), rtol=0, atol=1e-9)
+    assert np.allclose(found.mean.numpy(), expected.mean.numpy(), rtol=0, atol=1e-9)
+    assert not torch.equal(found.root, expected.root)
+    assert torch.count_nonzero(found.root.triu(1)) == 0
 
 
 @pytest.mark.parametrize("factor", [-0.1, 1.1, float("nan")])

@@ -24,14 +24,15 @@ WIDTH = LANES
 """Columns that a panel is multiplied with; a robot of more joints takes several rounds."""
 
 
-def pack(matrix: Array, triangular: bool) -> Array:
+def pack(matrix: Array, before: int) -> Array:
     """Panels of `matrix`, (K, M), one after the other, flat; zeros fill the last.
 
-    triangular: what lies right of each panel's last diagonal element is zero, and left out.
+    before: columns before those of the diagonal; what lies right of each panel's last diagonal element is zero, and
+    left out.
     """
-    panels = []
+    panels = [np.zeros(0)]
     for first in range(0, matrix.shape[0], ROWS):
-        rows = matrix[first : first + ROWS, : first + ROWS if triangular else None]
+        rows = matrix[first : first + ROWS, : before + min(first + ROWS, matrix.shape[0])]
         panel = np.zeros((rows.shape[1], ROWS))
         panel[:, : len(rows)] = rows.T
         panels.append(panel.reshape(-1))
@@ -80,8 +81,9 @@ def answer(
 ) -> None:
     """Write the torques of N queries, and as much of their uncertainty as `what` says.
 
-    fixed: variances of the P linear weights, the panel of the mean, then those of the root; blocks: (N, S + 1, n, n)
-    from `Cross`; features: (N, P, n), Φᵀ; floor: (n,), smallest variance, at least 0;
+    fixed: the panel of the mean, those of the root's rows that are subtracted, one an output, then those that are
+    added, one a linear weight; blocks: (N, S + 1, n, n) from `Cross`; features: (N, P, n), Φᵀ; floor: (n,), smallest
+    variance, at least 0;
     misfit: (5, n), variance at rest, the speed where it has faded to exp(−1), variance that grows with speed and
     acceleration beyond the usual ones, and those, see `posterior.misfit`; motions: (N, 3, n), of which dq and ddq are
     read;
@@ -95,25 +97,21 @@ def answer(
     for query in range(queries):
         _gather(blocks[query].reshape(-1), outputs, features[query], n, query * step, memory)
         for group in range(groups):
-            multiply(fixed, linear, memory, query * step + group * size * WIDTH, size, memory, products)
+            multiply(fixed, 0, memory, query * step + group * size * WIDTH, size, memory, products)
             for j in range(min(WIDTH, n - group * WIDTH)):
                 tau[query, group * WIDTH + j] = memory[products + j]
     if what == MEAN:
         return
 
     full = what == COVARIANCE
-    covariance[:] = 0.0
-    panel = linear + ROWS * size
-    for first in range(0, size, ROWS):  # all queries meet a panel while the cache holds it
-        reach = min(first + ROWS, size)
-        for query in range(queries):
-            for group in range(groups):
-                columns = query * step + group * size * WIDTH
-                multiply(fixed, panel, memory, columns, reach, memory, products + group * ROWS * WIDTH)
-            _add_squares(memory, products, full, covariance[query])
-        panel += ROWS * reach
     for query in range(queries):
-        _subtract(blocks[query, -1], fixed, features[query], std_factor * std_factor, full, covariance[query])
+        _begin(blocks[query, -1], full, covariance[query])
+    panel = _add_panels(fixed, ROWS * size, 0, chosen, size, memory, full, covariance)
+    for query in range(queries):
+        _scale(-1.0, full, covariance[query])
+    _add_panels(fixed, panel, chosen, size, size, memory, full, covariance)
+    for query in range(queries):
+        _scale(std_factor * std_factor, full, covariance[query])
         speed, acceleration = 0.0, 0.0
         for j in range(n):
             speed += (motions[query, 1, j] / misfit[3, j]) ** 2
@@ -176,6 +174,35 @@ def _gather(rows: Array, outputs: Indices, features: Array, n: int, at: int, mem
 
 
 @compiled
+def _begin(prior: Array, full: bool, out: Array) -> None:
+    """Write minus the nonlinear term's own covariance, (n, n); unless `full` only its diagonal."""
+    out[:] = 0.0
+    for i in range(prior.shape[0]):
+        for j in range(0 if full else i, i + 1):
+            out[i, j] = -prior[i, j]
+
+
+@compiled
+def _add_panels(
+    fixed: Array, panel: int, first: int, last: int, size: int, memory: Array, full: bool, out: Array
+) -> int:
+    """Add the squares of the root's rows from `first` to before `last`, whose panels begin at `panel`, times the
+    columns in memory, to those of N queries, (N, n, n). Return where the next panel begins."""
+    queries, groups = out.shape[0], (out.shape[1] + WIDTH - 1) // WIDTH
+    step = groups * size * WIDTH
+    products = queries * step
+    for row in range(first, last, ROWS):  # all queries meet a panel while the cache holds it
+        reach = min(row + ROWS, last)
+        for query in range(queries):
+            for group in range(groups):
+                columns = query * step + group * size * WIDTH
+                multiply(fixed, panel, memory, columns, reach, memory, products + group * ROWS * WIDTH)
+            _add_squares(memory, products, full, out[query])
+        panel += ROWS * reach
+    return panel
+
+
+@compiled
 def _add_squares(memory: Array, products: int, full: bool, out: Array) -> None:
     """Add Vᵀ V of one panel's products V, (groups, ROWS, WIDTH); unless `full` only its diagonal."""
     for i in range(out.shape[0]):
@@ -190,11 +217,8 @@ def _add_squares(memory: Array, products: int, full: bool, out: Array) -> None:
 
 
 @compiled
-def _subtract(prior: Array, variances: Array, features: Array, scale: float, full: bool, out: Array) -> None:
-    """What the data explain becomes what they leave: scale (prior + Φ Λ Φᵀ − out); unless `full` only its diagonal."""
-    for i in range(prior.shape[0]):
+def _scale(factor: float, full: bool, out: Array) -> None:
+    """Multiply by a factor, both triangles where `full`."""
+    for i in range(out.shape[0]):
         for j in range(0 if full else i, i + 1):
-            total = prior[i, j]
-            for row in range(features.shape[0]):
-                total += variances[row] * features[row, i] * features[row, j]
-            out[i, j] = out[j, i] = scale * (total - out[i, j])
+            out[i, j] = out[j, i] = factor * out[i, j]
