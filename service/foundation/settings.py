@@ -51,6 +51,12 @@ class Settings(BaseSettings):
     uds_mode: FileMode = Field(
         0o660, ge=0, le=0o777, description="File mode of that socket, octal: whoever may write to it may ask."
     )
+    grpc_port: int | None = Field(
+        None,
+        ge=0,
+        le=65535,
+        description="Port of the same address to listen on for gRPC, too; 0 takes a free one. Needs `lipserve[grpc]`.",
+    )
     log_level: str = Field("info", pattern="^(critical|error|warning|info|debug)$")
     log_format: Literal["console", "json"] = Field(
         "console", description="Form of the log's lines: for people, or JSON, one object a line."
