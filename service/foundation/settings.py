@@ -282,6 +282,12 @@ class Settings(BaseSettings):
             raise ValueError("cluster: expected database_url and files_url too, which its workers share")
         return self
 
+    @model_validator(mode="after")
+    def _ports_apart(self) -> Self:
+        if self.grpc_port and self.grpc_port == self.port:
+            raise ValueError(f"grpc_port is {self.grpc_port}, expected another port than that of HTTP")
+        return self
+
     @property
     def keys_needed(self) -> bool:
         """Whether requests need API keys."""

@@ -2,10 +2,12 @@
 
 import json
 import os
+import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 
 import grpc
@@ -22,6 +24,8 @@ from service import __version__
 from service.app import create_app
 from service.foundation.settings import Settings
 from service.oip import rpc
+from service.oip.query import PARTS
+from service.oip.rpc.messages import MOST
 from tests.service.data import DEADLINE, eventually
 from tests.service.oip import message, path_of, refused, tensors
 from tests.service.server import Server, free_port
@@ -62,6 +66,7 @@ class Calls:
 def calls(tmp_path_factory) -> Iterator[Calls]:
     port = free_port()
     limits = {"LIPSERVE_MAX_REQUEST_BYTES": str(MOST_BYTES), "LIPSERVE_BODY_S": str(BODY_S)}
+    limits["LIPSERVE_LOG_REFUSALS_PER_S"] = "1000"  # every one of them
     home = tmp_path_factory.mktemp("grpc") / "home"
     address = f"127.0.0.1:{port}"
     with (
@@ -244,6 +249,24 @@ def test_requests_that_are_refused(calls, kind):
     assert dict(error.trailing_metadata())["lipserve-error-code"] == "invalid_request"
 
 
+def test_what_no_right_request_has_so_many_of_costs_no_more_than_reading_it(calls):
+    """Millions of inputs, outputs or axes: each is refused for the first that is wrong."""
+    assert len(calls.client.get_model_metadata("panda-sim").outputs) + len(PARTS) < MOST
+    for many, words in (
+        (changed(lambda r: [r.inputs.add() for _ in range(5000)]), "inputs[3].name is , expected one of q, dq, ddq"),
+        (changed(lambda r: [r.outputs.add(name="tau") for _ in range(2000)]), "outputs[1].name is tau, expected each"),
+        (changed(lambda r: r.inputs[0].shape.extend([1] * 9000)), "q.shape is [7, 1, 1"),
+    ):
+        assert calls.refusal(calls.stub.ModelInfer, many).details().startswith(words)
+
+
+def test_a_trusted_proxy_says_who_asks(calls):
+    named = (("x-forwarded-for", "203.0.113.7"), ("x-request-id", "far-1"))
+    calls.refusal(calls.stub.ModelInfer, request(MOTION, "x"), metadata=named)
+    lines = eventually(lambda: [line for line in calls.server.log.read_text().splitlines() if "far-1" in line])
+    assert json.loads(lines[0])["client"] == "203.0.113.7"
+
+
 def test_errors_are_worded_as_over_http(calls):
     narrow = {name: [0.0] * 3 for name in MOTION}
     http = refused(calls.server.client.post(PATH, json=message(narrow)))
@@ -385,6 +408,29 @@ def test_a_service_that_stops_ends_its_calls(tmp_path):
         with pytest.raises(grpc.RpcError) as caught:
             stub.ModelInfer(request(MOTION), timeout=DEADLINE)
         assert caught.value.code() == Code.UNAVAILABLE
+
+
+def heard(connection: socket.socket) -> bytes:
+    """What a service says, nothing where it has closed."""
+    try:
+        return connection.recv(1000)
+    except ConnectionResetError:
+        return b""
+
+
+def test_connections_beyond_the_most_there_may_be_and_those_that_say_nothing(tmp_path):
+    port, limits = free_port(), {"LIPSERVE_MAX_CONNECTIONS": "3", "LIPSERVE_HEADER_S": "1"}
+    with Server(tmp_path / "home", warm=True, LIPSERVE_GRPC_PORT=str(port), **limits), ExitStack() as stack:
+        silent = [stack.enter_context(socket.create_connection(("127.0.0.1", port), DEADLINE)) for _ in range(4)]
+        assert sum(bool(heard(each)) for each in silent) == 3  # HTTP/2's server speaks first
+        for each in silent:
+            while heard(each):  # until the service closes it
+                pass
+        channel = stack.enter_context(grpc.insecure_channel(f"127.0.0.1:{port}"))
+        live = GRPCInferenceServiceStub(channel).ServerLive(
+            published.ServerLiveRequest(), timeout=DEADLINE, wait_for_ready=True
+        )
+        assert live.live
 
 
 def test_a_port_that_is_taken_is_named(tmp_path, calls):

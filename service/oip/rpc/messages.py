@@ -17,6 +17,9 @@ from service.web.route import Reply
 
 PROTOBUF = b"application/grpc"
 InferRequest, InferResponse = message("ModelInferRequest"), message("ModelInferResponse")
+MOST = 100
+"""Inputs, outputs and axes that are looked at: more than any right request has, so one with more is refused for them.
+A message of the largest size may have millions, each of which takes more memory than it has bytes."""
 _FIELDS = {"FP64": "fp64_contents", "FP32": "fp32_contents"}
 
 
@@ -41,8 +44,9 @@ class Message:
         """sent: an InferRequest. Raise InvalidRequestError for a shape that is none."""
         self._sent, self._raw = sent, len(sent.raw_input_contents) > 0
         self.request = schema.InferRequest(
-            [_input(place, tensor) for place, tensor in enumerate(sent.inputs)],
-            [schema.InferOutput(each.name, _output_parameters(each.parameters)) for each in sent.outputs] or None,
+            [_input(place, tensor) for place, tensor in enumerate(sent.inputs[:MOST])],
+            [schema.InferOutput(each.name, _output_parameters(each.parameters)) for each in sent.outputs[:MOST]]
+            or None,
         )
 
     def check(self) -> None:
@@ -92,7 +96,7 @@ class Message:
 
 
 def _input(place: int, tensor: Any) -> schema.InferInput:
-    shape = list(tensor.shape)
+    shape = list(tensor.shape[:MOST])
     for axis, size in enumerate(shape):
         if size < 0:
             raise invalid_request(f"inputs[{place}].shape[{axis}]", size, "a whole number of at least 0")
