@@ -2,9 +2,11 @@
 
 import json
 import re
+import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -38,6 +40,35 @@ def test_the_node_compiles_without_a_warning(compiler, tmp_path):
     if not here(compiler):
         pytest.skip(f"{compiler} is not installed")
     compiled(compiler, NODE / "src/feedforward.cpp", tmp_path)
+
+
+def test_the_package_builds_with_cmake(any_compiler, tmp_path):
+    """With packages in the place of those of ROS: its own targets, paths and options are those that there are."""
+    if shutil.which("cmake") is None:
+        pytest.skip("cmake is not installed")
+    made = {"ament_cmake": "macro(ament_package)\nendmacro()\n"}
+    for name in ("rclcpp", "sensor_msgs", "trajectory_msgs"):
+        made[name] = (
+            f"add_library({name}::{name} INTERFACE IMPORTED)\n"
+            f'target_include_directories({name}::{name} INTERFACE "{STUBS}")\n'
+            f"set({name}_TARGETS {name}::{name})\n"
+        )
+    for name, text in made.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / f"{name}-config.cmake").write_text(text)
+    options = [f"-DCMAKE_CXX_COMPILER={any_compiler}", f"-DCMAKE_PREFIX_PATH={tmp_path}"]
+    options += [f"-D{name}_DIR={tmp_path / name}" for name in made]
+    for command in (
+        ["cmake", "-S", NODE, "-B", tmp_path / "build", *options],
+        ["cmake", "--build", tmp_path / "build"],
+        ["cmake", "--install", tmp_path / "build", "--prefix", tmp_path / "out"],
+    ):
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+    assert (tmp_path / "out/lib/lipserve_ros2/feedforward").exists()
+    manifest = ElementTree.parse(NODE / "package.xml").getroot()
+    assert manifest.findtext("name") == "lipserve_ros2"
+    assert {each.text for each in manifest.iter("depend")} == made.keys() - {"ament_cmake"}
 
 
 @pytest.fixture(scope="module", params=["address,undefined", "thread"])
