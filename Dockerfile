@@ -10,7 +10,7 @@ COPY lipcore lipcore
 COPY service service
 COPY docs docs
 COPY models/panda-sim models/panda-sim
-RUN /opt/lipserve/bin/python -m pip install --no-cache-dir --disable-pip-version-check ./clients/python '.[cluster]' \
+RUN /opt/lipserve/bin/python -m pip install --no-cache-dir --disable-pip-version-check ./clients/python '.[cluster,grpc]' \
     && /opt/lipserve/bin/python -m pip uninstall --yes --quiet setuptools pip \
     && site=$(echo /opt/lipserve/lib/python3*/site-packages) \
     && rm -rf "$site"/torch/include "$site"/torch/share "$site"/torch/test \
@@ -21,7 +21,7 @@ RUN /opt/lipserve/bin/python -m pip install --no-cache-dir --disable-pip-version
     && find "$site"/numpy "$site"/scipy "$site"/sympy "$site"/networkx "$site"/dask \
         "$site"/distributed -type d -name tests -prune -exec rm -rf {} + \
     && cd / && NUMBA_CACHE_DIR=/opt/numba /opt/lipserve/bin/python -m lipcore.warm_up \
-    && /opt/lipserve/bin/python -c "import service.cli.serve, service.cli.worker, lipserve.sync, distributed, s3fs, psycopg"
+    && /opt/lipserve/bin/python -c "import service.cli.serve, service.cli.worker, service.oip.rpc.listening, lipserve.sync, distributed, s3fs, psycopg"
 # the last two also leave the bytecode of what a start imports, 50 MB: the container's user cannot write it, and without
 # it every start takes four seconds longer
 
@@ -41,7 +41,7 @@ ENV PATH=/opt/lipserve/bin:$PATH \
 # a container listens on all its addresses to be reached, so the service asks for API keys; make the first one with
 # `docker exec CONTAINER lipserve keys create --name admin --scope admin`
 VOLUME /data
-EXPOSE 8000
+EXPOSE 8000 8001
 USER lipserve
 HEALTHCHECK --interval=10s --timeout=3s --start-period=30s \
     CMD ["python", "-c", "import urllib.request as r; r.urlopen('http://127.0.0.1:8000/health/ready', timeout=2)"]

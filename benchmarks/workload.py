@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from lipcore.robots.simulation import Stream, simulate
 from lipserve import Client
 from lipserve.progress import follow
 from lipserve.states import SUCCEEDED
-from service.cli.demo import ServiceProcess
+from service.cli.demo import ServiceProcess, free_port
 from service.cli.simulate import write_recording
 from service.foundation.settings import Settings
 from service.models import registry
@@ -85,11 +86,12 @@ class Workload:
 
 @dataclass(frozen=True)
 class Bed:
-    """A running service with the model, and how to reach it. pid: of its process."""
+    """A running service with the model, and how to reach it. grpc: None without the extra; pid: of its process."""
 
     client: Client
     tcp: Address
     unix: Address
+    grpc: tuple[str, int] | None
     dataset: str
     workload: Workload
     pid: int
@@ -102,6 +104,9 @@ def open_bed(home: Path, source: Source, console: Console) -> Iterator[Bed]:
         _install(home, source.folder)
     unix = home / "lipserve.sock"
     env = {"LIPSERVE_HOME": str(home), "LIPSERVE_UDS": str(unix), "LIPSERVE_LOG_LEVEL": "warning"}
+    calls = ("127.0.0.1", free_port()) if find_spec("grpc") is not None else None
+    if calls is not None:
+        env["LIPSERVE_GRPC_PORT"] = str(calls[1])
     service = ServiceProcess(0, env)
     try:
         with Client(service.url) as client:
@@ -115,7 +120,7 @@ def open_bed(home: Path, source: Source, console: Console) -> Iterator[Bed]:
                 )
             else:
                 workload = Workload.load(source.folder, simulator(source.folder), None, source.stream)
-            yield Bed(client, ("127.0.0.1", service.port), unix, dataset, workload, service.process.pid)
+            yield Bed(client, ("127.0.0.1", service.port), unix, calls, dataset, workload, service.process.pid)
     finally:
         service.stop()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import AsyncIterator
-from contextlib import AsyncExitStack, asynccontextmanager, nullcontext
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 
 import torch
 from anyio import CapacityLimiter, to_thread
@@ -33,6 +33,7 @@ from service.models import registry
 from service.models import routes as models
 from service.models.loaded import LoadedModels
 from service.oip import routes as oip
+from service.oip import rpc
 from service.replication import Replication
 from service.robots import routes as robots
 from service.storage.files.store import start_sweeping
@@ -67,6 +68,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     """Build the application. Nothing is opened before it starts."""
     settings = settings or Settings()
     stopping, meters = Stopping(), Meters(settings.max_metric_models)
+    calls = rpc.check_installed(settings)
     keyring = Keyring(settings.keys_refresh_s) if settings.keys_needed else None
 
     @asynccontextmanager
@@ -78,7 +80,11 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         _share(app, storage, jobs, learners)
         replication = Replication(learners) if storage.database.shared else None
         try:
-            async with nullcontext() if keyring is None else keyring.watching(storage.database):
+            async with AsyncExitStack() as serving:
+                if keyring is not None:
+                    await serving.enter_async_context(keyring.watching(storage.database))
+                if calls:
+                    await serving.enter_async_context(_calls(app, settings, stopping))
                 yield
         finally:
             async with AsyncExitStack() as rest:
@@ -90,6 +96,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
                 await to_thread.run_sync(jobs.close)  # first: what learns needs the CPU to store its state
 
     hot = [*inference.hot.routes, *routes.echo_hot.routes, *oip.hot.routes, *observations.hot.routes]
+    if calls:
+        hot.append(_calls_route())
     # the documentation page loads nothing from other hosts: robots' networks often have no way out
     app = FastAPIOffline(
         title="LIPServe",
@@ -122,6 +130,18 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     dashboard.install(app)
     guide.install(app)
     return app
+
+
+def _calls_route() -> BaseRoute:
+    from service.oip.rpc.methods import Methods  # noqa: PLC0415 - of an extra
+
+    return Methods()
+
+
+def _calls(app: FastAPI, settings: Settings, stopping: Stopping) -> AbstractAsyncContextManager[int]:
+    from service.oip.rpc.listening import listening  # noqa: PLC0415 - of an extra
+
+    return listening(app, settings, stopping)
 
 
 def _add_middleware(

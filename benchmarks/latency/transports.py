@@ -27,6 +27,7 @@ _LABELS = {
     "http-unix": "HTTP JSON, Unix socket",
     "v2-json": "/v2 infer, JSON",
     "v2-binary": "/v2 infer, binary",
+    "grpc": "gRPC ModelInfer",
 }
 _ECHOES = {
     "echo-ws": "WebSocket echo",
@@ -35,7 +36,7 @@ _ECHOES = {
     "echo-http-unix": "HTTP echo, Unix socket",
 }
 _FLOORS = {name.removeprefix("echo-"): name for name in _ECHOES}
-_FLOORS |= {"v2-json": "echo-http", "v2-binary": "echo-http", CLIENT: "echo-ws"}
+_FLOORS |= {"v2-json": "echo-http", "v2-binary": "echo-http", "grpc": "echo-http", CLIENT: "echo-ws"}
 KEYS = (*_LABELS, *_ECHOES)
 _TENSORS = ("q", "dq", "ddq")
 _OUTPUTS = ("tau", "tau_std")
@@ -67,6 +68,7 @@ def open_all(bed: Bed, wanted: Callable[[str], bool], stack: ExitStack) -> list[
             found += _http(bed, address, suffix, stack)
         if not suffix:
             found += [_v2(bed, key, stack) for key in ("v2-json", "v2-binary") if wanted(key)]
+            found += [_grpc(bed.grpc, bed, stack)] if wanted("grpc") and bed.grpc is not None else []
     return [subject for subject in found if wanted(subject.key)]
 
 
@@ -159,6 +161,30 @@ def _infer(motion: Array, binary: bool) -> bytes:
         return post(path, text)
     body = text + np.ascontiguousarray(motion, "<f8").tobytes()
     return post(path, body, "application/octet-stream", {HEADER: str(len(text))})
+
+
+def _grpc(address: tuple[str, int], bed: Bed, stack: ExitStack) -> Subject:
+    import grpc  # noqa: PLC0415 - of an extra, as what follows
+
+    from service.oip.rpc.definition import SERVICE  # noqa: PLC0415
+    from service.oip.rpc.messages import InferRequest, InferResponse  # noqa: PLC0415
+
+    channel = stack.enter_context(grpc.insecure_channel("{}:{}".format(*address)))
+    ask = channel.unary_unary(f"/{SERVICE}/ModelInfer")
+    requests = []
+    for motion in bed.workload.queries:
+        request = InferRequest(model_name=MODEL)
+        for tensor, values in zip(_TENSORS, motion, strict=True):
+            request.inputs.add(name=tensor, datatype="FP64", shape=[len(values)])
+            request.raw_input_contents.append(values.astype("<f8").tobytes())
+        requests.append(request.SerializeToString())
+    count = len(requests)
+
+    def answer(number: int) -> Answer:
+        tau, std = InferResponse.FromString(ask(requests[number])).raw_output_contents
+        return np.frombuffer(tau, "<f8"), np.frombuffer(std, "<f8")
+
+    return _subject("grpc", lambda number: ask(requests[number % count]), answer)
 
 
 def _subject(key: str, ask: Callable[[int], object], answer: Callable[[int], Answer]) -> Subject:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -33,6 +34,10 @@ def create(
         list[str], typer.Option(help=f"What it may do: {', '.join(SCOPES)}; several separated by commas or repeated.")
     ],
     days: Annotated[float | None, typer.Option(help="Days after which it expires, never by default.")] = None,
+    file: Annotated[
+        Path | None,
+        typer.Option(help="File with a key to store, made elsewhere: lip_ and 43 or more letters. It is not printed."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Make a key and print it: the only time that it can be seen. What else is to be said goes to standard error."""
@@ -41,11 +46,13 @@ def create(
     expires = None if days is None else datetime.now(UTC) + timedelta(days=days)
     with _database() as (database, settings):
         scopes = [part.strip() for given in scope for part in given.split(",")]
-        row, secret = keys.create(database, name, scopes, expires)
+        given = None if file is None else file.read_text("utf-8").strip()
+        row, secret = keys.create(database, name, scopes, expires, given)
     if as_json:
-        print_json({**_document(row), "key": secret})
+        print_json({**_document(row), **({"key": secret} if given is None else {})})
         return
-    typer.echo(secret)
+    if given is None:
+        typer.echo(secret)
     until = f"until {row.expires_at}" if row.expires_at else "until it is revoked"
     note(
         f"{row.id} may {', '.join(row.scopes)} {until}; a running service knows it after {settings.keys_refresh_s:g} s"

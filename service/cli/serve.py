@@ -11,6 +11,7 @@ import uvicorn
 from service.app import create_app
 from service.cli.options import alone, settings_of
 from service.compute.allocator import keep_little
+from service.oip import rpc
 from service.storage.storage import HomeError, check_home
 from service.web.observability import logs
 from service.web.server import sockets
@@ -24,14 +25,16 @@ ERRORS = (HomeError,)
 def serve(
     host: Annotated[str | None, typer.Option(help="Address to listen on (LIPSERVE_HOST).")] = None,
     port: Annotated[int | None, typer.Option(help="Port to listen on (LIPSERVE_PORT).")] = None,
+    grpc_port: Annotated[int | None, typer.Option(help="Port to listen on for gRPC, too (LIPSERVE_GRPC_PORT).")] = None,
     uds: Annotated[Path | None, typer.Option(help="Unix-domain socket to listen on too (LIPSERVE_UDS).")] = None,
 ) -> None:
     """Serve models and run training jobs."""
-    settings = settings_of(host=host, port=port, uds=uds)
+    settings = settings_of(host=host, port=port, grpc_port=grpc_port, uds=uds)
     keep_little()
     logs.configure(logs.LogOptions(settings.log_level, settings.log_format))
     check_home(settings)  # before the app opens it for good: what is wrong is said without a traceback
     served = create_app(settings)
+    rpc.check_port(settings)
     config = uvicorn.Config(
         served,
         host=settings.host,

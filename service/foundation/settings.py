@@ -51,6 +51,12 @@ class Settings(BaseSettings):
     uds_mode: FileMode = Field(
         0o660, ge=0, le=0o777, description="File mode of that socket, octal: whoever may write to it may ask."
     )
+    grpc_port: int | None = Field(
+        None,
+        ge=0,
+        le=65535,
+        description="Port of the same address to listen on for gRPC, too; 0 takes a free one. Needs `lipserve[grpc]`.",
+    )
     log_level: str = Field("info", pattern="^(critical|error|warning|info|debug)$")
     log_format: Literal["console", "json"] = Field(
         "console", description="Form of the log's lines: for people, or JSON, one object a line."
@@ -298,6 +304,12 @@ class Settings(BaseSettings):
             raise ValueError("database_url and files_url: expected both, for services that share them, or none of them")
         if self.cluster is not None and self.database_url is None:
             raise ValueError("cluster: expected database_url and files_url too, which its workers share")
+        return self
+
+    @model_validator(mode="after")
+    def _ports_apart(self) -> Self:
+        if self.grpc_port and self.grpc_port == self.port:
+            raise ValueError(f"grpc_port is {self.grpc_port}, expected another port than that of HTTP")
         return self
 
     @property

@@ -1,9 +1,9 @@
-"""From tensors to a query, and from that to the bytes of its answer: all is checked, nothing guessed, and nothing
-computed that was not asked for."""
+"""From tensors to a query, and from that to the tensors of its answer, whatever the transport: all is checked, nothing
+guessed, and nothing computed that was not asked for."""
 
 from __future__ import annotations
 
-from math import prod
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -17,8 +17,8 @@ from service.foundation.errors import invalid_request
 from service.foundation.settings import Settings
 from service.inference.predicting import Query, check_answer
 from service.models.loaded import Served
-from service.oip import schema, wire
-from service.oip.wire import Headers, Message
+from service.oip import schema
+from service.oip.tensors import Answer, Header, Message
 from service.web.route import Reply
 
 Array = NDArray[np.float64]
@@ -90,22 +90,22 @@ class Question(NamedTuple):
         return self.query.values.shape[1] == 1 and self.outputs.keys() <= QUICK
 
 
-def read(message: Message, body: bytes, model: TorqueModel, settings: Settings) -> Question:
+def read(message: Message, model: TorqueModel, settings: Settings) -> Question:
     """Turn a request into a question; raise InvalidRequestError."""
-    request, offset = message
+    request = message.request
     outputs = _outputs(request, model)
     tensors = _inputs(request, bool(NEED_TORQUE & outputs.keys()))
     shape = request.inputs[0].shape
     _check_shape(request.inputs[0], shape, model, settings, bool(PARTS.keys() & outputs.keys()))
-    _check_payload(request, len(body) - offset)
+    message.check()
     single, rows = len(shape) == 1, 1 if len(shape) == 1 else shape[0]
     values = np.empty((len(tensors), rows, model.n_joints))
     places = {name: place for place, name in enumerate(tensors)}
-    for tensor in request.inputs:  # binary data lie in this order, whatever the order of the names
+    for place, tensor in enumerate(request.inputs):  # binary data lie in this order, whatever that of the names
         if tensor.shape != shape:
             raise invalid_request(f"{tensor.name}.shape", tensor.shape, f"that of {request.inputs[0].name}, {shape}")
-        numbers, offset = _values(tensor, body, offset)
-        values[places[tensor.name]] = numbers.reshape(rows, -1)
+        dtype = _dtype(tensor)
+        values[places[tensor.name]] = _as_read(message.numbers(place, dtype), dtype).reshape(rows, -1)
     query = Query(values, single)
     datatypes = {tensor.name: tensor.datatype for tensor in request.inputs}
     query.check(settings.max_position, lambda name: f"a finite number of {datatypes[name]}")
@@ -173,34 +173,15 @@ def _check_shape(
         raise invalid_request(field, shape, expected)
 
 
-def _check_payload(request: schema.InferRequest, present: int) -> None:
-    """Compare the bytes after the JSON with those that the inputs announce."""
-    announced = sum(each.parameters.binary_data_size or 0 for each in request.inputs if each.parameters)
-    if announced != present:
-        expected = (
-            f"{announced} bytes, the sum of every binary_data_size, after the JSON whose length {schema.HEADER} gives"
-        )
-        raise invalid_request("the binary data", f"{present} bytes", expected)
-
-
-def _values(tensor: schema.InferInput, body: bytes, offset: int) -> tuple[Array, int]:
-    """Numbers of a tensor, flat or in rows, and where the next one's binary data begin."""
-    name, count, given = tensor.name, prod(tensor.shape), tensor.parameters
+def _dtype(tensor: schema.InferInput) -> np.dtype[np.floating]:
+    """Elements of a tensor that lies in the body."""
+    name, given = tensor.name, tensor.parameters
     dtype = _DTYPES.get(tensor.datatype)
     if dtype is None:
         raise invalid_request(f"{name}.datatype", tensor.datatype, " or ".join(schema.DATATYPES))
     if given is not None and given.shared_memory_region is not None:
         raise invalid_request(f"{name}.parameters.shared_memory_region", given.shared_memory_region, _NO_TENSORS)
-    size = None if given is None else given.binary_data_size
-    if (size is None) == (tensor.data is None):
-        given_data = "missing" if size is None else "given, and binary_data_size too"
-        raise invalid_request(f"{name}.data", given_data, "numbers in data, or binary_data_size and binary data")
-    if size is None:
-        return _as_read(_listed(tensor, count), dtype), offset
-    if size != count * dtype.itemsize:
-        expected = f"{count * dtype.itemsize} bytes: the shape {tensor.shape} of {tensor.datatype}"
-        raise invalid_request(f"{name}.parameters.binary_data_size", size, expected)
-    return _as_read(np.frombuffer(body, dtype, count, offset), dtype), offset + size
+    return dtype
 
 
 def _as_read(values: NDArray[np.floating], dtype: np.dtype[np.floating]) -> Array:
@@ -209,18 +190,6 @@ def _as_read(values: NDArray[np.floating], dtype: np.dtype[np.floating]) -> Arra
         return values.astype(np.float64, copy=False)
     with np.errstate(over="ignore", invalid="ignore"):  # what it cannot hold becomes infinite and is refused as such
         return values.astype(dtype).astype(np.float64)
-
-
-def _listed(tensor: schema.InferInput, count: int) -> Array:
-    field, expected = f"{tensor.name}.data", f"{count} numbers or rows of them, as the shape {tensor.shape} has"
-    try:
-        values = np.array(tensor.data, np.float64)
-    except ValueError:
-        raise invalid_request(field, "numbers and lists, or lists of different lengths", expected) from None
-    if values.size != count or (values.ndim == 2 and list(values.shape) != tensor.shape):
-        given = f"{values.size} numbers" if values.ndim == 1 else f"rows of shape {list(values.shape)}"
-        raise invalid_request(field, given, expected)
-    return values
 
 
 def compute(served: Served, query: Query, names: frozenset[str]) -> dict[str, Array]:
@@ -272,13 +241,14 @@ def _torques(model: TorqueModel, motion: Array, names: frozenset[str]) -> dict[s
     return {}
 
 
-def infer(served: Served, body: bytes, headers: Headers, settings: Settings) -> Reply:
-    """Answer a request; raise InvalidRequestError or UnsupportedMediaTypeError. Not for the event loop."""
-    message = wire.decode(body, headers)
-    return respond(served, message.request, read_question(served, message, body, settings))
+def infer(served: Served, decode: Callable[[], Message], settings: Settings) -> Reply:
+    """Answer a request that is still to be decoded; raise what decoding raises, or InvalidRequestError. Not for the
+    event loop."""
+    message = decode()
+    return respond(served, message, read_question(served, message, settings))
 
 
-def read_question(served: Served, message: Message, body: bytes, settings: Settings) -> Question:
+def read_question(served: Served, message: Message, settings: Settings) -> Question:
     """Check a request and read its query; raise InvalidRequestError."""
     request = message.request
     for field, value, expected in (
@@ -287,36 +257,18 @@ def read_question(served: Served, message: Message, body: bytes, settings: Setti
     ):
         if value not in (None, expected):
             raise invalid_request(field, value, f"that which the path leads to, {expected}")
-    return read(message, body, served.model, settings)
+    return read(message, served.model, settings)
 
 
-def respond(served: Served, request: schema.InferRequest, question: Question) -> Reply:
+def respond(served: Served, message: Message, question: Question) -> Reply:
     """Compute the answer to a query and encode it; raise InvalidRequestError."""
     values_of = compute(served, question.query, frozenset(question.outputs))
-    tensors: list[schema.InferTensor] = []
-    payload: list[bytes] = []
+    answers: list[Answer] = []
     for name, binary in question.outputs.items():
         values = values_of[name]
         if question.query.single and name not in OF_MODEL:
             values = values[0]
         check_answer(name, values)
-        tensors.append(_tensor(name, values, payload if binary else None))
-    response = schema.InferResponse(
-        served.name,
-        str(served.version),
-        schema.AnswerParameters(served.revision, served.model.torque_convention),
-        tensors,
-    )
-    if request.id is not None:
-        response.id = request.id
-    return wire.encode(response, payload)
-
-
-def _tensor(name: str, values: Array, payload: list[bytes] | None) -> schema.InferTensor:
-    """Describe a tensor that lies in the JSON, or at the end of the payload."""
-    shape = list(values.shape)
-    if payload is None:
-        return schema.InferTensor(name, "FP64", shape, data=values.ravel().tolist())
-    data = values.astype("<f8", copy=False).tobytes()
-    payload.append(data)
-    return schema.InferTensor(name, "FP64", shape, schema.TensorParameters(len(data)))
+        answers.append(Answer(name, values, binary))
+    parameters = schema.AnswerParameters(served.revision, served.model.torque_convention)
+    return message.encode(Header(served.name, str(served.version), parameters), answers)

@@ -1,17 +1,20 @@
-"""Bytes of an inference message: JSON, and binary tensors after it."""
+"""An inference request over HTTP: JSON, and binary tensors after it; and the bytes of its answer."""
 
 from __future__ import annotations
 
 import json
 import re
 from collections.abc import Iterable, Iterator
-from math import isfinite
-from typing import Any, NamedTuple
+from math import isfinite, prod
+from typing import Any
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from service.foundation.errors import InvalidRequestError, UnsupportedMediaTypeError, invalid_request, problem, sentence
-from service.oip.schema import HEADER, InferRequest, InferResponse
+from service.oip.schema import HEADER, InferInput, InferRequest, InferResponse, InferTensor, TensorParameters
+from service.oip.tensors import Answer, Header
 from service.web.route import OCTETS, Reply
 
 _HEADER, _ENCODING = HEADER.lower().encode(), b"content-encoding"
@@ -36,11 +39,51 @@ _KINDS = {
 Headers = Iterable[tuple[bytes, bytes]]
 
 
-class Message(NamedTuple):
-    """A request and where its binary tensors begin in the body."""
+class Message:
+    """A request, with what its body holds after the JSON."""
 
-    request: InferRequest
-    offset: int
+    def __init__(self, request: InferRequest, body: bytes, offset: int) -> None:
+        self.request, self._body, self._offset = request, body, offset
+
+    def check(self) -> None:
+        """Compare the bytes after the JSON with those that the inputs announce; raise InvalidRequestError."""
+        sizes = (each.parameters.binary_data_size or 0 for each in self.request.inputs if each.parameters)
+        announced, present = sum(sizes), len(self._body) - self._offset
+        if announced != present:
+            expected = (
+                f"{announced} bytes, the sum of every binary_data_size, after the JSON whose length {HEADER} gives"
+            )
+            raise invalid_request("the binary data", f"{present} bytes", expected)
+
+    def numbers(self, place: int, dtype: np.dtype[np.floating]) -> NDArray[np.floating]:
+        """Numbers of an input, flat or in rows; to be asked in the order of the inputs, as binary data lie."""
+        tensor = self.request.inputs[place]
+        name, count = tensor.name, prod(tensor.shape)
+        size = None if tensor.parameters is None else tensor.parameters.binary_data_size
+        if (size is None) == (tensor.data is None):
+            given_data = "missing" if size is None else "given, and binary_data_size too"
+            raise invalid_request(f"{name}.data", given_data, "numbers in data, or binary_data_size and binary data")
+        if size is None:
+            return _listed(tensor, count)
+        if size != count * dtype.itemsize:
+            expected = f"{count * dtype.itemsize} bytes: the shape {tensor.shape} of {tensor.datatype}"
+            raise invalid_request(f"{name}.parameters.binary_data_size", size, expected)
+        begin, self._offset = self._offset, self._offset + size
+        return np.frombuffer(self._body, dtype, count, begin)
+
+    def encode(self, header: Header, answers: list[Answer]) -> Reply:
+        """Encode an answer, each tensor as it was asked for."""
+        tensors: list[InferTensor] = []
+        payload: list[bytes] = []
+        for name, values, binary in answers:
+            tensors.append(_tensor(name, values, payload if binary else None))
+        response = InferResponse(header.model, header.version, header.parameters, tensors)
+        if self.request.id is not None:
+            response.id = self.request.id
+        text = _encode(response)
+        if not payload:
+            return Reply(text)
+        return Reply(b"".join([text, *payload]), OCTETS, ((_HEADER, b"%d" % len(text)),))
 
 
 def decode(body: bytes, headers: Headers) -> Message:
@@ -56,17 +99,31 @@ def decode(body: bytes, headers: Headers) -> Message:
     offset = len(body) if length is None else _length(length, len(body))
     text = body if offset == len(body) else memoryview(body)[:offset]
     try:
-        return Message(_decode(text), offset)
+        return Message(_decode(text), body, offset)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise _explain(error, bytes(text), length is None) from error
 
 
-def encode(response: InferResponse, tensors: list[bytes]) -> Reply:
-    """Encode a response with its binary tensors."""
-    text = _encode(response)
-    if not tensors:
-        return Reply(text)
-    return Reply(b"".join([text, *tensors]), OCTETS, ((_HEADER, b"%d" % len(text)),))
+def _listed(tensor: InferInput, count: int) -> NDArray[np.float64]:
+    field, expected = f"{tensor.name}.data", f"{count} numbers or rows of them, as the shape {tensor.shape} has"
+    try:
+        values = np.array(tensor.data, np.float64)
+    except ValueError:
+        raise invalid_request(field, "numbers and lists, or lists of different lengths", expected) from None
+    if values.size != count or (values.ndim == 2 and list(values.shape) != tensor.shape):
+        given = f"{values.size} numbers" if values.ndim == 1 else f"rows of shape {list(values.shape)}"
+        raise invalid_request(field, given, expected)
+    return values
+
+
+def _tensor(name: str, values: NDArray[np.float64], payload: list[bytes] | None) -> InferTensor:
+    """Describe a tensor that lies in the JSON, or at the end of the payload."""
+    shape = list(values.shape)
+    if payload is None:
+        return InferTensor(name, "FP64", shape, data=values.ravel().tolist())
+    data = values.astype("<f8", copy=False).tobytes()
+    payload.append(data)
+    return InferTensor(name, "FP64", shape, TensorParameters(len(data)))
 
 
 def _length(value: bytes, total: int) -> int:

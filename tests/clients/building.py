@@ -13,7 +13,6 @@ CPP = ROOT / "clients/cpp"
 VECTORS = ROOT / "clients/stream-vectors.txt"
 COMPILERS = ("g++", "clang++")
 STRICT = ("-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
-SANITIZED = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 
 def here(*compilers: str) -> tuple[str, ...]:
@@ -22,9 +21,10 @@ def here(*compilers: str) -> tuple[str, ...]:
 
 
 @cache
-def sanitizers(compiler: str) -> tuple[str, ...]:
-    """Options that switch the sanitizers on, none where the compiler comes without their runtime."""
-    return SANITIZED if _runs(compiler, "int main() {}\n", *SANITIZED) else ()
+def sanitizers(compiler: str, kinds: str = "address,undefined") -> tuple[str, ...]:
+    """Options that switch sanitizers on, none where the compiler comes without their runtime."""
+    options = (f"-fsanitize={kinds}", "-fno-sanitize-recover=all")
+    return options if _runs(compiler, "int main() {}\n", *options) else ()
 
 
 def fuzzes(compiler: str) -> bool:

@@ -12,6 +12,7 @@ REASONS = frozenset(
     {
         "installs the package",
         "needs Docker",
+        "needs Kubernetes",
         "needs a reverse proxy",
         "needs a robot",
         "needs ROS 2",

@@ -1,4 +1,4 @@
-"""compose.yaml and docs/examples/kubernetes.yaml: settings, commands, ports and names in them are those there are."""
+"""compose.yaml: settings, commands, ports and names in it are those there are."""
 
 import re
 import shlex
@@ -8,7 +8,6 @@ import pytest
 import yaml
 from distributed.cli.dask_scheduler import main as dask_scheduler
 
-from service.app import create_app
 from service.foundation.settings import Settings
 from tests.docs.blocks import ROOT
 from tests.docs.test_pages import parse
@@ -16,10 +15,6 @@ from tests.docs.test_pages import parse
 COMPOSE = yaml.safe_load((ROOT / "compose.yaml").read_text("utf-8"))
 SERVICES = COMPOSE["services"]
 VARIABLE = re.compile(r"\$\{([A-Z0-9_]+)([^}]*)\}")
-EXAMPLES = ROOT / "docs/examples"
-OBJECTS = list(yaml.safe_load_all((EXAMPLES / "kubernetes.yaml").read_text("utf-8")))
-GPU = yaml.safe_load((EXAMPLES / "kubernetes-gpu.yaml").read_text("utf-8"))
-"""What a Deployment of workers with a GPU has instead."""
 PORT = Settings.model_fields["port"].default
 
 
@@ -29,28 +24,7 @@ def environment(name: str) -> dict[str, str]:
     return {key: VARIABLE.sub("0123456789abcdef", value) for key, value in given.items()}
 
 
-def of_kind(kind: str) -> dict[str, dict]:
-    """Objects of Kubernetes by their names."""
-    return {each["metadata"]["name"]: each for each in OBJECTS if each["kind"] == kind}
-
-
-DEPLOYMENTS = of_kind("Deployment")
-
-
-def container(deployment: str) -> dict:
-    """The one of a Deployment."""
-    (only,) = DEPLOYMENTS[deployment]["spec"]["template"]["spec"]["containers"]
-    return only
-
-
-def given() -> dict[str, str]:
-    """What containers have in their environment on Kubernetes."""
-    more = {each["name"]: each["value"] for each in container("lipserve").get("env", [])}
-    return {**of_kind("ConfigMap")["lipserve"]["data"], **of_kind("Secret")["lipserve"]["stringData"], **more}
-
-
 ENVIRONMENTS = {name: environment(name) for name, each in SERVICES.items() if each["image"] == "lipserve"}
-ENVIRONMENTS["kubernetes"] = given()
 
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)
@@ -63,15 +37,17 @@ def test_settings_are_those_that_there_are(name, monkeypatch):
     Settings()
 
 
+def check_command(program: str, *words: str) -> None:
+    """Raise where there is no such command."""
+    if program == "dask":
+        dask_scheduler.make_parser(click.Context(dask_scheduler)).parse_args(list(words[1:]))
+    else:
+        parse(shlex.join([program, *words]))
+
+
 def test_commands_are_those_that_there_are():
-    commands = [SERVICES[name]["command"] for name in ("service", "worker", "scheduler")]
-    commands += [container(name)["command"] for name in DEPLOYMENTS]
-    commands += [each["command"] for each in GPU["spec"]["template"]["spec"]["containers"]]
-    for program, *words in commands:
-        if program == "dask":
-            dask_scheduler.make_parser(click.Context(dask_scheduler)).parse_args(words[1:])
-        else:
-            parse(shlex.join([program, *words]))
+    for name in ("service", "worker", "scheduler"):
+        check_command(*SERVICES[name]["command"])
     program, flag, code = SERVICES["bucket"]["command"]
     assert (program, flag) == ("python", "-c")
     compile(code, "compose.yaml", "exec")
@@ -130,41 +106,3 @@ def test_only_the_balancer_of_compose_is_published_and_no_secret_has_a_default()
         assert rest.startswith(":?" if re.search("PASSWORD|SECRET|KEY", name) else ":-"), name
     for key, value in re.findall(r"(\w*(?:PASSWORD|SECRET)\w*): (.*)", body):
         assert value.startswith("${"), key
-
-
-@pytest.mark.parametrize("name", DEPLOYMENTS)
-def test_selectors_of_kubernetes_find_what_is_made(name):
-    spec = DEPLOYMENTS[name]["spec"]
-    assert spec["selector"]["matchLabels"] == spec["template"]["metadata"]["labels"]
-    mounts = {mount["name"] for mount in container(name).get("volumeMounts", [])}
-    assert mounts == {volume["name"] for volume in spec["template"]["spec"].get("volumes", [])}
-    for source in container(name).get("envFrom", []):
-        (kind,) = source
-        assert source[kind]["name"] in of_kind({"configMapRef": "ConfigMap", "secretRef": "Secret"}[kind])
-
-
-def test_services_of_kubernetes_lead_to_ports_that_are_listened_on(tmp_path):
-    for service in of_kind("Service").values():
-        selector = service["spec"]["selector"]
-        (name,) = (name for name, each in DEPLOYMENTS.items() if each["spec"]["selector"]["matchLabels"] == selector)
-        ports = {port["name"] for port in container(name)["ports"]}
-        assert {port["targetPort"] for port in service["spec"]["ports"]} <= ports
-    host, port = port_of(given()["LIPSERVE_CLUSTER"])
-    assert of_kind("Service")[host]["spec"]["ports"][0]["port"] == port
-    assert str(port) in container("lipserve-scheduler")["command"]
-    assert container("lipserve")["ports"][0]["containerPort"] == PORT
-    paths = create_app(Settings(home=tmp_path)).openapi()["paths"]
-    for probe in ("startupProbe", "livenessProbe", "readinessProbe"):
-        assert container("lipserve")[probe]["httpGet"]["path"] in paths
-
-
-def test_only_members_reach_the_cluster_on_kubernetes():
-    policy = of_kind("NetworkPolicy")["lipserve-cluster"]["spec"]
-    members = {each["key"]: set(each["values"]) for each in policy["podSelector"]["matchExpressions"]}
-    for name in ("lipserve-scheduler", "lipserve-worker"):
-        labels = DEPLOYMENTS[name]["spec"]["template"]["metadata"]["labels"]
-        assert all(labels[key] in values for key, values in members.items())
-    service = DEPLOYMENTS["lipserve"]["spec"]["template"]["metadata"]["labels"]
-    assert service["part"] not in members["part"]
-    (source,) = policy["ingress"][0]["from"]
-    assert source["podSelector"]["matchLabels"].items() <= service.items()

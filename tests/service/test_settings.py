@@ -30,6 +30,12 @@ def test_environment_variables_are_read(monkeypatch, name, text, value):
     assert getattr(Settings(), name) == value
 
 
+def test_each_protocol_has_a_port_of_its_own():
+    assert (Settings().grpc_port, Settings(port=0, grpc_port=0).grpc_port) == (None, 0)
+    with pytest.raises(ValidationError, match="grpc_port is 8000, expected another port than that of HTTP"):
+        Settings(grpc_port=8000)
+
+
 def test_defaults_are_safe():
     settings = Settings()
     assert (settings.host, settings.keys, settings.keys_needed) == ("127.0.0.1", "auto", False)

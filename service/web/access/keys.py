@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import re
 import secrets
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from contextlib import asynccontextmanager, contextmanager
@@ -28,6 +29,8 @@ from service.web.access.scopes import ADMIN, SCOPES
 
 PREFIX = "lip_"
 SECRET_BYTES = 32
+GIVEN = re.compile(rf"{PREFIX}[A-Za-z0-9_-]{{43,200}}")
+"""A key that was made elsewhere: 43 letters of base64 are the 32 bytes of ours."""
 
 
 @dataclass(slots=True, eq=False)
@@ -59,8 +62,13 @@ def digest_of(secret: bytes) -> bytes:
     return sha256(secret).digest()
 
 
-def create(database: Database, name: str, scopes: Iterable[str], expires_at: datetime | None) -> tuple[ApiKeyRow, str]:
-    """Store a new key; return its row and the key, which nobody can tell again. Raise ValueError for wrong values."""
+def create(
+    database: Database, name: str, scopes: Iterable[str], expires_at: datetime | None, given: str | None = None
+) -> tuple[ApiKeyRow, str]:
+    """Store a new key; return its row and the key, which nobody can tell again. Raise ValueError for wrong values.
+
+    given: a key that was made elsewhere. One that is stored already, revoked or not, stays as it is.
+    """
     try:
         for_people("name", name)
     except InvalidRequestError as error:
@@ -71,7 +79,9 @@ def create(database: Database, name: str, scopes: Iterable[str], expires_at: dat
     for scope in allowed:
         if scope not in SCOPES:
             raise ValueError(f"scope is {scope!r}, expected one of {', '.join(SCOPES)}")
-    secret = PREFIX + secrets.token_urlsafe(SECRET_BYTES)
+    if given is not None and not GIVEN.fullmatch(given):
+        raise ValueError(f"the key is not one, expected {PREFIX} and 43 to 200 random letters, digits, - or _")
+    secret = given or PREFIX + secrets.token_urlsafe(SECRET_BYTES)
     row = ApiKeyRow(
         id=new_id("key"),
         name=name,
@@ -81,6 +91,10 @@ def create(database: Database, name: str, scopes: Iterable[str], expires_at: dat
         expires_at=None if expires_at is None else expires_at.astimezone(UTC).isoformat(timespec="milliseconds"),
     )
     with database.transaction() as session:
+        if given is not None:
+            known = session.scalar(select(ApiKeyRow).where(ApiKeyRow.hash == row.hash))
+            if known is not None:
+                return known, secret
         session.add(row)
     return row, secret
 

@@ -22,6 +22,8 @@ SCOPES = {
 WEBSOCKET = "WEBSOCKET"
 """Stands for the method of a WebSocket, which has none."""
 STREAM = "/v1/models/{model}/stream"
+CALLS = "/inference.GRPCInferenceService/"
+"""Paths of gRPC's calls begin so."""
 
 TABLE: dict[tuple[str, str], str] = {
     ("GET", "/metrics"): READ,
@@ -84,6 +86,10 @@ TABLE: dict[tuple[str, str], str] = {
     ("GET", "/v2/models/{model}/versions/{version}/ready"): READ,
     ("POST", "/v2/models/{model}/infer"): PREDICT,
     ("POST", "/v2/models/{model}/versions/{version}/infer"): PREDICT,
+    ("POST", f"{CALLS}ServerMetadata"): READ,
+    ("POST", f"{CALLS}ModelReady"): READ,
+    ("POST", f"{CALLS}ModelMetadata"): READ,
+    ("POST", f"{CALLS}ModelInfer"): PREDICT,
 }
 """(method, path as in the OpenAPI document) of each route that needs a key, and the scope it needs."""
 
@@ -104,7 +110,7 @@ OPEN: frozenset[tuple[str, str]] = frozenset(
         "/guide/{page}",
         "/guide/files/{name}",
     )
-)
+) | {("POST", f"{CALLS}ServerLive"), ("POST", f"{CALLS}ServerReady")}
 """Routes without a key: health, for what watches over the service, documentation, guide, and the dashboard's files."""
 
 LONGEST_PATH = 1000

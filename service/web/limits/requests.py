@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from ipaddress import IPv6Address, ip_address
 from math import ceil
 from time import monotonic
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
-from anyio import CapacityLimiter
+from anyio import CapacityLimiter, to_thread
 from fastapi import Depends, Request
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -169,6 +169,28 @@ class Turns:
     predictions: CapacityLimiter
     uploads: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(2))
     archives: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))
+
+
+Made = TypeVar("Made")
+
+
+async def in_turn(turns: CapacityLimiter, make: Callable[..., Made], *args: Any) -> Made:
+    """Compute in a thread when it is this one's turn, which lasts until the thread is through.
+
+    Who asks may go away, as a call of gRPC does at its deadline: then what waits is not computed, and what computes
+    keeps its turn, so that no more is computed at a time than there are turns.
+    """
+    turn = object()
+    await turns.acquire_on_behalf_of(turn)
+
+    def over(done: asyncio.Future[Made]) -> None:
+        turns.release_on_behalf_of(turn)
+        if not done.cancelled():
+            done.exception()  # else asyncio logs one that nobody waits for any more
+
+    computing = asyncio.ensure_future(to_thread.run_sync(make, *args, limiter=CapacityLimiter(1)))
+    computing.add_done_callback(over)
+    return await asyncio.shield(computing)
 
 
 def _of(kind: str) -> Callable[[Request], Awaitable[CapacityLimiter]]:

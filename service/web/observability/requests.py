@@ -20,7 +20,15 @@ from service.web.observability.logs import KEY_ID, REQUEST_ID, given_request_id,
 from service.web.observability.meters import Kind, Meters
 
 EXPORTER = "opentelemetry.exporter.otlp.proto.http"
-MONITORING = frozenset({"/health/live", "/health/ready", "/v2/health/live", "/v2/health/ready", "/metrics"})
+_OF_CALLS = "/inference.GRPCInferenceService/"
+MONITORING = frozenset(
+    {
+        *("/health/live", "/health/ready", "/v2/health/live", "/v2/health/ready", "/metrics"),
+        *(f"{_OF_CALLS}ServerLive", f"{_OF_CALLS}ServerReady"),
+    }
+)
+QUIET = frozenset({f"{_OF_CALLS}ModelInfer"})
+"""Routes of control loops that no request over HTTP reaches."""
 
 
 def telemetry(settings: Settings) -> TelemetryConfig:
@@ -67,7 +75,7 @@ class RequestLog:
     """
 
     def __init__(self, quiet: Iterable[str], slow_s: float, most_refusals: int) -> None:
-        self.quiet, self.slow_s, self.most_refusals = frozenset(quiet) | MONITORING, slow_s, most_refusals
+        self.quiet, self.slow_s, self.most_refusals = frozenset(quiet) | QUIET | MONITORING, slow_s, most_refusals
         self._refusals: dict[tuple[str, int, str], tuple[int, int]] = {}  # the second, and how many there were in it
 
     def may_log(self, route: str, seconds: float) -> bool:

@@ -38,6 +38,29 @@ def test_a_key_is_all_that_create_prints_and_a_home_is_made_for_it(lipserve, hom
     assert (made["key"].startswith("lip_"), made["state"]) == (True, "valid")
 
 
+def test_a_key_of_a_file_is_stored_once_and_not_printed(lipserve, keys_database, tmp_path):
+    file = tmp_path / "admin"
+    secret = "lip_" + "0123456789abcdef" * 4
+    file.write_text(secret + "\n")
+    for _ in range(2):
+        code, out, err = lipserve("keys", "create", "--name", "admin", "--scope", "admin", "--file", str(file))
+        assert (code, out) == (0, "")
+        assert "may admin" in err
+    [row] = keys.stored(keys_database)
+    assert row.hash == digest_of(secret.encode()).hex()
+    keys.revoke(keys_database, row.id)
+    assert lipserve("keys", "create", "--name", "again", "--scope", "read", "--file", str(file))[0] == 0
+    [row] = keys.stored(keys_database)
+    assert (row.name, row.revoked_at is None) == ("admin", False)
+    for wrong in ("lip_short", "x" * 64, secret + " x", ""):
+        file.write_text(wrong)
+        code, _, err = lipserve("keys", "create", "--name", "admin", "--scope", "admin", "--file", str(file))
+        assert code == 1
+        assert "the key is not one, expected lip_ and 43 to 200" in err
+        assert not wrong or wrong not in err
+    assert lipserve("keys", "create", "--name", "a", "--scope", "admin", "--file", str(tmp_path / "none"))[0] == 1
+
+
 def test_keys_are_listed_without_the_keys(lipserve, keys_database):
     made = [keys.create(keys_database, name, ["read"], None) for name in ("one", "two [bold]", "three")]
     keys.revoke(keys_database, made[0][0].id)

@@ -1,0 +1,143 @@
+"""Messages of the protocol's gRPC service: what its published definition says, as classes of protobuf.
+
+They are made when this is imported, in a pool of their own: no code is generated, no other package is needed, and a
+client's copy of the same definition, as Triton's, may be in the same process.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorProto
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
+
+PACKAGE = "inference"
+SERVICE = f"{PACKAGE}.GRPCInferenceService"
+_DEFINITION = """
+message ServerLiveRequest
+message ServerLiveResponse
+  bool live = 1
+message ServerReadyRequest
+message ServerReadyResponse
+  bool ready = 1
+message ModelReadyRequest
+  string name = 1
+  string version = 2
+message ModelReadyResponse
+  bool ready = 1
+message ServerMetadataRequest
+message ServerMetadataResponse
+  string name = 1
+  string version = 2
+  repeated string extensions = 3
+message ModelMetadataRequest
+  string name = 1
+  string version = 2
+message ModelMetadataResponse
+  string name = 1
+  repeated string versions = 2
+  string platform = 3
+  repeated ModelMetadataResponse.TensorMetadata inputs = 4
+  repeated ModelMetadataResponse.TensorMetadata outputs = 5
+message ModelMetadataResponse.TensorMetadata
+  string name = 1
+  string datatype = 2
+  repeated int64 shape = 3
+message ModelInferRequest
+  string model_name = 1
+  string model_version = 2
+  string id = 3
+  parameters = 4
+  repeated ModelInferRequest.InferInputTensor inputs = 5
+  repeated ModelInferRequest.InferRequestedOutputTensor outputs = 6
+  repeated bytes raw_input_contents = 7
+message ModelInferRequest.InferInputTensor
+  string name = 1
+  string datatype = 2
+  repeated int64 shape = 3
+  parameters = 4
+  InferTensorContents contents = 5
+message ModelInferRequest.InferRequestedOutputTensor
+  string name = 1
+  parameters = 2
+message ModelInferResponse
+  string model_name = 1
+  string model_version = 2
+  string id = 3
+  parameters = 4
+  repeated ModelInferResponse.InferOutputTensor outputs = 5
+  repeated bytes raw_output_contents = 6
+message ModelInferResponse.InferOutputTensor
+  string name = 1
+  string datatype = 2
+  repeated int64 shape = 3
+  parameters = 4
+  InferTensorContents contents = 5
+message InferParameter
+  one bool bool_param = 1
+  one int64 int64_param = 2
+  one string string_param = 3
+  one double double_param = 4
+  one uint64 uint64_param = 5
+message InferTensorContents
+  repeated bool bool_contents = 1
+  repeated int32 int_contents = 2
+  repeated int64 int64_contents = 3
+  repeated uint32 uint_contents = 4
+  repeated uint64 uint64_contents = 5
+  repeated float fp32_contents = 6
+  repeated double fp64_contents = 7
+  repeated bytes bytes_contents = 8
+"""
+"""The definition in short: `parameters` is a `map<string, InferParameter>`, `one` a member of `oneof
+parameter_choice`."""
+_FIELD = re.compile(r"  (?:(?P<label>repeated|one) )?(?:(?P<type>[\w.]+) )?(?P<name>\w+) = (?P<number>\d+)")
+_SCALARS = ("bool", "int32", "int64", "uint32", "uint64", "float", "double", "string", "bytes")
+
+
+def _file() -> FileDescriptorProto:
+    file = FileDescriptorProto(name="lipserve/open_inference.proto", package=PACKAGE, syntax="proto3")
+    made: dict[str, DescriptorProto] = {}
+    for line in _DEFINITION.strip().splitlines():
+        if line.startswith("message "):
+            outer, _, name = line.removeprefix("message ").rpartition(".")
+            message = (made[outer].nested_type if outer else file.message_type).add(name=name)
+            path = f"{outer}.{name}" if outer else name
+            made[path] = message
+        else:
+            match = _FIELD.fullmatch(line)
+            assert match is not None, line
+            _add_field(message, path, match["label"], match["type"], match["name"], int(match["number"]))
+    return file
+
+
+def _add_field(
+    message: DescriptorProto, path: str, label: str | None, kind: str | None, name: str, number: int
+) -> None:
+    if kind is None:  # a map: protobuf knows it as a list of entries
+        entry = message.nested_type.add(name="ParametersEntry")
+        entry.options.map_entry = True
+        _add_field(entry, path, None, "string", "key", 1)
+        _add_field(entry, path, None, "InferParameter", "value", 2)
+        label, kind = "repeated", f"{path}.ParametersEntry"
+    field = message.field.add(name=name, number=number)
+    field.label = FieldDescriptorProto.LABEL_REPEATED if label == "repeated" else FieldDescriptorProto.LABEL_OPTIONAL
+    if kind in _SCALARS:
+        field.type = getattr(FieldDescriptorProto, f"TYPE_{kind.upper()}")
+    else:
+        field.type, field.type_name = FieldDescriptorProto.TYPE_MESSAGE, f".{PACKAGE}.{kind}"
+    if label == "one":
+        if not message.oneof_decl:
+            message.oneof_decl.add(name="parameter_choice")
+        field.oneof_index = 0
+
+
+POOL = DescriptorPool()
+POOL.Add(_file())
+
+
+def message(name: str) -> Any:
+    """The class of a message by its name, as `ModelInferRequest`."""
+    return GetMessageClass(POOL.FindMessageTypeByName(f"{PACKAGE}.{name}"))

@@ -1,0 +1,449 @@
+"""The Open Inference Protocol over gRPC, as NVIDIA's client speaks it: the answers are those of HTTP."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import grpc
+import numpy as np
+import pytest
+import tritonclient.grpc as triton
+from google.protobuf.descriptor import FieldDescriptor
+from numpy.testing import assert_array_equal
+from tritonclient.grpc import service_pb2 as published
+from tritonclient.grpc.service_pb2_grpc import GRPCInferenceServiceStub
+from tritonclient.utils import InferenceServerException
+
+from service import __version__
+from service.app import create_app
+from service.foundation.settings import Settings
+from service.oip import rpc
+from service.oip.query import PARTS
+from service.oip.rpc.messages import MOST
+from tests.service.data import DEADLINE, eventually
+from tests.service.oip import message, path_of, refused, tensors
+from tests.service.server import Server, free_port
+
+definition = pytest.importorskip("service.oip.rpc.definition")
+MOTION = {"q": [0.0, -0.5, 0.0, -2.0, 0.0, 1.5, 0.7], "dq": [0.1] * 7, "ddq": [0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0]}
+BATCH = {name: np.linspace(values, np.array(values) + 0.3, 4) for name, values in MOTION.items()}
+PATH = path_of("panda-sim")
+MOST_BYTES = 20_000
+BODY_S = 1.0
+ROUTE = "/inference.GRPCInferenceService/ModelInfer"
+Code = grpc.StatusCode
+
+
+@dataclass(frozen=True)
+class Calls:
+    """A service in a process of its own that listens for gRPC, NVIDIA's client of it, and the plain stub."""
+
+    server: Server
+    client: triton.InferenceServerClient
+    stub: GRPCInferenceServiceStub
+    channel: grpc.Channel
+
+    def plain(self, motion, *outputs):
+        """What the service answers over HTTP."""
+        answer = self.server.client.post(PATH, json=message(motion, *outputs))
+        assert answer.status_code == 200, answer.text
+        return tensors(answer.json())
+
+    def refusal(self, call, *arguments, **options) -> grpc.RpcError:
+        """The error that a call of the stub ends in."""
+        with pytest.raises(grpc.RpcError) as caught:
+            call(*arguments, timeout=DEADLINE, **options)
+        return caught.value
+
+
+@pytest.fixture(scope="module")
+def calls(tmp_path_factory) -> Iterator[Calls]:
+    port = free_port()
+    limits = {"LIPSERVE_MAX_REQUEST_BYTES": str(MOST_BYTES), "LIPSERVE_BODY_S": str(BODY_S)}
+    limits["LIPSERVE_LOG_REFUSALS_PER_S"] = "1000"  # every one of them
+    home = tmp_path_factory.mktemp("grpc") / "home"
+    address = f"127.0.0.1:{port}"
+    with (
+        Server(home, warm=True, LIPSERVE_GRPC_PORT=str(port), LIPSERVE_LOG_FORMAT="json", **limits) as server,
+        triton.InferenceServerClient(address) as client,
+        grpc.insecure_channel(address) as channel,
+    ):
+        yield Calls(server, client, GRPCInferenceServiceStub(channel), channel)
+
+
+def inputs(motion, datatype="FP64"):
+    made = [triton.InferInput(name, list(np.shape(values)), datatype) for name, values in motion.items()]
+    for tensor, values in zip(made, motion.values(), strict=True):
+        tensor.set_data_from_numpy(np.array(values, {"FP64": np.float64, "FP32": np.float32}[datatype]))
+    return made
+
+
+def request(motion, *outputs, datatype="FP64", raw=True, **fields):
+    """A request as the published definition has it."""
+    made = published.ModelInferRequest(**{"model_name": "panda-sim", **fields})
+    for name, values in motion.items():
+        tensor = made.inputs.add(name=name, datatype=datatype, shape=np.shape(values))
+        flat = np.ravel(values)
+        if raw:
+            made.raw_input_contents.append(flat.astype({"FP64": "<f8", "FP32": "<f4"}[datatype]).tobytes())
+        else:
+            getattr(tensor.contents, {"FP64": "fp64_contents", "FP32": "fp32_contents"}[datatype]).extend(flat)
+    for name in outputs:
+        made.outputs.add(name=name)
+    return made
+
+
+def fields(descriptor):
+    """Name, number, type and shape of all fields of a message."""
+    return {
+        (each.name, each.number, each.type, each.is_repeated, each.message_type and each.message_type.full_name)
+        for each in descriptor.fields
+    }
+
+
+def test_messages_are_the_published_ones():
+    names = set()
+    for name in definition.POOL.FindFileByName("lipserve/open_inference.proto").message_types_by_name:
+        pending = [(definition.POOL.FindMessageTypeByName(f"inference.{name}"), published.DESCRIPTOR)]
+        while pending:
+            ours, _ = pending.pop()
+            theirs = published.DESCRIPTOR.pool.FindMessageTypeByName(ours.full_name)
+            assert fields(ours) == fields(theirs), ours.full_name
+            assert ours.GetOptions().map_entry == theirs.GetOptions().map_entry
+            assert [each.name for each in ours.oneofs] == [each.name for each in theirs.oneofs]
+            pending += [(each, None) for each in ours.nested_types]
+            names.add(ours.full_name)
+    assert {"inference.ModelInferRequest.InferInputTensor.ParametersEntry", "inference.InferParameter"} <= names
+    assert FieldDescriptor.TYPE_DOUBLE in {
+        kind for _, _, kind, _, _ in fields(definition.message("InferParameter").DESCRIPTOR)
+    }
+
+
+def test_the_client_sees_server_and_model(calls):
+    assert calls.client.is_server_live()
+    assert calls.client.is_server_ready()
+    assert calls.client.is_model_ready("panda-sim")
+    assert calls.client.is_model_ready("panda-sim", "1")
+    seen = calls.client.get_server_metadata(as_json=True)
+    assert seen == {"name": "lipserve", "version": __version__, "extensions": ["binary_tensor_data"]}
+    found = calls.client.get_model_metadata("panda-sim")
+    expected = calls.server.client.get("/v2/models/panda-sim").json()
+    assert (found.name, list(found.versions), found.platform) == ("panda-sim", ["1"], expected["platform"])
+    for ours, theirs in ((found.inputs, expected["inputs"]), (found.outputs, expected["outputs"])):
+        assert [(each.name, each.datatype, list(each.shape)) for each in ours] == [
+            (each["name"], each["datatype"], each["shape"]) for each in theirs
+        ]
+
+
+@pytest.mark.parametrize("motion", [MOTION, BATCH], ids=["query", "batch"])
+def test_the_client_gets_what_http_answers_to_the_bit(calls, motion):
+    result = calls.client.infer("panda-sim", inputs(motion), request_id="7")
+    response = result.get_response()
+    assert (response.id, response.model_name, response.model_version) == ("7", "panda-sim", "1")
+    assert response.parameters["revision"].int64_param == 0
+    assert response.parameters["torque_convention"].string_param == "gravity_included"
+    expected = calls.plain(motion)
+    assert [each.name for each in response.outputs] == list(expected) == ["tau", "tau_std"]
+    for name, values in expected.items():
+        assert result.as_numpy(name).dtype == np.float64
+        assert_array_equal(result.as_numpy(name), values)
+
+
+@pytest.mark.parametrize("motion", [MOTION, BATCH], ids=["query", "batch"])
+def test_the_client_gets_what_it_asks_for(calls, motion):
+    names = ("tau_gravity", "covariance", "noise_std", "kinetic_energy", "inertia_matrix_std", "forward_dynamics")
+    asked = [triton.InferRequestedOutput(name) for name in names]
+    motion = motion | {"tau": np.ones(np.shape(motion["q"]))}
+    result = calls.client.infer("panda-sim", inputs(motion), model_version="1", outputs=asked)
+    for name, values in calls.plain(motion, *names).items():
+        assert_array_equal(result.as_numpy(name), values, err_msg=name)
+
+
+@pytest.mark.parametrize("datatype", ["FP64", "FP32"])
+@pytest.mark.parametrize("motion", [MOTION, BATCH], ids=["query", "batch"])
+def test_typed_numbers_are_those_that_raw_ones_are(calls, motion, datatype):
+    answer = calls.stub.ModelInfer(request(motion, datatype=datatype, raw=False), timeout=DEADLINE)
+    raw = calls.client.infer("panda-sim", inputs(motion, datatype))
+    assert list(answer.raw_output_contents) == []
+    for tensor in answer.outputs:
+        values = np.reshape(tensor.contents.fp64_contents, list(tensor.shape))
+        assert_array_equal(values, raw.as_numpy(tensor.name))
+
+
+def changed(change, motion=MOTION, **options):
+    made = request(motion, **options)
+    change(made)
+    return made
+
+
+JOINTS = "[7] for one query or [N, 7] for a batch: the joints are "
+SHARED = "tensors in the body: of the extensions, binary_tensor_data is supported"
+REFUSED = {
+    "unknown input": (changed(lambda r: setattr(r.inputs[0], "name", "p")), "inputs[0].name is p, expected one of q"),
+    "input twice": (changed(lambda r: setattr(r.inputs[1], "name", "q")), "inputs[1].name is q, expected each input"),
+    "no inputs": (request({}), "q is missing, expected the inputs q, dq, ddq"),
+    "datatype": (
+        changed(lambda r: setattr(r.inputs[0], "datatype", "INT32")),
+        "q.datatype is INT32, expected FP64 or FP32",
+    ),
+    "joints": (request({name: [0.0] * 3 for name in MOTION}), f"q.shape is [3], expected {JOINTS}"),
+    "negative": (
+        changed(lambda r: r.inputs[0].shape.__setitem__(0, -7)),
+        "inputs[0].shape[0] is -7, expected a whole number of at least 0",
+    ),
+    "other shape": (
+        changed(lambda r: r.inputs[1].shape.insert(0, 1)),
+        "dq.shape is [1, 7], expected that of q, [7]",
+    ),
+    "huge": (changed(lambda r: r.inputs[0].shape.insert(0, 2**40)), f"q.shape is [{2**40}, 7], expected at most 1000"),
+    "too few bytes": (
+        changed(lambda r: r.raw_input_contents.__setitem__(1, b"1234")),
+        "raw_input_contents[1] is 4 bytes, expected 56 bytes for dq: the shape [7] of FP64",
+    ),
+    "too few raw": (
+        changed(lambda r: r.raw_input_contents.pop()),
+        "raw_input_contents is 2 of them, expected one of each of the 3 inputs",
+    ),
+    "raw and typed": (
+        changed(lambda r: r.inputs[2].contents.fp64_contents.append(1.0)),
+        "ddq.contents is given, and raw_input_contents too, expected",
+    ),
+    "too few numbers": (
+        changed(lambda r: r.inputs[0].contents.fp64_contents.pop(), raw=False),
+        "q.contents.fp64_contents is 6 numbers, expected 7 numbers, as the shape [7] has",
+    ),
+    "other contents": (
+        changed(lambda r: setattr(r.inputs[0], "datatype", "FP32"), raw=False),
+        "q.contents.fp32_contents is 0 numbers, expected 7",
+    ),
+    "shared memory": (
+        changed(lambda r: setattr(r.inputs[1].parameters["shared_memory_region"], "string_param", "r")),
+        f"dq.parameters.shared_memory_region is r, expected {SHARED}",
+    ),
+    "classification": (
+        changed(lambda r: setattr(r.outputs.add(name="tau").parameters["classification"], "int64_param", 3)),
+        f"outputs[0].parameters.classification is 3, expected {SHARED}",
+    ),
+    "output": (request(MOTION, "tau", "torque"), "outputs[1].name is torque, expected what a model with"),
+    "no torque": (request(MOTION, "forward_dynamics"), "tau is missing, expected the torque that forward_dynamics or"),
+    "not finite": (
+        request(MOTION | {"dq": [0.0, np.nan] + [0.0] * 5}),
+        "dq[1] is nan, expected a finite number of FP64",
+    ),
+    "degrees": (request(MOTION | {"q": [0.0, 90.0] + [0.0] * 5}), "q[1] is 90, expected radians (or metres) within"),
+    "no model": (request(MOTION, model_name=""), "model_name is missing, expected the name of a model"),
+}
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_requests_that_are_refused(calls, kind):
+    wrong, words = REFUSED[kind]
+    error = calls.refusal(calls.stub.ModelInfer, wrong)
+    assert (error.code(), error.details()[: len(words)]) == (Code.INVALID_ARGUMENT, words)
+    assert dict(error.trailing_metadata())["lipserve-error-code"] == "invalid_request"
+
+
+def test_what_no_right_request_has_so_many_of_costs_no_more_than_reading_it(calls):
+    """Millions of inputs, outputs or axes: each is refused for the first that is wrong."""
+    assert len(calls.client.get_model_metadata("panda-sim").outputs) + len(PARTS) < MOST
+    for many, words in (
+        (changed(lambda r: [r.inputs.add() for _ in range(5000)]), "inputs[3].name is , expected one of q, dq, ddq"),
+        (changed(lambda r: [r.outputs.add(name="tau") for _ in range(2000)]), "outputs[1].name is tau, expected each"),
+        (changed(lambda r: r.inputs[0].shape.extend([1] * 9000)), "q.shape is [7, 1, 1"),
+    ):
+        assert calls.refusal(calls.stub.ModelInfer, many).details().startswith(words)
+
+
+def test_a_trusted_proxy_says_who_asks(calls):
+    named = (("x-forwarded-for", "203.0.113.7"), ("x-request-id", "far-1"))
+    calls.refusal(calls.stub.ModelInfer, request(MOTION, "x"), metadata=named)
+    lines = eventually(lambda: [line for line in calls.server.log.read_text().splitlines() if "far-1" in line])
+    assert json.loads(lines[0])["client"] == "203.0.113.7"
+
+
+def test_errors_are_worded_as_over_http(calls):
+    narrow = {name: [0.0] * 3 for name in MOTION}
+    http = refused(calls.server.client.post(PATH, json=message(narrow)))
+    assert calls.refusal(calls.stub.ModelInfer, request(narrow)).details() == http
+    for name, version in (("nobody", ""), ("panda-sim", "2"), ("panda-sim", "nothing"), ("x" * 5000, "")):
+        http = refused(calls.server.client.post(path_of(name, version or None), json=message(MOTION)), 404)
+        error = calls.refusal(calls.stub.ModelInfer, request(MOTION, model_name=name, model_version=version))
+        assert (error.code(), error.details()) == (Code.NOT_FOUND, http)
+        for method, kind in (("ModelReady", "ModelReadyRequest"), ("ModelMetadata", "ModelMetadataRequest")):
+            asked = getattr(published, kind)(name=name, version=version)
+            assert calls.refusal(getattr(calls.stub, method), asked).code() == Code.NOT_FOUND
+    with pytest.raises(InferenceServerException, match=r"INVALID_ARGUMENT.*q\.shape is \[3\], expected \[7\]"):
+        calls.client.infer("panda-sim", inputs(narrow))
+
+
+def test_what_is_not_protobuf_and_what_is_not_offered(calls):
+    ask = calls.channel.unary_unary(ROUTE)
+    for data in (b"\xff", b"\x0a\x05ab", b"\x0a\x02\xff\xfe"):  # the last: a name that is not UTF-8
+        error = calls.refusal(ask, data)
+        assert error.code() == Code.INVALID_ARGUMENT
+        assert error.details().startswith("the message is not protobuf that can be read")
+    assert calls.refusal(ask, b"").details().startswith("model_name is missing")
+    for call in (calls.client.get_model_repository_index, calls.client.get_inference_statistics):
+        with pytest.raises(InferenceServerException) as caught:
+            call()
+        assert caught.value.status() == "StatusCode.UNIMPLEMENTED"
+    # a request over HTTP reaches no method
+    answer = calls.server.client.post("/inference.GRPCInferenceService/ServerLive", content=b"")
+    assert answer.status_code == 404
+
+
+def test_messages_beyond_the_limit(calls):
+    rows = {name: np.zeros((MOST_BYTES // 168 + 1, 7)) for name in MOTION}
+    assert calls.refusal(calls.stub.ModelInfer, request(rows)).code() == Code.RESOURCE_EXHAUSTED
+    fitting = {name: np.tile(values, (100, 1)) for name, values in MOTION.items()}
+    answer = calls.stub.ModelInfer(request(fitting, "tau"), timeout=DEADLINE)
+    assert_array_equal(
+        np.frombuffer(answer.raw_output_contents[0]).reshape(100, 7), calls.plain(BATCH)["tau"][[0] * 100]
+    )
+    error = calls.refusal(calls.stub.ModelInfer, request(fitting), compression=grpc.Compression.Gzip)
+    assert error.code() == Code.UNIMPLEMENTED
+    padded = (("x-padding", "x" * 100_000),)
+    assert calls.refusal(calls.stub.ModelInfer, request(MOTION), metadata=padded).code() == Code.RESOURCE_EXHAUSTED
+
+
+def test_calls_end_at_their_deadline_or_that_of_their_message(calls):
+    enough = threading.Event()
+
+    def never():
+        enough.wait(DEADLINE)
+        yield b""
+
+    ask = calls.channel.stream_unary(ROUTE)
+    with pytest.raises(grpc.RpcError) as caught:
+        ask(never(), timeout=0.05)
+    assert (caught.value.code(), caught.value.details()) == (Code.DEADLINE_EXCEEDED, "Deadline Exceeded")
+    eventually(lambda: shown(calls, "lipserve_requests_total", 'status="499"'))
+    error = calls.refusal(ask, never())
+    enough.set()
+    expected = "the body came too slowly: 0 bytes of it so far"
+    assert (error.code(), error.details()) == (Code.DEADLINE_EXCEEDED, expected)
+
+
+def shown(calls, metric, *labels):
+    """Lines of a metric of inference that have these labels."""
+    lines = calls.server.client.get("/metrics").text.splitlines()
+    return [line for line in lines if line.startswith(metric) and all(each in line for each in (ROUTE, *labels))]
+
+
+def test_calls_are_named_counted_and_logged(calls):
+    _, call = calls.stub.ModelInfer.with_call(request(MOTION), metadata=(("x-request-id", "cell-3.7"),))
+    assert dict(call.trailing_metadata())["x-request-id"] == "cell-3.7"
+    error = calls.refusal(calls.stub.ModelInfer, request(MOTION, "x"), metadata=(("x-request-id", "wrong-1"),))
+    assert dict(error.trailing_metadata())["x-request-id"] == "wrong-1"
+    lines = eventually(lambda: [line for line in calls.server.log.read_text().splitlines() if "wrong-1" in line])
+    said = json.loads(lines[0])
+    assert (said["route"], said["status"], said["code"], said["client"]) == (ROUTE, 422, "invalid_request", "127.0.0.1")
+    assert shown(calls, "lipserve_requests_total", 'status="422"')
+    assert shown(calls, "lipserve_request_duration_seconds_count", 'model="panda-sim"')
+
+
+@pytest.fixture(scope="module")
+def guarded(tmp_path_factory) -> Iterator[tuple[GRPCInferenceServiceStub, dict[str, str], Server]]:
+    """A service that asks for keys and limits rates, and a key of each of two scopes."""
+    from service.storage.database import Database
+    from service.web.access import keys
+
+    home, port = tmp_path_factory.mktemp("grpc-keys") / "home", free_port()
+    settings = {"LIPSERVE_KEYS": "on", "LIPSERVE_MAX_REQUESTS_PER_S": "0.001", "LIPSERVE_MAX_REQUEST_BURST": "4"}
+    database = Database.of(Settings(home=home))
+    secrets = {scope: keys.create(database, scope, [scope], None)[1] for scope in ("read", "predict")}
+    database.close()
+    with (
+        Server(home, warm=True, LIPSERVE_GRPC_PORT=str(port), **settings) as server,
+        grpc.insecure_channel(f"127.0.0.1:{port}") as channel,
+    ):
+        yield GRPCInferenceServiceStub(channel), secrets, server
+
+
+def test_keys_scopes_and_rates_are_those_of_http(guarded):
+    stub, secrets, server = guarded
+    assert stub.ServerLive(published.ServerLiveRequest(), timeout=DEADLINE).live
+    assert stub.ServerReady(published.ServerReadyRequest(), timeout=DEADLINE).ready
+
+    def ask(secret=None):
+        metadata = () if secret is None else (("authorization", f"Bearer {secret}"),)
+        return stub.ModelInfer(request(MOTION), timeout=DEADLINE, metadata=metadata)
+
+    for secret, code, words in (
+        (None, Code.UNAUTHENTICATED, "no API key was given"),
+        ("lip_wrong", Code.UNAUTHENTICATED, "the API key is not one of this service"),
+        (secrets["read"], Code.PERMISSION_DENIED, "this needs predict"),
+    ):
+        with pytest.raises(grpc.RpcError) as caught:
+            ask(secret)
+        assert caught.value.code() == code
+        assert words in caught.value.details()
+        assert dict(caught.value.trailing_metadata())["www-authenticate"].startswith('Bearer realm="lipserve"')
+    headers = {"Authorization": f"Bearer {secrets['predict']}"}
+    for _ in range(2):  # one bucket for both ways
+        assert len(ask(secrets["predict"]).raw_output_contents) == 2
+        assert server.client.post(PATH, json=message(MOTION), headers=headers).status_code == 200
+    with pytest.raises(grpc.RpcError, match=r"asks more than 0.001 times per s") as caught:
+        ask(secrets["predict"])
+    assert caught.value.code() == Code.RESOURCE_EXHAUSTED
+    assert int(dict(caught.value.trailing_metadata())["retry-after"]) > 0
+
+
+def test_a_service_that_stops_ends_its_calls(tmp_path):
+    port = free_port()
+    with (
+        Server(tmp_path / "home", warm=True, LIPSERVE_GRPC_PORT=str(port)) as server,
+        grpc.insecure_channel(f"127.0.0.1:{port}") as channel,
+    ):
+        stub = GRPCInferenceServiceStub(channel)
+        assert len(stub.ModelInfer(request(MOTION), timeout=DEADLINE).outputs) == 2
+        server.terminate()
+        assert "Application shutdown complete" in server.log.read_text()
+        with pytest.raises(grpc.RpcError) as caught:
+            stub.ModelInfer(request(MOTION), timeout=DEADLINE)
+        assert caught.value.code() == Code.UNAVAILABLE
+
+
+def heard(connection: socket.socket) -> bytes:
+    """What a service says, nothing where it has closed."""
+    try:
+        return connection.recv(1000)
+    except ConnectionResetError:
+        return b""
+
+
+def test_connections_beyond_the_most_there_may_be_and_those_that_say_nothing(tmp_path):
+    port, limits = free_port(), {"LIPSERVE_MAX_CONNECTIONS": "3", "LIPSERVE_HEADER_S": "1"}
+    with Server(tmp_path / "home", warm=True, LIPSERVE_GRPC_PORT=str(port), **limits), ExitStack() as stack:
+        silent = [stack.enter_context(socket.create_connection(("127.0.0.1", port), DEADLINE)) for _ in range(4)]
+        assert sum(bool(heard(each)) for each in silent) == 3  # HTTP/2's server speaks first
+        for each in silent:
+            while heard(each):  # until the service closes it
+                pass
+        channel = stack.enter_context(grpc.insecure_channel(f"127.0.0.1:{port}"))
+        live = GRPCInferenceServiceStub(channel).ServerLive(
+            published.ServerLiveRequest(), timeout=DEADLINE, wait_for_ready=True
+        )
+        assert live.live
+
+
+def test_a_port_that_is_taken_is_named(tmp_path, calls):
+    taken, environment = calls.server.port, {**os.environ, "LIPSERVE_HOME": str(tmp_path / "home")}
+    command = [sys.executable, "-m", "service", "serve", "--port", str(free_port()), "--grpc-port", str(taken)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=DEADLINE)
+    assert done.returncode == 1
+    assert f"error: LIPSERVE_GRPC_PORT is {taken}, expected a port that is free: Address already in use" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_missing_extra_is_named_at_the_start(tmp_path, monkeypatch):
+    monkeypatch.setattr(rpc, "find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"LIPSERVE_GRPC_PORT is set, which needs .*pip install 'lipserve\[grpc\]'"):
+        create_app(Settings(home=tmp_path, grpc_port=0))
+    create_app(Settings(home=tmp_path))

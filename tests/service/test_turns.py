@@ -1,0 +1,49 @@
+"""Turns to compute: what waits for one can be given up, what computes keeps its own to the end."""
+
+import asyncio
+import threading
+
+import pytest
+from anyio import CapacityLimiter
+
+from service.web.limits.requests import in_turn
+from tests.service.data import DEADLINE
+
+
+async def until(look):
+    async with asyncio.timeout(DEADLINE):
+        while not look():
+            await asyncio.sleep(0.001)
+
+
+def test_who_goes_away_frees_no_turn_that_is_used_and_needs_none_that_is_not():
+    begun, go, computed = threading.Event(), threading.Event(), []
+
+    def slow():
+        begun.set()
+        go.wait(DEADLINE)
+        computed.append("slow")
+        raise ValueError("nobody waits for it")
+
+    async def run():
+        turns = CapacityLimiter(1)
+        asking = asyncio.create_task(in_turn(turns, slow))
+        await until(begun.is_set)
+        asking.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await asking
+        assert turns.borrowed_tokens == 1
+        waiting = asyncio.create_task(in_turn(turns, computed.append, "given up"))
+        await until(lambda: turns.statistics().tasks_waiting == 1)
+        waiting.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await waiting
+        last = asyncio.create_task(in_turn(turns, computed.append, "last"))
+        await until(lambda: turns.statistics().tasks_waiting == 1)
+        assert computed == []
+        go.set()
+        await last
+        assert computed == ["slow", "last"]
+        assert turns.borrowed_tokens == 0
+
+    asyncio.run(run())
