@@ -8,9 +8,9 @@ TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 WORKERS ?= 3
 SHARE := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test warm-lip warm-chain bytecode test-all screenshots cpp lint install serve image clean
+.PHONY: demo test warm-lip warm-chain bytecode test-all screenshots cpp lint install serve image docs dist sbom clean
 
-demo: install
+demo: $(VENV)/.running
 	$(BIN)/lipserve demo
 
 # five to six minutes on two cores; some tests of each kind, the others are slow
@@ -62,20 +62,54 @@ lint: install
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-serve: install
+serve: $(VENV)/.running
 	$(BIN)/lipserve serve
 
 image:
 	docker build -t lipserve .
 
+# the documentation as a site, build/site
+docs: install
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
+
+# wheels and sdists of both distributions, dist/; with TAG=v1.2.3 they have to be of that version
+dist: install
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist clients/python
+	$(BIN)/python -m build --outdir dist .
+	$(BIN)/twine check --strict dist/*
+	@test -z "$(TAG)" || ls $(patsubst v%,dist/lipserve-%-py3-none-any.whl,$(TAG)) $(patsubst v%,dist/lipserve_client-%-py3-none-any.whl,$(TAG))
+
+# what the image's environment holds: build/sbom.json (CycloneDX) and build/licences.md; the release writes one of the
+# image as a whole. Fails at a licence that does not go with Apache-2.0. Known: psycopg is LGPL and linked at run time;
+# Qhull, which names no licence, has a permissive one of its own.
+IMAGE := build/image
+LICENCES := $(BIN)/pip-licenses --python $(IMAGE)/bin/python --from mixed
+sbom: install
+	rm -rf $(IMAGE) && $(PYTHON) -m venv $(IMAGE)
+	.ci/install-torch $(IMAGE)/bin/python
+	$(IMAGE)/bin/python -m pip install --quiet $$(grep -o "\./clients/python '[^']*'" Dockerfile | tr -d "'")
+	$(IMAGE)/bin/python -m pip uninstall --yes --quiet setuptools pip
+	$(BIN)/cyclonedx-py environment --pyproject pyproject.toml --output-file build/sbom.json $(IMAGE)/bin/python
+	$(LICENCES) --format markdown --output-file build/licences.md
+	$(LICENCES) --partial-match --fail-on "GPL;General Public;Affero;SSPL;UNKNOWN" \
+		--ignore-packages psycopg psycopg-binary cmeel-qhull > /dev/null
+
 install: $(VENV)/.installed
 
-$(VENV)/.installed: pyproject.toml clients/python/pyproject.toml .ci/install-torch
-	@echo "installing into $(VENV): about 3 GB, two to four minutes"
+# what the main job needs
+$(VENV)/.running: pyproject.toml clients/python/pyproject.toml .ci/install-torch
+	@echo "installing into $(VENV): 2 GB, one to three minutes"
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, this is " + sys.version)'
 	$(PYTHON) -m venv $(VENV)
 	.ci/install-torch $(BIN)/python
-	$(BIN)/python -m pip install --disable-pip-version-check -e clients/python -e '.[sim,plot,cluster,dev]'
+	$(BIN)/python -m pip install --disable-pip-version-check -e clients/python -e '.[sim]'
+	@touch $@
+
+# and what tests it
+$(VENV)/.installed: $(VENV)/.running
+	@echo "installing what the tests need into $(VENV): 1 GB, one to two minutes"
+	$(BIN)/python -m pip install --disable-pip-version-check -e clients/python -e '.[all,dev,docs,publish]'
 	@touch $@
 
 clean:

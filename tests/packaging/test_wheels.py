@@ -1,0 +1,212 @@
+"""Both distributions as they are published: built, checked, installed where nothing else is, used. Needs an index."""
+
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import venv
+from pathlib import Path
+from urllib.parse import urlparse
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from lipserve import __version__
+from tests.clients.test_python_package import SERVER
+from tests.docs.blocks import ROOT, all_pages
+from tests.service.server import Server
+
+pytestmark = pytest.mark.slow
+PIP = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
+PLAIN = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+SOURCES = {"clients/python": "lipserve-client", ".": "lipserve"}
+"""Folder and name of each distribution."""
+MOST_MB = 90
+DEPENDENCIES = {"numpy", "httpx", "httpcore", "h11", "anyio", "idna", "certifi", "websockets", "msgspec"}
+MORE = {"typing-extensions", "typing_extensions", "sniffio"}
+"""What some versions of these need on some versions of Python."""
+
+ASKING = """
+import asyncio, json, sys
+from importlib.metadata import distributions
+from lipserve import AsyncClient, Client, StreamClient
+zeros = [0.0] * 7
+with Client() as client:
+    answer = client.predict("panda-sim", zeros, zeros, zeros)
+    record = client.version("panda-sim", 1)
+    following = client.live("panda-sim")
+    event = next(following)
+async def again():
+    async with AsyncClient() as client:
+        return (await client.predict("panda-sim", zeros, zeros, zeros)).tau.tolist()
+with StreamClient("panda-sim") as stream:
+    frame = stream.ask(zeros, zeros, zeros)
+try:
+    import lipserve.progress
+except ModuleNotFoundError as error:
+    missing = str(error)
+print(json.dumps({
+    "missing": missing, "tau": [answer.tau.tolist(), asyncio.run(again()), frame.tau.tolist()],
+    "joints": record.joint_names, "event": type(event).__name__,
+    "modules": sorted(sys.modules), "names": sorted(each.name for each in distributions()),
+}))
+"""
+
+
+@pytest.fixture(scope="module")
+def dist(tmp_path_factory):
+    """Folder of both sdists, and of the wheels that were built from them."""
+    pytest.importorskip("build", reason="build is missing: pip install build")
+    folder = tmp_path_factory.mktemp("dist")
+    for source in SOURCES:
+        command = [sys.executable, "-m", "build", "--outdir", str(folder), str(ROOT / source)]
+        subprocess.run(command, check=True, capture_output=True)
+    return folder
+
+
+def installed(place: Path, dist: Path, name: str) -> Path:
+    """Make an environment that has a distribution, its dependencies and nothing else; return its folder of packages."""
+    venv.create(place, with_pip=False)
+    python = str(place / "bin/python")
+    command = [*PIP, "--quiet", "--python", python, "install", "--no-compile", "--find-links", str(dist)]
+    subprocess.run([*command, f"{name}=={__version__}"], check=True)
+    subprocess.run([*PIP, "--python", python, "check"], check=True)
+    (packages,) = place.glob("lib/python3*/site-packages")
+    return packages
+
+
+class Installed(Server):
+    """`lipserve serve` of an environment."""
+
+    patience = 300  # it compiles its kernels
+    place: Path
+
+    def _spawned(self, arguments, environment):
+        environment = {name: value for name, value in environment.items() if name != "PYTHONPATH"}
+        with self.log.open("ab") as log:
+            return subprocess.Popen(
+                [str(self.place / "bin/lipserve"), *arguments], env=environment, cwd=self.place, stdout=log, stderr=log
+            )
+
+
+@pytest.fixture(scope="module")
+def server(dist, tmp_path_factory):
+    """A service of the wheel, in an environment of its own."""
+    Installed.place = tmp_path_factory.mktemp("environment")
+    installed(Installed.place, dist, "lipserve")
+    with Installed(tmp_path_factory.mktemp("server") / "home") as started:
+        yield started
+    shutil.rmtree(Installed.place)  # gigabytes, which pytest would keep
+
+
+def test_both_are_there_with_one_version_and_metadata_that_an_index_takes(dist):
+    pytest.importorskip("twine", reason="Twine is missing: pip install twine")
+    names = {each.name for each in dist.iterdir()}
+    stems = {f"{name.replace('-', '_')}-{__version__}" for name in SOURCES.values()}
+    assert names == {stem + end for stem in stems for end in (".tar.gz", "-py3-none-any.whl")}
+    files = [str(each) for each in sorted(dist.iterdir())]
+    command = [sys.executable, "-m", "twine", "--no-color", "check", "--strict", *files]
+    done = subprocess.run(command, cwd=dist, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    assert done.stdout.count("PASSED") == len(names)
+
+
+def test_the_wheel_of_the_service_serves_its_model_pages_and_guide(server):
+    zeros = [0.0] * 7
+    answer = server.client.post("/v1/models/panda-sim/predict", json={"q": zeros, "dq": zeros, "ddq": zeros})
+    assert len(answer.json()["tau"]) == len(zeros)
+    assert server.client.get("/openapi.json").json()["info"]["version"] == __version__
+    for page, shown in {"/": "LIPServe", "/guide/operations": "Leave it running"}.items():
+        assert shown in server.client.get(page).text
+    assert server.client.get("/guide/files/demo.png").headers["content-type"] == "image/png"
+
+
+def test_the_wheel_of_the_client_alone_asks_it(server, dist, tmp_path):
+    place = tmp_path / "environment"
+    packages = installed(place, dist, "lipserve-client")
+    environment = {**PLAIN, "LIPSERVE_URL": server.url}
+    command = [str(place / "bin/python"), "-c", ASKING]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    seen = json.loads(done.stdout)
+
+    first, second, framed = seen["tau"]
+    assert first == second
+    assert framed == pytest.approx(first, abs=1e-12)
+    assert (len(seen["joints"]), seen["event"]) == (7, "LiveStatus")
+    assert set(seen["names"]) - MORE == DEPENDENCIES | {"lipserve-client"}
+    assert set(seen["modules"]).isdisjoint(SERVER)
+    assert seen["missing"] == "bars need Rich: pip install 'lipserve-client[progress]'"
+    assert (packages / "lipserve/py.typed").is_file()
+    size = sum(each.stat().st_size for each in packages.rglob("*") if each.is_file())
+    assert size < MOST_MB * 1_000_000
+
+
+INSTALLING = re.compile(r"pip install((?: +(?:'[^']+'|[\w.\[\]/:=-]+))+)")
+TORCH_OF_CPUS = "https://download.pytorch.org/whl/cpu"
+
+
+def lines() -> dict[str, str]:
+    """Every `pip install` that a page or a message of ours tells of, by what it installs."""
+    code = [path for name in ("lipcore", "service", "clients", "benchmarks") for path in (ROOT / name).rglob("*.py")]
+    pages = [*all_pages(), *sorted((ROOT / "docs/examples").iterdir()), *(ROOT / "clients").glob("*/README.md")]
+    texts = (path.read_text("utf-8") for path in [*pages, *code])
+    return {" ".join(requirements(line)): line for text in texts for line in INSTALLING.findall(text)}
+
+
+def requirements(line: str) -> list[str]:
+    """What the arguments of pip install, with folders of the checkout as the distributions that are built of them."""
+    words = shlex.split(line)
+    if "--index-url" in words:
+        at = words.index("--index-url")
+        assert words == ["torch", "--index-url", TORCH_OF_CPUS], "that index has torch alone"
+        del words[at:]
+    wanted = []
+    for word in (each for each in words if each != "-e"):
+        folder, bracket, extras = word.removeprefix("./").partition("[")
+        wanted.append(SOURCES.get(folder, folder) + bracket + extras)
+    return wanted
+
+
+def resolved(dist: Path, folder: Path, *arguments: str) -> list[dict]:
+    """What pip would install, each with its metadata."""
+    report = folder / "report.json"
+    command = [*PIP, "install", "--dry-run", "--ignore-installed", "--find-links", str(dist), "--report", str(report)]
+    done = subprocess.run([*command, *arguments], cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(report.read_text("utf-8"))["install"]
+
+
+def missing(install: list[dict], wanted: str) -> list[str]:
+    """Names and extras of a line's requirements that what pip would install does not have."""
+    offered = {
+        canonicalize_name(each["metadata"]["name"]): each["metadata"].get("provides_extra", []) for each in install
+    }
+    lacking = []
+    for each in map(Requirement, wanted.split()):
+        extras = offered.get(canonicalize_name(each.name))
+        lacking += (
+            [str(each)] if extras is None else [f"{each.name}[{one}]" for one in each.extras if one not in extras]
+        )
+    return lacking
+
+
+def test_lines_that_install_find_what_they_name(dist, tmp_path):
+    wanted = sorted(lines())
+    assert {"lipserve-client", "lipserve[cluster]"} <= set(wanted)
+    # all together: what answers all of them answers each
+    install = resolved(dist, tmp_path, *dict.fromkeys(word for each in wanted for word in each.split()))
+    assert {lines()[each]: lack for each in wanted if (lack := missing(install, each))} == {}
+    for each in install:
+        if each["metadata"]["name"] in SOURCES.values():  # that of this checkout, not another's of this name
+            assert Path(urlparse(each["download_info"]["url"]).path).parent == dist
+
+
+def test_an_extra_or_a_name_that_there_is_not_is_noticed(dist, tmp_path):
+    install = resolved(dist, tmp_path, "--no-deps", "lipserve-client[bars]")
+    assert missing(install, "lipserve-client[bars]") == ["lipserve-client[bars]"]
+    assert missing(install, "lipserve-client[progress] lipserve") == ["lipserve"]
