@@ -27,7 +27,10 @@ def text(path: str) -> str:
     [
         ("CHANGELOG.md", r"\A# Changelog\n\n## Unreleased\n(?:[^#].*\n|\n)*## (\S+) - \d{4}-\d\d-\d\d\n"),
         ("clients/cpp/CMakeLists.txt", r"^project\(lipserve-client VERSION (\S+)"),
-        *((f"deploy/kubernetes/{kind}/kustomization.yaml", r"newTag: ([^\s}]+)") for kind in ("single", "shared", "gpu", "kserve")),
+        *(
+            (f"deploy/kubernetes/{kind}/kustomization.yaml", r"newTag: ([^\s}]+)")
+            for kind in ("single", "shared", "gpu", "kserve")
+        ),
     ],
 )
 def test_what_names_the_version_names_this_one(path, pattern):

@@ -8,7 +8,7 @@ import lipcore
 from lipcore.data.metrics import evaluate
 from lipcore.data.samples import Samples
 from service.models import registry
-from service.models.archive_import import Lineage
+from service.models.archive_fields import Lineage
 from service.models.lineage import learnt_from, named
 from service.storage.database import DatasetRow
 from service.training.holding_out import CannotHoldOutError, remembered
