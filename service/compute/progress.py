@@ -14,7 +14,7 @@ from pathlib import Path
 
 LOOK_S = 1.0
 """Seconds between two looks; more than twice as many count as so many: who looks may have stood still as well."""
-WORTH_S = 0.01
+TICK_S = 0.01
 """CPU time that is progress, s: the system counts in such ticks. Waiting in vain takes far less."""
 
 
@@ -58,7 +58,7 @@ class Progress:
         passed, self._looked = min(now - self._looked, 2 * LOOK_S), now
         spent = {pid: each for pid in self._pids() if (each := self._spent(pid)) is not None}
         self._stepless_s += passed
-        if not spent or any(each - self._known.get(pid, -WORTH_S) >= WORTH_S for pid, each in spent.items()):
+        if not spent or any(each - self._known.get(pid, -TICK_S) >= TICK_S for pid, each in spent.items()):
             self.silent_s, self._known = 0.0, spent
         else:
             self.silent_s += passed

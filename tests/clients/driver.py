@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import threading
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -13,24 +14,36 @@ import numpy as np
 from tests.service.data import DEADLINE
 
 
+def rows_file(program: Path, rows: np.ndarray, owner: object) -> Path:
+    """Rows as a driven program reads them, in a file beside it that is this owner's alone."""
+    file = program.with_name(f"{program.name}-{id(owner)}.rows")
+    file.write_bytes(np.ascontiguousarray(rows, "<f8").tobytes())
+    return file
+
+
+def started(
+    program: Path, options: Mapping[str, Any], environment: Mapping[str, str] | None = None
+) -> subprocess.Popen[str]:
+    """A program that does what it is told line by line. environment: this process's where None."""
+    return subprocess.Popen(
+        [program, *(f"{name}={value}" for name, value in options.items())],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    )
+
+
 class Driver:
     """The client; options: those of `lipserve::Options`, as the program takes them. rows: (N, 4, n) q, dq, ddq, tau."""
 
     def __init__(self, program: Path, rows: np.ndarray | None = None, **options: Any) -> None:
         if rows is not None:
-            file = program.with_name(f"{program.name}-{id(self)}.rows")
-            file.write_bytes(np.ascontiguousarray(rows, "<f8").tobytes())
-            options |= {"rows": file, "joints": rows.shape[2]}
+            options |= {"rows": rows_file(program, rows, self), "joints": rows.shape[2]}
         environment = {name: value for name, value in os.environ.items() if not name.startswith("LIPSERVE_")}
         environment |= {name: options.pop(name) for name in list(options) if name.startswith("LIPSERVE_")}
-        self.process = subprocess.Popen(
-            [program, *(f"{name}={value}" for name, value in options.items())],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=environment,
-        )
+        self.process = started(program, options, environment)
         self._limit = threading.Timer(4 * DEADLINE, self.process.kill)  # a client that hangs fails its test
         self._limit.start()
 

@@ -13,6 +13,7 @@ import pytest
 
 import lipcore
 from tests.clients.building import COMPILERS, CPP, STRICT, here, sanitizers
+from tests.clients.driver import rows_file, started
 from tests.clients.services import Talk, serving, streaming
 from tests.docs.blocks import ROOT
 from tests.service import streams
@@ -85,17 +86,10 @@ class Node:
     """The node, driven line by line; parameters: of the node."""
 
     def __init__(self, program: Path, motions: np.ndarray, url: str, **parameters: Any) -> None:
-        file = program.with_name(f"{program.name}-{id(self)}.rows")
-        file.write_bytes(np.ascontiguousarray(motions, "<f8").tobytes())
+        file = rows_file(program, motions, self)
         host, _, port = url.removeprefix("http://").rpartition(":")
         given = {"host": host, "port": port, "period": PERIOD, "deadline_s": DEADLINE, "rows_file": file, **parameters}
-        self.process = subprocess.Popen(
-            [program, *(f"{name}={value}" for name, value in given.items())],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+        self.process = started(program, given)
 
     def do(self, line: str) -> dict[str, Any]:
         assert self.process.stdin is not None

@@ -1,13 +1,8 @@
 """The Open Inference Protocol over gRPC, as NVIDIA's client speaks it: the answers are those of HTTP."""
 
 import json
-import os
-import socket
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass
 
 import grpc
@@ -21,23 +16,18 @@ from tritonclient.grpc.service_pb2_grpc import GRPCInferenceServiceStub
 from tritonclient.utils import InferenceServerException
 
 from service import __version__
-from service.app import create_app
-from service.foundation.settings import Settings
-from service.oip import rpc
 from service.oip.query import PARTS
 from service.oip.rpc.messages import MOST
 from tests.service.data import DEADLINE, eventually
 from tests.service.oip import message, path_of, refused, tensors
+from tests.service.oip_grpc import MOTION, PATH, Code, request
 from tests.service.server import Server, free_port
 
 definition = pytest.importorskip("service.oip.rpc.definition")
-MOTION = {"q": [0.0, -0.5, 0.0, -2.0, 0.0, 1.5, 0.7], "dq": [0.1] * 7, "ddq": [0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0]}
 BATCH = {name: np.linspace(values, np.array(values) + 0.3, 4) for name, values in MOTION.items()}
-PATH = path_of("panda-sim")
 MOST_BYTES = 20_000
 BODY_S = 1.0
 ROUTE = "/inference.GRPCInferenceService/ModelInfer"
-Code = grpc.StatusCode
 
 
 @dataclass(frozen=True)
@@ -81,21 +71,6 @@ def inputs(motion, datatype="FP64"):
     made = [triton.InferInput(name, list(np.shape(values)), datatype) for name, values in motion.items()]
     for tensor, values in zip(made, motion.values(), strict=True):
         tensor.set_data_from_numpy(np.array(values, {"FP64": np.float64, "FP32": np.float32}[datatype]))
-    return made
-
-
-def request(motion, *outputs, datatype="FP64", raw=True, **fields):
-    """A request as the published definition has it."""
-    made = published.ModelInferRequest(**{"model_name": "panda-sim", **fields})
-    for name, values in motion.items():
-        tensor = made.inputs.add(name=name, datatype=datatype, shape=np.shape(values))
-        flat = np.ravel(values)
-        if raw:
-            made.raw_input_contents.append(flat.astype({"FP64": "<f8", "FP32": "<f4"}[datatype]).tobytes())
-        else:
-            getattr(tensor.contents, {"FP64": "fp64_contents", "FP32": "fp32_contents"}[datatype]).extend(flat)
-    for name in outputs:
-        made.outputs.add(name=name)
     return made
 
 
@@ -346,104 +321,3 @@ def test_calls_are_named_counted_and_logged(calls):
     assert (said["route"], said["status"], said["code"], said["client"]) == (ROUTE, 422, "invalid_request", "127.0.0.1")
     assert shown(calls, "lipserve_requests_total", 'status="422"')
     assert shown(calls, "lipserve_request_duration_seconds_count", 'model="panda-sim"')
-
-
-@pytest.fixture(scope="module")
-def guarded(tmp_path_factory) -> Iterator[tuple[GRPCInferenceServiceStub, dict[str, str], Server]]:
-    """A service that asks for keys and limits rates, and a key of each of two scopes."""
-    from service.storage.database import Database
-    from service.web.access import keys
-
-    home, port = tmp_path_factory.mktemp("grpc-keys") / "home", free_port()
-    settings = {"LIPSERVE_KEYS": "on", "LIPSERVE_MAX_REQUESTS_PER_S": "0.001", "LIPSERVE_MAX_REQUEST_BURST": "4"}
-    database = Database.of(Settings(home=home))
-    secrets = {scope: keys.create(database, scope, [scope], None)[1] for scope in ("read", "predict")}
-    database.close()
-    with (
-        Server(home, warm=True, LIPSERVE_GRPC_PORT=str(port), **settings) as server,
-        grpc.insecure_channel(f"127.0.0.1:{port}") as channel,
-    ):
-        yield GRPCInferenceServiceStub(channel), secrets, server
-
-
-def test_keys_scopes_and_rates_are_those_of_http(guarded):
-    stub, secrets, server = guarded
-    assert stub.ServerLive(published.ServerLiveRequest(), timeout=DEADLINE).live
-    assert stub.ServerReady(published.ServerReadyRequest(), timeout=DEADLINE).ready
-
-    def ask(secret=None):
-        metadata = () if secret is None else (("authorization", f"Bearer {secret}"),)
-        return stub.ModelInfer(request(MOTION), timeout=DEADLINE, metadata=metadata)
-
-    for secret, code, words in (
-        (None, Code.UNAUTHENTICATED, "no API key was given"),
-        ("lip_wrong", Code.UNAUTHENTICATED, "the API key is not one of this service"),
-        (secrets["read"], Code.PERMISSION_DENIED, "this needs predict"),
-    ):
-        with pytest.raises(grpc.RpcError) as caught:
-            ask(secret)
-        assert caught.value.code() == code
-        assert words in caught.value.details()
-        assert dict(caught.value.trailing_metadata())["www-authenticate"].startswith('Bearer realm="lipserve"')
-    headers = {"Authorization": f"Bearer {secrets['predict']}"}
-    for _ in range(2):  # one bucket for both ways
-        assert len(ask(secrets["predict"]).raw_output_contents) == 2
-        assert server.client.post(PATH, json=message(MOTION), headers=headers).status_code == 200
-    with pytest.raises(grpc.RpcError, match=r"asks more than 0.001 times per s") as caught:
-        ask(secrets["predict"])
-    assert caught.value.code() == Code.RESOURCE_EXHAUSTED
-    assert int(dict(caught.value.trailing_metadata())["retry-after"]) > 0
-
-
-def test_a_service_that_stops_ends_its_calls(tmp_path):
-    port = free_port()
-    with (
-        Server(tmp_path / "home", warm=True, LIPSERVE_GRPC_PORT=str(port)) as server,
-        grpc.insecure_channel(f"127.0.0.1:{port}") as channel,
-    ):
-        stub = GRPCInferenceServiceStub(channel)
-        assert len(stub.ModelInfer(request(MOTION), timeout=DEADLINE).outputs) == 2
-        server.terminate()
-        assert "Application shutdown complete" in server.log.read_text()
-        with pytest.raises(grpc.RpcError) as caught:
-            stub.ModelInfer(request(MOTION), timeout=DEADLINE)
-        assert caught.value.code() == Code.UNAVAILABLE
-
-
-def heard(connection: socket.socket) -> bytes:
-    """What a service says, nothing where it has closed."""
-    try:
-        return connection.recv(1000)
-    except ConnectionResetError:
-        return b""
-
-
-def test_connections_beyond_the_most_there_may_be_and_those_that_say_nothing(tmp_path):
-    port, limits = free_port(), {"LIPSERVE_MAX_CONNECTIONS": "3", "LIPSERVE_HEADER_S": "1"}
-    with Server(tmp_path / "home", warm=True, LIPSERVE_GRPC_PORT=str(port), **limits), ExitStack() as stack:
-        silent = [stack.enter_context(socket.create_connection(("127.0.0.1", port), DEADLINE)) for _ in range(4)]
-        assert sum(bool(heard(each)) for each in silent) == 3  # HTTP/2's server speaks first
-        for each in silent:
-            while heard(each):  # until the service closes it
-                pass
-        channel = stack.enter_context(grpc.insecure_channel(f"127.0.0.1:{port}"))
-        live = GRPCInferenceServiceStub(channel).ServerLive(
-            published.ServerLiveRequest(), timeout=DEADLINE, wait_for_ready=True
-        )
-        assert live.live
-
-
-def test_a_port_that_is_taken_is_named(tmp_path, calls):
-    taken, environment = calls.server.port, {**os.environ, "LIPSERVE_HOME": str(tmp_path / "home")}
-    command = [sys.executable, "-m", "service", "serve", "--port", str(free_port()), "--grpc-port", str(taken)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=DEADLINE)
-    assert done.returncode == 1
-    assert f"error: LIPSERVE_GRPC_PORT is {taken}, expected a port that is free: Address already in use" in done.stderr
-    assert "Traceback" not in done.stderr
-
-
-def test_a_missing_extra_is_named_at_the_start(tmp_path, monkeypatch):
-    monkeypatch.setattr(rpc, "find_spec", lambda name: None)
-    with pytest.raises(ValueError, match=r"LIPSERVE_GRPC_PORT is set, which needs .*pip install 'lipserve\[grpc\]'"):
-        create_app(Settings(home=tmp_path, grpc_port=0))
-    create_app(Settings(home=tmp_path))

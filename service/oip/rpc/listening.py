@@ -39,7 +39,7 @@ _CODES = {
     507: grpc.StatusCode.RESOURCE_EXHAUSTED,
 }
 """What stands for a status of HTTP; INTERNAL for all others."""
-_TOLD = frozenset({b"x-request-id", b"retry-after", b"www-authenticate"})
+_TRAILING = frozenset({b"x-request-id", b"retry-after", b"www-authenticate"})
 """Headers that a call's trailing metadata have, too."""
 ERROR_CODE = "lipserve-error-code"
 """Trailing metadata with the code of an error, as `invalid_request`."""
@@ -119,12 +119,12 @@ async def _answer(app: ASGIApp, path: str, _: Any, context: Any) -> bytes:
     except Exception:
         if not parts:  # else the application has logged and answered it
             logger.exception("unexpected error at %s", path)
-    told = tuple((name.decode(), value.decode("latin-1")) for name, value in headers if name in _TOLD)
+    trailing = tuple((name.decode(), value.decode("latin-1")) for name, value in headers if name in _TRAILING)
     if status == 200:
-        context.set_trailing_metadata(told)
+        context.set_trailing_metadata(trailing)
         return b"".join(parts)
     code, words = _error(b"".join(parts))
-    await context.abort(_CODES.get(status, grpc.StatusCode.INTERNAL), words, (*told, (ERROR_CODE, code)))
+    await context.abort(_CODES.get(status, grpc.StatusCode.INTERNAL), words, (*trailing, (ERROR_CODE, code)))
     raise AssertionError("abort has raised")
 
 

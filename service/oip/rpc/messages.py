@@ -107,8 +107,8 @@ def _input(place: int, tensor: Any) -> schema.InferInput:
 
 
 def _output_parameters(given: Any) -> schema.OutputParameters:
-    wanted = given["classification"].int64_param if "classification" in given else None
-    return schema.OutputParameters(None, _text(given, "shared_memory_region"), wanted)
+    classes = given["classification"].int64_param if "classification" in given else None
+    return schema.OutputParameters(None, _text(given, "shared_memory_region"), classes)
 
 
 def _text(given: Any, name: str) -> str | None:

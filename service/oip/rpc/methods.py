@@ -82,9 +82,11 @@ async def _model_ready(state: State, scope: Scope, body: bytes) -> Reply:
 async def _model_metadata(state: State, scope: Scope, body: bytes) -> Reply:
     name, version = _model(scope, decode(message("ModelMetadataRequest"), body), "name", "version")
     served = await dataplane.find(state.loaded, state.turns.predictions, name, version)
-    found = await to_thread.run_sync(dataplane.metadata, state.loaded, served)
-    answer = message("ModelMetadataResponse")(name=found.name, versions=found.versions, platform=found.platform)
-    for tensors, described in ((answer.inputs, found.inputs), (answer.outputs, found.outputs)):
+    description = await to_thread.run_sync(dataplane.metadata, state.loaded, served)
+    answer = message("ModelMetadataResponse")(
+        name=description.name, versions=description.versions, platform=description.platform
+    )
+    for tensors, described in ((answer.inputs, description.inputs), (answer.outputs, description.outputs)):
         for each in described:
             tensors.add(name=each.name, datatype=each.datatype, shape=each.shape)
     return encode(answer)
