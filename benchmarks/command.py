@@ -35,13 +35,13 @@ from benchmarks.scale.running import PARTS as SCALE_PARTS
 from benchmarks.soak import running as soak_running
 from benchmarks.soak import table as soak_table
 from benchmarks.workload import BenchError, Source, model_folder
-from lipcore.robots.library import ROBOTS, SimulationUnavailableError
+from lipcore.robots.library import ROBOTS
 from lipserve import ApiError, StreamError
 from service.cli.demo import DemoError
 from service.foundation.errors import ServiceError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
-ERRORS = (ApiError, BadAnswerError, BenchError, DemoError, ServiceError, SimulationUnavailableError, StreamError)
+ERRORS = (ApiError, BadAnswerError, BenchError, DemoError, ServiceError, StreamError)
 """What a user is told without a traceback."""
 
 QUICK_RUNS, QUICK_QUERIES, QUICK_SECONDS = 3, 1000, 5.0

@@ -17,6 +17,7 @@ what was `expected`. Below `/v2` the Open Inference Protocol sets the shape, `{"
 |---|---|
 | 408, 429, 503 | wait, as long as `Retry-After` says where it is given, and send the same again |
 | 507 | make room, then send the same again |
+| 501 | have the extra installed where the service runs; `detail` has the line |
 | 500 | read the service's log; `damaged_data` and `unreadable_version` name what is damaged |
 | all others | change the request |
 

@@ -18,6 +18,7 @@ pyproject.toml, checks it):
     preparation  from recordings to samples: filters, rates, derivatives
     robots       URDFs, Pinocchio models, simulated recordings
     data         samples of motion and torque, splits, metrics
+    extras       what may be missing is imported there; on the floor of vocabulary
     vocabulary   the names that things go by
 """
 

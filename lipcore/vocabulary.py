@@ -35,6 +35,9 @@ CHAINED_ARM = "rigid-body+lip-chain"
 ROBOT_ESTIMATORS = ("rigid-body", CHAINED_ARM)
 """Estimators with the term `rigid_body`, which take a robot."""
 
+DIFFERENTIATED = ("se", "gip", "lse")
+"""Estimators that torch differentiates as they are trained: the extra `train`. What they answer needs none."""
+
 GeometryMode = Literal["learn", "calibrate", "fixed"]
 GEOMETRY_MODES: tuple[GeometryMode, ...] = get_args(GeometryMode)
 """Where the joint axes of rigid bodies lie: learnt from torque alone, learnt around a URDF or another unit's arm, or as

@@ -18,7 +18,7 @@ from benchmarks.reproduce.results import FILE, Results
 from benchmarks.reproduce.running import ReproductionError, run
 from lipcore.fitting.estimators import ESTIMATORS
 from lipcore.fitting.task import MIN_SAMPLES
-from lipcore.robots.library import ROBOTS, SimulationUnavailableError
+from lipcore.robots.library import ROBOTS
 from service.cli.consoles import print_json
 from service.cli.options import Json
 
@@ -30,7 +30,7 @@ CURVE_SETS = 5
 
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-ERRORS = (ReproductionError, SimulationUnavailableError, figures.FiguresUnavailableError)
+ERRORS = (ReproductionError,)
 """What a user is told without a traceback."""
 
 

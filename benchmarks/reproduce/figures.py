@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from benchmarks.reproduce import table
 from benchmarks.reproduce.report import Run
 from lipcore.data.metrics import RELIABILITY_LEVELS
 from lipcore.data.samples import Array
+from lipcore.extras import need
 
 COLOURS = {
     "se": "#999999",
@@ -43,17 +43,10 @@ STYLE = {
 }
 
 
-class FiguresUnavailableError(RuntimeError):
-    """The package that draws is not installed."""
-
-
 def pyplot() -> Any:
-    """Matplotlib's pyplot, without a window; raise FiguresUnavailableError with the remedy where it is missing."""
-    try:
-        importlib.import_module("matplotlib").use("agg")
-        return importlib.import_module("matplotlib.pyplot")
-    except ImportError as error:
-        raise FiguresUnavailableError("figures need Matplotlib: pip install 'lipserve[plot]'") from error
+    """Matplotlib's pyplot, without a window; raise MissingExtraError."""
+    need("matplotlib", "plot").use("agg")
+    return need("matplotlib.pyplot", "plot")
 
 
 def draw(run: Run, folder: Path) -> None:
@@ -102,8 +95,8 @@ def _boxes(plt: Any, run: Run) -> Any:
         axis.grid(False, axis="x")
         for edge in np.arange(len(run.joint_names) - 1) + 0.5:
             axis.axvline(edge, color="#e6e6e6", lw=0.7)
-    patches = importlib.import_module("matplotlib.patches")
-    lines = importlib.import_module("matplotlib.lines")
+    patches = need("matplotlib.patches", "plot")
+    lines = need("matplotlib.lines", "plot")
     handles = [patches.Patch(color=COLOURS.get(name, OTHER), label=name) for name in run.estimators]
     handles.append(lines.Line2D([], [], color="black", lw=1, ls=(0, (3, 2)), label="noise / torque variance"))
     _legend(figure, handles)

@@ -53,6 +53,7 @@ ROOMS: dict[str, tuple[str, tuple[type[BaseModel], ...]]] = {
     "server": (
         "The service, and what the Open Inference Protocol tells of it.",
         (
+            readiness.Health,
             readiness.Live,
             readiness.Ready,
             oip.ServerMetadata,

@@ -13,8 +13,9 @@ from numpy.linalg import LinAlgError
 
 from lipcore.arm.problem import Point, Problem
 from lipcore.data.samples import Array
+from lipcore.extras import MissingExtraError
 from lipcore.kernels.geometry import STANDARD_GRAVITY, Geometry, aligned, rotation_of
-from lipcore.robots.library import ROBOTS, SimulationUnavailableError, installed_profiles
+from lipcore.robots.library import ROBOTS, installed_profiles
 from lipcore.robots.urdf import JointMismatchError, RigidBody
 from lipcore.robots.urdf_text import UrdfError
 from lipcore.vocabulary import JointType
@@ -99,7 +100,7 @@ def known_geometries(joint_types: tuple[JointType, ...], gravity: bool) -> tuple
     for name in installed_profiles():
         joints = ROBOTS[name].free
         if len(joints) == len(joint_types):
-            with suppress(JointMismatchError, UrdfError, SimulationUnavailableError):
+            with suppress(JointMismatchError, UrdfError, MissingExtraError):
                 geometries.append(Geometry.from_robot(RigidBody.from_profile(name, joints, joint_types), gravity))
     return tuple(geometries)
 

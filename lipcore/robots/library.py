@@ -6,9 +6,6 @@ any axes, any offsets and plausible masses.
 
 from __future__ import annotations
 
-import importlib
-import site
-import sys
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,11 +14,8 @@ from typing import Any
 import numpy as np
 
 from lipcore.data.samples import Array
+from lipcore.extras import MissingExtraError, need, need_folder
 from lipcore.vocabulary import JointType
-
-
-class SimulationUnavailableError(RuntimeError):
-    """The packages that simulation needs are not installed."""
 
 
 class UnknownRobotError(ValueError):
@@ -119,18 +113,12 @@ class Robot:
 
 
 def pinocchio() -> Any:
-    """The pinocchio module; raise SimulationUnavailableError with the remedy where it is missing."""
-    try:
-        return importlib.import_module("pinocchio")
-    except ImportError as error:
-        raise SimulationUnavailableError(
-            "rigid-body dynamics need Pinocchio: pip install pin; a minimal system may also lack its OpenMP runtime, "
-            f"libgomp1 ({error})"
-        ) from error
+    """The pinocchio module; raise MissingExtraError. A minimal system may also lack its OpenMP runtime, libgomp1."""
+    return need("pinocchio", "robots")
 
 
 def load_robot(name: str) -> Robot:
-    """Load a robot by name; raise UnknownRobotError or SimulationUnavailableError."""
+    """Load a robot by name; raise UnknownRobotError or MissingExtraError."""
     if name not in ROBOTS:
         raise UnknownRobotError(f"robot is {name!r}, expected one of {', '.join(ROBOTS)}")
     pin, source = pinocchio(), ROBOTS[name]
@@ -158,25 +146,20 @@ def installed_profiles() -> tuple[str, ...]:
     """Names of the robots whose URDFs are installed here."""
     try:
         folder = _robots_folder()
-    except SimulationUnavailableError:
+    except MissingExtraError:
         return ()
     return tuple(name for name, source in ROBOTS.items() if (folder / source.urdf).is_file())
 
 
 def profile_urdf(name: str) -> str:
-    """The URDF of a robot of ROBOTS as text; raise UnknownRobotError or SimulationUnavailableError."""
+    """The URDF of a robot of ROBOTS as text; raise UnknownRobotError or MissingExtraError."""
     if name not in ROBOTS:
         raise UnknownRobotError(f"robot is {name!r}, expected one of {', '.join(ROBOTS)}")
     return (_robots_folder() / ROBOTS[name].urdf).read_text()
 
 
 def _robots_folder() -> Path:
-    roots = [*site.getsitepackages(), site.getusersitepackages(), *sys.path]
-    for root in roots:
-        folder = Path(root) / "cmeel.prefix/share/example-robot-data/robots"
-        if folder.is_dir():
-            return folder
-    raise SimulationUnavailableError("robots by name need example-robot-data: pip install 'lipserve[sim]'")
+    return need_folder("sim")
 
 
 def another_unit(robot: Robot, share: float, seed: int) -> Robot:

@@ -100,7 +100,7 @@ def inverse_dynamics(
 ) -> Array:
     """Rigid-body torque (N, n) by Pinocchio's recursive Newton–Euler.
 
-    q, dq, ddq: (N, n), SI; loaded: (N,), rows that are not zero carry the payload. Raise SimulationUnavailableError.
+    q, dq, ddq: (N, n), SI; loaded: (N,), rows that are not zero carry the payload. Raise MissingExtraError.
     """
     pin = pinocchio()
     model, with_payload = robot.model, robot.model

@@ -77,7 +77,7 @@ class RigidBody:
     def from_profile(cls, profile: str, joint_names: Sequence[str], joint_types: Sequence[str]) -> RigidBody:
         """Build a robot of ROBOTS; its joints are matched by name, or by order where the data have other names.
 
-        Raise UnknownRobotError, SimulationUnavailableError without example-robot-data, JointMismatchError.
+        Raise UnknownRobotError, MissingExtraError without example-robot-data, JointMismatchError.
         """
         if profile not in ROBOTS:
             raise UnknownRobotError(f"robot is {profile!r}, expected one of {', '.join(ROBOTS)}")

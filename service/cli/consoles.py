@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 from rich.console import Console
 from rich.markup import escape
 
+from lipcore.extras import MissingExtraError
+
 PIPE_WIDTH = 160
 """Columns of a table that no terminal shows: room for the inertia matrix of seven joints."""
 out = Console(soft_wrap=True, width=None if sys.stdout.isatty() else PIPE_WIDTH)
@@ -93,11 +95,11 @@ class CommandError(RuntimeError):
 def explain(error: Exception, expected: tuple[type[Exception], ...] = ()) -> Explained | None:
     """Return what to say of an error; None for one that is no user's business: a fault, or the shell's broken pipe.
 
-    expected: errors that a command's module says are the user's, beside ValueError and OSError.
+    expected: errors that a command's module says are the user's, beside ValueError, OSError and MissingExtraError.
     """
     if isinstance(error, CommandError):
         return error.explained
-    if isinstance(error, BrokenPipeError) or not isinstance(error, (ValueError, OSError, *expected)):
+    if isinstance(error, BrokenPipeError) or not isinstance(error, (ValueError, OSError, MissingExtraError, *expected)):
         return None
     if isinstance(error, _refusals()):
         code, status = getattr(error, "code", ""), getattr(error, "status", None)

@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from lipcore.data.samples import Samples
-from lipcore.robots.library import Robot, SimulationUnavailableError, load_robot
+from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import FAST, Stream, simulate
 from lipserve import ApiError, Client, Evaluation, Prediction
 from lipserve.asking import Reading
@@ -184,7 +184,7 @@ def free_port() -> int:
 
 
 app = alone()
-ERRORS = (ApiError, DemoError, SimulationUnavailableError)
+ERRORS = (ApiError, DemoError)
 
 
 @app.command()

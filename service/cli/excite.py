@@ -18,13 +18,14 @@ import lipcore
 from lipcore import profiles
 from lipcore.data.samples import Array
 from lipcore.excitation import Belief, Limits, Plan, PlanOptions, plan
+from lipcore.extras import MissingExtraError
 from lipcore.files import persistence
 from lipcore.files.manifest import DEFAULT_LIMITS, MANIFEST, ROBOT, TENSORS, ModelFormatError
 from lipcore.fitting.estimators import ESTIMATORS
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.profiles import Profile, names
-from lipcore.robots.library import ROBOTS, Robot, SimulationUnavailableError, load_robot
+from lipcore.robots.library import ROBOTS, Robot, load_robot
 from lipcore.robots.simulation import FAST, Stream, sinusoids
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import JointType
@@ -92,7 +93,7 @@ def _named(name: str, model: TorqueModel | None) -> Arm:
     if name in ROBOTS:
         try:
             robot = load_robot(name)
-        except SimulationUnavailableError:  # limits are known all the same
+        except MissingExtraError:  # limits are known all the same
             return Arm(name, limits, None, None)
         bodies = RigidBody.from_profile(name, robot.joint_names, robot.joint_types)
     return Arm(name, limits, robot, bodies)
@@ -164,7 +165,7 @@ def fetch(name: str, url: str) -> TorqueModel:
 
 
 app = alone()
-ERRORS = (ApiError, NotPositiveDefiniteError, SimulationUnavailableError, plotting.PlotUnavailableError)
+ERRORS = (ApiError, NotPositiveDefiniteError)
 """What a user is told without a traceback, beside ValueError and OSError."""
 COMPARED = 5
 """Random motions whose expected value the planned one is compared with."""

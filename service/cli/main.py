@@ -30,7 +30,8 @@ class Entry(NamedTuple):
 class LazyGroup(TyperGroup):
     """Commands by name in `entries`; lists and help show them as they are described there.
 
-    What a command's module names in `ERRORS` is told to the user without a traceback, beside ValueError and OSError.
+    What a command's module names in `ERRORS` is told to the user without a traceback, beside ValueError, OSError and
+    MissingExtraError.
     """
 
     entries: ClassVar[Mapping[str, Entry]] = {}

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from lipcore.data.samples import Array
-from lipcore.robots.library import SimulationUnavailableError, load_robot
+from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import FAST, Payload, Stream, simulate
 from lipcore.vocabulary import TorqueConvention
 from lipserve import StreamClient, StreamError
@@ -160,7 +160,7 @@ def simulated(
 ) -> Motion:
     """A robot along random sinusoids, with a payload (kg) from a time (s) on where that is not 0.
 
-    Raise CommandError where what simulates is not installed, ValueError for other robots.
+    Raise MissingExtraError where what simulates is not installed, ValueError for other robots.
     """
     stream = Stream(
         n_samples=max(2, round(seconds * rate)),
@@ -168,10 +168,7 @@ def simulated(
         speed=FAST if fast else 1.0,
         payload=Payload(payload, at) if payload else None,
     )
-    try:
-        made = simulate(load_robot(robot), stream, seed)
-    except SimulationUnavailableError as error:
-        raise CommandError(str(error)) from error
+    made = simulate(load_robot(robot), stream, seed)
     return Motion(made.t, made.q, made.dq, made.ddq, made.tau, tuple(made.joint_names), "gravity_included")
 
 

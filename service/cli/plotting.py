@@ -9,25 +9,16 @@ import numpy as np
 
 from lipcore.data.samples import Samples
 from lipcore.excitation import Plan
+from lipcore.extras import need
 from lipserve import Prediction
 
 HEADINGS = ("position, rad (m)", "speed, per s", "acceleration, per s²")
 
 
-class PlotUnavailableError(RuntimeError):
-    """Matplotlib is not installed."""
-
-
 def pyplot() -> Any:
-    """Matplotlib's plotting module; raise PlotUnavailableError with the remedy where it is missing."""
-    try:
-        import matplotlib  # noqa: PLC0415 - an extra
-    except ImportError as error:
-        raise PlotUnavailableError("a plot needs matplotlib: pip install 'lipserve[plot]'") from error
-    matplotlib.use("agg")
-    from matplotlib import pyplot as plt  # noqa: PLC0415
-
-    return plt
+    """Matplotlib's plotting module; raise MissingExtraError."""
+    need("matplotlib", "plot").use("agg")
+    return need("matplotlib.pyplot", "plot")
 
 
 def draw_motion(path: Path, made: Plan) -> None:

@@ -10,7 +10,7 @@ import typer
 
 from lipcore.data.samples import Samples
 from lipcore.robots.dirt import Dirt
-from lipcore.robots.library import ROBOTS, SimulationUnavailableError, load_robot
+from lipcore.robots.library import ROBOTS, load_robot
 from lipcore.robots.simulation import FAST, Payload, Stream, simulate
 from service.cli.consoles import print_result
 from service.cli.options import Json, alone
@@ -34,7 +34,6 @@ def write_recording(path: Path, samples: Samples) -> None:
 
 
 app = alone()
-ERRORS = (SimulationUnavailableError,)
 
 
 @app.command("simulate")

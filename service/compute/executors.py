@@ -23,6 +23,7 @@ from math import inf
 from multiprocessing.process import BaseProcess
 from typing import Any, ParamSpec, Protocol, Self, TypeVar
 
+from lipcore.extras import need
 from lipcore.fitting.hyperparameters import FitCancelledError
 from service.compute import remote
 from service.compute.process import Place, start_process
@@ -157,10 +158,9 @@ class Workers(Executor):
 
 
 def connect(address: str, name: str = "lipserve") -> Any:
-    """A client of a cluster's scheduler. Raise ClusterUnavailableError."""
-    import distributed  # noqa: PLC0415 - an extra, and slow to import
-
-    new: Any = distributed.Client  # its module is typed in part
+    """A client of a cluster's scheduler. Raise ClusterUnavailableError, MissingExtraError."""
+    distributed = need("distributed", "cluster", "LIPSERVE_CLUSTER is set")
+    new: Any = distributed.Client
     logging.getLogger("distributed").setLevel(logging.WARNING)  # importing it has set another one
     try:
         return new(address, timeout=CONNECT_S, set_as_default=False, direct_to_workers=True, name=name)

@@ -1,8 +1,7 @@
-"""Serves the dashboard: one page at `/`, its files below `/dashboard`, Plotly's JavaScript from its Python package."""
+"""Serves the dashboard: one page at `/`, its files below `/dashboard`, and Plotly's JavaScript."""
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 
 from fastapi import FastAPI
@@ -11,8 +10,10 @@ from starlette.responses import FileResponse, Response
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service.dashboard import plotly
+
 STATIC = Path(__file__).with_name("static")
-FILES, PLOTLY = "/dashboard", "/dashboard/plotly"
+FILES = "/dashboard"
 POLICY = (
     "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -29,21 +30,13 @@ HEADERS = {
 def install(app: FastAPI) -> None:
     """Add the dashboard to an application. It needs no key: its pages ask for one where the API does."""
     app.add_api_route("/", page, include_in_schema=False)
-    app.mount(PLOTLY, StaticPages(plotly()))
+    plotly.install(app, HEADERS)
     app.mount(FILES, StaticPages(STATIC))
 
 
 async def page() -> Response:
     """The one page, which shows all others."""
     return FileResponse(STATIC / "index.html", headers=HEADERS)
-
-
-def plotly() -> Path:
-    """The folder of Plotly's JavaScript, found without importing the package, which takes a second."""
-    spec = find_spec("plotly")
-    assert spec is not None
-    assert spec.origin is not None
-    return Path(spec.origin).with_name("package_data")
 
 
 class StaticPages:

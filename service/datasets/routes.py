@@ -19,6 +19,7 @@ from service.foundation.errors import (
     InvalidDataError,
     InvalidRequestError,
     NotFoundError,
+    NotInstalledError,
     TooLargeError,
     UnsupportedMediaTypeError,
     invalid_request,
@@ -42,7 +43,14 @@ router = APIRouter(
     "",
     status_code=status.HTTP_201_CREATED,
     summary="Upload a recording",
-    responses=responses(InvalidDataError, InvalidRequestError, TooLargeError, UnsupportedMediaTypeError, ConflictError),
+    responses=responses(
+        InvalidDataError,
+        InvalidRequestError,
+        TooLargeError,
+        UnsupportedMediaTypeError,
+        ConflictError,
+        NotInstalledError,
+    ),
     openapi_extra=UPLOAD_BODY,
 )
 async def upload(

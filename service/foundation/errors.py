@@ -16,6 +16,8 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import Receive, Scope, Send
 
+from lipcore.extras import MissingExtraError, install_line
+
 logger = logging.getLogger(__name__)
 
 OPEN_INFERENCE = "/v2"
@@ -154,6 +156,13 @@ class StorageFullError(ServiceError):
     status, code = 507, "storage_full"
 
 
+class NotInstalledError(ServiceError):
+    """The service runs without the packages that this needs: `detail` names the extra and the line that installs it,
+    where the service runs. `GET /health` says what it can do."""
+
+    status, code = 501, "not_installed"
+
+
 class DamagedDataError(ServiceError):
     """A stored data set does not have the checksum that it was stored with."""
 
@@ -197,6 +206,11 @@ def invalid_data(field: str, value: object, expected: str) -> InvalidDataError:
     return InvalidDataError(sentence(item), [item])
 
 
+def not_installed(error: MissingExtraError) -> NotInstalledError:
+    """Error for an extra that is not installed."""
+    return NotInstalledError(str(error), [problem("extra", error.extra, install_line(error.extra))])
+
+
 def not_found(kind: str, name: object) -> NotFoundError:
     """Error for something that does not exist."""
     return NotFoundError(f"no {kind} {str(name)[:200]!r}", [problem(kind, str(name), f"an existing {kind}")])
@@ -216,6 +230,7 @@ def responses(*errors: type[ServiceError]) -> dict[int | str, dict[str, Any]]:
 def install(app: FastAPI) -> None:
     """Make every error of the app take the one shape."""
     app.add_exception_handler(ServiceError, _service_error)
+    app.add_exception_handler(MissingExtraError, _missing_extra)
     app.add_exception_handler(RequestValidationError, _validation_error)
     app.add_exception_handler(HTTPException, _http_error)
     app.add_exception_handler(ClientDisconnect, _cut_off)
@@ -249,6 +264,11 @@ def _answer(scope: Scope, status: int, code: str, message: str, detail: Sequence
 async def _service_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, ServiceError)
     return answer_of(request.scope, error)
+
+
+async def _missing_extra(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, MissingExtraError)
+    return answer_of(request.scope, not_installed(error))
 
 
 async def _validation_error(request: Request, error: Exception) -> JSONResponse:

@@ -12,6 +12,7 @@ from service.foundation.errors import (
     InvalidDataError,
     InvalidRequestError,
     NotFoundError,
+    NotInstalledError,
     TooLargeError,
     UnsupportedMediaTypeError,
     responses,
@@ -33,7 +34,9 @@ router = APIRouter(prefix="/v1/robots", tags=["robots"], responses=responses(Inv
     "",
     status_code=status.HTTP_201_CREATED,
     summary="Upload a URDF",
-    responses=responses(InvalidDataError, InvalidRequestError, TooLargeError, UnsupportedMediaTypeError),
+    responses=responses(
+        InvalidDataError, InvalidRequestError, TooLargeError, UnsupportedMediaTypeError, NotInstalledError
+    ),
     openapi_extra=UPLOAD_BODY,
 )
 async def upload(

@@ -102,7 +102,7 @@ def delete(database: Database, robot: str) -> None:
 def resolve(database: Database, robot: str, joint_names: Sequence[str], joint_types: Sequence[str]) -> RigidBody:
     """The rigid bodies of a profile or an uploaded URDF for data with these joints.
 
-    Raise UnknownRobotError, JointMismatchError, UrdfError, or SimulationUnavailableError where profiles are missing.
+    Raise UnknownRobotError, JointMismatchError, UrdfError, or MissingExtraError where profiles are missing.
     """
     if robot in ROBOTS:
         return _of_profile(robot, joint_names, joint_types)

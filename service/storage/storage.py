@@ -19,11 +19,12 @@ from fastapi import Depends
 from sqlalchemy import text
 from sqlalchemy.exc import SQLAlchemyError
 
+from lipcore.extras import MissingExtraError
 from lipserve.states import PartState
 from service.foundation.errors import StorageFullError
 from service.foundation.fields import of_app
 from service.foundation.settings import Settings
-from service.storage.database.engine import FILE, Database, DriverMissingError
+from service.storage.database.engine import FILE, Database
 from service.storage.database.migrations import DatabaseVersionError
 from service.storage.files import Files, FilesUnreachableError
 
@@ -218,7 +219,7 @@ def usable(settings: Settings) -> Iterator[None]:
     """Raise HomeError, which says what would help, for what keeps a block from using the database or shared files."""
     try:
         yield
-    except (DatabaseVersionError, DriverMissingError) as error:
+    except (DatabaseVersionError, MissingExtraError) as error:
         raise HomeError(str(error)) from error
     except FilesUnreachableError as error:
         raise HomeError(_unusable_files(settings, error)) from error

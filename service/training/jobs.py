@@ -9,10 +9,12 @@ from typing import Any, Literal
 from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session
 
+from lipcore import extras
 from lipcore.fitting.base import BaseMismatchError, Kind, check_base
 from lipcore.fitting.estimators import UnknownEstimatorError, check_estimator
 from lipcore.fitting.options import FitOptions
-from lipcore.robots.library import ROBOTS, SimulationUnavailableError
+from lipcore.robots.library import ROBOTS
+from lipcore.vocabulary import DIFFERENTIATED
 from lipserve.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING
 from service.datasets import store
 from service.foundation.errors import (
@@ -54,6 +56,8 @@ def create(queue: JobQueue, request: JobRequest, retry_of: str | None = None, na
     if request.holdout is not None:
         holding_out.check(rows, request.holdout, queue.settings.min_samples)
     queue.storage.disk.require()  # for the version that will be made
+    if queue.settings.cluster is None:  # else its workers have what it takes, or say so
+        _check_extra(request)
     base = None
     if request.base is None:
         _check_estimator(queue.database, request, rows[0].joint_names, joint_types)
@@ -198,9 +202,15 @@ def _check_estimator(database: Database, request: JobRequest, joint_names: list[
     except UnknownEstimatorError as error:
         expected = str(error).partition("expected ")[2]
         raise invalid_request("estimator", request.estimator, expected) from None
-    except (ValueError, SimulationUnavailableError) as error:
+    except ValueError as error:
         detail = problem("robot", request.robot, "a profile or the id of an uploaded URDF, with the joints of the data")
         raise InvalidRequestError(str(error), [detail]) from None
+
+
+def _check_extra(request: JobRequest) -> None:
+    """Raise MissingExtraError where the training process would."""
+    if request.estimator in DIFFERENTIATED or request.options.device == "cuda":
+        extras.check("train")
 
 
 def _check_base(base: VersionRow, request: JobRequest, data: DatasetRow, joint_types: list[str]) -> None:

@@ -16,6 +16,7 @@ from service.foundation.errors import (
     ConflictError,
     InvalidRequestError,
     NotFoundError,
+    NotInstalledError,
     TooLargeError,
     responses,
 )
@@ -75,7 +76,7 @@ router = APIRouter(
     "",
     status_code=status.HTTP_202_ACCEPTED,
     summary="Train a model",
-    responses=responses(NotFoundError, TooLargeError, BusyError, ConflictError),
+    responses=responses(NotFoundError, TooLargeError, BusyError, ConflictError, NotInstalledError),
 )
 def create(queue: JobQueueDep, request: JobRequest, response: Response, idempotency_key: KeyHeader = None) -> Job:
     """Queue a training job. It runs in another process and ends in a new version of the model."""

@@ -12,13 +12,14 @@ from sqlalchemy import update
 from sqlalchemy.orm import Session
 
 import lipcore
+from lipcore.extras import MissingExtraError
 from lipcore.fitting.task import Task
 from lipcore.model.torque_model import TorqueModel
 from lipcore.training.conditioning import should_condition
 from lipcore.training.train import fit_model
 from lipserve.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, JobState, PromotionOption
 from service.compute.executors import ClusterUnavailableError
-from service.foundation.errors import ServiceError, StorageFullError, StorageUnavailableError
+from service.foundation.errors import NotInstalledError, ServiceError, StorageFullError, StorageUnavailableError
 from service.foundation.settings import Settings
 from service.models import registry
 from service.models.lineage import MOST_SAMPLES, figures, software
@@ -215,6 +216,8 @@ def _code(error: Exception) -> str:
         return StorageFullError.code
     if isinstance(error, (TakenBackError, CannotHoldOutError, ServiceError)):  # the last as of a damaged data set
         return error.code
+    if isinstance(error, MissingExtraError):
+        return NotInstalledError.code
     return "not_positive_definite" if isinstance(error, lipcore.NotPositiveDefiniteError) else "training_failed"
 
 

@@ -1,9 +1,13 @@
 """The dashboard's files as the service sends them; what they do is tested in a browser (tests/browser)."""
 
+import hashlib
 import re
 
 import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
 
+from service.dashboard import plotly
 from service.dashboard.routes import STATIC
 
 FILES = sorted(path.relative_to(STATIC).as_posix() for path in STATIC.rglob("*") if path.is_file())
@@ -51,7 +55,7 @@ def test_nothing_from_the_service_is_parsed_as_html():
             ), file
 
 
-@pytest.mark.parametrize("path", ["/", "/dashboard/app.js", "/dashboard/plotly/plotly.min.js"])
+@pytest.mark.parametrize("path", ["/", "/dashboard/app.js", "/dashboard/plotly/cartesian.js"])
 def test_pages_may_load_nothing_from_elsewhere_and_are_shown_in_no_frame(api, path):
     headers = api.get(path).headers
     policy = dict(part.strip().split(" ", 1) for part in headers["content-security-policy"].split(";"))
@@ -62,9 +66,67 @@ def test_pages_may_load_nothing_from_elsewhere_and_are_shown_in_no_frame(api, pa
 
 
 @pytest.mark.parametrize(
-    "path", ["/dashboard/", "/dashboard/pages", "/dashboard/..%2froutes.py", "/dashboard/plotly/../../__init__.py"]
+    "path",
+    [
+        "/dashboard/",
+        "/dashboard/pages",
+        "/dashboard/..%2froutes.py",
+        "/dashboard/plotly/0123.js",
+        "/dashboard/plotly/../../__init__.py",
+    ],
 )
 def test_nothing_else_is_served(api, path):
     answer = api.get(path)
     assert answer.status_code == 404
     assert answer.json()["error"]["code"] == "not_found"
+
+
+@pytest.mark.parametrize("name", plotly.NAMES)
+def test_plotly_is_sent_compressed_and_kept_by_browsers(api, name):
+    named = api.get(f"/dashboard/plotly/{name}.js", follow_redirects=False)
+    assert (named.status_code, named.headers["cache-control"]) == (307, "no-cache")
+    address = named.headers["location"]
+    packed = api.get(address, headers={"accept-encoding": "gzip, br"})
+    assert packed.headers["content-encoding"] == "gzip"
+    assert int(packed.headers["content-length"]) < 0.4 * len(packed.content)
+    assert "immutable" in packed.headers["cache-control"]
+    assert packed.headers["vary"] == "accept-encoding"
+    plain = api.get(address, headers={"accept-encoding": "identity"})
+    assert "content-encoding" not in plain.headers
+    assert plain.content == packed.content
+    assert hashlib.sha256(plain.content).hexdigest().startswith(address.rpartition("/")[2].removesuffix(".js"))
+    assert plain.content[:100].startswith(b"/**\n* plotly.js")
+
+
+def test_bundles_are_taken_before_the_python_package_and_another_content_has_another_address(tmp_path):
+    for name in plotly.NAMES:
+        (tmp_path / f"plotly-{name}-1.0.0.min.js").write_text(f"// {name}")
+    found = plotly.scripts(tmp_path)
+    assert [each.path.name for each in found.values()] == [f"plotly-{name}-1.0.0.min.js" for name in plotly.NAMES]
+    assert len({each.digest for each in found.values()}) == len(plotly.NAMES)
+
+
+def test_without_either_the_service_runs_and_answers_that_there_is_no_script(tmp_path, monkeypatch):
+    monkeypatch.setattr(plotly, "find_spec", lambda name: None)
+    app = FastAPI()
+    plotly.install(app, {}, plotly.scripts(tmp_path))
+    assert TestClient(app).get("/dashboard/plotly/cartesian.js").status_code == 404
+
+
+CARTESIAN, GL3D = {"scatter", "box", "bar", "heatmap", "histogram", "contour"}, {"scatter", "scatter3d", "mesh3d"}
+"""Some of what each bundle draws: plotly.js, dist/README.md."""
+
+
+def test_every_trace_is_drawn_by_the_bundle_that_is_loaded_for_it():
+    used, axes = set(), {"line", "log", "linear", "date", "category"}
+    for file in FILES:
+        if file.endswith(".js"):
+            text = (STATIC / file).read_text()
+            if "plots.js" in text or file == "plots.js":
+                used |= set(re.findall(r'\btype: "(\w+)"', text))
+    spatial = set(
+        re.findall(r'"(\w+)"', re.search(r"SPATIAL = new Set\((.*?)\)", (STATIC / "plots.js").read_text())[1])
+    )
+    controls = {"text", "number", "checkbox", "button", "radio", "range", "file", "submit", "password"}
+    assert spatial <= GL3D - CARTESIAN
+    assert used - spatial - axes - controls <= CARTESIAN

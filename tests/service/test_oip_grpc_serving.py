@@ -12,9 +12,9 @@ import pytest
 from tritonclient.grpc import service_pb2 as published
 from tritonclient.grpc.service_pb2_grpc import GRPCInferenceServiceStub
 
+from lipcore.extras import EXTRAS, Extra, MissingExtraError
 from service.app import create_app
 from service.foundation.settings import Settings
-from service.oip import rpc
 from tests.service.data import DEADLINE
 from tests.service.oip import message
 from tests.service.oip_grpc import MOTION, PATH, Code, request
@@ -116,7 +116,7 @@ def test_a_port_that_is_taken_is_named(tmp_path, guarded):
 
 
 def test_a_missing_extra_is_named_at_the_start(tmp_path, monkeypatch):
-    monkeypatch.setattr(rpc, "find_spec", lambda name: None)
-    with pytest.raises(ValueError, match=r"LIPSERVE_GRPC_PORT is set, which needs .*pip install 'lipserve\[grpc\]'"):
+    monkeypatch.setitem(EXTRAS, "grpc", Extra("answer over gRPC", ("grpc_that_is_not_there",)))
+    with pytest.raises(MissingExtraError, match=r"LIPSERVE_GRPC_PORT is set, which needs .*'lipserve\[grpc\]'"):
         create_app(Settings(home=tmp_path, grpc_port=0))
     create_app(Settings(home=tmp_path))

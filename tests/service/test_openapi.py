@@ -92,7 +92,7 @@ def test_errors_that_any_route_answers_are_documented_at_each(operations):
         answered = set(operation["responses"])
         wrong = "400" if " /v2" in name else "422"
         assert {wrong, "403", "429", "500", "503"} <= answered, name
-        assert ("401" in answered) != name.endswith(("/health/live", "/health/ready")), name
+        assert ("401" in answered) != name.endswith(("/health", "/health/live", "/health/ready")), name
         assert ("requestBody" in operation) == ("408" in answered) == ("413" in answered) == ("415" in answered), name
         stores = not name.startswith("GET") and not name.endswith(
             ("/predict", "/evaluate", "/trace", "/compare", "/echo", "/infer")

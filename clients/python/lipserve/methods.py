@@ -140,6 +140,7 @@ class Calls:
     alarms = Listed(calls.learning.alarms)
     live = Followed(calls.learning.live)
 
+    abilities = One(calls.inference.abilities)
     health = One(calls.inference.health)
     live_health = One(calls.inference.live_health)
     metrics = One(calls.inference.metrics)

@@ -1,21 +1,26 @@
-// Plots by Plotly, whose JavaScript is loaded when the first one is drawn. Colours follow the page's theme.
+// Plots by Plotly, whose JavaScript is loaded in two parts, each when it first has something to draw. Colours follow the page's theme.
 
 import { h } from "./dom.js";
 
-let loaded = null;
+const SPATIAL = new Set(["scatter3d", "mesh3d"]);
+const loading = new Map();
 
-/** Plotly, once it is there. */
-export function plotly() {
-  loaded ??= new Promise((resolve, reject) => {
-    const script = h("script", { src: "/dashboard/plotly/plotly.min.js" });
-    script.onload = () => resolve(window.Plotly);
+/** Plotly, once it is there: its part that draws plots with two axes, or with "gl3d" scenes in 3-D. */
+export function plotly(bundle = "cartesian") {
+  if (!loading.has(bundle)) loading.set(bundle, load(bundle));
+  return loading.get(bundle);
+}
+
+function load(bundle) {
+  return new Promise((resolve, reject) => {
+    const script = h("script", { src: `/dashboard/plotly/${bundle}.js` });
+    script.onload = () => resolve(window.Plotly); // each part by itself: one replaces the other there
     script.onerror = () => {
-      loaded = null;
-      reject(new Error("Plotly's JavaScript could not be loaded from the service"));
+      loading.delete(bundle);
+      reject(new Error("Plotly's JavaScript could not be loaded from the service: where it runs, pip install plotly"));
     };
     document.head.append(script);
   });
-  return loaded;
 }
 
 /**
@@ -24,7 +29,7 @@ export function plotly() {
  * Returns {element, react(traces, layout), extend(update, indices, most)}.
  */
 export async function plot(element, traces, layout = {}, { label = "", signal = null } = {}) {
-  const Plotly = await plotly();
+  const Plotly = await plotly(traces.flat().some(({ type }) => SPATIAL.has(type)) ? "gl3d" : "cartesian");
   element.classList.add("plot");
   element.setAttribute("role", "img");
   element.setAttribute("aria-label", label || layout.title || "plot");

@@ -15,17 +15,8 @@ import pyarrow as pa
 import pyarrow.csv as pacsv
 
 from lipcore.data.samples import Array
-from service.datasets.formats.table import (
-    MISSING,
-    NUMBER,
-    NumberColumn,
-    StampColumn,
-    Table,
-    checked_names,
-    first_line,
-    left_out,
-    stacked,
-)
+from service.datasets.formats.arrow import MISSING, NUMBER, NumberColumn, StampColumn
+from service.datasets.formats.table import Table, checked_names, first_line, left_out, stacked
 from service.datasets.options import ReadOptions
 from service.foundation.errors import InvalidDataError, invalid_data, invalid_request
 from service.foundation.settings import Settings

@@ -17,12 +17,11 @@ from lipcore.data.samples import Array
 from service.datasets.formats.json import decode
 from service.datasets.formats.parquet import ParquetSource
 from service.datasets.formats.table import Table, checked_names, first_line
-from service.datasets.formats.zips import ERRORS, by_numbers, measure, open_zip
+from service.datasets.formats.zips import ERRORS, INFO, by_numbers, measure, open_zip, root_of
 from service.datasets.options import ReadOptions
 from service.foundation.errors import ServiceError, TooLargeError, invalid_data
 from service.foundation.settings import Settings
 
-INFO = "meta/info.json"
 EXPECTED = "a zip of a LeRobot data set: meta/info.json and data/…parquet"
 MAX_INFO = 4 * 1024 * 1024
 ENDINGS = {"observation.state": ".pos", "observation.velocity": ".vel", "observation.effort": ".effort"}
@@ -62,12 +61,6 @@ def open_lerobot(path: Path, options: ReadOptions, settings: Settings) -> Iterat
                 "states of LeRobot may be degrees or shares of a range: give `units` where they are not radians"
             )
         yield Table(("t", *columns) if clock else columns, reader.blocks(columns, clock), units={"t": "s"}, facts=facts)
-
-
-def root_of(names: list[str]) -> str | None:
-    """Folder of a LeRobot data set within an archive: "" or "name/"; None where there is none."""
-    roots = [name.removesuffix(INFO) for name in names if name == INFO or name.endswith(f"/{INFO}")]
-    return min(roots, key=len) if roots and min(roots, key=len).count("/") <= 1 else None
 
 
 class _Files:

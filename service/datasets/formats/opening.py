@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import cast
 
-from service.datasets.formats.csv import open_csv
+from lipcore.extras import need
 from service.datasets.formats.json import decode, open_json, open_json_lines
-from service.datasets.formats.lerobot import open_lerobot, root_of
 from service.datasets.formats.npz import open_npz
-from service.datasets.formats.parquet import open_parquet
 from service.datasets.formats.table import Table
-from service.datasets.formats.zips import open_zip
+from service.datasets.formats.zips import open_zip, root_of
 from service.datasets.options import ReadOptions
 from service.foundation.errors import ServiceError, invalid_data
 from service.foundation.settings import Settings
@@ -64,14 +63,14 @@ _FOREIGN = (
     (b"\xd0\xcf\x11\xe0", "an Office document"),
 )
 Opener = Callable[[Path, ReadOptions, Settings], AbstractContextManager[Table]]
-OPENERS: dict[str, Opener] = {
-    "csv": open_csv,
-    "parquet": open_parquet,
-    "npz": open_npz,
-    "json_lines": open_json_lines,
-    "json": open_json,
-    "lerobot": open_lerobot,
+OPENERS: dict[str, Opener] = {"npz": open_npz, "json_lines": open_json_lines, "json": open_json}
+"""Of the formats that NumPy and msgspec read; all others need the extra `ingest`."""
+FURTHER = {
+    "csv": ("service.datasets.formats.csv", "open_csv"),
+    "parquet": ("service.datasets.formats.parquet", "open_parquet"),
+    "lerobot": ("service.datasets.formats.lerobot", "open_lerobot"),
 }
+"""Modules and names of openers that stand on Arrow; bags have one for all their kinds."""
 
 
 def sniff(path: Path, settings: Settings | None = None) -> str | None:
@@ -143,7 +142,7 @@ def _text(head: bytes) -> str | None:
 
 @contextmanager
 def open_table(path: Path, kind: str | None, options: ReadOptions, settings: Settings) -> Iterator[Table]:
-    """Open a recording as a table; raise InvalidDataError or TooLargeError.
+    """Open a recording as a table; raise InvalidDataError, TooLargeError or MissingExtraError.
 
     kind: what it is said to be, one of `KINDS` or "zip", None where nobody says. Where its content is of another
     kind it is read as that, which is a fact of the table; where it is none that is read here, the error names both.
@@ -181,6 +180,11 @@ def _starts(path: Path, magic: bytes) -> bool:
 def _open(path: Path, kind: str, options: ReadOptions, settings: Settings) -> AbstractContextManager[Table]:
     if kind in OPENERS:
         return OPENERS[kind](path, options, settings)
-    from service.datasets.formats.bags.reading import BagKind, open_bag  # noqa: PLC0415, as most uploads are no bags
+    need("pyarrow", "ingest")  # what is imported from here on stands on it
+    if kind in FURTHER:
+        module, name = FURTHER[kind]
+        opener: Opener = getattr(import_module(module), name)
+        return opener(path, options, settings)
+    from service.datasets.formats.bags.reading import BagKind, open_bag  # noqa: PLC0415
 
     return open_bag(path, cast(BagKind, kind), options, settings)

@@ -16,7 +16,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lipcore.data.samples import Array
-from service.datasets.formats.table import Node, Table, block_rows, checked_names, first_line, left_out, plan, stacked
+from service.datasets.formats.arrow import Node, plan
+from service.datasets.formats.table import Table, block_rows, checked_names, first_line, left_out, stacked
 from service.datasets.options import ReadOptions
 from service.foundation.errors import TooLargeError, invalid_data
 from service.foundation.settings import Settings

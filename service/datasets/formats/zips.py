@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
+from typing import IO, Any
 
-import pyarrow as pa
-
+from lipcore.extras import need
 from service.datasets.formats.table import first_line
 from service.foundation.errors import TooLargeError, invalid_data
 from service.foundation.settings import Settings
@@ -50,6 +50,16 @@ def open_zip(path: Path, settings: Settings, expected: str) -> Iterator[zipfile.
                     raise invalid_data("member", name, "every member once")
                 seen.add(name)
             yield archive
+
+
+INFO = "meta/info.json"
+"""What tells a LeRobot data set from other archives."""
+
+
+def root_of(names: list[str]) -> str | None:
+    """Folder of a LeRobot data set within an archive: "" or "name/"; None where there is none."""
+    roots = [name.removesuffix(INFO) for name in names if name == INFO or name.endswith(f"/{INFO}")]
+    return min(roots, key=len) if roots and min(roots, key=len).count("/") <= 1 else None
 
 
 def measure(members: list[zipfile.ZipInfo], settings: Settings) -> None:
@@ -93,7 +103,7 @@ def _unpack(archive: zipfile.ZipFile, folder: Path, settings: Settings) -> list[
         file = folder / f"{index}.bag"
         packed = member.filename.endswith(".zstd")
         with archive.open(member) as source, file.open("xb") as target:
-            stream = pa.CompressedInputStream(pa.PythonFile(source, "r"), "zstd") if packed else source
+            stream = _unpacked(source) if packed else source
             while piece := stream.read(PIECE):
                 room -= len(piece)
                 if room < 0:
@@ -101,6 +111,11 @@ def _unpack(archive: zipfile.ZipFile, folder: Path, settings: Settings) -> list[
                 target.write(piece)
         files.append(file)
     return files
+
+
+def _unpacked(source: IO[bytes]) -> Any:
+    pa = need("pyarrow", "ingest")
+    return pa.CompressedInputStream(pa.PythonFile(source, "r"), "zstd")
 
 
 def _bag_members(archive: zipfile.ZipFile, settings: Settings) -> list[zipfile.ZipInfo]:

@@ -89,7 +89,7 @@ class Bodies:
     """Rigid-body torques of a robot whose joints come in the order of the data."""
 
     def __init__(self, urdf: str, name: str, names: tuple[str, ...], limits: Limits) -> None:
-        """Raise SimulationUnavailableError, or ValueError where the URDF cannot be used for these joints."""
+        """Raise MissingExtraError, or ValueError where the URDF cannot be used for these joints."""
         robot = RigidBody.from_urdf(urdf, names, limits.joint_types, limits.urdf_joints, name)
         self.name, self.names, self.urdf_joints = name, names, robot.urdf_joints
         self._arm = arm_of_robot(robot)

@@ -16,14 +16,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import qr
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
+from lipcore.extras import MissingExtraError
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.friction import FRICTION_TERMS, SIGN_WIDTH
-from lipcore.robots.library import SimulationUnavailableError
 from lipcore.robots.urdf import PARAMETERS, RigidBody
 from service.datasets.report.fit import OWN, Fit, friction_terms, own_features
 from service.datasets.report.signals import Limits, Rows, spread
@@ -221,7 +220,7 @@ def judge_rigid_bodies(
     try:
         robot = RigidBody.from_urdf(urdf, names, limits.joint_types, limits.urdf_joints, name)
         kernel = ArmKernel(arm_of_robot(robot, gravity, "zero"))
-    except (SimulationUnavailableError, ValueError) as error:
+    except (MissingExtraError, ValueError) as error:
         return f"the rigid bodies of robot {name} were not used: {error}"
     n, size = len(names), len(names) * PARAMETERS
     reference = _reference(kernel, limits)
@@ -259,6 +258,8 @@ def _reference(kernel: ArmKernel, limits: Limits) -> _Reference:
     _, values, directions = np.linalg.svd(regressor / scale, full_matrices=False)
     count = int(np.sum(values > STRUCTURAL * values[0]))
     back = directions[:count].T / values[:count] * np.sqrt(len(regressor)) / scale[:, None]
+    from scipy.linalg import qr  # noqa: PLC0415 - serving does without it
+
     base = np.sort(qr(regressor / scale, mode="r", pivoting=True)[1][:count])
     return _Reference(regressor, base, back)
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lipcore.extras import MissingExtraError
 from lipcore.profiles import Profile, profile, recognise
-from lipcore.robots.library import SimulationUnavailableError
 from service.datasets.report.advice import listed
 from service.datasets.report.bodies import Against, Bodies, Signals, compare
 from service.datasets.report.remedies import Upload, remedy
@@ -29,7 +29,7 @@ def bodies_of(robot: Profile, names: tuple[str, ...]) -> Bodies | None:
         return None
     try:
         return Bodies(robot.urdf, robot.name, names, limits)
-    except (SimulationUnavailableError, ValueError):
+    except (MissingExtraError, ValueError):
         return None
 
 

@@ -17,7 +17,6 @@ from math import inf
 from typing import Any, Literal
 
 import numpy as np
-from scipy.special import stdtrit
 
 from lipcore.data.metrics import BLOCK_S, MAX_BLOCKS, Answer, Difference, of_blocks, surprise
 from lipcore.data.samples import Array
@@ -133,6 +132,8 @@ class Contest:
         Each look may be wrong half as often as the one before, so that equal versions are taken for different with a
         probability below 2 · CHANCE, however long the contest. Student's quantile accounts for few blocks.
         """
+        from scipy.special import stdtrit  # noqa: PLC0415 - most learners compare no versions
+
         return float(-stdtrit(self._difference().freedom[0], CHANCE / 2**self.looks))
 
     def evidence(self) -> dict[str, Any]:

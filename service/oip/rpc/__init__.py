@@ -2,8 +2,8 @@
 imported where a service listens for it."""
 
 import socket
-from importlib.util import find_spec
 
+from lipcore import extras
 from service.foundation.settings import Settings
 
 
@@ -12,13 +12,10 @@ class PortError(OSError):
 
 
 def check_installed(settings: Settings) -> bool:
-    """Whether the service shall listen for gRPC; raise ValueError where the packages for it are missing."""
+    """Whether the service shall listen for gRPC; raise MissingExtraError."""
     if settings.grpc_port is None:
         return False
-    if any(find_spec(name) is None for name in ("grpc", "google")) or find_spec("google.protobuf") is None:
-        raise ValueError(
-            "LIPSERVE_GRPC_PORT is set, which needs the packages grpcio and protobuf: pip install 'lipserve[grpc]'"
-        )
+    extras.check("grpc", "LIPSERVE_GRPC_PORT is set")
     return True
 
 

@@ -18,6 +18,7 @@ from urllib.parse import quote
 from sqlalchemy import Connection, CursorResult, Select, create_engine, event, text
 from sqlalchemy.orm import Session, sessionmaker
 
+from lipcore.extras import need
 from service.foundation.settings import CONNECTIONS, Settings
 from service.storage.database import tables
 from service.storage.database.migrations import migrate
@@ -166,10 +167,6 @@ PATIENCE_S = 30.0
 """Longest wait for another writer, of processes that nobody waits for."""
 
 
-class DriverMissingError(RuntimeError):
-    """What PostgreSQL needs is not installed."""
-
-
 class Database:
     """Sessions on one database; safe to share between threads. timeout_s: longest wait for another writer.
 
@@ -243,8 +240,7 @@ class Database:
 def _adapter(home: Path, timeout_s: float, url: str | None, connections: int) -> Sqlite | Postgresql:
     if url is None:
         return Sqlite(home, timeout_s)
-    try:
-        from service.storage.database.postgresql import Postgresql  # noqa: PLC0415 - its driver is an extra
-    except ModuleNotFoundError as error:
-        raise DriverMissingError("LIPSERVE_DATABASE_URL needs more: pip install 'lipserve[cluster]'") from error
+    need("psycopg", "cluster", "LIPSERVE_DATABASE_URL is set")
+    from service.storage.database.postgresql import Postgresql  # noqa: PLC0415 - its driver is an extra
+
     return Postgresql(url, timeout_s, connections)

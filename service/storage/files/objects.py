@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol, TypeVar
 from urllib.parse import unquote, urlsplit
 
+from lipcore.extras import need
 from service.storage.files import local
 
 logger = logging.getLogger(__name__)
@@ -104,15 +105,14 @@ class Patient:
 def store_of(url: str) -> Objects:
     """The store that a `files_url` names, checked by the settings; nothing is asked of it yet.
 
-    Raise FilesUnreachableError where what speaks to it is not installed.
+    Raise MissingExtraError where what speaks to it is not installed.
     """
     parts = urlsplit(url)
     if parts.scheme == "file":
         return Mounted(Path(unquote(parts.path)))
-    try:
-        from service.storage.files.bucket import Bucket  # noqa: PLC0415 - its library is an extra
-    except ImportError as error:
-        raise unreachable(f"{error.name or 'a library'} is not installed: pip install 'lipserve[cluster]'") from None
+    need("s3fs", "cluster", "LIPSERVE_FILES_URL is set")
+    from service.storage.files.bucket import Bucket  # noqa: PLC0415 - its library is an extra
+
     return Bucket(parts.netloc, parts.path.strip("/"))
 
 

@@ -96,6 +96,7 @@ TABLE: dict[tuple[str, str], str] = {
 OPEN: frozenset[tuple[str, str]] = frozenset(
     ("GET", path)
     for path in (
+        "/health",
         "/health/live",
         "/health/ready",
         "/v2/health/live",

@@ -110,8 +110,8 @@ def _too_slow(seen: int) -> HTTPException:
     return HTTPException(408, f"the body came too slowly: {seen} bytes of it so far", {"Connection": "close"})
 
 
-HEALTH = "/health/"
-"""Requests below it are always answered: a service that is busy is not one that is dead."""
+HEALTH = "/health"
+"""Requests there and below are always answered: a service that is busy is not one that is dead."""
 
 
 class Gate:

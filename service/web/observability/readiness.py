@@ -6,14 +6,15 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Annotated, Literal, Protocol
 
 from fastapi import APIRouter, Depends
 from pydantic import BaseModel, Field
 
+from lipcore.extras import EXTRAS, install_line, installed
 from lipserve.states import PartState
 from service import __version__
 from service.foundation.errors import NotReadyError, problem, responses
@@ -128,7 +129,48 @@ class Ready(BaseModel):
     checks: list[Part]
 
 
+class Missing(BaseModel):
+    """What the service cannot do for want of an extra."""
+
+    extra: str = Field(examples=["ingest"])
+    gives: str = Field(description="What it is for, in words", examples=["use URDFs"])
+    install: str = Field(
+        description="What installs it, where the service runs", examples=["pip install 'lipserve[ingest]'"]
+    )
+
+
+class Health(BaseModel):
+    """The process answers, and what it can do."""
+
+    status: Literal["alive"] = "alive"
+    version: str
+    can: dict[str, bool] = Field(
+        description="What is installed besides serving, teaching and training of learnt arms, by the name of its "
+        "extra: " + "; ".join(f"`{name}`, to {extra.gives}" for name, extra in EXTRAS.items()),
+        examples=[{"train": True, "robots": True, "ingest": False}],
+    )
+    missing: list[Missing] = Field(description="Of what is not installed")
+
+
 router = APIRouter(prefix="/health", tags=["health"], route_class=Route)
+
+
+@router.get("", summary="What can the service do?")
+async def health() -> Health:
+    """Answer which extras are installed. Who asks for what needs another one is answered 501 `not_installed`."""
+    return Health(version=__version__, can=dict(_can()), missing=list(_missing()))
+
+
+@cache
+def _can() -> tuple[tuple[str, bool], ...]:
+    """Of every extra whether it is installed: looked up once, as a running service does not see what is new."""
+    return tuple((name, installed(name)) for name in EXTRAS)
+
+
+def _missing() -> Iterator[Missing]:
+    for name, there in _can():
+        if not there:
+            yield Missing(extra=name, gives=EXTRAS[name].gives, install=install_line(name))
 
 
 @router.get("/live", summary="Is the process alive?")

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Awaitable, Iterable
-from importlib.util import find_spec
 from time import monotonic, perf_counter
 from typing import Any
 
@@ -14,16 +13,16 @@ from opentelemetry import trace  # FastAPI's own requirement
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from lipcore import extras
 from service.foundation.errors import ERROR_CODE
 from service.foundation.settings import Settings
 from service.web.observability.logs import KEY_ID, REQUEST_ID, given_request_id, new_request_id, request_id
 from service.web.observability.meters import Kind, Meters
 
-EXPORTER = "opentelemetry.exporter.otlp.proto.http"
 _OF_CALLS = "/inference.GRPCInferenceService/"
 MONITORING = frozenset(
     {
-        *("/health/live", "/health/ready", "/v2/health/live", "/v2/health/ready", "/metrics"),
+        *("/health", "/health/live", "/health/ready", "/v2/health/live", "/v2/health/ready", "/metrics"),
         *(f"{_OF_CALLS}ServerLive", f"{_OF_CALLS}ServerReady"),
     }
 )
@@ -32,16 +31,13 @@ QUIET = frozenset({f"{_OF_CALLS}ModelInfer"})
 
 
 def telemetry(settings: Settings) -> TelemetryConfig:
-    """What FastAPI shall report; raise ValueError where the packages for it are missing.
+    """What FastAPI shall report; raise MissingExtraError.
 
     Metrics are at /metrics, and what went wrong is in the log, with the id of the request: neither goes this way.
     """
     on = settings.opentelemetry
-    if on and not _installed():
-        raise ValueError(
-            f"LIPSERVE_OPENTELEMETRY is set, which needs the package {EXPORTER.replace('.', '-')}: "
-            "pip install 'lipserve[opentelemetry]'"
-        )
+    if on:
+        extras.check("opentelemetry", "LIPSERVE_OPENTELEMETRY is set")
     return {
         "tracing": on,
         "metrics": False,
@@ -50,13 +46,6 @@ def telemetry(settings: Settings) -> TelemetryConfig:
         "auto_configure": on,
         "exclude": lambda scope: scope["path"] in MONITORING,
     }
-
-
-def _installed() -> bool:
-    try:
-        return find_spec(EXPORTER) is not None
-    except ModuleNotFoundError:
-        return False
 
 
 request_lines = logging.getLogger("service.requests")

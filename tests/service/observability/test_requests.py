@@ -11,6 +11,7 @@ from opentelemetry.sdk.trace import TracerProvider
 from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 
+from lipcore.extras import EXTRAS, Extra, MissingExtraError
 from service.app import create_app
 from service.compute.process import Place
 from service.foundation.settings import Settings
@@ -242,7 +243,7 @@ def spans(monkeypatch):
     provider = TracerProvider()
     provider.add_span_processor(SimpleSpanProcessor(exporter))
     monkeypatch.setattr(trace, "get_tracer_provider", lambda: provider)
-    monkeypatch.setattr(requests, "_installed", lambda: True)
+    monkeypatch.setitem(EXTRAS, "opentelemetry", Extra("send traces", ()))
     return exporter.get_finished_spans
 
 
@@ -268,8 +269,8 @@ def test_neither_monitoring_is_traced_nor_anything_unless_it_is_asked_for(spans,
 
 
 def test_without_the_package_the_start_says_what_to_install(monkeypatch, home):
-    monkeypatch.setattr(requests, "EXPORTER", "opentelemetry.exporter.nowhere")
-    with pytest.raises(ValueError, match=r"pip install 'lipserve\[opentelemetry\]'"):
+    monkeypatch.setitem(EXTRAS, "opentelemetry", Extra("send traces", ("opentelemetry.exporter.nowhere",)))
+    with pytest.raises(MissingExtraError, match=r"pip install 'lipserve\[opentelemetry\]'"):
         client(home, opentelemetry=True)
 
 

@@ -11,7 +11,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lipserve.call import Answer, Call, Route, document, given, record, route
-from lipserve.records.server import Live, ModelMetadata, ModelReady, Ready, ServerLive, ServerMetadata, ServerReady
+from lipserve.records.server import (
+    Health,
+    Live,
+    ModelMetadata,
+    ModelReady,
+    Ready,
+    ServerLive,
+    ServerMetadata,
+    ServerReady,
+)
 from lipserve.results import Array, array
 from lipserve.results.evaluation import Comparison, Evaluation, read_comparison, read_evaluation
 from lipserve.results.series import Prediction, Trace, read_prediction, read_trace
@@ -98,6 +107,12 @@ def trace(
 
 
 V2_MODEL, V2_VERSION = "/v2/models/{model}", "/v2/models/{model}/versions/{version}"
+
+
+@route("GET", "/health")
+def abilities(at: Route) -> Call[Health]:
+    """What the service can do: which extras are installed there."""
+    return at(record(Health), names={})
 
 
 @route("GET", "/health/live")

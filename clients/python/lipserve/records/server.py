@@ -7,6 +7,35 @@ from typing import Any, Literal
 from lipserve.records import Record
 
 
+class Missing(Record, frozen=True, kw_only=True):
+    """What the service cannot do for want of an extra.
+
+    gives: What it is for, in words
+    install: What installs it, where the service runs
+    """
+
+    extra: str
+    gives: str
+    install: str
+
+
+class Health(Record, frozen=True, kw_only=True):
+    """The process answers, and what it can do.
+
+    can: What is installed besides serving, teaching and training of learnt arms, by the name of its extra: `train`, to
+        train the estimators se, gip and lse, and train on a GPU; `robots`, to use URDFs; `sim`, to simulate robots and
+        know them by name; `ingest`, to read CSV, Parquet, LeRobot and bags (NPZ and JSON need no extra); `cluster`, to
+        share PostgreSQL, S3 and a Dask cluster; `grpc`, to answer over gRPC; `opentelemetry`, to send traces; `plot`,
+        to draw pictures
+    missing: Of what is not installed
+    """
+
+    status: Literal["alive"] = "alive"
+    version: str
+    can: dict[str, bool]
+    missing: list[Missing]
+
+
 class Live(Record, frozen=True, kw_only=True):
     """The process answers."""
 
