@@ -1,39 +1,39 @@
-# The image of services and workers: no robot descriptions, no C compiler, no CUDA.
-FROM python:3.11-slim AS build
+# Two images of services and workers, without a C compiler and without CUDA:
+#   docker build -t lipserve .                        all that runs in a container: every extra but robots' descriptions
+#   docker build --target serve -t lipserve:serve .   serves, streams, learns, trains learnt arms; see GET /health
+FROM python:3.11-slim AS sources
+RUN apt-get update && apt-get install --yes --no-install-recommends binutils libgomp1
 WORKDIR /src
-RUN python -m venv /opt/lipserve
-COPY .ci/install-torch .ci/install-torch
-RUN .ci/install-torch /opt/lipserve/bin/python
-COPY pyproject.toml README.md LICENSE ./
+COPY .ci .ci
+COPY pyproject.toml hatch_build.py README.md LICENSE ./
 COPY clients/python clients/python
 COPY lipcore lipcore
 COPY service service
 COPY docs docs
 COPY models/panda-sim models/panda-sim
-RUN /opt/lipserve/bin/python -m pip install --no-cache-dir --disable-pip-version-check ./clients/python '.[cluster,grpc]' \
-    && /opt/lipserve/bin/python -m pip uninstall --yes --quiet setuptools pip \
-    && site=$(echo /opt/lipserve/lib/python3*/site-packages) \
-    && rm -rf "$site"/torch/include "$site"/torch/share "$site"/torch/test \
-    && find "$site"/plotly -mindepth 1 -maxdepth 1 ! -name package_data ! -name __init__.py -exec rm -rf {} + \
-    && find "$site"/botocore/data -mindepth 1 -maxdepth 1 -type d ! -name s3 ! -name sts ! -name 'sso*' ! -name signin \
-        -exec rm -rf {} + \
-    && find /opt/lipserve -name __pycache__ -prune -exec rm -rf {} + \
-    && find "$site"/numpy "$site"/scipy "$site"/sympy "$site"/networkx "$site"/dask \
-        "$site"/distributed -type d -name tests -prune -exec rm -rf {} + \
-    && cd / && NUMBA_CACHE_DIR=/opt/numba /opt/lipserve/bin/python -m lipcore.warm_up \
-    && /opt/lipserve/bin/python -c "import service.cli.serve, service.cli.worker, service.oip.rpc.listening, lipserve.sync, distributed, s3fs, psycopg"
-# the last two also leave the bytecode of what a start imports, 50 MB: the container's user cannot write it, and without
-# it every start takes four seconds longer
 
-FROM python:3.11-slim
+FROM sources AS build-serve
+RUN .ci/install-image ./clients/python '.'
+
+FROM sources AS build-full
+RUN .ci/install-image ./clients/python '.[train,robots,ingest,cluster,grpc]'
+
+# the system, without what installs packages of Python: a layer can only add, so it is copied as it is in the end
+FROM python:3.11-slim AS system
 # Pinocchio's OpenMP runtime, which slim images lack
-RUN apt-get update && apt-get install --yes --no-install-recommends libgomp1 && rm -rf /var/lib/apt/lists/*
-RUN useradd --system --uid 10001 --no-create-home --shell /usr/sbin/nologin lipserve \
-    && mkdir --mode=700 /data && chown lipserve /data
-COPY --from=build /opt/lipserve /opt/lipserve
-# compiled kernels; writable, since another processor than the build's compiles its own
-COPY --from=build --chown=lipserve /opt/numba /opt/numba
-ENV PATH=/opt/lipserve/bin:$PATH \
+RUN apt-get update && apt-get install --yes --no-install-recommends libgomp1 \
+    && useradd --system --uid 10001 --no-create-home --shell /usr/sbin/nologin lipserve \
+    && mkdir --mode=700 /data && chown lipserve /data \
+    && rm -rf /var/lib/apt/lists/* /var/cache/apt/* /usr/share/doc/* /usr/share/man/* /usr/share/locale/* \
+    && for python in /usr/lib/python3* /usr/local/lib/python3*; do \
+        rm -rf "$python"/ensurepip "$python"/idlelib "$python"/test "$python"/lib2to3 \
+            "$python"/*-packages/pip* "$python"/*-packages/setuptools* "$python"/*-packages/wheel*; \
+    done; rm -rf /usr/share/python-wheels
+
+FROM scratch AS base
+COPY --from=system / /
+ENV PATH=/opt/lipserve/bin:/usr/local/bin:/usr/local/sbin:/usr/sbin:/usr/bin:/sbin:/bin \
+    LANG=C.UTF-8 \
     PYTHONUNBUFFERED=1 \
     NUMBA_CACHE_DIR=/opt/numba \
     LIPSERVE_HOME=/data \
@@ -46,3 +46,12 @@ USER lipserve
 HEALTHCHECK --interval=10s --timeout=3s --start-period=30s \
     CMD ["python", "-c", "import urllib.request as r; r.urlopen('http://127.0.0.1:8000/health/ready', timeout=2)"]
 CMD ["lipserve", "serve"]
+
+FROM base AS serve
+COPY --from=build-serve /opt/lipserve /opt/lipserve
+# compiled kernels; writable, since another processor than the build's compiles its own
+COPY --from=build-serve --chown=lipserve /opt/numba /opt/numba
+
+FROM base AS full
+COPY --from=build-full /opt/lipserve /opt/lipserve
+COPY --from=build-full --chown=lipserve /opt/numba /opt/numba

@@ -8,7 +8,7 @@ TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 WORKERS ?= 3
 SHARE := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test warm-lip warm-chain bytecode test-all screenshots cpp lint install serve image docs dist sbom clean
+.PHONY: demo test warm-lip warm-chain bytecode test-all screenshots cpp lint install serve image image-serve docs dist sbom clean
 
 demo: $(VENV)/.running
 	$(BIN)/lipserve demo
@@ -65,8 +65,12 @@ lint: install
 serve: $(VENV)/.running
 	$(BIN)/lipserve serve
 
+# the image of all that runs in a container, and one that serves, streams and learns only
 image:
 	docker build -t lipserve .
+
+image-serve:
+	docker build --target serve -t lipserve:serve .
 
 # the documentation as a site, build/site
 docs: install
@@ -88,7 +92,7 @@ LICENCES := $(BIN)/pip-licenses --python $(IMAGE)/bin/python --from mixed
 sbom: install
 	rm -rf $(IMAGE) && $(PYTHON) -m venv $(IMAGE)
 	.ci/install-torch $(IMAGE)/bin/python
-	$(IMAGE)/bin/python -m pip install --quiet $$(grep -o "\./clients/python '[^']*'" Dockerfile | tr -d "'")
+	$(IMAGE)/bin/python -m pip install --quiet $$(grep -o "\./clients/python '[^']*'" Dockerfile | tail -1 | tr -d "'")
 	$(IMAGE)/bin/python -m pip uninstall --yes --quiet setuptools pip
 	$(BIN)/cyclonedx-py environment --pyproject pyproject.toml --output-file build/sbom.json $(IMAGE)/bin/python
 	$(LICENCES) --format markdown --output-file build/licences.md
@@ -98,17 +102,17 @@ sbom: install
 install: $(VENV)/.installed
 
 # what the main job needs
-$(VENV)/.running: pyproject.toml clients/python/pyproject.toml .ci/install-torch
-	@echo "installing into $(VENV): 2 GB, one to three minutes"
+$(VENV)/.running: pyproject.toml clients/python/pyproject.toml hatch_build.py .ci/install-torch
+	@echo "installing into $(VENV): one to two minutes"
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, this is " + sys.version)'
 	$(PYTHON) -m venv $(VENV)
 	.ci/install-torch $(BIN)/python
-	$(BIN)/python -m pip install --disable-pip-version-check -e clients/python -e '.[sim]'
+	$(BIN)/python -m pip install --disable-pip-version-check --no-compile -e clients/python -e '.[sim,ingest]'
 	@touch $@
 
 # and what tests it
 $(VENV)/.installed: $(VENV)/.running
-	@echo "installing what the tests need into $(VENV): 1 GB, one to two minutes"
+	@echo "installing what the tests need into $(VENV): 2 GB, one to two minutes"
 	$(BIN)/python -m pip install --disable-pip-version-check -e clients/python -e '.[all,dev,docs,publish]'
 	@touch $@
 

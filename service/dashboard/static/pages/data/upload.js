@@ -1,5 +1,6 @@
 // Uploading recordings: by a button or by dropping them on the page, one after the other.
 
+import { lacking } from "../../abilities.js";
 import { upload } from "../../api.js";
 import { h, replace } from "../../dom.js";
 import { bytes, counted } from "../../format.js";
@@ -22,6 +23,7 @@ export function uploader({ onUploaded, signal }) {
     h("p", {}, "Drop recordings anywhere on this page, or choose them here."),
     h("div", { class: "actions" }, choose, input),
     h("p", { class: "hint" }, "CSV, Parquet, NPZ, JSON, rosbag1, rosbag2, MCAP, LeRobot (zip). At least times, positions and torques."),
+    lacking("ingest"),
   );
   const ready = h("div", { hidden: true });
   const as = h("p", { class: "hint" });

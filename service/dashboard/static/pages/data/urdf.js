@@ -1,5 +1,6 @@
 // Adding a robot of one's own: the upload of its URDF.
 
+import { lacking } from "../../abilities.js";
 import { upload } from "../../api.js";
 import { h, replace } from "../../dom.js";
 import { counted } from "../../format.js";
@@ -22,5 +23,6 @@ export function urdfButton(onAdded) {
       replace(problem, errorBox(error));
     }
   });
-  return h("div", {}, h("div", { class: "actions" }, button("Add a URDF", () => input.click()), input), problem);
+  const add = button("Add a URDF", () => input.click());
+  return h("div", {}, h("div", { class: "actions" }, add, input), lacking("robots", add), problem);
 }
