@@ -3,6 +3,7 @@ here, when it is needed, and gets the module or an error that says what to insta
 
 from __future__ import annotations
 
+import shlex
 import site
 import sys
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ ROBOTS_DATA = "cmeel.prefix/share/example-robot-data/robots"
 
 @dataclass(frozen=True)
 class Extra:
-    """An extra of `pip install 'lipserve[NAME]'`.
+    """An extra, as pip takes it behind the name of the distribution.
 
     gives: what it is for, to be read after "to"; modules: those that it brings and that are imported here; folder: of
     data that it brings, below a folder of packages.
@@ -60,7 +61,7 @@ class MissingExtraError(RuntimeError):
 
 def install_line(extra: str) -> str:
     """The line that installs an extra."""
-    return f"pip install 'lipserve[{extra}]'"
+    return "pip install " + shlex.quote(f"lipserve[{extra}]")
 
 
 def need(module: str, extra: str, reason: str | None = None) -> Any:

@@ -18,6 +18,7 @@ from packaging.utils import canonicalize_name
 from lipserve import __version__
 from tests.clients.test_python_package import SERVER
 from tests.docs.blocks import ROOT, all_pages
+from tests.packaging.test_pieces import BASE
 from tests.service.server import Server
 
 pytestmark = pytest.mark.slow
@@ -25,7 +26,7 @@ PIP = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
 PLAIN = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
 SOURCES = {"clients/python": "lipserve-client", ".": "lipserve"}
 """Folder and name of each distribution."""
-MOST_MB = 90
+MOST_MB, MOST_SERVING_MB = 90, 450
 DEPENDENCIES = {"numpy", "httpx", "httpcore", "h11", "anyio", "idna", "certifi", "websockets", "msgspec"}
 MORE = {"typing-extensions", "typing_extensions", "sniffio"}
 """What some versions of these need on some versions of Python."""
@@ -123,6 +124,15 @@ def test_the_wheel_of_the_service_serves_its_model_pages_and_guide(server):
     for page, shown in {"/": "LIPServe", "/guide/operations": "Leave it running"}.items():
         assert shown in server.client.get(page).text
     assert server.client.get("/guide/files/demo.png").headers["content-type"] == "image/png"
+
+
+@pytest.mark.skipif("torch" in BASE, reason="torch is part of the base")
+def test_what_serves_is_small_and_brings_what_the_dashboard_draws_with(server):
+    files = (each for each in Installed.place.rglob("*") if each.is_file() and not each.is_symlink())
+    # as pip has put them there: bytecode and machine code came with the start
+    size = sum(each.stat().st_size for each in files if "__pycache__" not in each.parts)
+    assert size < MOST_SERVING_MB * 1_000_000
+    assert len(server.client.get("/dashboard/plotly/cartesian.js", follow_redirects=True).content) > 1_000_000
 
 
 def test_the_wheel_of_the_client_alone_asks_it(server, dist, tmp_path):
