@@ -16,8 +16,6 @@ from typing import Any, NamedTuple
 from rich.console import Console
 from rich.markup import escape
 
-from lipcore.extras import MissingExtraError
-
 PIPE_WIDTH = 160
 """Columns of a table that no terminal shows: room for the inertia matrix of seven joints."""
 out = Console(soft_wrap=True, width=None if sys.stdout.isatty() else PIPE_WIDTH)
@@ -99,7 +97,7 @@ def explain(error: Exception, expected: tuple[type[Exception], ...] = ()) -> Exp
     """
     if isinstance(error, CommandError):
         return error.explained
-    if isinstance(error, BrokenPipeError) or not isinstance(error, (ValueError, OSError, MissingExtraError, *expected)):
+    if isinstance(error, BrokenPipeError) or not isinstance(error, (ValueError, OSError, *_missing(), *expected)):
         return None
     if isinstance(error, _refusals()):
         code, status = getattr(error, "code", ""), getattr(error, "status", None)
@@ -110,8 +108,17 @@ def explain(error: Exception, expected: tuple[type[Exception], ...] = ()) -> Exp
 
 
 def _refusals() -> tuple[type[Exception], ...]:
-    """Errors that tell what a service has said, of modules that are imported: others cannot have been raised."""
-    kinds = {"lipserve.sending": "ApiError", "lipserve.exchange": "StreamError"}
+    """Errors that tell what a service has said."""
+    return _imported({"lipserve.sending": "ApiError", "lipserve.exchange": "StreamError"})
+
+
+def _missing() -> tuple[type[Exception], ...]:
+    """The error of an extra that is not installed."""
+    return _imported({"lipcore.extras": "MissingExtraError"})
+
+
+def _imported(kinds: Mapping[str, str]) -> tuple[type[Exception], ...]:
+    """Errors by their modules, of those that are imported: others cannot have been raised."""
     return tuple(getattr(sys.modules[module], name) for module, name in kinds.items() if module in sys.modules)
 
 
