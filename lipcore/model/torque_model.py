@@ -54,7 +54,7 @@ TrainingRange = dict[str, dict[str, list[float]]]
 def training_range(motion: Motion) -> TrainingRange:
     """Smallest and largest q, dq and ddq of N instants, SI units."""
     return {
-        name: {"min": values.min(0).values.tolist(), "max": values.max(0).values.tolist()}
+        name: {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
         for name, values in (("q", motion.q), ("dq", motion.dq), ("ddq", motion.ddq))
     }
 

@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from torch import Tensor
 from torch.func import jacrev
 
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Motion
 from lipcore.data.samples import Samples
 from lipcore.kernels.base import PairKernel, Params, State
 from lipcore.kernels.chain import ChainKernel
@@ -163,7 +163,7 @@ def scale_of(energies: Sequence[Energy], x: Instant, y: Instant, terms: Tensor) 
 
 def instant(motion: Motion, row: int) -> Instant:
     """One sample of a motion."""
-    return motion.q[row], motion.dq[row], motion.ddq[row]
+    return torch.from_numpy(motion.q[row]), torch.from_numpy(motion.dq[row]), torch.from_numpy(motion.ddq[row])
 
 
 Shapes = dict[str, tuple[int, ...]]
@@ -174,26 +174,26 @@ class Problem:
     """A kernel with hyperparameters and a motion to evaluate it on."""
 
     kernel: LipKernel | ChainKernel
-    params: dict[str, Tensor]
+    params: dict[str, Array]
     motion: Motion
 
     def energies(self) -> list[Energy]:
         """The energies that the kernel's documentation states: the potential one, then one for each link."""
         energies = lip_energies if isinstance(self.kernel, LipKernel) else chain_energies
-        return energies(self.kernel.joint_types, self.params)
+        return energies(self.kernel.joint_types, {name: torch.as_tensor(each) for name, each in self.params.items()})
 
 
 class TorchForm(PairKernel):
-    """A compiled kernel as devices other than the CPU have it: blocks in PyTorch, gradients by autograd."""
+    """A compiled kernel as its formula has it, gradients by autograd."""
 
     def __init__(self, kernel: PairKernel) -> None:
         self.kernel, self.n_joints = kernel, kernel.n_joints
 
-    def blocks(self, params: Params, x: State, y: State) -> Tensor:
+    def blocks(self, params: Params, x: State, y: State) -> Array:
         """Blocks of the kernel itself."""
         return self.kernel.blocks(params, x, y)
 
-    def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
+    def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
         """Start of the kernel itself."""
         return self.kernel.initial(motion, tau)
 
@@ -229,7 +229,7 @@ def random_problem(joint_types: Sequence[str], samples: int, seed: int, kernel: 
     rng, n = np.random.default_rng(seed), len(joint_types)
     make, shapes = KERNELS[kernel]
     both = shapes(n) | {"noise.log_std": (n,), "friction.log_std": (n, 3)}
-    params = {name: torch.tensor(rng.uniform(*width(name), shape)).double() for name, shape in both.items()}
+    params = {name: np.array(rng.uniform(*width(name), shape)) for name, shape in both.items()}
     params["noise.log_std"] = params["noise.log_std"] - 1.0
     motion = Motion.from_arrays(*rng.uniform(-2.0, 2.0, (3, samples, n)))
     return Problem(make(joint_types), params, motion)
@@ -253,7 +253,7 @@ def problems(
         return draw(arrays(np.float64, shape, elements=st.floats(-bound, bound, allow_subnormal=False)))
 
     bounds = {name: 1.0 if name.startswith("kinetic.log_") else 3.0 for name in shapes(n)}
-    params = {name: torch.from_numpy(array(shape, bounds[name])) for name, shape in shapes(n).items()}
+    params = {name: array(shape, bounds[name]) for name, shape in shapes(n).items()}
     motion = Motion.from_arrays(*(array((samples, n), 4.0) for _ in range(3)))
     return Problem(make(joint_types), params, motion)
 
@@ -271,7 +271,7 @@ def worst_block_error(problem: Problem, pairs: Sequence[tuple[int, int]] = PAIRS
     for i, j in pairs:
         x, y = instant(motion, i), instant(motion, j)
         terms = torque_terms(energies, x, y)
-        error = float((blocks[:, :, i, j] - terms.sum(0)).abs().max())
+        error = float(np.abs(blocks[:, :, i, j] - terms.sum(0).numpy()).max())
         worst = max(worst, error / scale_of(energies, x, y, terms))
     return worst
 
@@ -290,7 +290,7 @@ def worst_energy_error(problem: Problem, pairs: Sequence[tuple[int, int]] = PAIR
         scale = scale_of(energies, x, y, terms)
         for found, each in ((torques, terms), (values, alone)):
             expected = torch.stack([each[1:].sum(0), each[0]])
-            worst = max(worst, float((found[..., i, j] - expected).abs().max()) / scale)
+            worst = max(worst, float(np.abs(found[..., i, j] - expected.numpy()).max()) / scale)
     return worst
 
 
@@ -306,7 +306,7 @@ def opposite(kind: str, share: Sequence[float], q: float) -> float:
 def in_full(model: TorqueModel, samples: Samples) -> TorqueModel:
     """The model with every sample counted in full, and nothing besides posterior and noise: the textbook's."""
     posterior, motion = model.posterior, samples.motion()
-    noise, residual = posterior.noise_variance, samples.torque() - posterior.kernel.mean(motion)
+    noise, residual = posterior.noise_variance, samples.tau - posterior.kernel.mean(motion)
     every = collect(posterior.basis, noise, motion, residual)
     built = CompactPosterior.build(posterior.kernel, posterior.basis, every, noise, posterior.std_factor)
     return replace(model, posterior=built)

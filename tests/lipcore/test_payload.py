@@ -112,7 +112,7 @@ def test_what_answers_is_the_linear_model_around_the_load(carrier, recorded):
     features, base = Linearised(carrier, load).rows(motion)
     mean = base + np.einsum("knj,k->nj", features, load.mean)
     variance = np.einsum("knj,kl,lnj->nj", features, load.covariance, features)
-    variance += carrier.model.posterior.misfit.variance(motion).numpy()
+    variance += carrier.model.posterior.misfit.variance(motion)
     answer = carrier.carrying(load).predict(other.q, other.dq, other.ddq)
     np.testing.assert_allclose(answer.tau, mean, atol=1e-6)
     np.testing.assert_allclose(answer.tau_std, np.sqrt(variance), rtol=1e-3)
@@ -143,7 +143,7 @@ def open_arm():
 def test_what_training_says_of_an_arm_of_another_geometry_is_what_its_samples_say(open_arm):
     samples, carrier = open_arm
     memory, model, arm = carrier.memory, carrier.model, carrier.term.arm
-    variance = model.posterior.noise_variance.numpy()
+    variance = model.posterior.noise_variance
     weight = model.posterior.statistics.samples / len(samples)
     seen = Motion.from_arrays(samples.q, samples.dq, samples.ddq)
     virtual = Motion.from_arrays(*memory.motions.swapaxes(0, 1))

@@ -182,7 +182,6 @@ def test_the_echo(api, body, given, answered):
 
 COUNT_THREADS = """
 import asyncio, sys
-import torch
 from anyio import to_thread
 from threadpoolctl import threadpool_info
 from service.app import create_app
