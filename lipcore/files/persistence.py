@@ -131,7 +131,9 @@ def decode(files: Mapping[str, bytes], limits: Limits = DEFAULT_LIMITS) -> Torqu
     tensors = read_tensors(_verified(files, TENSORS, manifest["tensors"]), n, limits)
     robot = _robot(files, manifest, limits)
     try:
-        return _restore(manifest, tensors, robot)
+        # what numbers of strangers overflow to is refused by the checks that follow
+        with np.errstate(over="ignore", invalid="ignore"):
+            return _restore(manifest, tensors, robot)
     except ModelFormatError:
         raise
     except Exception as error:  # whatever numerics make of numbers that no training has made

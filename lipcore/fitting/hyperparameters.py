@@ -205,7 +205,9 @@ class _Search:
         self.evaluations += 1
         params = self.unpack(flat)
         try:
-            evidence = negative_log_evidence(self.kernel, params, self.motion, self.tau, self.device)
+            # a line search may step to where exponentials overflow: that covariance is not finite, and is refused
+            with np.errstate(over="ignore", invalid="ignore"):
+                evidence = negative_log_evidence(self.kernel, params, self.motion, self.tau, self.device)
         except NotPositiveDefiniteError:
             if not np.isfinite(self.best):
                 raise  # not even the starting point is well posed

@@ -161,7 +161,7 @@ def _vector_rows(name: ComponentName, at: dict[str, int], n: int) -> Array:
 
 def _inertia_rows(at: dict[str, int], n: int) -> Array:
     """Coefficients (n (n+1) / 2, S, n) of ½ (M_ij + M_ji) for i ≤ j; column j of M is f(q, 0, e_j) − f(q, 0, 0)."""
-    i, j = np.triu_indices(n, n)
+    i, j = np.triu_indices(n)
     entry, first_push, rest = np.arange(len(i)), at["push 0"], at["rest"]
     rows = np.zeros((len(i), len(at), n))
     for row, column in ((i, j), (j, i)):
@@ -172,7 +172,7 @@ def _inertia_rows(at: dict[str, int], n: int) -> Array:
 
 def _symmetric(upper: Array, n: int) -> Array:
     """Entries i ≤ j, (N, n (n+1) / 2), as symmetric matrices (N, n, n)."""
-    i, j = np.triu_indices(n, n)
+    i, j = np.triu_indices(n)
     full = np.empty((len(upper), n, n), dtype=upper.dtype)
     full[:, i, j] = full[:, j, i] = upper
     return full

@@ -58,8 +58,9 @@ def pooled_weight(params: Mapping[str, Tensor], link: int, joint: int) -> Tensor
     )
 
 
-def lip_energies(joint_types: Sequence[str], params: Mapping[str, Tensor]) -> list[Energy]:
+def lip_energies(joint_types: Sequence[str], params: Mapping[str, Array]) -> list[Energy]:
     """Energies of the paper: the potential over all joints, then one kinetic energy for each link."""
+    params = {name: torch.as_tensor(each) for name, each in params.items()}
     potential_shares = shares_of(params["potential.logits"])
     scale = torch.exp(params["potential.log_scale"])
 
@@ -93,8 +94,9 @@ def chain_base_kernel(kind: str, alpha: Tensor, q: Tensor, q2: Tensor) -> Tensor
     return 1 - alpha + alpha * (torch.cos(q - q2) if kind == "revolute" else q * q2)
 
 
-def chain_energies(joint_types: Sequence[str], params: Mapping[str, Tensor]) -> list[Energy]:
+def chain_energies(joint_types: Sequence[str], params: Mapping[str, Array]) -> list[Energy]:
     """Energies of a serial chain: the potentials of all links added up, then one kinetic energy for each link."""
+    params = {name: torch.as_tensor(each) for name, each in params.items()}
     n, scales = len(joint_types), torch.exp(params["potential.log_scales"])
     alpha = 1 / (1 + torch.exp(-params["chain.logits"]))
 
@@ -180,7 +182,7 @@ class Problem:
     def energies(self) -> list[Energy]:
         """The energies that the kernel's documentation states: the potential one, then one for each link."""
         energies = lip_energies if isinstance(self.kernel, LipKernel) else chain_energies
-        return energies(self.kernel.joint_types, {name: torch.as_tensor(each) for name, each in self.params.items()})
+        return energies(self.kernel.joint_types, self.params)
 
 
 class TorchForm(PairKernel):

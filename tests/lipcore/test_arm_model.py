@@ -97,21 +97,21 @@ def test_a_saved_arm_comes_back(kind: str, learnt: TorqueModel, samples: Samples
 
 Edit = Callable[[dict[str, Array]], object]
 WRONG: dict[str, tuple[Edit, str]] = {
-    "no rotation": (lambda t: t["arm/rotation"].mul_(2), "no rotation"),
-    "no axis": (lambda t: t["arm/axis"].zero_(), "not of length one"),
+    "no rotation": (lambda t: t["arm/rotation"].__imul__(2), "no rotation"),
+    "no axis": (lambda t: t["arm/axis"].fill(0), "not of length one"),
     "missing": (lambda t: t.pop("arm/unit"), "'arm/unit' is missing"),
-    "order": (lambda t: t["arm/order"].zero_(), "expected each joint once"),
-    "widths": (lambda t: t["arm/widths"].zero_(), "not above zero"),
+    "order": (lambda t: t["arm/order"].fill(0), "expected each joint once"),
+    "widths": (lambda t: t["arm/widths"].fill(0), "not above zero"),
     "parameters": (lambda t: t.update({"arm/parameters": t["arm/parameters"][:2].copy()}), "parameters has shape"),
     "rotor": (lambda t: t.update({"arm/rotor": t["arm/rotation"][0, 0, :2].copy()}), "rotor has shape"),
     "steps": (lambda t: t.update({"arm/expected": t["arm/expected"][:1].copy()}), "expected has shape"),
-    "not finite": (lambda t: t["arm/translation"].fill_(np.nan), "finite"),
+    "not finite": (lambda t: t["arm/translation"].fill(np.nan), "finite"),
     "coefficients": (
         lambda t: t.update({"arm/other/linear": t["arm/other/linear"][:, :, :2].copy()}),
         r"'arm/other/linear' has shape \(3, 3, 2\), expected \(3, 3, 4\)",
     ),
-    "no probability": (lambda t: t["arm/other/probability"].zero_(), "between 0 and 1"),
-    "improbable": (lambda t: t["arm/other/probability"].fill_(0.9), "positive definite|cholesky"),
+    "no probability": (lambda t: t["arm/other/probability"].fill(0), "between 0 and 1"),
+    "improbable": (lambda t: t["arm/other/probability"].fill(0.9), "positive definite|cholesky"),
     "none": (lambda t: t.update({"arm/other/probability": np.zeros(0)}), "has shape"),
     "unknown": (lambda t: t.update({"arm/shadow": np.zeros(1)}), "does not know"),
 }

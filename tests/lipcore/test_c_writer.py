@@ -84,11 +84,11 @@ def drawn(model: TorqueModel, count: int, seed: int, beyond: float = 1.0) -> np.
 
 
 def exact(model: TorqueModel, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """tau and tau_std of the posterior's own formulas, in fractions; covariances of the energies in PyTorch."""
+    """tau and tau_std of the posterior's own formulas, in fractions; covariances of the energies by their formula."""
     posterior, query = model.posterior, Motion.from_arrays(*motion)
     basis, n = posterior.basis, model.n_joints
     features = np.concatenate([each.features(query) for each in basis.linear], axis=2)
-    prior = np.concatenate([each.covariance(posterior.params).diagonal() for each in basis.linear])
+    prior = np.concatenate([each.variances(posterior.params) for each in basis.linear])
     rubbing = np.zeros(features.shape[2] - basis.linear[0].size)
     centre = np.concatenate([basis.linear[0].prior_weights(), rubbing])
     fraction = np.frompyfunc(Fraction, 1, 1)
@@ -121,8 +121,8 @@ def with_misfit(model: TorqueModel) -> TorqueModel:
     """The same with all that adds to a variance."""
     rng, n = np.random.default_rng(0), model.n_joints
     rows = np.stack([rng.uniform(0.1, 1.0, n), np.full(n, 0.1), *rng.uniform(0.5, 1.0, (3, n))])
-    misfit = Misfit.unpacked(model.posterior.noise_variance.new_tensor(rows))
-    floor = model.posterior.noise_variance.new_tensor([1e-4, 10.0, *[1e-4] * (n - 2)])
+    misfit = Misfit.unpacked(rows)
+    floor = np.array([1e-4, 10.0, *[1e-4] * (n - 2)])
     return replace(model, posterior=replace(model.posterior, misfit=misfit, floor=floor, std_factor=1.3))
 
 

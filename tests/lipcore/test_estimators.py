@@ -128,7 +128,7 @@ def test_gradient_of_the_evidence_equals_finite_differences(name: str, prior: st
     assert gradient.keys() == params.keys()
 
     def value(key: str, index: tuple[int, ...], step: float) -> float:
-        moved = {other: tensor.copy() for other, tensor in params.items()}
+        moved = {other: np.array(tensor) for other, tensor in params.items()}
         moved[key][index] += step
         return negative_log_evidence(kernel, moved, motion, tau).value
 

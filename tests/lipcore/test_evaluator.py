@@ -56,7 +56,7 @@ class Case:
             rows.append(self.term.gram(self.params, self.inducing, query)[self.outputs])
         for each in self.linear:
             features = each.features(query)
-            rows.append(each.covariance(self.params) @ features.reshape(len(query) * n, -1).T)
+            rows.append(np.diag(each.variances(self.params)) @ features.reshape(len(query) * n, -1).T)
         cross = np.concatenate(rows)
         mean = prior.mean(query) + (self.weights @ cross).reshape(-1, n)
         white, chosen = (self.root @ cross).reshape(-1, len(query), n), len(self.outputs)

@@ -53,7 +53,7 @@ def test_gradient_is_that_of_evidence_and_priors_together(estimator: str) -> Non
     kernel, motion, tau = make_estimator(estimator, ("revolute",) * 2).kernel, samples.motion(), samples.tau
     start = kernel.initial(motion, tau) | {"noise.log_std": np.full((2,), -3.0)}
     floor = np.full((2,), -20.0)
-    objective = fitting._Search(kernel, start, floor, motion, tau, lambda: False)
+    objective = fitting._Search(kernel, start, floor, motion, tau, lambda: False, "cpu")
     at = objective.pack(start) + np.random.default_rng(0).uniform(-1, 1, objective.pack(start).shape)
     gradient = objective(at)[1]
     for k in range(len(at)):

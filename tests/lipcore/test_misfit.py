@@ -82,7 +82,7 @@ def test_rows_of_one_second_share_what_lasts() -> None:
     misfit = Misfit(0.5 * one, one, np.array([0.25, 1.0]), one, one)
     counted = misfit.of_row(noise, dq)
     expected = [0.75 + ROWS * (0.25 + 0.5), ROWS * (1.0 + 0.5 * np.exp(-9.0))]
-    np.testing.assert_allclose(counted, np.array([expected]), check_dtype=False)
+    np.testing.assert_allclose(counted, np.array([expected]))
 
 
 def test_answers_hold_it(model: TorqueModel) -> None:

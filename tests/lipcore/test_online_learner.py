@@ -382,7 +382,8 @@ def test_probe_finds_answers_that_are_none(base: TorqueModel) -> None:
     statistics = posterior.statistics
     assert statistics is not None
     inducing, outputs = posterior.basis.inducing, posterior.basis.outputs
-    restored = CompactPosterior.restore(base.estimator.kernel, params, inducing, outputs, statistics)
+    with np.errstate(over="ignore"):
+        restored = CompactPosterior.restore(base.estimator.kernel, params, inducing, outputs, statistics)
     broken = replace(base, posterior=restored)
     with pytest.raises(ModelFormatError, match="noise_std of a probe"):
         probe(broken)

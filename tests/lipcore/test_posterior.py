@@ -149,7 +149,7 @@ def test_covariance_that_cannot_be_factored_is_reported() -> None:
     params = problem.params | {"noise.log_std": np.array([float("nan")])}
     kernel = SumKernel(problem.kernel, FrictionKernel(1))
     with pytest.raises(NotPositiveDefiniteError):
-        negative_log_evidence(kernel, params, problem.motion, np.zeros(5, 1))
+        negative_log_evidence(kernel, params, problem.motion, np.zeros((5, 1)))
 
 
 ROBOT = "double-pendulum"

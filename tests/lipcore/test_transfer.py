@@ -71,8 +71,8 @@ def test_what_is_expected_is_the_other_unit(base: TorqueModel, unseen: Samples) 
     assert mean is not None
     off = kernel.torque(mean, motion) - true
     assert (np.sqrt(np.mean(off**2, axis=0)) < 0.05 * true.std(axis=0)).all()
-    features, variance = kernel.features(motion), kernel.covariance(kernel.initial(motion, unseen.tau))
-    std = np.sqrt(np.square(features) @ variance.diagonal())
+    features, variance = kernel.features(motion), kernel.variances(kernel.initial(motion, unseen.tau))
+    std = np.sqrt(np.square(features) @ variance)
     assert (np.sqrt(np.mean(std**2, axis=0)) < 0.5 * true.std(axis=0)).all()
     assert (np.mean(np.abs(second - true - off) < 2 * std, axis=0) > 0.9).all()
 
