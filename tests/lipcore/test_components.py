@@ -274,7 +274,7 @@ def small(request: pytest.FixtureRequest) -> Small:
 
 def torque_covariance(energies: list[Energy], xs: Sequence[Instant], ys: Sequence[Instant]) -> np.ndarray:
     """Covariance of the torques of the energies alone: (len(xs) n, len(ys) n)."""
-    blocks = [[torque_terms(energies, x, y).sum(0) for y in ys] for x in xs]
+    blocks = [[torque_terms(energies, x, y).sum(0).numpy() for y in ys] for x in xs]
     return np.block(blocks)
 
 
@@ -282,7 +282,7 @@ def friction_covariance(params: Mapping[str, Array], xs: Sequence[Instant], ys: 
     variances = np.exp(2 * params["friction.log_std"])
 
     def features(v: Array) -> np.ndarray:
-        return np.stack([v, np.tanh(v / SIGN_WIDTH), np.ones(N)], axis=1)
+        return np.stack([v, np.tanh(np.asarray(v) / SIGN_WIDTH), np.ones(N)], axis=1)
 
     return np.block([[np.diag((features(x[1]) * variances * features(y[1])).sum(1)) for y in ys] for x in xs])
 
@@ -308,9 +308,9 @@ def test_energies(small: Small, row: int) -> None:
     found = dynamics.components(small.model, small.query, names)
     x = instant(small.query, row)
     origin = dynamics.reference_posture(small.model)
-    reference = (origin, np.zeros(N), np.zeros(N))
+    reference = tuple(map(torch.as_tensor, (origin, np.zeros(N), np.zeros(N))))
     data = samples(small.motion)
-    torques = np.array([[energy_torque(small.energies, at, y) for y in data] for at in (x, reference)])
+    torques = np.array([[energy_torque(small.energies, at, y).numpy() for y in data] for at in (x, reference)])
     torques = torques.transpose(0, 2, 1, 3).reshape(2, len(small.energies), -1)  # (at, energy, m)
 
     def value(which: int, at: Instant, other: Instant) -> float:

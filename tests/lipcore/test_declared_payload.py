@@ -106,7 +106,7 @@ def test_all_components_are_of_the_arm_with_its_payload(learnt: tuple[Robot, Tor
     robot, without = learnt
     model, heavy = carrying(without, BODY), loaded(robot, BODY)
     asked = moved(heavy, 7, 40, 0.0)
-    parts = dynamics.components(model, asked.motion(), dynamics.COMPONENTS, tensor(asked.tau))
+    parts = dynamics.components(model, asked.motion(), dynamics.COMPONENTS, asked.tau)
     middle = dynamics.reference_posture(model)
     truth, light = (truth_of(each, asked, middle, VISCOUS) for each in (heavy, robot))
     for name, part in parts.items():
