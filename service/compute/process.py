@@ -29,7 +29,7 @@ from service.web.observability.logs import LogOptions
 logger = logging.getLogger(__name__)
 
 THREAD_VARIABLES = (
-    "OMP_NUM_THREADS",  # torch
+    "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",  # NumPy and SciPy
     "MKL_NUM_THREADS",
     "VECLIB_MAXIMUM_THREADS",

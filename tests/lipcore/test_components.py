@@ -328,7 +328,7 @@ def test_energies(small: Small, row: int) -> None:
 @pytest.mark.parametrize("row", few(range(QUERIES), lambda row: row == 0))
 def test_torques_and_inertia(small: Small, row: int) -> None:
     q, v, a = instant(small.query, row)
-    zero, eye = np.zeros(N), np.eye(N)
+    zero, eye = torch.zeros(N, dtype=torch.float64), torch.eye(N, dtype=torch.float64)
     stack = [(q, zero, zero), (q, v, zero), (q, zero, a), *((q, zero, eye[j]) for j in range(N))]
     prior = torque_covariance(small.energies, stack, stack)
     cross = torque_covariance(small.energies, stack, samples(small.motion))

@@ -19,7 +19,7 @@ from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import Stream, simulate
 from lipcore.robots.urdf import RigidBody
 from tests.choosing import slow
-from tests.lipcore.arm_oracles import arm, as_robot, followed, lagrangian_torque, motions, recorded, tensor
+from tests.lipcore.arm_oracles import arm, as_robot, followed, lagrangian_torque, motions, recorded
 from tests.lipcore.arms import random_bodies
 from tests.lipcore.test_components import truth_of
 
