@@ -97,7 +97,7 @@ class Posterior(ABC):
             part = query[start : start + QUERIES_PER_CHUNK]
             cross = self.cross(kernel, part)
             means.append(kernel.mean(part) + (self.weights @ cross).reshape(-1, n))
-            white = self.whiten(cross).reshape(-1, len(part), n).transpose(1, 2, 0)  # (N, n, r)
+            white = np.ascontiguousarray(self.whiten(cross).reshape(-1, len(part), n).transpose(1, 2, 0))  # (N, n, r)
             explained = white @ white.mT
             covariances.append(self.std_factor**2 * (kernel.variance(self.params, part) - explained))
         return Prediction(np.concatenate(means), np.concatenate(covariances))
