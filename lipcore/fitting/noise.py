@@ -77,7 +77,9 @@ def refine(
         excess = _left_out(*_inverse(gram, log_std, y), n)
         if (excess <= TOLERATED).all():
             break
-        log_std = log_std + np.where(excess > TOLERATED, 0.5 * np.log(excess), 0.0).clip(max=LARGEST_STEP)
+        log_std = log_std + np.where(excess > TOLERATED, 0.5 * np.log(excess.clip(TOLERATED)), 0.0).clip(
+            max=LARGEST_STEP
+        )
     return {**params, "noise.log_std": log_std}
 
 
